@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fixtures of the Blender tests, above all the elbow: recorded, trained and bound once; and functions that measure."""
+"""Fixtures of the Blender tests, above all the elbow's files; and functions that read and compare positions."""
 
 import os
 import shutil
@@ -47,7 +47,7 @@ def _shared_trainings() -> Trainings:
 
 
 def train(recording: Path, model: Path, *options: object) -> None:
-    """Train a model as `train` does, in a process that all such trainings share: starting PyTorch takes seconds."""
+    """Train a model like the verb `train`, but in a process that all tests share: PyTorch takes seconds to start."""
     trainings = _shared_trainings()
     try:
         trainings.add(recording, model, *options)
@@ -78,7 +78,7 @@ def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
     files = ElbowFiles(*(folder / name for name in ("elbow.blend", "recording", "elbow.onnx", "bound.blend")))
     with FileLock(folder.with_suffix(".lock")):
         if not files.bound.exists():
-            # What a process left that failed here.
+            # Remove the files that another process left when it failed here.
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             bpy.ops.wm.read_factory_settings(use_empty=True)

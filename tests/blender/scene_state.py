@@ -8,7 +8,7 @@ import numpy as np
 
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
-TRANSFORMS = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
+TRANSFORM_PROPERTIES = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
 
 
 def fresh_elbow() -> SceneRig:
@@ -39,11 +39,21 @@ def scene_state(rig: SceneRig) -> dict:
             [track.name for track in animation.nla_tracks],
         ),
         "pose": {
-            bone.name: (bone.rotation_mode, _properties(bone), *([*getattr(bone, name)] for name in TRANSFORMS))
+            bone.name: (
+                bone.rotation_mode,
+                _properties(bone),
+                *([*getattr(bone, name)] for name in TRANSFORM_PROPERTIES),
+            )
             for bone in armature_object.pose.bones
         },
         "objects": {
-            o.name: (o.mode, o.hide_viewport, o.select_get(), _properties(o), *([*getattr(o, n)] for n in TRANSFORMS))
+            o.name: (
+                o.mode,
+                o.hide_viewport,
+                o.select_get(),
+                _properties(o),
+                *([*getattr(o, n)] for n in TRANSFORM_PROPERTIES),
+            )
             for o in scene.objects
         },
         "active": bpy.context.view_layer.objects.active and bpy.context.view_layer.objects.active.name,

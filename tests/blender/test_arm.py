@@ -112,8 +112,8 @@ def test_the_mesh_has_the_lengths_of_an_arm(surface):
     assert arm.points[arm.joints == JOINT_INDEX["thumb_2"], 0].max() < tips["pinky"]
 
 
-def test_no_finger_follows_another(surface):
-    """Rest points of a finger lie about that finger's bones."""
+def test_fingers_follow_their_own_bones(surface):
+    """Every vertex of a finger is near the bones of the same finger."""
     _, arm = surface
     for name in FINGERS:
         for i in (1, 2, 3):

@@ -30,20 +30,20 @@ def verb(request, elbow, tmp_path):
     return lambda rig_path, *options: [request.param, rig_path, *more_arguments, *options]
 
 
-def test_a_missing_rig_file(refusal, verb, tmp_path):
+def test_a_missing_rig_file_is_refused(refusal, verb, tmp_path):
     path = tmp_path / "none.blend"
     assert refusal(*verb(path)) == f"There is no file '{path}'; give the path of a .blend file."
     assert "There is no file" in refusal(*verb(tmp_path))
 
 
-def test_a_rig_that_is_not_a_blend_file(refusal, verb, tmp_path):
+def test_a_rig_that_is_not_a_blend_file_is_refused(refusal, verb, tmp_path):
     path = tmp_path / "text.blend"
     path.write_text("not a blend file\n" * 100)
     text = refusal(*verb(path))
     assert text.startswith(f"Blender cannot open '{path}' (") and text.endswith("); give a .blend file.")
 
 
-def test_a_scene_without_a_mesh(refusal, verb, tmp_path):
+def test_a_scene_without_a_mesh_is_refused(refusal, verb, tmp_path):
     path = save_elbow(tmp_path / "rig.blend", lambda rig: bpy.data.objects.remove(rig.mesh_object))
     assert refusal(*verb(path)).startswith("The scene has no mesh; open a file with a character")
 
@@ -54,19 +54,19 @@ def add_second_mesh(rig) -> None:
     bpy.context.scene.collection.objects.link(second)
 
 
-def test_two_skinned_meshes_and_no_object_option(refusal, verb, tmp_path):
+def test_a_scene_with_two_skinned_meshes_needs_the_option_object(refusal, verb, tmp_path):
     path = save_elbow(tmp_path / "rig.blend", add_second_mesh)
     assert refusal(*verb(path)) == ("2 meshes have an Armature modifier ('elbow', 'sleeve'); choose one with --object.")
 
 
-def test_a_missing_object(refusal, verb, tmp_path):
+def test_a_missing_object_is_refused(refusal, verb, tmp_path):
     path = save_elbow(tmp_path / "rig.blend", add_second_mesh)
     assert refusal(*verb(path, "--object", "glove")) == (
         "The scene has no mesh object 'glove'; its mesh objects: 'elbow', 'sleeve'."
     )
 
 
-def test_a_mesh_without_an_armature_modifier(refusal, verb, tmp_path):
+def test_a_mesh_without_an_armature_modifier_is_refused(refusal, verb, tmp_path):
     def remove_armature(rig):
         rig.mesh_object.parent = None
         rig.mesh_object.modifiers.remove(rig.mesh_object.modifiers["Armature"])
@@ -81,13 +81,13 @@ def lock_all_rotations(rig) -> None:
         bone.lock_rotation = (True, True, True)
 
 
-def test_a_rig_whose_bones_are_all_locked(refusal, elbow, tmp_path):
+def test_a_rig_whose_bones_are_all_locked_is_refused(refusal, elbow, tmp_path):
     path = save_elbow(tmp_path / "rig.blend", lock_all_rotations)
     expected = "No bone of 'elbow_rig' may be sampled: all 2 are locked or moved by constraints; unlock an axis"
     assert refusal("record", path, tmp_path / "r").startswith(expected)
 
 
-def test_a_mesh_without_vertices(refusal, verb, tmp_path):
+def test_a_mesh_without_vertices_is_refused(refusal, verb, tmp_path):
     path = save_elbow(tmp_path / "rig.blend", lambda rig: rig.mesh_object.data.clear_geometry())
     assert "The mesh of 'elbow' has no vertices" in refusal(*verb(path))
 
@@ -130,18 +130,18 @@ def index_changer(**values):
         pytest.param(write_nan, "holds values that are not numbers (residuals, pose 3); record again", id="NaN"),
     ],
 )
-def test_training_on_a_damaged_recording(refusal, elbow, tmp_path, damage, words):
+def test_training_on_a_damaged_recording_is_refused(refusal, elbow, tmp_path, damage, words):
     path = shutil.copytree(elbow.recording, tmp_path / "recording")
     damage(path)
     assert words in refusal("train", path, tmp_path / "m.onnx")
 
 
-def test_recording_into_a_folder_with_a_recording(refusal, elbow, tmp_path):
+def test_recording_into_a_folder_with_a_recording_is_refused(refusal, elbow, tmp_path):
     path = shutil.copytree(elbow.recording, tmp_path / "recording")
     assert "holds a recording already; continue it with --resume" in refusal("record", elbow.rig, path)
 
 
-def test_resuming_with_other_options(refusal, elbow, tmp_path):
+def test_resuming_with_other_options_is_refused(refusal, elbow, tmp_path):
     path = shutil.copytree(elbow.recording, tmp_path / "recording")
     index_changer(complete=40)(path)
     text = refusal("record", elbow.rig, path, "--poses", 150, "--seed", 1, "--resume")
@@ -173,17 +173,17 @@ def writing_verb(request, elbow, tmp_path_factory):
     }[request.param]
 
 
-def test_an_output_below_a_file(refusal, writing_verb, tmp_path):
+def test_an_output_below_a_file_is_refused(refusal, writing_verb, tmp_path):
     (tmp_path / "file").write_text("old")
     text = refusal(*writing_verb(tmp_path / "file" / "out"))
     assert text.startswith("Cannot write")
 
 
-def test_an_output_in_an_unwritable_folder(refusal, writing_verb):
+def test_an_output_in_an_unwritable_folder_is_refused(refusal, writing_verb):
     assert refusal(*writing_verb(systems.UNWRITABLE)).startswith("Cannot write")
 
 
-def test_an_output_in_a_missing_folder(refusal, writing_verb, tmp_path):
+def test_an_output_in_a_missing_folder_is_refused(refusal, writing_verb, tmp_path):
     if writing_verb("")[0] == "record":
         pytest.skip("record makes its folder")
     text = refusal(*writing_verb(tmp_path / "none" / "out"))
@@ -191,17 +191,17 @@ def test_an_output_in_a_missing_folder(refusal, writing_verb, tmp_path):
 
 
 def deep_path(folder: Path) -> Path:
-    """Return a path that is longer than Blender's limit, which lies inside a folder name of the path."""
+    """Return a path that exceeds Blender's limit for paths; the limit falls inside a folder name."""
     return folder.joinpath(*(letter * 200 for letter in "abcdef"))
 
 
-def test_an_output_path_that_is_too_long_for_blender(refusal, writing_verb, tmp_path):
+def test_an_output_path_that_is_too_long_for_blender_is_refused(refusal, writing_verb, tmp_path):
     """Blender would truncate the path, and could overwrite another file."""
     text = refusal(*writing_verb(deep_path(tmp_path) / "out.blend"))
     assert text.startswith("Cannot write") and "bytes, and Blender takes 1,023; choose a shorter folder." in text
 
 
-def test_a_rig_path_that_is_too_long_for_blender(refusal, verb, elbow, tmp_path):
+def test_a_rig_path_that_is_too_long_for_blender_is_refused(refusal, verb, elbow, tmp_path):
     path = deep_path(tmp_path) / "rig.blend"
     path.parent.mkdir(parents=True)
     shutil.copy(elbow.rig, path)
@@ -209,13 +209,13 @@ def test_a_rig_path_that_is_too_long_for_blender(refusal, verb, elbow, tmp_path)
     assert text.startswith("Blender cannot open or write") and "bytes, and Blender takes 1,023; choose a sh" in text
 
 
-def test_an_output_that_is_a_folder(refusal, writing_verb, tmp_path):
+def test_an_output_that_is_a_folder_is_refused(refusal, writing_verb, tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "letter.txt").write_text("dear")
     assert refusal(*writing_verb(tmp_path / "folder")).startswith("Cannot ")
 
 
-def test_an_output_on_a_full_disk(refusal_on_a_full_disk, writing_verb, tmp_path):
+def test_an_output_on_a_full_disk_is_refused(refusal_on_a_full_disk, writing_verb, tmp_path):
     with limited_file_size(100):
         text = refusal_on_a_full_disk(*writing_verb(tmp_path / "out"))
     assert text.startswith("Cannot write"), text
@@ -230,7 +230,7 @@ def test_a_full_disk_leaves_the_old_file(refusal_on_a_full_disk, writing_verb, t
     assert file_contents(tmp_path) == {"out": b"old"}
 
 
-def test_a_model_that_cannot_be_copied_beside_the_bound_file(refusal, elbow, tmp_path):
+def test_a_model_that_cannot_be_copied_beside_the_bound_file_is_refused(refusal, elbow, tmp_path):
     (tmp_path / elbow.model.name).write_bytes(b"another model")
     text = refusal("bind", elbow.rig, elbow.model, tmp_path / "b.blend")
     assert f"there is another '{elbow.model.name}'; remove it or choose another folder" in text

@@ -85,21 +85,21 @@ def flip_face(rig) -> None:
     ],
     ids=["vertex count", "joints", "rest pose", "parents", "rest positions", "weights", "topology"],
 )
-def test_a_model_of_another_rig(refusal, verb, elbow, tmp_path, change, words):
+def test_a_model_of_another_rig_is_refused(refusal, verb, elbow, tmp_path, change, words):
     assert len(json.loads((elbow.recording / "recording.json").read_text())["joints"]) == 2
     text = refusal(*verb(save_elbow(tmp_path / "rig.blend", change), elbow.model))
     assert text.startswith(f"The model '{elbow.model}' was trained for another rig: {words}")
     assert text.endswith(". Record and train this rig.")
 
 
-def test_a_missing_model(refusal, verb, elbow, tmp_path):
+def test_a_missing_model_is_refused(refusal, verb, elbow, tmp_path):
     path = tmp_path / "none.onnx"
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
 
 
 @pytest.mark.parametrize("content", [b"", b"text, not a model\n" * 50, bytes(5000)])
-def test_a_file_that_is_not_an_onnx_file(refusal, verb, elbow, tmp_path, content):
+def test_a_file_that_is_not_an_onnx_file_is_refused(refusal, verb, elbow, tmp_path, content):
     path = tmp_path / "m.onnx"
     path.write_bytes(content)
     assert refusal(*verb(elbow.rig, path)) == (
@@ -108,7 +108,7 @@ def test_a_file_that_is_not_an_onnx_file(refusal, verb, elbow, tmp_path, content
 
 
 @pytest.mark.parametrize("kept_ratio", [0.1, 0.5, 0.999])
-def test_a_truncated_model(refusal, verb, elbow, tmp_path, kept_ratio):
+def test_a_truncated_model_is_refused(refusal, verb, elbow, tmp_path, kept_ratio):
     path, data = tmp_path / "m.onnx", elbow.model.read_bytes()
     path.write_bytes(data[: int(len(data) * kept_ratio)])
     assert f"'{path}' is not a model" in refusal(*verb(elbow.rig, path))
@@ -157,7 +157,7 @@ def set_version_2(model) -> None:
         (set_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
     ],
 )
-def test_onnx_files_that_are_not_models_of_the_add_on(refusal, verb, elbow, tmp_path, change, words):
+def test_onnx_files_that_are_not_models_of_the_add_on_are_refused(refusal, verb, elbow, tmp_path, change, words):
     path = write_edited(elbow.model, tmp_path / "m.onnx", change)
     text = refusal(*verb(elbow.rig, path))
     assert str(path) in text and words in text
@@ -176,19 +176,19 @@ def use_double_input(model) -> None:
 
 
 @pytest.mark.parametrize("change", [use_unknown_operator, create_loop])
-def test_graphs_that_are_refused_before_onnx_runtime_loads_them(refusal, verb, elbow, tmp_path, change):
+def test_invalid_graphs_are_refused_before_onnx_runtime_loads_them(refusal, verb, elbow, tmp_path, change):
     path = write_edited(elbow.model, tmp_path / "m.onnx", change)
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"The model '{path}' is refused: ") and text.endswith("; give one that train made.")
 
 
-def test_a_graph_that_onnx_runtime_refuses(refusal, verb, elbow, tmp_path):
+def test_a_graph_with_double_inputs_is_refused(refusal, verb, elbow, tmp_path):
     path = write_edited(elbow.model, tmp_path / "m.onnx", use_double_input)
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
 
 
-def test_weights_that_do_not_match_the_checksum(refusal, verb, elbow, tmp_path):
+def test_weights_that_do_not_match_the_checksum_are_refused(refusal, verb, elbow, tmp_path):
     data = bytearray(elbow.model.read_bytes())
     weights = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
     data[bytes(data).index(bytes(weights)) + len(weights) // 2] ^= 0x40
@@ -205,7 +205,7 @@ def output_nan(model) -> None:
     model.graph.node.append(helper.make_node("Mul", ["good", "nan"], ["positions"]))
 
 
-def test_evaluating_a_model_that_returns_nan(refusal, elbow, tmp_path):
+def test_evaluation_of_a_model_that_returns_nan_is_refused(refusal, elbow, tmp_path):
     path = write_edited(elbow.model, tmp_path / "m.onnx", output_nan)
     text = refusal("evaluate", elbow.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
     assert f"The model '{path}' gives positions that are not numbers (held-out poses, pose 0)" in text
@@ -256,7 +256,7 @@ def output_fewer_vertices(model) -> None:
     model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
 
 
-def test_a_model_whose_output_has_another_shape(refusal, verb, elbow, tmp_path):
+def test_a_model_whose_output_has_another_shape_is_refused(refusal, verb, elbow, tmp_path):
     path = write_edited(elbow.model, tmp_path / "m.onnx", output_fewer_vertices)
     assert "is refused: its output 'positions' comes out as (1, 7, 3), not as (1, 300, 3)" in refusal(
         *verb(elbow.rig, path)

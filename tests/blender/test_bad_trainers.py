@@ -37,7 +37,7 @@ STARTED = print_message_code(MessageType.STARTED, partitions=1, poses=1, vertice
 PROGRESSED = print_message_code(MessageType.PROGRESS, epoch=1, epochs=2, validation_mm=0.5)
 
 
-def test_a_python_without_torch(train_refusal, tmp_path, monkeypatch):
+def test_a_python_without_torch_is_reported(train_refusal, tmp_path, monkeypatch):
     packages = tmp_path / "packages"
     packages.mkdir()
     (packages / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")
@@ -49,7 +49,7 @@ def test_a_python_without_torch(train_refusal, tmp_path, monkeypatch):
     assert PYTHON_VARIABLE in text
 
 
-def test_a_python_that_cannot_import_the_trainer(train_refusal, tmp_path, monkeypatch):
+def test_a_python_that_cannot_import_the_trainer_is_reported(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(
         tmp_path,
         monkeypatch,
@@ -70,7 +70,7 @@ def test_a_trainer_in_the_current_folder_is_not_run(tmp_path):
     assert result.returncode == 0 and "usage: " in result.stdout, result.stderr
 
 
-def test_a_missing_python(train_refusal, monkeypatch):
+def test_a_missing_python_is_reported(train_refusal, monkeypatch):
     monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
     assert re.fullmatch(
         r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); set "
@@ -79,24 +79,24 @@ def test_a_missing_python(train_refusal, monkeypatch):
     )
 
 
-def test_a_python_that_is_not_executable(train_refusal, tmp_path, monkeypatch):
+def test_a_python_that_is_not_executable_is_reported(train_refusal, tmp_path, monkeypatch):
     path = tmp_path / "python"
     path.write_text("")
     monkeypatch.setenv(PYTHON_VARIABLE, str(path))
     assert "cannot be started (" in train_refusal()
 
 
-def test_a_trainer_that_fails_without_output(train_refusal, tmp_path, monkeypatch):
+def test_a_trainer_that_fails_without_output_is_reported(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, status=3)
     assert train_refusal() == "The trainer ended with status 3 before it was done; no model was written, train again."
 
 
-def test_a_trainer_that_exits_with_0_before_it_is_done(train_refusal, tmp_path, monkeypatch):
+def test_a_trainer_that_exits_with_0_before_it_is_done_is_reported(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, STARTED)
     assert "The trainer ended with status 0 before it was done;" in train_refusal()
 
 
-def test_a_trainer_that_writes_an_error_and_exits(train_refusal, tmp_path, monkeypatch):
+def test_a_trainer_that_writes_an_error_and_exits_is_reported(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, "sys.stderr.write('first\\nImportError: Jürgen 李\\n')", status=1)
     assert train_refusal() == (
         "The trainer ended with status 1 before it was done (ImportError: Jürgen 李); no model was written, train "
@@ -105,7 +105,7 @@ def test_a_trainer_that_writes_an_error_and_exits(train_refusal, tmp_path, monke
 
 
 @pytest.mark.parametrize("verb", ["train", "record"])
-def test_no_temporary_folder_is_writable(refusal, elbow, tmp_path, monkeypatch, verb):
+def test_a_missing_temporary_folder_is_reported(refusal, elbow, tmp_path, monkeypatch, verb):
     arguments = {
         "train": ["train", elbow.recording, tmp_path / "m.onnx"],
         "record": ["record", elbow.rig, tmp_path / "r", "--poses", 20, "--fit-linear", "hard"],
@@ -118,14 +118,14 @@ def test_no_temporary_folder_is_writable(refusal, elbow, tmp_path, monkeypatch, 
     assert text.endswith("); make room there, or name another folder in TMPDIR.")
 
 
-def test_a_trainer_that_lacks_a_library(train_refusal, tmp_path, monkeypatch):
+def test_a_trainer_that_lacks_a_library_is_reported(train_refusal, tmp_path, monkeypatch):
     error = "ImportError: DLL load failed while importing _C: Das angegebene Modul wurde nicht gefunden."
     stand_in_trainer(tmp_path, monkeypatch, f"sys.stderr.write({error!r})", status=1)
     text = train_refusal()
     assert f"({error}); install Microsoft's Visual C++ runtime from https://aka.ms/vs/17/release/vc_redist." in text
 
 
-def test_a_trainer_that_is_killed(train_refusal, tmp_path, monkeypatch):
+def test_a_trainer_that_is_killed_is_reported(train_refusal, tmp_path, monkeypatch):
     """On Windows, a process that the Task Manager kills has exit status 1, like a process that fails."""
     kill = "os.kill(os.getpid(), getattr(signal, 'SIGKILL', 15))"
     stand_in_trainer(tmp_path, monkeypatch, STARTED, PROGRESSED, kill)
@@ -135,7 +135,7 @@ def test_a_trainer_that_is_killed(train_refusal, tmp_path, monkeypatch):
     )
 
 
-def test_a_trainer_that_crashes(train_refusal, tmp_path, monkeypatch):
+def test_a_trainer_that_crashes_is_reported(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, STARTED, "import faulthandler", "faulthandler._read_null()")
     cause = "crashed: access violation, status 0xC0000005" if os.name == "nt" else "was ended by signal 11"
     assert train_refusal(status=TRY_AGAIN).startswith(f"The trainer {cause}")
@@ -143,7 +143,7 @@ def test_a_trainer_that_crashes(train_refusal, tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="/dev/full is Linux's")
 @pytest.mark.parametrize("is_silent", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_trainer_whose_disk_is_full(elbow, train_refusal, tmp_path, monkeypatch, is_silent):
+def test_a_trainer_whose_disk_is_full_is_reported(elbow, train_refusal, tmp_path, monkeypatch, is_silent):
     """The trainer cannot write to stdout, and in one case not to stderr."""
     lines = ["os.dup2(os.open('/dev/full', os.O_WRONLY), 1)", *(["os.dup2(1, 2)"] if is_silent else [])]
     packages = tmp_path / "packages"
@@ -169,7 +169,7 @@ def test_lines_that_are_not_messages_are_ignored(train_refusal, tmp_path, monkey
 
 
 @pytest.mark.parametrize("lines", [(STARTED, print_message_code(MessageType.CANCELLED)), ()])
-def test_a_trainer_that_another_program_cancels(elbow, tmp_path, monkeypatch, lines):
+def test_a_trainer_that_another_program_cancels_ends_with_status_130(elbow, tmp_path, monkeypatch, lines):
     stand_in_trainer(tmp_path, monkeypatch, *lines, status=130)
     assert run("train", elbow.recording, tmp_path / "m.onnx") == 130
     assert not (tmp_path / "m.onnx").exists()

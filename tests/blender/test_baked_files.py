@@ -39,7 +39,7 @@ def baked_folder(elbow, tmp_path_factory) -> Path:
     return folder
 
 
-class TestFiles:
+class TestWrittenFiles:
     def test_a_point_cache_contains_the_model_s_positions(self, baked_folder, wave_positions):
         start, rate, positions = read_pc2(baked_folder / "walk.pc2")
         assert (start, rate) == (1, 1) and positions.shape == wave_positions.shape
@@ -144,7 +144,7 @@ class TestWithoutTheAddOn:
         assert [key.name for key in keys] == ["Basis", *(f"Frame {frame}" for frame in WAVE_FRAMES)]
 
 
-class TestLinked:
+class TestLinkedCharacters:
     @pytest.fixture
     def shot(self, elbow, tmp_path) -> Path:
         """Return a function that saves a file with a linked elbow, or with a library override of it."""

@@ -85,7 +85,7 @@ def test_a_baked_bound_file_is_not_bound(elbow, wave_positions, tmp_path):
     assert np.abs(evaluated(mesh_object) - wave_positions[16]).max() < POSITION_TOLERANCE
 
 
-class TestBorrowed:
+class TestSceneRestoration:
     @pytest.fixture
     def unusual_rig(self):
         rig = fresh_elbow()

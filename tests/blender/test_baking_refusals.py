@@ -13,11 +13,11 @@ from .refusals import file_contents, limited_file_size, save_elbow
 
 
 class TestRefusals:
-    def test_a_missing_action(self, refusal, elbow, tmp_path):
+    def test_a_missing_action_is_refused(self, refusal, elbow, tmp_path):
         text = refusal("bake", elbow.rig, elbow.model, tmp_path / "a.pc2", "--action", "jump")
         assert text == "The file has no action 'jump'; its actions: 'elbow_wave'."
 
-    def test_a_model_of_another_rig(self, refusal, elbow, tmp_path):
+    def test_a_model_of_another_rig_is_refused(self, refusal, elbow, tmp_path):
         def move_vertex(rig):
             rig.mesh_object.data.vertices[0].co.x += 0.01
 
@@ -26,7 +26,7 @@ class TestRefusals:
             "bake", rig, elbow.model, tmp_path / "a.pc2"
         )
 
-    def test_a_missing_model(self, refusal, elbow, tmp_path):
+    def test_a_missing_model_is_refused(self, refusal, elbow, tmp_path):
         assert "none.onnx' cannot be read" in refusal("bake", elbow.rig, tmp_path / "none.onnx", tmp_path / "a.pc2")
 
     @pytest.mark.parametrize(
@@ -39,23 +39,23 @@ class TestRefusals:
             ("a.pc2", ["--frames", 1, 2000000], "Blender has frames up to 1048574, not from 1 to 2000000; give fewer."),
         ],
     )
-    def test_wrong_usage(self, elbow, tmp_path, capfd, out, options, words):
+    def test_wrong_options_end_with_status_2(self, elbow, tmp_path, capfd, out, options, words):
         assert run("bake", elbow.rig, elbow.model, tmp_path / out, *options) == 2
         captured = capfd.readouterr()
         assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
         assert file_contents(tmp_path) == {}
 
-    def test_an_output_that_is_the_rig_s_file(self, refusal, elbow, tmp_path):
+    def test_an_output_that_is_the_rig_s_file_is_refused(self, refusal, elbow, tmp_path):
         rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
         text = refusal("bake", rig, elbow.model, rig)
         assert text == f"Cannot write '{rig}': it is read for this; give another name, or --overwrite."
 
-    def test_a_point_cache_that_cannot_be_written(self, refusal, elbow, tmp_path):
+    def test_a_point_cache_that_cannot_be_written_is_refused(self, refusal, elbow, tmp_path):
         (tmp_path / "a.pc2").mkdir()
         text = refusal("bake", elbow.rig, elbow.model, tmp_path / "a.blend")
         assert text == f"Cannot write '{tmp_path / 'a.pc2'}': it is a folder; give the name of a file."
 
-    def test_a_missing_folder(self, refusal, elbow, tmp_path):
+    def test_a_missing_folder_is_refused(self, refusal, elbow, tmp_path):
         assert "does not exist; create it first." in refusal("bake", elbow.rig, elbow.model, tmp_path / "b" / "a.pc2")
 
     @pytest.mark.parametrize(("out", "options"), [("a.pc2", []), ("a.blend", []), ("a.blend", ["--shape-keys"])])
@@ -76,7 +76,7 @@ class TestRefusals:
             text = refusal_on_a_full_disk("bake", rig, elbow.model, tmp_path / out, *options)
         assert re.match(f"Cannot write '{tmp_path / 'a'}.", text)
 
-    def test_a_modifier_that_changes_the_topology_before_the_armature(self, refusal, elbow, tmp_path):
+    def test_a_modifier_that_changes_the_topology_before_the_armature_is_refused(self, refusal, elbow, tmp_path):
         def add_subdivision(rig):
             rig.mesh_object.modifiers.new("Changes", "SUBSURF")
             rig.mesh_object.modifiers.move(2, 0)
@@ -86,6 +86,6 @@ class TestRefusals:
             "bake", rig, elbow.model, tmp_path / "a.blend"
         )
 
-    def test_an_armature_in_rest_position(self, refusal, elbow, tmp_path):
+    def test_an_armature_in_rest_position_is_refused(self, refusal, elbow, tmp_path):
         rig = save_elbow(tmp_path / "rig.blend", lambda rig: setattr(rig.armature_object.data, "pose_position", "REST"))
         assert "shows its rest position; set it to pose." in refusal("bake", rig, elbow.model, tmp_path / "a.pc2")

@@ -244,7 +244,7 @@ def test_binding_can_overwrite_the_rig_s_file(elbow, tmp_path):
     assert_plays(open_in_new_session(rig), elbow.model)
 
 
-def test_binding_a_bound_file_again(elbow, tmp_path):
+def test_binding_a_bound_file_again_keeps_one_modifier(elbow, tmp_path):
     assert run("bind", elbow.bound, elbow.model, tmp_path / "b.blend") == 0
     mesh_object = open_in_new_session(tmp_path / "b.blend")
     assert sum(m.type == "NODES" for m in mesh_object.modifiers) == 1

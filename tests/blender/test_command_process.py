@@ -18,7 +18,7 @@ from .conftest import run
 from .refusals import file_contents
 
 ROOT = Path(__file__).resolve().parents[2]
-POSES = 8 * BATCH_POSES
+POSE_COUNT = 8 * BATCH_POSES
 
 INTERRUPT_SIGNAL = "CTRL_BREAK_EVENT" if os.name == "nt" else "SIGINT"
 STOP_SIGNALS = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
@@ -112,7 +112,7 @@ def recorded_pose_count(path: Path) -> int:
 
 def test_an_interrupted_recording_resumes(elbow, tmp_path):
     """A recording that Ctrl-C stops and `--resume` continues has the same bytes as an uninterrupted one."""
-    options = ["--poses", POSES, "--seed", 5]
+    options = ["--poses", POSE_COUNT, "--seed", 5]
     path = tmp_path / "interrupted"
     process = start_verb("record", elbow.rig, path, *options)
     wait_for(lambda: recorded_pose_count(path) > 0, process)
@@ -120,7 +120,7 @@ def test_an_interrupted_recording_resumes(elbow, tmp_path):
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert out.count("\n") == 1 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
-    assert 0 < recorded_pose_count(path) < POSES
+    assert 0 < recorded_pose_count(path) < POSE_COUNT
     assert run("record", elbow.rig, path, *options, "--resume") == 0
     assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
     assert file_contents(path) == file_contents(tmp_path / "whole")
@@ -128,14 +128,14 @@ def test_an_interrupted_recording_resumes(elbow, tmp_path):
 
 def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
     path = tmp_path / "killed"
-    process = start_verb("record", elbow.rig, path, "--poses", POSES)
+    process = start_verb("record", elbow.rig, path, "--poses", POSE_COUNT)
     wait_for(lambda: recorded_pose_count(path) > 0, process)
     process.kill()
     process.communicate(timeout=60)
     assert process.returncode == (1 if os.name == "nt" else -signal.SIGKILL)
-    assert 0 < recorded_pose_count(path) < POSES
-    assert run("record", elbow.rig, path, "--poses", POSES, "--resume") == 0
-    assert run("record", elbow.rig, tmp_path / "whole", "--poses", POSES) == 0
+    assert 0 < recorded_pose_count(path) < POSE_COUNT
+    assert run("record", elbow.rig, path, "--poses", POSE_COUNT, "--resume") == 0
+    assert run("record", elbow.rig, tmp_path / "whole", "--poses", POSE_COUNT) == 0
     assert file_contents(path) == file_contents(tmp_path / "whole")
 
 

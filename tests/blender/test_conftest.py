@@ -19,7 +19,7 @@ for line in sys.stdin:
     print("error of", line, file=sys.stderr, flush=True)
     print(int("fail" in line), flush=True)
 """
-"""It dies or fails if its arguments say so."""
+"""Program that ends if its arguments contain "die", and answers with status 1 if they contain "fail"."""
 
 
 @pytest.fixture

@@ -63,7 +63,7 @@ def folder(elbow, tmp_path_factory) -> Path:
     return folder
 
 
-def test_recording_code(folder):
+def test_code_of_the_recording_chapter_runs(folder):
     """The code prints the same mean residual of the first pose as `fdda_addon.core`."""
     from fdda_addon.core.metrics import distances
     from fdda_addon.core.recording.reader import read_recording
@@ -79,24 +79,24 @@ def test_recording_code(folder):
     assert shape and float(value) == pytest.approx(expected, rel=1e-3)
 
 
-def test_model_code(folder):
+def test_code_of_the_model_chapter_runs(folder):
     assert run_code(chapter("Model"), folder).startswith("['upper', 'lower'] (2, 300, 3) [1. ")
 
 
-def test_evaluation_code(folder):
+def test_code_of_the_evaluation_chapter_runs(folder):
     lines = run_code(chapter("Evaluation"), folder).splitlines()
     report = json.loads((folder / "evaluation.json").read_text())
     assert lines[0].startswith(f"mean {report['fdda']['mean']:.3f} mm, linear skinning ")
     assert lines[1].startswith("largest error: ")
 
 
-def test_messages_code(folder, tmp_path):
+def test_code_of_the_messages_chapter_runs(folder, tmp_path):
     shutil.copytree(folder / "recording", tmp_path / "recording")
     lines = run_code(chapter("Trainer messages"), tmp_path, trainer_python()).splitlines()
     assert len(lines) == 3 and lines[1].startswith("2/2: ") and lines[2] == "finished 0"
 
 
-def test_development_code(elbow, tmp_path):
+def test_code_of_the_development_page_runs(elbow, tmp_path):
     """Playback equals the model's output, and the model is nearer to the rig than linear skinning."""
     text = run_code(DEVELOPMENT_PAGE, tmp_path, arguments=(elbow.bound, "elbow", 12))
     playback, model, linear = (

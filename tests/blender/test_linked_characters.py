@@ -64,7 +64,7 @@ def test_overrides_follow_their_actions(library, tmp_path):
     assert np.abs(positions_by_frame[0][1] - positions_by_frame[2][1]).max() > 1e-2
 
 
-def test_overrides_after_undo_and_redo(pair, library):
+def test_overrides_play_after_undo_and_redo(pair, library):
     assert_overrides_play(library)
     bpy.ops.ed.undo_push(message="start")
     bend_elbow(pair[0], 0.9)
@@ -87,7 +87,7 @@ def test_overrides_after_undo_and_redo(pair, library):
 
 
 @pytest.mark.parametrize("use_in_render", [False, True])
-def test_renders_of_overrides(pair, library, tmp_path, use_in_render):
+def test_renders_of_overrides_show_the_rig_or_the_model(pair, library, tmp_path, use_in_render):
     first, second = pair
     second.hide_render = True
     set_camera()
