@@ -13,7 +13,7 @@ import numpy as np
 from fdda_addon.runtime.binding import bind, model_disabled
 from fdda_addon.scene.scene_rig import find_rig
 from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated
-from tests.blender.test_broken_characters import with_control
+from tests.blender.test_broken_characters import add_control_to_model
 
 from .cases import CaseFailedError
 from .playback import open_bound, repeat
@@ -96,7 +96,7 @@ def run_controls(folder: Path, seed: int, first_case: int, end_case: int) -> Non
     bound, random = open_bound(folder), np.random.default_rng((seed, first_case))
     owner = bpy.data.objects[ELBOW_RIG]
     owner["dial"] = 0.5
-    bind(find_rig(ELBOW), with_control(folder / "elbow.onnx", "armature_object", '["dial"]'))
+    bind(find_rig(ELBOW), add_control_to_model(folder / "elbow.onnx", "armature_object", '["dial"]'))
 
     def remove_control() -> None:
         owner.pop("dial", None)

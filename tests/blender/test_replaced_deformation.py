@@ -13,7 +13,7 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, assert_plays, evaluated, pose, rig_positions, with_deformation
-from .test_changed_rigs import look
+from .test_changed_rigs import trigger_check
 
 
 def add(kind: str, place: int | None, **settings: object) -> Callable[[bpy.types.Object], None]:
@@ -102,13 +102,13 @@ def assert_shows_rig(mesh_object: bpy.types.Object, clause: str) -> np.ndarray:
     return shown
 
 
-@pytest.mark.parametrize("when", ["update", "frame"])
+@pytest.mark.parametrize("when", ["view layer", "frame"])
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_change_gives_the_rig_back(bound, what, when):
     change, clause = CHANGES[what]
     pose(angle=1.0)
     change(bound)
-    look(when)
+    trigger_check(when)
     assert_shows_rig(bound, clause)
 
 
@@ -116,7 +116,7 @@ def test_a_topology_that_only_renders_have(bound):
     """A model that renders use too would be given to other vertices there."""
     bound.fdda.use_in_render = True
     add("SUBSURF", 0, show_viewport=False)(bound)
-    look("update")
+    trigger_check("view layer")
     assert_shows_rig(bound, "it was recorded without the modifier 'Subsurf'")
 
 
@@ -149,7 +149,7 @@ def test_what_changes_nothing_that_was_recorded_plays_on(bound, elbow, what):
 def test_undone_it_plays_again(bound, elbow):
     pose(angle=1.0)
     add("SMOOTH", 0)(bound)
-    look("update")
+    trigger_check("view layer")
     assert bound.fdda.mode == "RIG"
     bound.modifiers.remove(bound.modifiers["Smooth"])
     bound.fdda.mode = "FDDA"
@@ -218,7 +218,7 @@ def test_a_shape_key_that_was_recorded(rig, elbow, what):
     assert rig.mesh_object.fdda.mode == "FDDA" and not rig.mesh_object.fdda.status
     change, clause = DRIVEN[what]
     change(rig.mesh_object, driver)
-    look("update")
+    trigger_check("view layer")
     assert_shows_rig(rig.mesh_object, clause)
 
 
