@@ -14,7 +14,14 @@ import fdda_addon
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.scene.scene_rig import find_rig
 from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated, pose, predicted
-from tests.blender.test_evaluations import FRAMES, export_alembic, export_usd, add_shape_key, positions_in_file, shown_in
+from tests.blender.test_evaluations import (
+    FRAMES,
+    add_shape_key,
+    export_alembic,
+    export_usd,
+    positions_in_file,
+    shown_in,
+)
 from tests.blender.test_renders import render_positions, set_camera, still
 
 from .cases import CaseFailedError, print_case, run_case
@@ -223,7 +230,8 @@ def _check_export(
         path = folder / f"exported{suffix}"
         export(path, mode)
         return max(
-            _distance_m(positions, expected[frame], MAX_FILE_ERROR_M) for frame, positions in positions_in_file(path).items()
+            _distance_m(positions, expected[frame], MAX_FILE_ERROR_M)
+            for frame, positions in positions_in_file(path).items()
         )
 
     return check

@@ -144,7 +144,7 @@ def test_metadata_table_names_every_key_of_a_partition():
 
     section = chapter("Model").partition("#### Partitions of a model\n")[2].partition("\n#")[0]
     keys = [field.name for field in fields(ModelPartition)]
-    assert [key for key in keys if not named(section, key)] == []
+    assert [key for key in keys if not is_key_documented(section, key)] == []
 
 
 @pytest.mark.parametrize("name", ["evaluation", "benchmark"])
