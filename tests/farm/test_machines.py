@@ -64,7 +64,7 @@ def test_a_full_temporary_folder_asks_to_try_again(write_plan, full_disk):
     ]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == TRY_AGAIN, result.stderr
-    assert "Error: No temporary file can be write_plan" in result.stderr and "Traceback" not in result.stderr
+    assert "Error: No temporary file can be written" in result.stderr and "Traceback" not in result.stderr
 
 
 class FailedFuture:
