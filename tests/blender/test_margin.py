@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Poses around the range of motion: beyond limits and off locked axes, the rig's own limits suspended meanwhile."""
+"""Random poses in the margin around the range of motion, for which the rig's own limits are muted."""
 
 import json
 import math
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.one_blender_version
 
 SETTINGS = RecordingSettings(poses=40, margin=2.0, influence_poses=2, actions=("elbow_wave",))
 INSIDE = 30
-"""Of the 40 random poses, the first."""
+"""Number of random poses inside the range of motion. They come first, and the other 10 are in the margin."""
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def recorded(rig: Path, path: Path, settings: RecordingSettings = SETTINGS) -> R
 
 
 def bends(recording: Recording) -> np.ndarray:
-    """(N, 3, 3) rotation of the lower bone against the upper one, in the lower one's own axes."""
+    """Return the rotation of the lower bone relative to the upper bone, in axes of the lower bone, (N, 3, 3)."""
     rig = recording.rig
     skin = skin_matrices(np.array(recording.pose_matrices, np.float64), rig.rest_matrices.astype(np.float64))
     rest = rig.rest_matrices[1, :3, :3].astype(np.float64)
@@ -65,7 +65,7 @@ def test_poses_of_the_margin_leave_the_limits_and_locked_axes(rig, tmp_path):
     assert (margin.factor, margin.poses) == (2.0, 10)
     own, turned = recording.info.sampling.channels, bends(recording)
     (bend,) = (c for c in own if c.name == "lower")
-    # The bone turns about the axis of its range alone, where limits hold; elsewhere about the others as well.
+    # Inside the range of motion the bone rotates about one axis only; in the margin it rotates about all axes.
     about = np.eye(3)[bend.axis]
     off_axis = np.degrees(np.arccos(np.clip(turned @ about @ about, -1, 1)))
     assert off_axis[:INSIDE].max() < 0.1 < 5 < off_axis[INSIDE : SETTINGS.poses].max()
@@ -75,7 +75,7 @@ def test_poses_of_the_margin_leave_the_limits_and_locked_axes(rig, tmp_path):
 
 
 def test_poses_inside_and_frames_are_those_of_a_recording_without_a_margin(rig, tmp_path):
-    """Neither an unlocked axis nor a limit that is off is left behind for the frames that follow."""
+    """After the poses of the margin, axes are locked and limits are active again for the frames of the action."""
     without = recorded(rig, tmp_path / "without", replace(SETTINGS, margin=1.0))
     recording = recorded(rig, tmp_path / "with")
     for name in ("pose_matrices", "residuals"):
@@ -86,7 +86,7 @@ def test_poses_inside_and_frames_are_those_of_a_recording_without_a_margin(rig, 
     assert recording.info.sampling.channels == without.info.sampling.channels
 
 
-def test_the_scene_is_given_back(rig, tmp_path):
+def test_the_scene_is_restored_after_a_whole_and_an_interrupted_recording(rig, tmp_path):
     found = opened(rig)
     muted = {c.name: c.mute for bone in found.armature_object.pose.bones for c in bone.constraints}
     before = scene_state(found)
@@ -101,7 +101,7 @@ def test_the_scene_is_given_back(rig, tmp_path):
 
 
 @pytest.mark.parametrize("at", [12, INSIDE + 3, SETTINGS.poses + 4])
-def test_resumed_it_is_bit_for_bit_the_same(rig, tmp_path, at):
+def test_a_resumed_recording_equals_an_uninterrupted_one_bit_for_bit(rig, tmp_path, at):
     drain(record(opened(rig), tmp_path / "whole", SETTINGS))
     steps = record(opened(rig), tmp_path / "broken", SETTINGS)
     for step in steps:
@@ -112,7 +112,7 @@ def test_resumed_it_is_bit_for_bit_the_same(rig, tmp_path, at):
     assert file_contents(tmp_path / "broken") == file_contents(tmp_path / "whole")
 
 
-def test_shards_join_to_the_same(rig, tmp_path):
+def test_merged_shards_equal_the_whole_recording(rig, tmp_path):
     drain(record(opened(rig), tmp_path / "whole", SETTINGS))
     shards = [tmp_path / str(number) for number in range(1, 4)]
     for number, shard in enumerate(shards, 1):
@@ -121,13 +121,13 @@ def test_shards_join_to_the_same(rig, tmp_path):
     assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
 
 
-def test_another_margin_is_another_recording(rig, tmp_path):
+def test_a_recording_cannot_be_resumed_with_another_margin(rig, tmp_path):
     drain(record(opened(rig), tmp_path / "r", SETTINGS), stop_after=10)
     with pytest.raises(RecordingError, match=r"recorded differently \(sampling\.margin"):
         drain(record(opened(rig), tmp_path / "r", replace(SETTINGS, margin=1.5, resume=True)))
 
 
-def test_only_limits_that_would_hold_a_pose_are_off():
+def test_only_limits_that_would_change_a_pose_are_muted():
     found = fresh_elbow()
     bone = found.armature_object.pose.bones["lower"]
     (limit,) = bone.constraints
@@ -147,7 +147,7 @@ def test_only_limits_that_would_hold_a_pose_are_off():
     assert not limit.mute
 
 
-def test_the_verb(rig, tmp_path, capfd):
+def test_record_accepts_margins_from_1_to_4(rig, tmp_path, capfd):
     assert run("record", rig, tmp_path / "r", "--poses", 20, "--margin", 1.5) == 0
     margin = read_recording(tmp_path / "r").info.sampling.margin
     assert (margin.factor, margin.poses) == (1.5, 5)
@@ -157,8 +157,8 @@ def test_the_verb(rig, tmp_path, capfd):
     assert not (tmp_path / "s").exists()
 
 
-def test_a_model_knows_what_lies_beyond(tmp_path):
-    """The same rig without its limits, so that evaluate can pose it beyond: a quarter of the error and less."""
+def test_a_margin_at_least_halves_the_error_beyond_the_range(tmp_path):
+    """The rig is evaluated without its limits, so that `evaluate` can pose it beyond the range of motion."""
     found = fresh_elbow()
     for bone in found.armature_object.pose.bones:
         for constraint in bone.constraints:
@@ -177,6 +177,6 @@ def test_a_model_knows_what_lies_beyond(tmp_path):
 
 
 def _errors(path: Path) -> tuple[float, float]:
-    """Mean error inside the range of motion, and at twice the range, mm."""
+    """Return the mean error inside the range of motion and the mean error at twice the range, mm."""
     found = json.loads(path.read_text())
     return found["fdda"]["mean"], found["scaled_ranges"][0]["fdda"]["mean"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mask: a vertex group that says where the model counts, painted, inverted, animated poses, baked, evaluated."""
+"""A mask is a vertex group whose weights blend the model with linear skinning at each vertex."""
 
 import bpy
 import numpy as np
@@ -25,7 +25,7 @@ GROUP = "learned"
 
 
 def paint(mesh_object: bpy.types.Object, weights: np.ndarray, name: str = GROUP) -> None:
-    """Give a vertex group weights; vertices with none are not in it."""
+    """Set the weights of a vertex group. Vertices with weight 0 are removed from the group."""
     group = mesh_object.vertex_groups.get(name) or mesh_object.vertex_groups.new(name=name)
     for index, weight in enumerate(weights.tolist()):
         if weight:
@@ -36,12 +36,12 @@ def paint(mesh_object: bpy.types.Object, weights: np.ndarray, name: str = GROUP)
 
 
 def ramp(mesh_object: bpy.types.Object) -> np.ndarray:
-    """(V,) weights of all kinds: none, all, and between."""
+    """Return weights from 0 to 1, shape (V,). The first and last quarter of the vertices have exactly 0 and 1."""
     return np.clip(np.linspace(-0.5, 1.5, len(mesh_object.data.vertices)), 0, 1).astype(np.float32)
 
 
 def both(mesh_object: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
-    """What linear skinning and the model alone show of the pose."""
+    """Return the positions with linear skinning and with the unmasked model in the current pose."""
     name, mode, mesh_object.fdda.mask = mesh_object.fdda.mask, mesh_object.fdda.mode, ""
     shown = []
     for mesh_object.fdda.mode in ("LINEAR", "FDDA"):
@@ -68,7 +68,7 @@ def test_the_weight_blends_the_model_with_linear_skinning(masked):
         pose(angle=angle)
         linear, model = both(masked)
         assert np.abs(evaluated(masked) - (linear + weights * (model - linear))).max() < 1e-6
-        # No rounding where nothing is to be blended.
+        # Vertices with weight 1 have the exact positions of the model.
         assert (evaluated(masked)[weights[:, 0] == 1] == model[weights[:, 0] == 1]).all()
     pose(angle=1.4)
     linear, model = both(masked)
@@ -83,7 +83,7 @@ def test_an_inverted_mask_leaves_the_group_out(masked):
     assert np.abs(evaluated(masked) - (linear + weights * (model - linear))).max() < 1e-6
 
 
-def test_strength_is_times_the_weight(masked):
+def test_strength_and_weight_are_multiplied(masked):
     linear, model = both(masked)
     masked.fdda.strength = 0.5
     bpy.context.view_layer.update()
@@ -91,7 +91,7 @@ def test_strength_is_times_the_weight(masked):
     assert np.abs(evaluated(masked) - expected).max() < 1e-6
 
 
-def test_weights_that_are_painted_while_it_plays_show(masked):
+def test_weights_painted_during_playback_take_effect(masked):
     linear, model = both(masked)
     weights = 1 - ramp(masked)
     paint(masked, weights)
@@ -100,7 +100,7 @@ def test_weights_that_are_painted_while_it_plays_show(masked):
 
 
 @pytest.mark.parametrize("what", ["removed", "renamed", "never there", "empty"])
-def test_without_the_group_the_model_counts_everywhere(masked, elbow, what):
+def test_without_its_vertex_group_a_mask_has_no_effect(masked, elbow, what):
     if what == "removed":
         masked.vertex_groups.remove(masked.vertex_groups[GROUP])
     elif what == "renamed":
@@ -116,7 +116,7 @@ def test_without_the_group_the_model_counts_everywhere(masked, elbow, what):
     assert mask_problem(masked) == (said if name else "")
 
 
-def test_a_group_that_is_not_a_bones_changes_nothing_of_the_rig(masked, elbow):
+def test_the_group_of_a_mask_does_not_change_the_fingerprint_of_the_rig(masked, elbow):
     info = Network(elbow.model).info
     rig = read_model_rig(SceneRig(masked, armature_of(masked)), info)
     assert rig.fingerprint == info.fingerprint
@@ -127,7 +127,7 @@ def test_a_group_that_is_not_a_bones_changes_nothing_of_the_rig(masked, elbow):
     assert np.abs(evaluated(masked) - (linear + ramp(masked)[:, None] * (model - linear))).max() < 1e-6
 
 
-def test_it_is_saved_and_undone_with_the_file(masked, tmp_path):
+def test_a_mask_is_saved_with_the_file_and_restored_by_undo(masked, tmp_path):
     bpy.context.scene.frame_set(12)
     before = evaluated(masked)
     bpy.ops.ed.undo_push(message="masked")
@@ -143,8 +143,7 @@ def test_it_is_saved_and_undone_with_the_file(masked, tmp_path):
     assert np.abs(evaluated(bpy.data.objects[ELBOW]) - before).max() < 1e-6
 
 
-def test_in_a_frame_a_mask_costs_nothing_where_there_is_none(bound, monkeypatch):
-    """Neither read nor blended, however the character is posed."""
+def test_without_a_mask_frames_neither_read_nor_blend_weights(bound, monkeypatch):
     asked = []
     monkeypatch.setattr(masks, "read_mask", lambda *_: asked.append("read"))
     monkeypatch.setattr("fdda_addon.runtime.player.read_mask", lambda *_: asked.append("read"))
@@ -155,7 +154,7 @@ def test_in_a_frame_a_mask_costs_nothing_where_there_is_none(bound, monkeypatch)
     assert not asked
 
 
-def test_weights_are_not_read_again_while_it_is_posed(masked, monkeypatch):
+def test_posing_does_not_read_the_weights_again(masked, monkeypatch):
     read = []
     monkeypatch.setattr("fdda_addon.runtime.player.read_mask", lambda *_: read.append(1))
     for angle in (0.3, 0.9):
@@ -165,7 +164,7 @@ def test_weights_are_not_read_again_while_it_is_posed(masked, monkeypatch):
     assert not read
 
 
-def test_what_is_baked_is_what_is_shown(masked, tmp_path):
+def test_a_baked_cache_contains_the_masked_deformation(masked, tmp_path):
     assert bpy.ops.fdda.bake(filepath=str(tmp_path / "a.pc2")) == {"FINISHED"}
     baked = read_pc2(tmp_path / "a.pc2")[2]
     for frame in (1, 12, 20):
@@ -176,7 +175,7 @@ def test_what_is_baked_is_what_is_shown(masked, tmp_path):
     assert np.abs(baked[20 - bpy.context.scene.frame_start] - evaluated(masked)).max() > 1e-4
 
 
-def test_what_is_evaluated_is_what_is_shown(masked):
+def test_an_evaluation_measures_the_masked_deformation(masked):
     bpy.ops.fdda.evaluate()
     errors = last_evaluation.get(masked).errors
     weights = ramp(masked)
@@ -207,7 +206,7 @@ def test_picture_shows_the_masked_model(masked, elbow, tmp_path, monkeypatch):
     assert np.abs(model_cell.positions - Network(elbow.model).positions(posed.pose_matrices[None])[0]).max() > 1e-4
 
 
-def test_members_of_a_crowd_have_masks_of_their_own(bound):
+def test_characters_of_a_crowd_have_separate_masks(bound):
     crowd = crowd_of(bound, 6)
     animate(crowd)
     paint(crowd[0], ramp(bound))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ranges measured from actions, and limits set from them; the rig poses as before."""
+"""Ranges are measured from actions and set as limits that do not change any pose of the rig."""
 
 import math
 
@@ -35,7 +35,7 @@ def wave() -> bpy.types.Action:
 
 
 def poses(rig: SceneRig) -> np.ndarray:
-    """Bone matrices of all frames of the wave."""
+    """Return the matrices of all bones in all frames of the action."""
     matrices = []
     for frame in range(1, FRAMES + 1):
         bpy.context.scene.frame_set(frame)
@@ -43,9 +43,9 @@ def poses(rig: SceneRig) -> np.ndarray:
     return np.array(matrices)
 
 
-def test_what_actions_key_and_move_is_measured(figure):
+def test_keyed_channels_that_move_are_measured(figure):
     found = measured_ranges(figure.armature_object, [wave()])
-    top = math.sin(11 / 23 * math.pi)  # The frames beside the middle one: there is no frame between them.
+    top = math.sin(11 / 23 * math.pi)  # Frames are whole numbers, and the maximum is between two frames.
     wanted = {
         ("spine", "rotation", 0): (0, 0.1 * top),
         ("spine", "rotation", 1): (0, 0.4 * top),
@@ -72,18 +72,18 @@ def test_several_actions_are_measured_together(figure):
     assert found["spine", "rotation", 1] == pytest.approx((0, 0.4), abs=1e-2)
 
 
-def test_turns_of_quaternions_go_on_beyond_half_a_turn(figure):
+def test_quaternion_rotations_are_measured_beyond_180_degrees(figure):
     arm = figure.armature_object.pose.bones["arm.L"]
     figure.armature_object.animation_data.action = spin = bpy.data.actions.new("spin")
     for frame in range(37):
         turn = Euler((math.radians(10 * frame), 0, 0)).to_quaternion()
-        # The same rotation has two quaternions, and what writes actions may take either.
+        # Two quaternions represent the same rotation, and an action may contain either of them.
         key_channel(arm, frame, "rotation_quaternion", -turn if frame % 2 else turn)
     found = measured_ranges(figure.armature_object, [spin])
     assert found == {("arm.L", "rotation", 0): pytest.approx((0, 2 * math.pi), abs=1e-5)}
 
 
-def test_angles_that_jump_by_a_turn_do_not_widen_a_range(figure):
+def test_angles_that_jump_by_360_degrees_do_not_widen_a_range(figure):
     spine = figure.armature_object.pose.bones["spine"]
     figure.armature_object.animation_data.action = baked = bpy.data.actions.new("baked")
     for frame, degrees in enumerate((-10, 10, 370, 380, 15)):
@@ -92,12 +92,12 @@ def test_angles_that_jump_by_a_turn_do_not_widen_a_range(figure):
     assert found == {("spine", "rotation", 1): pytest.approx((-math.radians(10), math.radians(20)), abs=1e-5)}
 
 
-def test_a_rotation_mode_that_is_not_in_use_says_nothing(figure):
+def test_keys_of_an_unused_rotation_mode_are_ignored(figure):
     figure.armature_object.pose.bones["arm.L"].rotation_mode = "XYZ"
     assert not any(bone == "arm.L" for bone, _, _ in measured_ranges(figure.armature_object, [wave()]))
 
 
-def test_keyed_numbers_are_measured_as_controls(figure):
+def test_keyed_properties_are_measured_as_controls(figure):
     if HAS_SLOTS:
         add_smile(figure, wave())
     arm = figure.armature_object.pose.bones["arm.R"]
@@ -113,13 +113,13 @@ def test_keyed_numbers_are_measured_as_controls(figure):
     assert not found
 
 
-def test_limits_state_the_ranges_with_their_margin_and_change_no_pose(figure):
+def test_limits_are_set_to_ranges_with_their_margin_and_change_no_pose(figure):
     before = poses(figure)
     limits = set_limits_from_actions(figure, [wave()], 0.5)
     assert all(not limit.reason_unset for limit in limits) and len(limits) == 9
     np.testing.assert_array_equal(poses(figure), before)
     bones = figure.armature_object.pose.bones
-    # A range that holds the rest pose: IK limits; one that does not: a constraint that holds nothing.
+    # A range that includes the rest pose becomes IK limits. Any other range becomes a constraint with influence 0.
     spine, left, right = (rotation_ranges(bones[name]) for name in ("spine", "arm.L", "arm.R"))
     assert [r.source for r in spine] == ["IK", "IK", "DEFAULT"] and not find_local_limit(
         bones["spine"], "LIMIT_ROTATION"
@@ -136,7 +136,7 @@ def test_limits_state_the_ranges_with_their_margin_and_change_no_pose(figure):
         assert channels[limit.bone, limit.kind, limit.axis] == pytest.approx((limit.low, limit.high), abs=1e-6)
 
 
-def test_a_range_without_the_rest_pose_is_stated_by_a_constraint(figure):
+def test_a_range_that_excludes_the_rest_pose_becomes_a_constraint(figure):
     arm = figure.armature_object.pose.bones["arm.L"]
     arm.use_ik_limit_y, arm.ik_min_y, arm.ik_max_y = True, -0.4, 0.3
     before = poses(figure)
@@ -152,7 +152,7 @@ def test_a_range_without_the_rest_pose_is_stated_by_a_constraint(figure):
     assert rotation_ranges(right)[2].source == "DEFAULT", "what does not move is left alone without a constraint"
 
 
-def test_an_axis_that_stands_still_is_stated_so_beside_a_constraint(figure):
+def test_an_axis_without_motion_gets_an_empty_range_beside_a_constraint(figure):
     set_limits_from_actions(figure, [wave()], 0.0)
     still = rotation_ranges(figure.armature_object.pose.bones["arm.L"])[1]
     assert (still.low, still.high, still.source, still.moves) == (0, 0, "CONSTRAINT", False)
@@ -166,7 +166,7 @@ def test_a_bone_that_ik_may_move_gets_no_ik_limits(figure):
         assert rotation_ranges(bone)[0].source == "CONSTRAINT"
 
 
-def test_limits_that_hold_stay_and_end_the_range():
+def test_active_limits_are_kept_and_clip_the_range():
     elbow = fresh_elbow()
     lower = elbow.armature_object.pose.bones["lower"]
     held = lower.constraints[0]
@@ -184,7 +184,7 @@ def test_limits_that_hold_stay_and_end_the_range():
     assert left["lower", 0] == "held by its limit, left so"
 
 
-def test_locked_axes_and_connected_bones_are_left(figure):
+def test_locked_axes_and_connected_bones_get_no_limits(figure):
     bones = figure.armature_object.pose.bones
     bones["spine"].lock_rotation[1] = bones["spine"].lock_location[0] = bones["arm.R"].lock_ik_x = True
     arm = bones["arm.L"]
@@ -214,7 +214,7 @@ def test_actions_of_another_rig_are_refused(figure):
         set_limits_from_actions(figure, [other])
 
 
-def test_linked_rigs_are_refused_and_overrides_are_not(figure, tmp_path):
+def test_linked_rigs_are_refused_and_overrides_are_accepted(figure, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "figure.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with bpy.data.libraries.load(str(tmp_path / "figure.blend"), link=True) as (_, linked):
@@ -232,7 +232,7 @@ def test_linked_rigs_are_refused_and_overrides_are_not(figure, tmp_path):
     assert rotation_ranges(own.pose.bones["arm.L"])[0].low == pytest.approx(0.1, abs=2e-2)
 
 
-def test_command_line(tmp_path, capsys):
+def test_the_limits_verb_sets_and_prints_limits(tmp_path, capsys):
     build_figure()
     add_wave(find_rig())
     source, out = tmp_path / "figure.blend", tmp_path / "limited.blend"
@@ -250,7 +250,7 @@ def test_command_line(tmp_path, capsys):
     assert "--margin must be 0 to 10." in capsys.readouterr().err
 
 
-def test_button(figure):
+def test_the_limits_button_uses_the_checked_actions(figure):
     bpy.context.view_layer.objects.active = figure.mesh_object
     with pytest.raises(RuntimeError, match="No action is checked; check the actions under Also Record Actions"):
         bpy.ops.fdda.limits_from_actions()

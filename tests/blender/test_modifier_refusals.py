@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What no model can stand in for is refused with the modifier's name, and parenting alone with the mesh's."""
+"""Modifiers that a model cannot replace, and meshes that are only parented to an armature, are refused by name."""
 
 import bpy
 import pytest
@@ -73,20 +73,19 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_no_model_can_stand_in_for_is_named(name, loose_model, tmp_path):
+def test_an_unsupported_modifier_is_named_in_the_message(name, loose_model, tmp_path):
     add, sentence = REFUSED[name]
     rig = build_rig(stacks.corrective_smooth)
     add(rig.mesh_object)
     sentence = f"Modifier 'It' of 'elbow' {sentence}"
     assert_refused(rig, loose_model, tmp_path / "recording", sentence)
-    # Switched off, nothing is wrong with it.
     rig.mesh_object.modifiers["It"].show_viewport = False
     assert check_recordable_rig(rig).problems == ()
     bind(rig, loose_model)
     assert_plays(rig.mesh_object, loose_model)
 
 
-def test_hidden_nodes_cannot_be_sorted(loose_model):
+def test_geometry_nodes_of_a_hidden_mesh_cannot_be_classified(loose_model):
     rig = build_rig()
     add_nodes_at(1, "GeometryNodeTransform")(rig.mesh_object)
     rig.mesh_object.hide_viewport = True
@@ -94,7 +93,7 @@ def test_hidden_nodes_cannot_be_sorted(loose_model):
         bind(rig, loose_model)
 
 
-def test_a_live_modifier_that_a_driver_keeps_on(tmp_path):
+def test_a_downstream_modifier_that_a_driver_keeps_enabled_is_named(tmp_path):
     rig = build_rig()
     modifier = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     drive(modifier, "show_viewport", rig.armature_object, "1")
@@ -105,7 +104,7 @@ def test_a_live_modifier_that_a_driver_keeps_on(tmp_path):
     assert str(error.value).endswith("; switch off the one that changes the topology (Subdivision).")
 
 
-def test_nodes_that_remove_vertices_in_some_poses(tmp_path):
+def test_nodes_that_remove_vertices_in_some_poses_are_refused(tmp_path):
     rig = build_rig()
     add_nodes_at(1, "GeometryNodeDeleteGeometry")(rig.mesh_object)
     group = rig.mesh_object.modifiers["It"].node_group
@@ -136,7 +135,7 @@ PARENTED = {
 
 @pytest.mark.parametrize("kind", PARENTED)
 @pytest.mark.parametrize("way", ["the only mesh", "by name", "active", "active armature"])
-def test_parenting_alone_is_no_rig(kind, way):
+def test_a_mesh_that_is_only_parented_to_an_armature_is_refused(kind, way):
     from fdda_addon.scene.active_rig import active_rig
 
     mesh_object, armature_object = tube()
@@ -150,7 +149,7 @@ def test_parenting_alone_is_no_rig(kind, way):
     assert str(error.value) == PARENTED[kind]
 
 
-def test_a_mesh_beside_a_parented_one_is_found():
+def test_a_parented_mesh_does_not_hide_the_rig_of_another_mesh():
     mesh_object, armature_object = tube()
     prop = bpy.data.objects.new("prop", bpy.data.meshes.new("prop"))
     bpy.context.scene.collection.objects.link(prop)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Every deforming modifier is recorded and played, what comes after the rig stays on, what cannot be is named."""
+"""Deforming modifiers are recorded and replaced by the model; modifiers after the rig stay enabled."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from .modifiers import FEW_POSES, add_modifier_at, add_nodes_at, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
 MOVES = 0.001
-"""Meters by which a stack moves some vertex, at the least, from where linear skinning has it."""
+"""Smallest distance of the farthest vertex from linear skinning with any of the stacks, meters."""
 
 
 def residuals(rig: SceneRig, folder: Path) -> np.ndarray:
@@ -68,7 +68,7 @@ def read_live(rig: SceneRig) -> tuple[str, ...]:
     return live
 
 
-def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(loose_model):
+def test_modifiers_that_add_vertices_after_the_rig_use_the_output_of_the_model(loose_model):
     rig = build_rig(stacks.subdivided)
     assert read_stack(rig.mesh_object) == ModifierStack(
         ("Armature", "Mush"), (), ("Subdivision", "Thickness", "Detail"), 2
@@ -78,14 +78,14 @@ def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(loose_m
     bind(rig, loose_model)
     playing = evaluated(rig.mesh_object)
     assert len(playing) == len(true) > 8 * len(rig.mesh_object.data.vertices)
-    # The mush of this character is not quite the one that the model has learned.
+    # The smoothing of this character differs slightly from the smoothing that the model has learned.
     assert np.linalg.norm(playing - true, axis=1).mean() < 0.002
     assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == [
         "FDDA", "Subdivision", "Thickness", "Detail",
     ]  # fmt: skip
 
 
-def test_an_evaluation_borrows_what_is_live(rig, elbow):
+def test_an_evaluation_disables_downstream_modifiers_and_restores_them(rig, elbow):
     settings = EvaluationSettings(poses=3, range_scales=())
     errors = drain(evaluate(rig, elbow.model, settings)).fdda
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
@@ -94,7 +94,7 @@ def test_an_evaluation_borrows_what_is_live(rig, elbow):
     assert_same_state(before, scene_state(rig))
 
 
-def test_times_are_those_of_a_frame_with_what_is_live(rig, elbow, monkeypatch):
+def test_frame_times_include_downstream_modifiers(rig, elbow, monkeypatch):
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     before = scene_state(rig)
     seen, time_frames = [], benchmark.time_frames
@@ -113,14 +113,14 @@ def test_times_are_those_of_a_frame_with_what_is_live(rig, elbow, monkeypatch):
     assert_same_state(before, scene_state(rig))
 
 
-def test_what_is_live_comes_back_when_a_recording_is_broken_off(tmp_path):
+def test_downstream_modifiers_are_restored_after_an_interrupted_recording(tmp_path):
     rig = build_rig(stacks.subdivided)
     before = scene_state(rig)
     drain(record(rig, tmp_path / "recording", FEW_POSES), stop_after=2)
     assert_same_state(before, scene_state(rig))
 
 
-def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(loose_model, tmp_path):
+def test_modifiers_that_do_not_deform_are_ignored_at_any_position(loose_model, tmp_path):
     rig = build_rig(stacks.corrective_smooth)
     plain = residuals(rig, tmp_path)
     first = ("UV_WARP", "VERTEX_WEIGHT_EDIT", "DATA_TRANSFER")
@@ -136,7 +136,7 @@ def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(loose_m
     assert_plays(rig.mesh_object, loose_model)
 
 
-def test_a_modifier_that_only_renders_show_is_off_while_a_model_renders(loose_model):
+def test_a_render_only_modifier_between_replaced_ones_is_disabled_while_a_model_renders(loose_model):
     rig = build_rig(stacks.corrective_smooth)
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF").show_viewport = False
     rig.mesh_object.modifiers.move(2, 1)
@@ -147,14 +147,14 @@ def test_a_modifier_that_only_renders_show_is_off_while_a_model_renders(loose_mo
     assert [state for state in shown(rig) if state[0] != "FDDA"] == before
 
 
-def test_a_modifier_that_is_off_after_what_is_live_stays_out_of_it(loose_model):
+def test_a_disabled_modifier_does_not_move_the_playback_modifier(loose_model):
     rig = build_rig(stacks.subdivided)
     rig.mesh_object.modifiers.new("Cast", "CAST").show_viewport = False
     bind(rig, loose_model)
     assert rig.mesh_object.modifiers.find("FDDA") == 2
 
 
-def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(loose_model):
+def test_the_playback_modifier_is_inserted_before_a_modifier_pinned_to_last(loose_model):
     rig = build_rig(stacks.corrective_smooth)
     last = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     last.use_pin_to_last = True
@@ -163,7 +163,7 @@ def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(loose
 
 
 @pytest.mark.parametrize("kind", ["BUILD", "EXPLODE", "PARTICLE_INSTANCE"])
-def test_what_makes_vertices_in_time_after_the_rig_is_live(kind):
+def test_time_dependent_modifiers_that_add_vertices_after_the_rig_are_downstream(kind):
     rig = build_rig(stacks.corrective_smooth)
     add_modifier_at(2, kind)(rig.mesh_object)
     assert read_stack(rig.mesh_object).downstream == ("It",)
@@ -186,7 +186,7 @@ def test_what_makes_vertices_in_time_after_the_rig_is_live(kind):
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else value,
 )
 @pytest.mark.parametrize("after", ["", "SUBSURF"])
-def test_geometry_nodes_are_sorted_by_what_they_do(kinds, expected, after):
+def test_geometry_nodes_are_classified_by_their_effect(kinds, expected, after):
     rig = build_rig(stacks.corrective_smooth)
     add_nodes_at(2, *kinds)(rig.mesh_object)
     if after:
@@ -198,7 +198,7 @@ def test_geometry_nodes_are_sorted_by_what_they_do(kinds, expected, after):
     assert_same_state(before, scene_state(rig))
 
 
-def test_a_group_whose_geometry_leads_nowhere_leaves_no_vertices():
+def test_a_node_group_with_unconnected_geometry_is_downstream():
     rig = build_rig()
     add_nodes_at(1)(rig.mesh_object)
     group = rig.mesh_object.modifiers["It"].node_group
@@ -206,7 +206,7 @@ def test_a_group_whose_geometry_leads_nowhere_leaves_no_vertices():
     assert read_stack(rig.mesh_object).downstream == ("It",)
 
 
-def test_an_attribute_that_is_the_position_moves_vertices():
+def test_nodes_that_store_the_position_attribute_are_replaced():
     rig = build_rig()
     add_nodes_at(1, "GeometryNodeStoreNamedAttribute")(rig.mesh_object)
     group = rig.mesh_object.modifiers["It"].node_group
@@ -214,8 +214,8 @@ def test_an_attribute_that_is_the_position_moves_vertices():
     assert read_stack(rig.mesh_object).replaced == ("Armature", "It")
 
 
-def test_shading_nodes_after_a_subdivision_are_no_reason_to_refuse_it(loose_model, tmp_path):
-    """As Blender adds them to every file that had auto smooth."""
+def test_shading_nodes_after_a_subdivision_are_accepted(loose_model, tmp_path):
+    """Blender adds such nodes to meshes of older files that used Auto Smooth."""
     rig = build_rig(stacks.corrective_smooth)
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     add_nodes_at(3, "GeometryNodeSetShadeSmooth")(rig.mesh_object)
@@ -225,7 +225,7 @@ def test_shading_nodes_after_a_subdivision_are_no_reason_to_refuse_it(loose_mode
     assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == ["FDDA", "Subdivision", "It"]
 
 
-def test_a_simulation_after_the_rig_works_on_what_the_model_gives(loose_model):
+def test_a_simulation_after_the_rig_uses_the_output_of_the_model(loose_model):
     rig = build_rig(stacks.corrective_smooth)
     add_modifier_at(2, "CLOTH", show_viewport=False)(rig.mesh_object)
     bind(rig, loose_model)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operator that bakes what is bound."""
+"""The operator that bakes the bound model, with its strength and mode."""
 
 import bpy
 import numpy as np
@@ -26,7 +26,7 @@ class TestOperator:
         return bound
 
     @pytest.mark.parametrize("action", ["elbow_wave", ""])
-    def test_what_is_bound_is_baked_and_plays_on(self, active, elbow, wave, tmp_path, action):
+    def test_the_bound_model_is_baked_and_stays_bound(self, active, elbow, wave, tmp_path, action):
         before = scene_state(find_rig())
         out = tmp_path / "a.blend"
         assert bpy.ops.fdda.bake(filepath=str(out), action=action) == {"FINISHED"}
@@ -37,13 +37,13 @@ class TestOperator:
         shown = shown_without_add_on(tmp_path, (out, [12.0]))
         assert np.abs(shown[out, 12.0] - wave[11]).max() < POSITION_TOLERANCE
 
-    def test_shape_keys_and_point_caches(self, active, wave, tmp_path):
+    def test_shape_keys_and_point_caches_are_baked(self, active, wave, tmp_path):
         assert bpy.ops.fdda.bake(filepath=str(tmp_path / "a.blend"), shape_keys=True) == {"FINISHED"}
         assert bpy.ops.fdda.bake(filepath=str(tmp_path / "b.pc2")) == {"FINISHED"}
         assert sorted(file_contents(tmp_path)) == ["a.blend", "b.pc2"]
         assert np.abs(read_pc2(tmp_path / "b.pc2")[2] - wave).max() < 1e-6
 
-    def test_refusals(self, active, tmp_path):
+    def test_a_wrong_path_action_or_binding_is_refused(self, active, tmp_path):
         refused(bpy.ops.fdda.bake, "No file was chosen; give the name of a .pc2 or .blend file.")
         refused(lambda: bpy.ops.fdda.bake(filepath=str(tmp_path / "a.txt")), "ends in neither .pc2 nor .blend")
         refused(
@@ -76,8 +76,8 @@ class TestOperator:
             assert np.abs(baked[frame - bpy.context.scene.frame_start] - evaluated(active)).max() < 1e-5
 
 
-def test_no_operator_remembers_the_file_or_object_of_the_last_time():
-    """Blender fills what is not given with what was used last: a second press would overwrite another character's."""
+def test_no_operator_reuses_the_path_or_object_of_its_last_call():
+    """Blender would fill missing arguments with those of the last call, and so overwrite another character's file."""
     from importlib import import_module
 
     from fdda_addon import operators

@@ -41,7 +41,7 @@ def evaluated_action(active):
     heat_map.clear_all()
 
 
-def test_error_on_the_active_action(active, elbow):
+def test_the_active_action_is_evaluated(active, elbow):
     before = scene_state(find_rig())
     assert bpy.ops.fdda.evaluate() == {"FINISHED"}
     assert_same_state(before, scene_state(find_rig()))
@@ -56,7 +56,7 @@ def test_error_on_the_active_action(active, elbow):
     assert last.partitions[0].fdda.max == pytest.approx(last.total["fdda"].max)
 
 
-def test_error_on_random_poses(active, elbow):
+def test_random_poses_are_evaluated(active, elbow):
     assert bpy.ops.fdda.evaluate(source="RANDOM", poses=7, seed=4) == {"FINISHED"}
     with model_disabled(active):
         expected = drain(evaluate(find_rig(), elbow.model, EvaluationSettings(7, 4)))
@@ -65,7 +65,7 @@ def test_error_on_random_poses(active, elbow):
     assert not last.name and last.seed == 4
 
 
-def test_what_cannot_be_evaluated_says_why(active):
+def test_an_evaluation_without_action_or_results_is_refused(active):
     refused(lambda: bpy.ops.fdda.evaluate(action="jump"), "no action 'jump'")
     bpy.data.objects[ELBOW_RIG].animation_data.action = None
     refused(bpy.ops.fdda.evaluate, "'elbow_rig' has no action; give it one, or compare on random poses.")
@@ -134,7 +134,7 @@ def test_overlay_follows_edited_and_replaced_faces(active, monkeypatch):
     assert drawn_triangles() is not edited
 
 
-def test_partitions_in_color(active):
+def test_each_partition_has_one_color(active):
     bpy.ops.fdda.color_mesh(colors="PARTITIONS")
     colors, partitions = heat_map.colors_of(active), make_partitions(read_rig(find_rig()))
     assert [len(np.unique(colors[p.vertices], axis=0)) for p in partitions] == [1, 1]
@@ -142,7 +142,7 @@ def test_partitions_in_color(active):
     heat_map.clear_all()
 
 
-def test_nothing_of_the_file_is_touched_by_colors(active, evaluated_action):
+def test_colors_do_not_change_the_file(active, evaluated_action):
     def datablocks():
         attributes = [attribute.name for attribute in active.data.attributes]
         return attributes, len(bpy.data.objects), len(bpy.data.materials), [m.name for m in active.modifiers]
@@ -174,7 +174,7 @@ def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
     refused(bpy.ops.fdda.remove_markers, "There are no markers at worst frames")
 
 
-def test_the_worst_random_pose_is_set(active, view):
+def test_jumping_to_the_worst_random_pose_sets_the_pose(active, view):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=9)
     last = last_evaluation.get(active)
     worst = int(last.errors["fdda"].max(axis=1).argmax())
@@ -198,7 +198,7 @@ def active_model(mesh_object):
     return model_path(mesh_object)
 
 
-def test_report_is_opened_beside_the_model(active, elbow, monkeypatch):
+def test_a_missing_report_is_refused_with_its_path(active, elbow, monkeypatch):
     report = elbow.model.with_name("report.html")
     assert report.is_file()
     report.rename(report.with_suffix(".away"))
@@ -208,7 +208,7 @@ def test_report_is_opened_beside_the_model(active, elbow, monkeypatch):
         report.with_suffix(".away").rename(report)
 
 
-def test_an_evaluation_does_not_outlive_many_others(active):
+def test_only_the_latest_evaluations_are_stored(active):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
     assert last_evaluation.get(active) is not None
     kept = last_evaluation._evaluations[active.session_uid]

@@ -34,7 +34,7 @@ def face(tmp_path: Path) -> SceneRig:
     return saved(tmp_path)
 
 
-def test_a_shape_key_with_and_without_a_range(face):
+def test_shape_keys_are_recorded_in_the_given_or_default_range(face):
     assert bpy.ops.fdda.add_control(name="flexed") == {"FINISHED"}
     assert bpy.ops.fdda.add_control(name="thin") == {"FINISHED"}
     control = face.mesh_object.fdda.settings.controls["flexed"]
@@ -49,7 +49,7 @@ def test_a_shape_key_with_and_without_a_range(face):
     assert np.ptp(recording.controls[:, 0]) > 0.1
 
 
-def test_all_shape_keys(face):
+def test_all_shape_keys_are_added_at_once(face):
     assert bpy.ops.fdda.add_control(name="shape_keys") == {"FINISHED"}
     with pytest.raises(RuntimeError, match="'shape_keys' is already in the list"):
         bpy.ops.fdda.add_control(name="shape_keys")
@@ -61,7 +61,7 @@ def test_all_shape_keys(face):
     ]
 
 
-def test_one_that_is_not_there_and_one_without_a_name(face):
+def test_an_unknown_control_is_a_problem_and_an_unnamed_one_is_not(face):
     with pytest.raises(RuntimeError, match="'elbow' has no control 'smile/'; give the name of a shape key"):
         bpy.ops.fdda.add_control(name="smile")
     settings = face.mesh_object.fdda.settings
@@ -86,7 +86,7 @@ def test_one_that_is_not_there_and_one_without_a_name(face):
         ("objects", None),
     ],
 )
-def test_a_full_data_path(face, path, name):
+def test_a_full_data_path_is_shortened(face, path, name):
     keys, armature = face.mesh_object.data.shape_keys, face.armature_object.data
     path = "bpy.data." + path.replace("KEYS", keys.name).replace(
         'armatures["elbow_rig"]', f'armatures["{armature.name}"]'
@@ -104,7 +104,7 @@ def test_a_full_data_path_is_added_by_its_short_name(face):
         bpy.ops.fdda.add_control(name=path)
 
 
-def test_an_empty_range(face):
+def test_an_empty_range_is_a_problem(face):
     bpy.ops.fdda.add_control(name="thin")
     control = face.mesh_object.fdda.settings.controls[0]
     control.has_range, control.low, control.high = True, 1.0, 0.5
@@ -112,7 +112,7 @@ def test_an_empty_range(face):
     assert problem.startswith("The control 'shape_keys/key_blocks[\"thin\"].value' has no range; give one")
 
 
-def test_those_that_drivers_read_are_found(tmp_path):
+def test_controls_that_drivers_read_are_detected(tmp_path):
     controls.custom_property()
     rig = saved(tmp_path)
     check = checks.check_now(rig)
@@ -133,7 +133,7 @@ def test_properties_are_suggested(arm):
     assert names == [IK, 'armature_object/pose.bones["fk_upper"]["follow"]']
 
 
-def test_where_controls_rest(arm):
+def test_the_default_values_of_controls_are_read(arm):
     arm.armature_object.id_properties_ui("ik").update(default=0.25)
     arm.armature_object["on"] = True
     arm.armature_object.pose.bones["fk_upper"]["follow"] = 3

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Jobs without a window: one at a time, ended by a sentence, a cancel or another file, and nothing left behind."""
+"""Jobs without a window: one runs at a time, and each ends with a message and cleans up after itself."""
 
 from collections.abc import Iterator
 
@@ -16,7 +16,7 @@ events: list[str] = []
 
 
 class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wants it
-    """Counts to `upto`, and does at `at` what `what` says."""
+    """Counts to `upto`; at the number `at` it does what `what` names, such as to fail."""
 
     bl_idname = "fdda.count"
     bl_label = "Count"
@@ -70,7 +70,7 @@ def _count(_addon: None) -> Iterator[None]:
     bpy.utils.unregister_class(FDDA_OT_count)
 
 
-def test_a_job_runs_to_its_end_where_there_is_no_window():
+def test_without_a_window_a_job_runs_until_it_is_done():
     assert bpy.ops.fdda.count() == bpy.ops.fdda.count("INVOKE_DEFAULT") == {"FINISHED"}
     assert events == ["given back", "finished with 3"] * 2
     state = job.state_of("count")
@@ -79,7 +79,7 @@ def test_a_job_runs_to_its_end_where_there_is_no_window():
     assert job.current() is None
 
 
-def test_a_job_that_changes_the_file_is_a_step_of_undo_and_marks_it():
+def test_a_job_that_changes_the_file_adds_an_undo_step_and_marks_the_file_as_changed():
     was_dirty = bpy.data.is_dirty
     bpy.ops.fdda.count()
     assert bpy.data.is_dirty is was_dirty
@@ -92,7 +92,7 @@ def test_a_job_that_changes_the_file_is_a_step_of_undo_and_marks_it():
     assert bpy.context.scene["counted"] == 3
 
 
-def test_an_error_is_reported_and_the_operator_cancelled():
+def test_an_error_is_reported_and_cancels_the_operator():
     with pytest.raises(RuntimeError, match=r"The number 1 is missing; count again\."):
         bpy.ops.fdda.count(at=1, what="fail")
     assert events == ["given back"]
@@ -100,7 +100,7 @@ def test_an_error_is_reported_and_the_operator_cancelled():
     assert bpy.ops.fdda.count() == {"FINISHED"}
 
 
-def test_a_cancelled_job_gives_back_and_says_how_far_it_came():
+def test_a_canceled_job_cleans_up_and_reports_its_progress():
     assert bpy.ops.fdda.count(at=2, what="cancel") == {"CANCELLED"}
     assert events == ["given back"]
     state = job.state_of("count")
@@ -124,7 +124,7 @@ def test_cancel_without_a_job_says_so():
 
 
 def under_way(changes_scene: bool) -> JobState:
-    """A job as a window has it between two ticks."""
+    """Return the state of a job that is still running, between two timer events."""
 
     def steps() -> Iterator[Progress]:
         try:
@@ -146,7 +146,7 @@ def test_another_file_ends_a_job(rig):
 
 
 @pytest.mark.parametrize("changes_scene", [True, False])
-def test_an_undo_ends_a_job_that_borrows_the_scene_and_no_other(rig, changes_scene):
+def test_an_undo_ends_only_jobs_that_change_the_scene(rig, changes_scene):
     bpy.ops.ed.undo_push()
     rig.mesh_object.location.x = 1
     bpy.ops.ed.undo_push()

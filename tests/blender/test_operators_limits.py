@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rotation limits of many bones at once: set, copied, mirrored, of a person, cleared."""
+"""Operators that set, copy, mirror and clear the rotation limits of several bones, and that set human limits."""
 
 import math
 
@@ -54,7 +54,7 @@ def degrees(pose_bone: bpy.types.PoseBone) -> list[tuple[float, float]]:
     return [(round(math.degrees(r.low)), round(math.degrees(r.high))) for r in rotation_ranges(pose_bone)]
 
 
-def test_many_bones_at_once(armature_object):
+def test_limits_of_all_selected_bones_are_set(armature_object):
     select(armature_object, "LeftArm", "tail")
     low, high = (math.radians(-10), 0, math.radians(-30)), (math.radians(20), 1, math.radians(5))
     assert bpy.ops.fdda.set_limits(axes=(True, False, True), low=low, high=high) == {"FINISHED"}
@@ -65,7 +65,7 @@ def test_many_bones_at_once(armature_object):
         bpy.ops.fdda.set_limits(low=high, high=low)
 
 
-def test_copy_and_mirror(armature_object):
+def test_limits_are_copied_mirrored_and_cleared(armature_object):
     select(armature_object, "LeftArm")
     low, high = ([math.radians(v) for v in values] for values in ((-10, -20, -30), (1, 2, 3)))
     bpy.ops.fdda.set_limits(low=low, high=high)
@@ -81,17 +81,17 @@ def test_copy_and_mirror(armature_object):
         bpy.ops.fdda.mirror_limits()
 
 
-def test_nothing_selected(armature_object):
+def test_operators_without_selected_bones_are_refused(armature_object):
     select(armature_object)
     for operator in (bpy.ops.fdda.set_limits, bpy.ops.fdda.mirror_limits, bpy.ops.fdda.clear_limits):
         with pytest.raises(RuntimeError, match="No bone of 'person' is selected; check bones in the list"):
             operator()
 
 
-def test_a_person(armature_object):
+def test_human_limits_are_set_for_body_parts_only(armature_object):
     assert bpy.ops.fdda.human_limits() == {"FINISHED"}
     assert all(r.source == DEFAULT for r in rotation_ranges(bone(armature_object, "tail")))
-    # Arms hang from a T pose by a turn about Y of the body; forearms fold by one about Z.
+    # Forearms bend by a rotation about the Z axis of the body.
     for side, sign in (("Left", 1), ("Right", -1)):
         found = human_ranges(armature_object, bone(armature_object, f"{side}ForeArm").bone)
         axes = bone(armature_object, f"{side}ForeArm").bone.matrix_local.to_3x3().transposed()
@@ -119,11 +119,11 @@ def test_a_person(armature_object):
         ("Head", ""),
     ],
 )
-def test_names_of_parts(name, side):
+def test_bones_are_recognized_as_body_parts_by_name(name, side):
     ranges, found = body_part_of(name)
     assert ranges is not None and found == side
 
 
 @pytest.mark.parametrize("name", ["tail", "skirt_01.L", "armor", "eye.L", "IK_target", "Bone.001"])
-def test_names_of_no_part(name):
+def test_other_bones_are_no_body_parts(name):
     assert body_part_of(name)[0] is None

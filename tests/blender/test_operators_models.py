@@ -19,7 +19,7 @@ from .test_operators_playback import refused
 
 @pytest.fixture
 def second(elbow, tmp_path):
-    """Another model of the elbow: the same, under another name, outside the folder of its file."""
+    """A copy of the elbow's model with another name, outside the folder of the .blend file."""
     return Path(shutil.copy(elbow.model, tmp_path / "second.onnx"))
 
 
@@ -50,7 +50,7 @@ def test_removing_a_model_unbinds_it(rig, elbow, second):
     refused(bpy.ops.fdda.remove_model, "The model library is empty")
 
 
-def test_the_list_comes_back_with_the_file(bound, elbow):
+def test_the_model_list_is_saved_with_the_file(bound, elbow):
     assert [(entry.name, entry.path) for entry in bound.fdda.models] == [("elbow", "//elbow.onnx")]
 
 
@@ -60,7 +60,7 @@ def test_a_model_of_another_rig_is_not_added(rig, elbow):
     assert not rig.mesh_object.fdda.models
 
 
-def test_an_index_that_is_none(bound):
+def test_an_index_outside_the_list_is_refused(bound):
     bpy.context.view_layer.objects.active = bound
     refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 models and none with index 3")
 
@@ -92,7 +92,7 @@ def rename_bone() -> None:
         (rename_bone, "lacks the joint 'lower'"),
     ],
 )
-def test_a_stale_model_says_what_changed(bound, change, words):
+def test_the_check_of_an_outdated_model_names_the_change(bound, change, words):
     bpy.context.view_layer.objects.active = bound
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
     bound.fdda.mode = "RIG"
@@ -102,7 +102,7 @@ def test_a_stale_model_says_what_changed(bound, change, words):
     )
 
 
-def test_another_range_of_motion_is_told_and_prevents_nothing(bound, elbow):
+def test_a_changed_range_of_motion_is_reported_and_does_not_prevent_playback(bound, elbow):
     from fdda_addon.models.changes import find_changes
     from fdda_addon.scene.scene_rig import find_rig
 
@@ -117,7 +117,7 @@ def test_another_range_of_motion_is_told_and_prevents_nothing(bound, elbow):
     assert_plays(bound, elbow.model)
 
 
-def test_a_listed_path_out_of_the_folder_is_not_followed(bound, elbow, second):
+def test_a_listed_model_outside_the_folder_of_the_file_is_refused(bound, elbow, second):
     bpy.context.view_layer.objects.active = bound
     entry = bound.fdda.models.add()
     entry.name, entry.path = "second", str(second)
@@ -130,8 +130,8 @@ def test_a_listed_path_out_of_the_folder_is_not_followed(bound, elbow, second):
     assert bound_entry(bound).name == "second" and len(bound.fdda.models) == 2
 
 
-def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_path):
-    """The file under a bound model is replaced, as a training does."""
+def test_a_model_file_that_is_replaced_is_reloaded(bound, elbow, second, tmp_path):
+    """Training again replaces the file of a bound model."""
     import onnx
 
     from fdda_addon.evaluation import last_evaluation
@@ -160,7 +160,7 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     assert len(bound.fdda.models) == 2
 
 
-def test_what_the_section_says_of_the_models(bound, elbow):
+def test_the_section_describes_the_problems_of_models(bound, elbow):
     from fdda_addon.panels import checks
     from fdda_addon.panels import models as section
     from fdda_addon.scene.scene_rig import find_rig
@@ -177,11 +177,11 @@ def test_what_the_section_says_of_the_models(bound, elbow):
     assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 
-def test_megabytes():
+def test_file_sizes_are_formatted_in_kilobytes_and_megabytes():
     assert [format_file_size(count) for count in (2_340, 1_340_169)] == ["2.3 kB", "1.3 MB"]
 
 
-def test_a_model_of_equal_size_that_replaces_another_plays(rig, second, tmp_path):
+def test_a_replaced_model_file_of_equal_size_is_reloaded_when_it_is_bound(rig, second, tmp_path):
     from onnx import numpy_helper
 
     def negate(proto) -> None:

@@ -24,7 +24,7 @@ def packed_elbow(bound, elbow):
     return bound
 
 
-def test_packed_model_plays_without_its_file(packed_elbow, elbow, tmp_path):
+def test_a_packed_model_plays_without_its_file(packed_elbow, elbow, tmp_path):
     entry = packed_elbow.fdda.models[0]
     assert entry.packed_bytes == elbow.model.stat().st_size and not entry.packed.use_fake_user
     pose(angle=0.9)
@@ -39,8 +39,8 @@ def test_packed_model_plays_without_its_file(packed_elbow, elbow, tmp_path):
     assert bytes(packed_model.read(mesh_object.fdda.packed)) == elbow.model.read_bytes()
 
 
-def test_a_refused_find_model_changes_nothing(packed_elbow, elbow, tmp_path):
-    """The model of another rig, and a file that is none."""
+def test_find_model_with_an_unsuitable_file_changes_nothing(packed_elbow, elbow, tmp_path):
+    """The chosen files are a model of another rig and a file that is not a model."""
     other = tmp_path / "other.onnx"
     shutil.copy(elbow.model, other)
     (tmp_path / "none.onnx").write_bytes(b"no model")
@@ -52,13 +52,13 @@ def test_a_refused_find_model_changes_nothing(packed_elbow, elbow, tmp_path):
         (entry,) = packed_elbow.fdda.models
         assert before == (entry.name, entry.path, entry.packed, entry.packed_bytes, packed_elbow.fdda.model_index)
         assert packed_elbow.fdda.packed == entry.packed and packed_elbow.fdda.is_bound
-    # Of a model that is in no list, none is made.
+    # Without an entry in the list, none is added.
     packed_elbow.fdda.models.clear()
     refused(lambda: bpy.ops.fdda.relink(filepath=str(other)), "the skin weights differ")
     assert not packed_elbow.fdda.models and packed_elbow.fdda.is_bound
 
 
-def test_undo_with_a_packed_model(packed_elbow, elbow):
+def test_a_packed_model_plays_after_an_undo(packed_elbow, elbow):
     bpy.ops.ed.undo_push(message="packed")
     pose(angle=0.9)
     bpy.ops.ed.undo_push(message="posed")
@@ -68,7 +68,7 @@ def test_undo_with_a_packed_model(packed_elbow, elbow):
     assert bpy.data.objects[ELBOW].fdda.packed is not None
 
 
-def test_unbinding_and_binding_a_packed_model(packed_elbow, elbow):
+def test_a_packed_model_can_be_unbound_bound_again_and_measured(packed_elbow, elbow):
     bpy.ops.fdda.unbind()
     assert len(bpy.data.texts) == 1
     bpy.ops.fdda.bind()
@@ -79,7 +79,7 @@ def test_unbinding_and_binding_a_packed_model(packed_elbow, elbow):
     assert packed_elbow.fdda.packed is not None and packed_elbow.fdda.is_bound
 
 
-def test_borrowing_gives_a_packed_model_back(packed_elbow, elbow, tmp_path):
+def test_a_temporary_binding_restores_a_packed_model(packed_elbow, elbow, tmp_path):
     from fdda_addon.runtime.binding import temporary_binding
     from fdda_addon.scene.scene_rig import find_rig
 
@@ -90,7 +90,7 @@ def test_borrowing_gives_a_packed_model_back(packed_elbow, elbow, tmp_path):
     assert bound_entry(packed_elbow) is not None
 
 
-def test_unpack_writes_what_was_packed_and_removes_it(packed_elbow, elbow, tmp_path):
+def test_unpacking_writes_the_model_and_removes_it_from_the_file(packed_elbow, elbow, tmp_path):
     path = tmp_path / "out.onnx"
     path.write_bytes(b"another")
     refused(lambda: bpy.ops.fdda.unpack_model(filepath=str(path)), "There is another file", "choose another name")
@@ -103,7 +103,7 @@ def test_unpack_writes_what_was_packed_and_removes_it(packed_elbow, elbow, tmp_p
     refused(bpy.ops.fdda.unpack_model, "is not packed")
 
 
-def test_unpack_beside_the_file_where_the_same_model_lies(packed_elbow, elbow):
+def test_unpacking_keeps_an_identical_file_beside_the_blend_file(packed_elbow, elbow):
     bpy.ops.fdda.unpack_model()
     assert packed_elbow.fdda.model == "//elbow.onnx"
     pose(angle=1.1)
@@ -115,7 +115,7 @@ def test_removing_a_packed_model_deletes_it(packed_elbow):
     assert not bpy.data.texts
 
 
-def test_a_packed_model_passes_the_same_checks(packed_elbow, elbow):
+def test_a_damaged_packed_model_is_refused(packed_elbow, elbow):
     packed_elbow.fdda.packed[packed_model.PACKED_MODEL_KEY] = b"\x08\x08" + elbow.model.read_bytes()[:100]
     path = elbow.bound.with_name("damaged.blend")
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)

@@ -15,7 +15,7 @@ from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
 
 
 def refused(call, *words: str) -> None:
-    """The operator is canceled with a report that holds the words."""
+    """Assert that an operator is canceled and that its report contains the words."""
     with pytest.raises(RuntimeError) as error:
         call()
     for word in words:
@@ -39,7 +39,7 @@ def test_bind_plays_and_unbind_restores(rig, elbow):
     assert len(mesh_object.fdda.models) == 1
 
 
-def test_bind_takes_the_model_that_is_chosen_in_the_list(rig, elbow):
+def test_bind_uses_the_model_that_is_active_in_the_list(rig, elbow):
     refused(bpy.ops.fdda.bind, "'elbow' has no model yet; train one, or choose a file.")
     bpy.ops.fdda.add_model(filepath=str(elbow.model))
     assert bpy.ops.fdda.bind() == {"FINISHED"}
@@ -60,7 +60,7 @@ def test_bind_with_the_armature_active(rig, elbow):
     assert rig.mesh_object.fdda.is_bound
 
 
-def test_what_is_no_model_is_not_put_into_the_list(rig, elbow, tmp_path):
+def test_a_file_that_is_not_a_model_is_not_listed(rig, elbow, tmp_path):
     path = tmp_path / "text.onnx"
     path.write_text("no model")
     refused(lambda: bpy.ops.fdda.bind(filepath=str(path)), "is not a model")
@@ -68,15 +68,15 @@ def test_what_is_no_model_is_not_put_into_the_list(rig, elbow, tmp_path):
     assert not rig.mesh_object.fdda.models and not rig.mesh_object.fdda.is_bound
 
 
-def test_a_model_of_another_rig_leaves_the_bound_one(bound, elbow):
+def test_a_refused_model_does_not_unbind_the_bound_model(bound, elbow):
     bpy.context.view_layer.objects.active = bound
     bound.data.vertices[0].co.x += 0.1
     refused(lambda: bpy.ops.fdda.bind(filepath=str(elbow.model)), "the rest pose of the mesh differs")
-    # The bound one is not of this mesh any more either: it is kept, and the rig shows.
+    # The bound model does not match the changed mesh either. It stays bound, and the rig is shown.
     assert bound.fdda.is_bound and bound.fdda.mode == "RIG" and "the rest pose of the mesh" in bound.fdda.status
 
 
-def test_undo_of_bind_and_unbind(rig, elbow):
+def test_bind_and_unbind_can_be_undone(rig, elbow):
     before = modifiers(rig.mesh_object)
     bpy.ops.ed.undo_push(message="start")
     bpy.ops.fdda.bind(filepath=str(elbow.model))
@@ -90,14 +90,14 @@ def test_undo_of_bind_and_unbind(rig, elbow):
     assert modifiers(bpy.data.objects[ELBOW]) == before
 
 
-def test_poll_says_why_not(elbow):
+def test_disabled_operators_say_why(elbow):
     refused(bpy.ops.fdda.unbind, "Nothing with a rig is active")
     bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
     for name in ("unbind", "set_mode", "measure_model", "relink", "evaluate", "open_report"):
         refused(getattr(bpy.ops.fdda, name), "No model is bound; bind one first")
 
 
-def test_switch(bound, elbow):
+def test_set_mode_changes_and_toggles_the_mode(bound, elbow):
     bpy.context.view_layer.objects.active = bound
     pose(angle=1.3)
     playing = assert_plays(bound, elbow.model)
@@ -112,14 +112,14 @@ def test_switch(bound, elbow):
     assert bound.fdda.mode == "RIG"
 
 
-def test_switch_says_why_a_model_cannot_play(bound):
+def test_set_mode_says_why_a_model_cannot_play(bound):
     bpy.context.view_layer.objects.active = bound
     bpy.ops.fdda.set_mode(mode="RIG")
     bound.modifiers.remove(playback_modifier.find_modifier(bound))
     refused(lambda: bpy.ops.fdda.set_mode(mode="FDDA"), "was removed; bind the model again")
 
 
-def test_measure(bound):
+def test_measuring_stores_frame_times_and_restores_the_mode(bound):
     bpy.context.view_layer.objects.active = bound
     bound.fdda.mode = "LINEAR"
     assert frame_times.get(bound) is None
@@ -134,7 +134,7 @@ def test_measure(bound):
     assert frame_times.get(bound) is None
 
 
-def test_a_model_that_was_moved_is_found_again(elbow, tmp_path):
+def test_relink_finds_a_model_that_was_moved(elbow, tmp_path):
     for path in (elbow.bound, elbow.model):
         shutil.copy(path, tmp_path)
     (tmp_path / "elbow.onnx").rename(tmp_path / "moved.onnx")
@@ -172,7 +172,7 @@ def test_confidence_is_the_model_s_and_computed_once_per_pose(bound, elbow, monk
     assert confidence.partition_confidence(bound) and len(calls) == 1
 
 
-def test_confidence_of_what_cannot_be_read_is_nothing(bound):
+def test_without_a_joint_or_armature_there_is_no_confidence(bound):
     bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "forearm"
     assert confidence.partition_confidence(bound) is None
     bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])

@@ -17,7 +17,7 @@ from fdda_addon.scene.scene_rig import SceneRig
 from .conftest import ELBOW_RIG
 
 
-def test_the_poses_that_are_shown_are_those_that_are_recorded(saved):
+def test_previewed_poses_are_the_poses_that_are_recorded(saved):
     settings = saved.mesh_object.fdda.settings
     settings.seed, settings.spread = 7, 0.5
     channels = sampled_channels(saved, read_rig(saved))
@@ -46,7 +46,7 @@ def test_the_number_field_shows_a_pose(saved):
     assert session.preview_pose == 3, "there is nothing to pose"
 
 
-def test_back_to_rest_and_undone(saved):
+def test_rest_pose_resets_the_bones_and_can_be_undone(saved):
     bpy.ops.fdda.preview_pose(number=1)
     bpy.ops.ed.undo_push()
     angle = saved.armature_object.pose.bones["lower"].rotation_euler[0]
@@ -94,7 +94,7 @@ def test_an_undo_cancels_the_step_that_is_to_be_added(saved, operator):
     assert not bpy.app.timers.is_registered(undo._push_undo)
 
 
-def test_nothing_to_pose(saved):
+def test_a_preview_with_all_rotations_locked_is_refused(saved):
     for bone in saved.armature_object.pose.bones:
         bone.lock_rotation = (True, True, True)
     with pytest.raises(RuntimeError, match="No bone of 'elbow_rig' may be sampled"):
@@ -108,7 +108,7 @@ def ranges(rig: SceneRig) -> dict[str, tuple[float, float]]:
     }
 
 
-def test_a_range_is_written_where_the_bone_has_it(saved):
+def test_a_range_is_written_to_the_existing_constraint(saved):
     bone = saved.armature_object.pose.bones["upper"]
     result = bpy.ops.fdda.set_limit(bone="upper", axis="Y", low=math.radians(10), high=math.radians(60))
     assert result == {"FINISHED"} and ranges(saved)["upper Y"] == (10, 60)
@@ -116,7 +116,7 @@ def test_a_range_is_written_where_the_bone_has_it(saved):
     assert not bone.use_ik_limit_y
 
 
-def test_a_bone_without_limits_gets_those_that_leave_posing_free(saved):
+def test_a_bone_without_limits_gets_ik_limits_if_they_include_the_rest_pose(saved):
     bone = saved.armature_object.pose.bones["upper"]
     bone.constraints.remove(bone.constraints[0])
     bone.lock_rotation[2] = True
@@ -131,7 +131,7 @@ def test_a_bone_without_limits_gets_those_that_leave_posing_free(saved):
     assert ranges(saved)["upper X"] == (29, 57) and len(bone.constraints) == 1
 
 
-def test_an_empty_range_and_an_unknown_bone(saved):
+def test_an_empty_range_and_an_unknown_bone_are_refused(saved):
     with pytest.raises(RuntimeError, match="The range of 'upper' about Y is empty; give a larger maximum"):
         bpy.ops.fdda.set_limit(bone="upper", axis="Y", low=1, high=0)
     with pytest.raises(RuntimeError, match="'elbow_rig' has no bone 'tail'; give the name of one"):

@@ -29,7 +29,7 @@ def record(rig: SceneRig, poses: int = 20, **options) -> set[str]:
     return bpy.ops.fdda.record(**options)
 
 
-def test_what_the_settings_say_is_recorded_beside_the_file(saved, tmp_path):
+def test_a_recording_follows_the_settings_and_is_stored_beside_the_file(saved, tmp_path):
     settings = saved.mesh_object.fdda.settings
     settings.seed, settings.spread = 5, 0.75
     bpy.data.actions["elbow_wave"].fdda.record = True
@@ -46,7 +46,7 @@ def test_what_the_settings_say_is_recorded_beside_the_file(saved, tmp_path):
     assert job.state_of("record").outcome == "Recorded 50 poses into 'elbow_recording'."
 
 
-def test_an_unsaved_file_has_no_place_for_it():
+def test_an_unsaved_file_is_refused_without_a_folder():
     bpy.ops.fdda.add_sample_arm(density="1")
     with pytest.raises(
         RuntimeError, match=r"Save the \.blend file first \(recordings are stored next to it\), or choose a Folder"
@@ -54,7 +54,7 @@ def test_an_unsaved_file_has_no_place_for_it():
         bpy.ops.fdda.record()
 
 
-def test_a_folder_that_is_named(saved, tmp_path):
+def test_a_recording_is_stored_in_the_given_folder(saved, tmp_path):
     saved.mesh_object.fdda.settings.recording = "//deep/down"
     assert record(saved) == {"FINISHED"}
     assert read_index(tmp_path / "deep" / "down")["complete"] == 20
@@ -62,7 +62,7 @@ def test_a_folder_that_is_named(saved, tmp_path):
     assert read_index(tmp_path / "other")["complete"] == 20
 
 
-def test_cancelled_and_resumed(saved, tmp_path, monkeypatch):
+def test_a_canceled_recording_keeps_its_poses_and_is_resumed(saved, tmp_path, monkeypatch):
     show = job.JobState.show
 
     def cancel(state, progress):
@@ -84,19 +84,19 @@ def test_cancelled_and_resumed(saved, tmp_path, monkeypatch):
     assert len(read_recording(recorded_folder(tmp_path)).residuals) == 20
 
 
-def test_another_blender_is_recording_there(saved, tmp_path):
+def test_a_folder_locked_by_another_blender_is_refused(saved, tmp_path):
     recorded_folder(tmp_path).mkdir()
     lock = recorded_folder(tmp_path) / LOCK_NAME
     lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
     with lock.open("r+b") as held:
-        # The system's lock is of the open file, so this is another's also in one process.
+        # The lock belongs to the open file, so a second open file in this process acts as another process.
         assert lock_file(held.fileno())
         with pytest.raises(RuntimeError, match=rf"Another Blender \(process {os.getppid()}\) is recording into"):
             record(saved)
     assert lock.exists()
 
 
-def test_removing_a_recording(saved, tmp_path):
+def test_deleting_a_recording_keeps_other_files(saved, tmp_path):
     with pytest.raises(RuntimeError, match="holds no recording; there is nothing to remove"):
         bpy.ops.fdda.delete_recording()
     record(saved)
@@ -105,7 +105,7 @@ def test_removing_a_recording(saved, tmp_path):
     assert [path.name for path in recorded_folder(tmp_path).iterdir()] == ["notes.txt"]
 
 
-def test_a_bound_rig_is_recorded_as_the_true_rig(bound, elbow, tmp_path):
+def test_a_bound_character_is_recorded_with_its_rig(bound, elbow, tmp_path):
     bpy.context.view_layer.objects.active = bound
     assert bound.fdda.is_playing
     bound.fdda.settings.poses = 5

@@ -12,7 +12,7 @@ from .scene_state import assert_same_state, scene_state
 
 
 class TestSampleArm:
-    def test_the_cube_of_a_new_file_is_out_of_the_way_and_the_arm_in_view(self):
+    def test_adding_the_arm_hides_the_default_cube_and_frames_the_arm(self):
         bpy.ops.wm.read_factory_settings()
         assert bpy.ops.fdda.add_sample_arm(density="1") == {"FINISHED"}
         assert not bpy.data.objects["Cube"].visible_get() and bpy.data.objects["Cube"].hide_render
@@ -21,7 +21,7 @@ class TestSampleArm:
         for view in views:
             assert 0.2 < view.view_location.x < 0.6 and 0.5 < view.view_distance < 1.5
 
-    def test_the_arm_is_added_to_the_scene_that_is_there(self):
+    def test_the_arm_is_added_to_the_current_scene(self):
         bpy.ops.mesh.primitive_cube_add()
         cube = bpy.context.active_object
         cube.location.x = 3
@@ -33,7 +33,7 @@ class TestSampleArm:
         assert cube.name in bpy.context.scene.objects and not cube.select_get()
         assert bpy.context.scene.frame_end == 250
 
-    def test_a_second_arm_has_a_rig_of_its_own(self):
+    def test_a_second_arm_has_a_separate_rig(self):
         bpy.ops.fdda.add_sample_arm(density="1")
         bpy.context.scene.frame_end = 77
         bpy.ops.fdda.add_sample_arm(density="1")
@@ -50,12 +50,12 @@ class TestSampleArm:
         bpy.ops.ed.undo()
         assert "arm" not in bpy.data.objects and "arm_rig" not in bpy.data.objects
 
-    def test_not_in_edit_mode(self, saved):
+    def test_adding_the_arm_in_edit_mode_is_refused(self, saved):
         bpy.ops.object.mode_set(mode="EDIT")
         with pytest.raises(RuntimeError, match="Objects can only be added in Object Mode"):
             bpy.ops.fdda.add_sample_arm(density="1")
 
-    def test_measuring_gives_back_the_scene_and_keeps_the_cost(self, saved):
+    def test_measuring_restores_the_scene_and_stores_the_cost(self, saved):
         before = scene_state(saved)
         assert bpy.ops.fdda.measure() == {"FINISHED"}
         assert_same_state(before, scene_state(saved))
@@ -64,32 +64,32 @@ class TestSampleArm:
         assert cost.rig > cost.linear > 0 and cost.model > cost.linear
         assert job.state_of("measure").outcome.endswith("Not worth it here: this rig is faster than a model.")
 
-    def test_what_cannot_be_evaluated_is_not_measured(self, saved):
+    def test_an_armature_in_rest_position_is_not_measured(self, saved):
         saved.armature_object.data.pose_position = "REST"
         with pytest.raises(RuntimeError, match="The armature 'elbow_rig' shows its rest position; set it to pose"):
             bpy.ops.fdda.measure()
 
 
 class TestUsedRig:
-    def test_nothing_active(self):
+    def test_operators_without_an_active_object_are_refused(self):
         with pytest.raises(RuntimeError, match="Nothing with a rig is active; select the mesh of a character"):
             bpy.ops.fdda.record()
 
-    def test_a_mesh_without_a_rig_but_another_with_one(self, saved):
+    def test_an_active_mesh_without_a_rig_is_refused(self, saved):
         bpy.ops.mesh.primitive_cube_add()
         with pytest.raises(RuntimeError, match="'Cube' has no Armature modifier with an armature"):
             bpy.ops.fdda.measure()
         assert bpy.ops.fdda.measure(object=ELBOW) == {"FINISHED"}
 
-    def test_a_name_that_is_not_there(self, saved):
+    def test_an_unknown_object_name_is_refused(self, saved):
         with pytest.raises(RuntimeError, match="The scene has no mesh object 'none'; its mesh objects: 'elbow'"):
             bpy.ops.fdda.record(object="none")
 
-    def test_the_armature_stands_for_its_mesh(self, saved):
+    def test_an_active_armature_selects_its_mesh(self, saved):
         bpy.context.view_layer.objects.active = saved.armature_object
         assert bpy.ops.fdda.measure() == {"FINISHED"}
 
-    def test_of_two_meshes_the_selected_or_the_chosen_one_is_meant(self, saved):
+    def test_of_two_meshes_the_selected_or_else_the_chosen_mesh_is_used(self, saved):
         other = saved.mesh_object.copy()
         other.data = saved.mesh_object.data.copy()
         bpy.context.scene.collection.objects.link(other)

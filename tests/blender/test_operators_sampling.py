@@ -25,7 +25,7 @@ IK = 'armature_object/["ik"]'
 
 
 def saved(tmp_path: Path) -> SceneRig:
-    """The character of the scene, active, in a file of its own, with few poses to record."""
+    """Save the file, make the character active and set 6 poses to record; return its rig."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
     rig = find_rig()
     bpy.context.view_layer.objects.active = rig.mesh_object
@@ -63,7 +63,7 @@ def select(rig: SceneRig, *names: str) -> None:
 
 
 def wave(rig: SceneRig) -> bpy.types.Action:
-    """An action that turns the lower bone of the FK chain about X, and blends to the IK chain; ticked."""
+    """Create a checked action that rotates the lower bone of the FK chain about X and blends to the IK chain."""
     bone, action = rig.armature_object.pose.bones["fk_lower"], bpy.data.actions.new("wave")
     rig.armature_object.animation_data_create().action = action
     for frame, angle, ik in ((1, 0.0, 0.0), (11, 0.8, 0.5)):
@@ -76,12 +76,12 @@ def wave(rig: SceneRig) -> bpy.types.Action:
 
 
 class TestBones:
-    def test_those_with_weights_where_nothing_is_chosen(self, arm):
+    def test_by_default_bones_with_weights_are_sampled(self, arm):
         assert recording_settings(arm).sample == ()
         assert checks.check_now(arm).problems == ()
         assert sampled_channels_by_bone(arm) is None, "the list has the joints"
 
-    def test_a_bone_collection(self, arm):
+    def test_the_bones_of_a_collection_are_sampled(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample = "COLLECTION"
         assert checks.check_now(arm).problems == (
@@ -100,14 +100,14 @@ class TestBones:
         assert [control.name for control in recording.rig.controls] == [IK]
         assert np.ptp(recording.controls, axis=0) > 0.1
 
-    def test_a_collection_that_is_gone(self, arm):
+    def test_a_missing_bone_collection_is_a_problem(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample, settings.bone_collection = "COLLECTION", "Face"
         assert checks.check_now(arm).problems == (
             "'elbow_rig' has no bone collection 'Face'; its collections: 'Controls'.",
         )
 
-    def test_what_the_ticked_actions_key(self, arm):
+    def test_the_keyed_channels_of_checked_actions_are_sampled(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample = "ACTIONS"
         with pytest.raises(RuntimeError, match="but no action is checked; check one"):
@@ -147,7 +147,7 @@ class TestBones:
         modifier.coefficients = (0.0, 0.1)
         assert turn() == pytest.approx((0.1, 1.1)), "a modifier of the curve counts as well"
 
-    def test_the_bones_that_were_selected(self, arm):
+    def test_the_bones_that_were_selected_are_stored_and_sampled(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample = "SELECTED"
         select(arm)
@@ -166,7 +166,7 @@ class TestBones:
         bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
         assert recording_settings(find_rig()).sample == ("bone:ik_hand", "bone:ik_pole")
 
-    def test_another_choice_is_another_recording(self, arm):
+    def test_a_recording_with_other_sampled_bones_is_reported(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
         recorded(arm)
@@ -178,7 +178,7 @@ class TestBones:
         sentence = cached_content(arm, recording_folder(arm.mesh_object)).sentence
         assert sentence == "It was recorded with other settings than those above: range of motion."
 
-    def test_the_mesh_is_not_read_again_for_another_choice_of_control_bones(self, arm):
+    def test_choosing_other_control_bones_does_not_read_the_mesh_again(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
         first = checks.check_now(arm)
@@ -194,7 +194,7 @@ def sampled_by_bone_now(rig: SceneRig) -> dict:
 
 
 class TestPreview:
-    def test_what_is_shown_is_what_is_recorded(self, arm):
+    def test_previewed_poses_and_controls_are_those_that_are_recorded(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
         bpy.ops.fdda.add_control(name=IK)
@@ -207,7 +207,7 @@ class TestPreview:
             np.testing.assert_allclose(recording.pose_matrices[number], shown, atol=1e-5)
             assert arm.armature_object["ik"] == pytest.approx(recording.controls[number, 0], abs=1e-6)
 
-    def test_the_rest_pose_puts_controls_back(self, face):
+    def test_the_rest_pose_resets_controls(self, face):
         keys = face.mesh_object.data.shape_keys.key_blocks
         bpy.ops.fdda.add_control(name="shape_keys")
         bpy.ops.fdda.preview_pose(number=2)
@@ -215,13 +215,13 @@ class TestPreview:
         assert bpy.ops.fdda.rest_pose() == {"FINISHED"}
         assert keys["flexed"].value == keys["thin"].value == 0
 
-    def test_the_rest_pose_needs_no_choice(self, arm):
+    def test_the_rest_pose_works_without_sampled_bones(self, arm):
         arm.mesh_object.fdda.settings.sample = "SELECTED"
         arm.armature_object.pose.bones["fk_upper"].rotation_euler[0] = 0.5
         assert bpy.ops.fdda.rest_pose() == {"FINISHED"}
         assert arm.armature_object.pose.bones["fk_upper"].rotation_euler[0] == 0
 
-    def test_also_where_actions_alone_are_recorded(self, arm):
+    def test_poses_are_previewed_even_if_only_actions_are_recorded(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample, settings.bone_collection, settings.poses = "COLLECTION", control_rigs.CONTROLS, 0
         assert bpy.ops.fdda.preview_pose(number=1) == {"FINISHED"}

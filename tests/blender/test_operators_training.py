@@ -27,7 +27,7 @@ def train(rig: SceneRig, elbow, **options) -> set[str]:
     return bpy.ops.fdda.train(recording=str(elbow.recording), **options)
 
 
-def test_a_model_with_these_settings_and_its_curves(saved, elbow, tmp_path):
+def test_a_model_is_trained_with_the_settings_and_learning_curves_are_stored(saved, elbow, tmp_path):
     saved.mesh_object.fdda.settings.model = "//models/a.onnx"
     assert train(saved, elbow) == {"FINISHED"}
     model = tmp_path / "models" / "a.onnx"
@@ -39,7 +39,7 @@ def test_a_model_with_these_settings_and_its_curves(saved, elbow, tmp_path):
     assert state.curves["validation"][-1] < state.curves["validation"][0]
 
 
-def test_cancelled(saved, elbow, tmp_path, monkeypatch):
+def test_a_canceled_training_writes_no_model(saved, elbow, tmp_path, monkeypatch):
     show = job.JobState.show
 
     def cancel(state, progress):
@@ -55,7 +55,7 @@ def test_cancelled(saved, elbow, tmp_path, monkeypatch):
     assert not (tmp_path / "m.onnx").exists()
 
 
-def test_more_poses_where_the_model_is_worst_and_training_on(saved, elbow, tmp_path):
+def test_refining_adds_poses_and_training_continues_from_the_checkpoint(saved, elbow, tmp_path):
     settings = saved.mesh_object.fdda.settings
     settings.poses, settings.epochs, settings.use_goal, settings.goal_mm = 20, 2, True, 0.001
     assert bpy.ops.fdda.record() == {"FINISHED"}
@@ -78,14 +78,14 @@ def test_more_poses_where_the_model_is_worst_and_training_on(saved, elbow, tmp_p
     assert report["poses"] == 26 and report["goal"]["verdict"] == "missed"
 
 
-def test_there_must_be_a_model_to_refine(saved):
+def test_refining_without_a_model_is_refused(saved):
     saved.mesh_object.fdda.settings.poses = 12
     bpy.ops.fdda.record()
     with pytest.raises(RuntimeError, match="train it first"):
         bpy.ops.fdda.refine()
 
 
-def test_no_recording_and_one_that_is_not_finished(saved, tmp_path):
+def test_a_missing_or_incomplete_recording_is_refused(saved, tmp_path):
     with pytest.raises(RuntimeError, match="is not a recording: it has no recording"):
         bpy.ops.fdda.train()
     saved.mesh_object.fdda.settings.poses = 4
@@ -96,7 +96,7 @@ def test_no_recording_and_one_that_is_not_finished(saved, tmp_path):
         bpy.ops.fdda.train()
 
 
-def test_a_python_that_is_not_there(saved, elbow, tmp_path, monkeypatch):
+def test_a_missing_python_of_the_trainer_is_refused(saved, elbow, tmp_path, monkeypatch):
     monkeypatch.setenv("FDDA_TRAINER_PYTHON", "/none/python")
     with pytest.raises(RuntimeError, match="The trainer's Python '/none/python' cannot be started"):
         train(saved, elbow)

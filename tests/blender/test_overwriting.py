@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""No verb writes over what it reads, or over a file of another kind, unless it is told to."""
+"""Without --overwrite, no verb overwrites a file that it reads, or a file of another kind."""
 
 import json
 import os
@@ -80,7 +80,7 @@ VERBS = {
         for name, verb in VERBS.items()
     ],
 )
-def test_a_verb_refuses(place, capfd, monkeypatch, line, path, kind):
+def test_a_verb_refuses_to_overwrite_an_input_or_another_kind_of_file(place, capfd, monkeypatch, line, path, kind):
     monkeypatch.chdir(place)
     words = IS_OTHER.format(kind) if kind else IS_READ
     assert Refusal(place, capfd)(*line.split()) == f"Cannot write '{Path(path)}': {words}"
@@ -106,7 +106,7 @@ def test_report_and_checkpoint_are_checked_too(place, capfd, monkeypatch):
         (place / name).unlink()
 
 
-def test_two_outputs_of_one_name(place, capfd, monkeypatch):
+def test_two_outputs_with_one_name_are_refused(place, capfd, monkeypatch):
     monkeypatch.chdir(place)
     refusal = Refusal(place, capfd)
     text = refusal("evaluate", "rig.blend", "m.onnx", "--json", "e", "--heatmap", "e")
@@ -123,8 +123,8 @@ def test_a_bound_file_does_not_take_the_name_of_the_copied_model(place, capfd, m
     assert text == f"Cannot write '{out}': the copy of the model beside it has that name; give another name."
 
 
-def test_a_torn_recording_is_replaced(place, capfd, monkeypatch):
-    """Neither a new recording nor `--resume` takes it; their sentences say what does."""
+def test_a_damaged_recording_is_replaced_only_with_overwrite(place, capfd, monkeypatch):
+    """A new recording and `--resume` refuse it, and their messages name `--overwrite`."""
     monkeypatch.chdir(place)
     index = place / "recording" / "recording.json"
     index.write_bytes(index.read_bytes()[:200])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Models travel with their file: packed when they are bound, or followed from folders that the user trusts."""
+"""Models are packed into their .blend file when they are bound, or loaded from folders that the user trusts."""
 
 import shutil
 
@@ -18,14 +18,14 @@ from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose, run
 
 @pytest.fixture
 def model(elbow, tmp_path):
-    """The elbow's model in a folder that is not the file's."""
+    """The elbow's model in another folder than the .blend file."""
     folder = tmp_path / "models"
     folder.mkdir()
     return shutil.copy(elbow.model, folder / "elbow.onnx")
 
 
 def save_elsewhere(tmp_path):
-    """Save the open file into a folder of its own and open it as a new Blender does."""
+    """Save the open file into a new folder and open it again."""
     path = tmp_path / "elsewhere" / "shot.blend"
     path.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
@@ -34,7 +34,7 @@ def save_elsewhere(tmp_path):
     return bpy.data.objects[ELBOW]
 
 
-def test_a_bound_model_comes_along_with_save_as(rig, elbow, model, tmp_path):
+def test_a_bound_model_is_saved_with_save_as(rig, elbow, model, tmp_path):
     bpy.ops.fdda.bind(filepath=str(model))
     assert rig.mesh_object.fdda.packed is not None
     mesh_object = save_elsewhere(tmp_path)
@@ -42,14 +42,14 @@ def test_a_bound_model_comes_along_with_save_as(rig, elbow, model, tmp_path):
     assert_plays(mesh_object, elbow.model)
 
 
-def test_a_found_model_comes_along(bound, elbow, model, tmp_path):
+def test_a_relinked_model_is_packed(bound, elbow, model, tmp_path):
     bpy.ops.fdda.relink(object=ELBOW, filepath=str(model))
     assert bound.fdda.packed is not None
     pose(angle=0.8)
     assert_plays(save_elsewhere(tmp_path), elbow.model)
 
 
-def test_a_bound_model_comes_along_with_append(rig, elbow, model, tmp_path):
+def test_a_bound_model_is_appended_with_its_object(rig, elbow, model, tmp_path):
     bpy.ops.fdda.bind(filepath=str(model))
     path = tmp_path / "library" / "character.blend"
     path.parent.mkdir()
@@ -66,7 +66,7 @@ def test_a_bound_model_comes_along_with_append(rig, elbow, model, tmp_path):
     assert set(bpy.context.scene.objects.keys()) - before == {ELBOW, ELBOW_RIG}
 
 
-def test_a_large_one_stays_outside_and_is_told(rig, model, monkeypatch):
+def test_a_large_model_is_not_packed_and_this_is_reported(rig, model, monkeypatch):
     monkeypatch.setattr(playback, "LARGE_MODEL_BYTES", 1000)
     assert playback.bind_model(rig, model_files.Path(model)).endswith("pack it in the Model Library.")
     assert rig.mesh_object.fdda.is_bound and rig.mesh_object.fdda.packed is None
@@ -74,13 +74,13 @@ def test_a_large_one_stays_outside_and_is_told(rig, model, monkeypatch):
     assert rig.mesh_object.fdda.packed is not None
 
 
-def test_the_preferences_can_leave_models_outside(rig, model, monkeypatch):
+def test_models_are_not_packed_if_the_preferences_say_so(rig, model, monkeypatch):
     monkeypatch.setattr(playback, "packs_models", lambda: False)
     bpy.ops.fdda.bind(filepath=str(model))
     assert rig.mesh_object.fdda.packed is None and not bpy.data.texts
 
 
-def test_a_packed_model_that_is_trained_anew_is_packed_anew(rig, elbow, model):
+def test_a_packed_model_that_is_trained_again_is_packed_again(rig, elbow, model):
     from fdda_addon.models.model_list import add_model
 
     bpy.ops.fdda.bind(filepath=str(model))
@@ -88,14 +88,14 @@ def test_a_packed_model_that_is_trained_anew_is_packed_anew(rig, elbow, model):
     add_model(rig.mesh_object, model_files.Path(model))
     assert rig.mesh_object.fdda.packed.session_uid == before, "the same file is not packed again"
     with open(model, "ab") as file:
-        # A field that nobody knows: another file, the same model.
+        # An unknown field changes the file but not the model.
         file.write(b"\xfa\x3f\x00")
     add_model(rig.mesh_object, model_files.Path(model))
     assert packed_model.read(rig.mesh_object.fdda.packed) == model_files.Path(model).read_bytes()
     assert len(rig.mesh_object.fdda.models) == 1 and len(bpy.data.texts) == 1
 
 
-def test_a_trusted_folder_is_followed_and_no_other(bound, elbow, model, tmp_path, monkeypatch):
+def test_models_are_loaded_from_trusted_folders_only(bound, elbow, model, tmp_path, monkeypatch):
     bound.fdda.model = bound.fdda.models[0].path = str(model)
     model_files._chosen_paths.clear()
     with pytest.raises(ModelError, match="or add its folder in the preferences"):
@@ -164,7 +164,7 @@ def test_paths_that_blender_on_windows_has_stored_are_followed(followed, tmp_pat
     assert named_paths(save_elsewhere(tmp_path)) == there
 
 
-def test_a_copy_finds_the_model_and_the_open_file_too(followed, elbow, tmp_path):
+def test_a_saved_copy_and_the_open_file_both_find_the_model(followed, elbow, tmp_path):
     before, copy = named_paths(followed), tmp_path / "copies" / "copy.blend"
     copy.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True)
@@ -182,7 +182,7 @@ def test_a_copy_finds_the_model_and_the_open_file_too(followed, elbow, tmp_path)
 
 
 @pytest.mark.parametrize(("folder", "stored"), [(".", "//models/elbow.onnx"), ("elsewhere", None)])
-def test_what_is_given_in_full_stays_so_unless_it_lies_below_the_file(followed, model, tmp_path, folder, stored):
+def test_absolute_paths_stay_absolute_unless_they_are_below_the_file(followed, model, tmp_path, folder, stored):
     bpy.data.objects[ELBOW].fdda.model = followed.fdda.models[0].path = str(model)
     (tmp_path / "source").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "source" / "first.blend"))
@@ -194,7 +194,7 @@ def test_what_is_given_in_full_stays_so_unless_it_lies_below_the_file(followed, 
 
 
 @systems.symbolic_links
-def test_a_file_that_is_bound_through_a_link_has_its_model_below(elbow, tmp_path):
+def test_a_file_opened_through_a_link_stores_the_model_path_relative(elbow, tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
     model = shutil.copy(elbow.model, tmp_path / "real" / "elbow.onnx")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the sections from rig to training draw, as far as that shows without a window."""
+"""The content of the sections from Rig to Training, computed without a window."""
 
 import json
 import re
@@ -34,13 +34,13 @@ def fresh() -> SceneRig:
 
 
 class TestChecks:
-    def test_a_rig_that_is_well(self, fresh):
+    def test_a_valid_rig_has_no_problems(self, fresh):
         assert checks.last_check(fresh) is None, "nothing is checked while drawing"
         check = checks.check_now(fresh)
         assert check.problems == () and check.rig.joint_names == ("upper", "lower") and len(check.channels) == 4
         assert checks.last_check(fresh) is check
 
-    def test_all_problems_at_once_in_the_sentences_of_the_command_line(self, fresh):
+    def test_all_problems_are_listed_with_the_messages_of_the_command_line(self, fresh):
         fresh.armature_object.data.pose_position = "REST"
         for bone in fresh.armature_object.pose.bones:
             bone.lock_rotation = (True, True, True)
@@ -88,7 +88,7 @@ class TestChecks:
         assert bound.fdda.is_playing and sentence == ""
         assert checks.check_now(rig).problems == ()
 
-    def test_no_rig_is_a_sentence_and_no_error(self):
+    def test_a_missing_rig_is_a_message_and_not_an_exception(self):
         assert panel_rig(bpy.context) == (
             None,
             "Nothing with a rig is active; select the mesh of a character, or its armature.",
@@ -146,7 +146,7 @@ class TestFolder:
 
 
 class TestTraining:
-    def test_curves_fall_in_their_colors(self):
+    def test_learning_curves_are_drawn_in_their_colors(self):
         falling = {"training": [1.0, 0.1, 0.01], "validation": [2.0, 0.2, 0.02]}
         pixels = curves.paint(falling)
         assert pixels.shape == (curves.HEIGHT, curves.WIDTH, 4) and pixels.dtype == np.float32

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A bound mesh shows the model's output for the evaluated pose, however the pose came about."""
+"""A bound mesh shows the output of its model for the evaluated pose, from any source of poses."""
 
 import shutil
 from itertools import pairwise
@@ -32,7 +32,7 @@ def test_posing(bound, elbow):
 
 
 def test_each_bone_of_a_chain(bound, elbow):
-    """The driver names the last bone alone: Blender evaluates it after those above, with a solver too."""
+    """The driver depends on the last bone only, which Blender evaluates after its parents, also with an IK solver."""
     buffer = playback_modifier.buffer_of(playback_modifier.find_modifier(bound))
     variables = buffer.animation_data.drivers[0].driver.variables
     assert {v.targets[0].bone_target for v in variables if v.type == "TRANSFORMS"} == {"", "lower"}
@@ -51,7 +51,7 @@ def test_each_bone_of_a_chain(bound, elbow):
     assert all(np.abs(after - before).max() > 1e-2 for before, after in pairwise(shown))
 
 
-def test_the_mesh_moves_away_from_its_armature(bound, elbow):
+def test_playback_follows_a_mesh_that_moves_away_from_its_armature(bound, elbow):
     pose(angle=0.8)
     before = assert_plays(bound, elbow.model)
     bound.location = (0.1, 0.2, 0.3)
@@ -70,7 +70,7 @@ def test_playing_differs_from_the_rig(bound, elbow):
     assert 0 < errors[0] < errors[1] / 3
 
 
-def test_modes_give_the_rig_back(bound, elbow):
+def test_rig_mode_shows_the_rig_again(bound, elbow):
     pose(angle=1.2)
     bound.fdda.mode = "RIG"
     assert [m.show_viewport for m in bound.modifiers] == [True, True, False]
@@ -145,7 +145,7 @@ def test_undo_of_bind(rig, elbow):
 
 
 @pytest.mark.parametrize("linked", [False, True], ids=["own mesh", "shared mesh"])
-def test_two_in_different_poses(bound, elbow, linked):
+def test_two_characters_play_different_poses(bound, elbow, linked):
     armature_object = bpy.data.objects[ELBOW_RIG]
     second, second_rig = bound.copy(), armature_object.copy()
     if not linked:
@@ -164,7 +164,7 @@ def test_two_in_different_poses(bound, elbow, linked):
 
 
 def test_objects_with_different_transforms(rig, elbow):
-    """The linear relation of mesh and armature changes after binding; Blender's own skinning is the measure."""
+    """The transform between mesh and armature changes after binding. Playback is compared with Blender's skinning."""
     bind(rig, elbow.model)
     rig.mesh_object.location = (0.3, -0.2, 0.1)
     rig.mesh_object.rotation_euler = (0.2, 0.4, -0.3)

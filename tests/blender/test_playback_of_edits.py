@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A bound character is edited, renamed and deleted in part."""
+"""Playback after the character is edited, renamed or partly deleted."""
 
 import bpy
 import numpy as np

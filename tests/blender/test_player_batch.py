@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Many bound characters in one file: one call for all of a model, several models side by side; and the first frame."""
+"""Many bound characters in one file: characters with the same model are evaluated in one network call."""
 
 import json
 import subprocess
@@ -22,7 +22,7 @@ COLD_START_SECONDS = 1.0
 
 
 def crowd_of(first: bpy.types.Object, count: int) -> list[bpy.types.Object]:
-    """Copies of a bound object, each with an armature of its own in a pose of its own; the first is the object."""
+    """Return a bound object and copies of it, each with a separate armature in a different pose."""
     crowd = [first]
     for _ in range(count - 1):
         mesh_copy, armature_copy = first.copy(), armature_modifier(first).object.copy()
@@ -39,7 +39,7 @@ def crowd_of(first: bpy.types.Object, count: int) -> list[bpy.types.Object]:
 
 @pytest.fixture
 def calls(monkeypatch) -> list[int]:
-    """How many poses each call of a network got."""
+    """The number of poses of each network call."""
     return count_calls(monkeypatch)
 
 
@@ -55,7 +55,7 @@ def count_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def animate(crowd: list[bpy.types.Object]) -> None:
-    """Let each bend its elbow with the frames, each from where it is."""
+    """Animate the elbow of each character, starting from its current angle."""
     for mesh_object in crowd:
         armature_object = armature_modifier(mesh_object).object
         armature_object.animation_data_clear()
@@ -66,7 +66,7 @@ def animate(crowd: list[bpy.types.Object]) -> None:
             bone.keyframe_insert("rotation_euler", index=0, frame=frame)
 
 
-def test_a_crowd_that_plays_is_one_call(bound, elbow, calls):
+def test_one_frame_of_a_crowd_is_one_network_call(bound, elbow, calls):
     crowd = crowd_of(bound, CROWD)
     animate(crowd)
     for frame in (1, 2, 3):
@@ -80,7 +80,7 @@ def test_a_crowd_that_plays_is_one_call(bound, elbow, calls):
     assert len({predicted(mesh_object, elbow.model).tobytes() for mesh_object in crowd}) == CROWD
 
 
-def test_one_of_a_crowd_that_is_posed_is_one_call(bound, elbow, calls):
+def test_posing_one_character_of_a_crowd_is_one_network_call(bound, elbow, calls):
     crowd = crowd_of(bound, CROWD)
     animate(crowd)
     for frame in (1, 2, 3):
@@ -101,7 +101,7 @@ def test_one_of_a_crowd_that_is_posed_is_one_call(bound, elbow, calls):
             assert_plays(mesh_object, elbow.model)
 
 
-def test_crowds_that_come_and_go_leave_no_hubs(bound):
+def test_removed_crowds_leave_no_batch_drivers(bound):
     crowd = crowd_of(bound, 5)
     animate(crowd)
     bpy.context.view_layer.update()
@@ -115,8 +115,8 @@ def test_crowds_that_come_and_go_leave_no_hubs(bound):
         assert len(bpy.data.objects) == count
 
 
-def test_one_leaves_a_crowd(bound, elbow):
-    """Deleted, failed, switched off, duplicated or given another strength while all play: the others go on."""
+def test_the_others_play_on_when_one_character_leaves_a_crowd(bound, elbow):
+    """One character is deleted, fails, is disabled, is duplicated or gets another strength."""
     crowd = crowd_of(bound, 12)
     animate(crowd)
     scene = bpy.context.scene
@@ -140,7 +140,7 @@ def test_one_leaves_a_crowd(bound, elbow):
             assert_plays(mesh_object, elbow.model)
 
 
-def test_only_those_that_moved_are_evaluated(bound, calls):
+def test_only_characters_that_moved_are_evaluated(bound, calls):
     crowd = crowd_of(bound, 5)
     bpy.context.view_layer.update()
     calls.clear()
@@ -168,7 +168,7 @@ def test_different_models_side_by_side(bound, elbow, tmp_path, calls):
     assert np.abs(predicted(crowd[0], elbow.model) - predicted(crowd[0], other)).max() > 1e-4
 
 
-def test_one_that_fails_leaves_the_others_playing(bound, elbow, capsys):
+def test_the_others_play_on_when_one_character_fails(bound, elbow, capsys):
     crowd = crowd_of(bound, 3)
     bpy.context.view_layer.update()
     bpy.data.objects.remove(armature_modifier(crowd[1]).object)
@@ -182,7 +182,7 @@ def test_one_that_fails_leaves_the_others_playing(bound, elbow, capsys):
 
 @pytest.fixture(scope="module")
 def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bound file of the densest arm, briefly trained: its size decides, not its error."""
+    """The bound file of the densest arm. The training is short, because only the number of vertices matters."""
     import fdda_addon
 
     folder = tmp_path_factory.mktemp("dense")
@@ -199,7 +199,7 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_first_frame_of_a_dense_mesh_comes_within_a_second(dense):
+def test_the_first_frame_of_a_dense_mesh_takes_less_than_a_second(dense):
     command = [sys.executable, str(ROOT / "benchmarks" / "measure.py"), "cold-start", str(dense)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     measured = json.loads(done.stdout.strip().splitlines()[-1])
@@ -207,8 +207,8 @@ def test_the_first_frame_of_a_dense_mesh_comes_within_a_second(dense):
     assert measured["is_right"] and measured["seconds"] < COLD_START_SECONDS
 
 
-def test_a_crowd_that_loses_a_joint(bound, calls):
-    """Their armatures share their bones."""
+def test_a_crowd_without_one_of_its_joints_shows_the_rig(bound, calls):
+    """The armature objects share one data-block, so renaming a bone affects all characters."""
     crowd = crowd_of(bound, 4)
     animate(crowd)
     for frame in range(1, 5):

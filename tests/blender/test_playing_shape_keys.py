@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shape keys of a playing character: not mixed while a model plays, and back with the rig."""
+"""Shape keys are muted while a model plays and restored when the rig is shown."""
 
 import bpy
 import numpy as np
@@ -8,7 +8,7 @@ from .conftest import assert_plays, evaluated, pose, rig_positions
 from .test_evaluations import add_shape_key
 
 
-def test_shape_keys_are_back_with_the_rig(bound, elbow):
+def test_shape_keys_are_restored_with_the_rig(bound, elbow):
     add_shape_key(bound)
     pose(angle=1.1)
     assert_plays(bound, elbow.model)
@@ -41,11 +41,11 @@ def test_shape_keys_are_not_mixed_while_a_model_plays(bound):
     assert not any(muted())
 
 
-def test_shape_keys_that_come_while_a_model_plays(bound, elbow):
+def test_an_undeformed_shape_key_added_during_playback_is_muted(bound, elbow):
     pose(angle=0.3)
     assert_plays(bound, elbow.model)
     bound.shape_key_add(name="Basis")
-    # As it is added, it moves nothing.
+    # A new key displaces no vertex, so the model still plays.
     bound.shape_key_add(name="bulge").value = 1
     for angle in (0.5, 0.7, 0.9):
         pose(angle=angle)
@@ -55,7 +55,7 @@ def test_shape_keys_that_come_while_a_model_plays(bound, elbow):
 
 
 def test_shape_keys_of_two_objects(bound, elbow):
-    """One plays, the other shows the rig of the same mesh."""
+    """Two objects share a mesh: one plays the model and the other shows the rig."""
     add_shape_key(bound)
     pose(angle=0.9)
     expected = rig_positions(bound)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a user, a script or another add-on does to a playing character does not spoil the frames that follow."""
+"""Frames stay correct after users, scripts or other add-ons change a character during playback."""
 
 import bpy
 import numpy as np
@@ -48,7 +48,7 @@ def test_a_handler_of_a_render_that_touches_it(bound, elbow, tmp_path, when, wha
 
 
 @pytest.mark.parametrize("is_applied", [False, True], ids=["removed", "applied"])
-def test_without_its_modifier_the_rig_is_back_at_once(bound, is_applied, capsys):
+def test_removing_the_playback_modifier_shows_the_rig_immediately(bound, is_applied, capsys):
     pose(angle=1.2)
     if is_applied:
         with bpy.context.temp_override(object=bound):
@@ -81,7 +81,7 @@ def test_duplicates_and_deletions_leave_nothing(bound, tmp_path):
     assert in_memory() == (objects - 1, meshes - 1)
 
 
-def test_what_is_duplicated_and_deleted_by_hand_is_not_saved(bound, elbow, tmp_path):
+def test_data_of_deleted_duplicates_is_not_saved(bound, elbow, tmp_path):
     bpy.ops.ed.undo_push(message="start")
     for _ in range(30):
         bpy.ops.object.select_all(action="DESELECT")
@@ -107,7 +107,7 @@ def test_a_deleted_character_leaves_nothing(bound):
     assert [o.name for o in bpy.data.objects] == [ELBOW_RIG]
 
 
-def test_purging_what_nothing_uses(bound, elbow):
+def test_playback_continues_after_a_purge_of_unused_data(bound, elbow):
     crowd = crowd_of(bound, 5)
     for frame in (1, 2, 3, 4):
         bpy.context.scene.frame_set(frame)
@@ -118,7 +118,7 @@ def test_purging_what_nothing_uses(bound, elbow):
             assert_plays(mesh_object, elbow.model)
 
 
-def test_without_the_addon_nothing_of_it_is_left_or_said(bound, tmp_path, capfd):
+def test_a_file_opened_without_the_addon_shows_no_trace_and_no_warning(bound, tmp_path, capfd):
     pose(angle=1.3)
     true = rig_positions(bound)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
@@ -148,8 +148,8 @@ def test_disabled_and_enabled(bound, elbow, capfd):
     assert "rror" not in "".join(capfd.readouterr())
 
 
-def test_a_file_that_was_saved_by_itself(bound, elbow, tmp_path):
-    """An auto-save calls no handler. Where the add-on is missing, the mesh is as it was modeled, not a point."""
+def test_an_auto_saved_file_shows_the_mesh_without_the_addon(bound, elbow, tmp_path):
+    """An auto-save calls no handler. Without the add-on, its file must show the mesh in rest pose, not a point."""
     handlers = [bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]]
     bpy.app.handlers.save_pre.clear()
     bpy.app.handlers.save_post.clear()
@@ -177,7 +177,7 @@ def test_reverting_a_file(bound, elbow):
 
 
 def test_a_joint_that_is_not_a_number(bound, elbow):
-    """What it moves follows the joint above it; the rest of the character is as it was."""
+    """Vertices of this joint follow its parent, and the rest of the character does not change."""
     armature_object = bpy.data.objects[ELBOW_RIG]
     armature_object.animation_data_clear()
     pose(angle=0.0)
@@ -192,7 +192,7 @@ def test_a_joint_that_is_not_a_number(bound, elbow):
     assert np.abs(shown - straight).max() > 1e-2
 
 
-def test_one_character_that_fails_in_any_way_leaves_the_others(bound, elbow, monkeypatch, capsys):
+def test_the_others_play_on_when_one_character_raises_any_error(bound, elbow, monkeypatch, capsys):
     from fdda_addon.runtime.player import Player
 
     crowd = crowd_of(bound, 3)
@@ -264,7 +264,7 @@ def test_undo_of_many_kinds(bound, elbow):
 
 
 def test_enabled_while_the_mesh_is_in_edit_mode(bound, elbow):
-    """Blender then holds no attributes of the mesh; the add-on is there, and the model plays on afterwards."""
+    """In Edit Mode Blender has no mesh attributes. The add-on must register, and the model plays afterwards."""
     bpy.context.view_layer.objects.active = bound
     fdda_addon.unregister()
     bpy.ops.object.mode_set(mode="EDIT")

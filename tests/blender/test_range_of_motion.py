@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the range of motion is read from, and that every kind of bone is posed by it."""
+"""The sources of the range of motion, and how bones of every rotation mode are posed in it."""
 
 import math
 
@@ -23,7 +23,7 @@ from .scene_state import drain, fresh_elbow
 
 @pytest.fixture
 def fresh() -> SceneRig:
-    """An elbow with one stated range: none. Limits are for the tests to set."""
+    """An elbow without limits. Each test sets its own limits."""
     rig = fresh_elbow()
     rig.armature_object.animation_data_clear()
     clear_pose(rig.armature_object)

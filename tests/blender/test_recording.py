@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recording the elbow: the residuals are those of what Blender shows, from any pose, for any object transform."""
+"""Recordings of the elbow: residuals reproduce the mesh that Blender shows, for any pose and object transform."""
 
 import json
 import re
@@ -44,7 +44,7 @@ def shown(rig: SceneRig) -> np.ndarray:
 
 
 def assert_reproduces(rig: SceneRig, recording: Recording, poses) -> None:
-    """Recorded pose and residual of each index give what Blender shows when the rig is posed so again."""
+    """Assert that recorded poses and residuals reproduce the mesh that Blender shows in the same poses."""
     skinning = LinearSkinning(recording.rig, recording.partitions)
     positions = skinning.complex_positions(recording.pose_matrices, recording.residuals)
     for index, set_pose in poses:
@@ -80,7 +80,7 @@ def test_linear_skinning_is_blender_s_armature_modifier(fresh):
     assert np.abs(positions - rig.rest_positions).max() > 0.1
 
 
-def test_rig_as_arrays(fresh):
+def test_the_rig_is_read_as_arrays(fresh):
     rig = read_rig(fresh)
     assert rig.joint_names == ("upper", "lower") and rig.parents.tolist() == [-1, 0]
     assert rig.skin_joints.shape == rig.skin_weights.shape == (rig.vertex_count, 4)
@@ -99,7 +99,7 @@ def test_rig_as_arrays(fresh):
 
 
 def test_objects_with_different_transforms(fresh, tmp_path):
-    """The pose matrices are in the space of the mesh object, wherever the two objects stand."""
+    """Pose matrices are in the space of the mesh object, for any transforms of the two objects."""
     fresh.mesh_object.parent = None
     fresh.mesh_object.location, fresh.mesh_object.rotation_euler = (0.3, -0.2, 0.1), (0.2, 0.4, -0.3)
     fresh.armature_object.location, fresh.armature_object.rotation_euler = (-0.5, 0.1, 0.9), (1.0, 0.2, 0)
@@ -113,7 +113,7 @@ def test_objects_with_different_transforms(fresh, tmp_path):
 
 
 def test_influences_of_the_elbow(fresh, tmp_path):
-    """The upper half is smoothed by the bend below, and neither sees the shoulder turn."""
+    """The bend of the lower bone affects the upper half, and the rotation of the upper bone affects no residual."""
     recording = recorded(fresh, tmp_path / "r", poses=3)
     assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
 
@@ -135,8 +135,8 @@ def test_rounding_far_from_the_origin_is_no_influence(fresh, tmp_path):
     assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
 
 
-def test_influences_reach_as_far_as_the_rig(fresh, tmp_path):
-    """A shape key that the upper bone drives on the lower half is found, on that half alone."""
+def test_influences_include_distant_vertices(fresh, tmp_path):
+    """The upper bone drives a shape key of the lower half, so it influences the lower half only."""
     mesh = fresh.mesh_object.data
     fresh.mesh_object.shape_key_add(name="Basis")
     key = fresh.mesh_object.shape_key_add(name="bump")
@@ -165,13 +165,13 @@ def test_an_action_is_recorded_frame_by_frame(fresh, tmp_path):
 
 
 def test_an_action_alone(fresh, tmp_path):
-    """Joints are taken to where the action brings them, one at a time: the upper one moves no residual."""
+    """For influences, joints are posed one at a time as in the action. The upper joint changes no residual."""
     recording = recorded(fresh, tmp_path / "r", poses=0, actions=("elbow_wave",))
     assert recording.pose_matrices.shape[0] == 30
     assert [p.influencing for p in recording.partitions] == [(1,), (1,)]
 
 
-def test_an_action_that_moves_the_object_gives_back_what_it_moved(fresh, tmp_path):
+def test_an_action_that_moves_the_object_restores_its_transform(fresh, tmp_path):
     rig = fresh.armature_object
     action = rig.animation_data.action = bpy.data.actions.new("walk")
     rig["mood"] = rig.pose.bones["lower"]['a "b"'] = 0.0
@@ -187,7 +187,7 @@ def test_an_action_that_moves_the_object_gives_back_what_it_moved(fresh, tmp_pat
     assert action.name == "walk" and rig.animation_data.action.name == "elbow_wave"
 
 
-def test_the_index_says_where_it_came_from(fresh, elbow):
+def test_the_index_describes_the_rig_and_its_sampling(fresh, elbow):
     index = json.loads((elbow.recording / "recording.json").read_text())
     assert index["rig"]["file"] == "elbow.blend" and index["rig"]["object"] == "elbow"
     assert index["blender"] == bpy.app.version_string
@@ -204,7 +204,7 @@ def test_the_index_says_where_it_came_from(fresh, elbow):
 def test_progress(fresh, tmp_path):
     poses = BATCH_POSES + 5
     steps = list(record(fresh, tmp_path / "r", RecordingSettings(poses=poses, influence_poses=4)))
-    # 4 times: a base pose, then each of the 2 joints moved.
+    # There are 4 influence poses, each with a base pose and one pose for each of the 2 joints.
     assert steps[:12] == [Progress("influences", done, 12) for done in range(1, 13)]
     first, *others = steps[12:]
     assert (first.stage, first.done, first.total) == ("poses", 0, poses)
@@ -227,7 +227,7 @@ def test_a_recording_that_is_closed_keeps_its_poses(fresh, tmp_path):
     )
 
 
-def test_same_seed_same_poses_other_seed_others(fresh, tmp_path):
+def test_the_seed_determines_the_poses(fresh, tmp_path):
     first, second, other = (
         recorded(fresh, tmp_path / name, poses=3, seed=seed) for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )

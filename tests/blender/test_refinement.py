@@ -34,7 +34,7 @@ def recording(elbow, tmp_path):
 
 
 def errors(recording, model, poses: slice) -> np.ndarray:
-    """(n,) largest error of the model in each of these poses, against what was recorded."""
+    """Return the largest error of the model in each of these recorded poses, shape (poses,)."""
     skinning = LinearSkinning(recording.rig, recording.partitions)
     matrices = np.array(recording.pose_matrices[poses])
     true = skinning.complex_positions(matrices, np.array(recording.residuals[poses]))
@@ -49,12 +49,12 @@ def test_poses_are_added_where_the_model_errs(elbow, recording):
     assert after.info.sampling.sources[-1] == type(after.info.sampling.sources[0])(REFINED, 60, "elbow.onnx")
     assert np.array_equal(after.pose_matrices[:150], before.pose_matrices)
     assert np.array_equal(after.residuals[:150], before.residuals)
-    # A model that did not see the poses errs more there than on poses like those it was trained on.
+    # The added poses were chosen for their large errors, so their mean error exceeds that of the other poses.
     rest = np.arange(0, 150, 10)
     assert errors(after, elbow.model, slice(150, 210)).mean() > 1.2 * errors(after, elbow.model, rest).mean()
 
 
-def test_what_is_added_is_what_the_rig_does(elbow, recording):
+def test_added_poses_have_the_residuals_of_the_rig(elbow, recording):
     assert run("record", elbow.rig, recording, "--refine", elbow.model, "--poses", 8) == 0
     read = read_recording(recording)
     bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
@@ -118,8 +118,8 @@ def test_another_rig_is_refused(elbow, recording, rig):
     assert "was trained for another rig" in sentence(rig, recording, elbow.model)
 
 
-def test_a_refinement_that_is_resumed_adds_what_is_missing(elbow, recording, rig, tmp_path):
-    """Stopped once, and run again when it is complete: the same bytes as in one go."""
+def test_a_resumed_refinement_adds_only_the_missing_poses(elbow, recording, rig, tmp_path):
+    """An interrupted and resumed refinement writes the same bytes as an uninterrupted one."""
     whole = shutil.copytree(recording, tmp_path / "whole")
     settings = RefinementSettings(poses=7, resume=True)
     list(refine(rig, whole, elbow.model, settings))
@@ -142,7 +142,7 @@ def test_poses_that_were_not_chosen_for_the_model_are_not_resumed(elbow, recordi
 
 
 @pytest.mark.parametrize("option", [["--shard", "1/2"], ["--action", "elbow_wave"], ["--poses", 0]])
-def test_options_that_contradict(elbow, recording, capfd, option):
+def test_contradicting_options_of_record_are_refused(elbow, recording, capfd, option):
     assert run("record", elbow.rig, recording, "--refine", elbow.model, *option) == 2
     assert "--refine adds random poses to a complete recording" in capfd.readouterr().err
 

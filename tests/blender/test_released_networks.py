@@ -17,7 +17,7 @@ from .conftest import ELBOW, assert_plays
 
 
 def opened(path) -> weakref.ref:
-    """Open a bound file; a reference to its network that does not keep it."""
+    """Open a bound file and return a weak reference to its network."""
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return weakref.ref(network_of(bpy.data.objects[ELBOW]))
 

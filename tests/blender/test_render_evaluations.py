@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What evaluates for renders and is no picture: OBJ, bakes; and pictures of poses that another add-on sets."""
+"""Evaluations for rendering: OBJ exports, Cycles bakes, and renders of poses that another add-on sets."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from .test_evaluations import add_shape_key, handler
 from .test_renders import FRAME, animation, set_camera, still
 
 OBJ_DIGITS = 2e-6
-"""Meters: an OBJ file has six digits."""
+"""Tolerance in meters, because an OBJ file stores six digits."""
 
 
 @pytest.fixture(params=[False, True], ids=["rig in renders", "model in renders"])
@@ -29,7 +29,7 @@ def character(request, bound, elbow) -> tuple[bpy.types.Object, np.ndarray, np.n
     return (bound, model, rig) if request.param else (bound, rig, model)
 
 
-def test_obj(character, tmp_path):
+def test_an_obj_export_has_the_rendered_deformation(character, tmp_path):
     _, shown, other = character
     path = tmp_path / "elbow.obj"
     axes = {"forward_axis": "Y", "up_axis": "Z"}
@@ -39,8 +39,8 @@ def test_obj(character, tmp_path):
     assert np.abs(positions - shown).max() < OBJ_DIGITS and np.abs(positions - other).max() > 1e-3
 
 
-def test_bake(character):
-    """Cycles bakes where each vertex is into a color attribute."""
+def test_a_cycles_bake_has_the_rendered_deformation(character):
+    """Cycles bakes the position of each vertex into a color attribute."""
     bound, shown, other = character
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.samples = "CYCLES", 1
@@ -59,8 +59,8 @@ def test_bake(character):
     assert np.abs(positions - shown).max() < 1e-4 < 1e-3 < np.abs(positions - other).max()
 
 
-def test_animations_of_poses_that_another_add_on_sets(bound, tmp_path):
-    """Each frame has its own pose, not that of the frame before."""
+def test_rendered_frames_have_poses_that_another_addon_sets(bound, tmp_path):
+    """Each frame shows its own pose, not the pose of the previous frame."""
     bound.fdda.use_in_render = True
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     set_camera()

@@ -10,7 +10,7 @@ import pytest
 from .conftest import ELBOW_RIG, assert_plays, predicted
 
 FRAME = 22
-"""Of the elbow's action: well bent."""
+"""Frame of the action in which the elbow is strongly bent."""
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def camera(bound):
 
 
 def set_camera() -> bpy.types.Object:
-    """A camera that sees the elbow, at a frame where it is well bent."""
+    """Add a camera that shows the elbow, and set the frame."""
     scene = bpy.context.scene
     scene.render.engine = "BLENDER_WORKBENCH"
     scene.render.resolution_x, scene.render.resolution_y = 160, 120
@@ -115,7 +115,7 @@ def test_render_of_a_posed_armature_without_action(bound, camera, tmp_path, elbo
     armature_object.animation_data_clear()
     bound.fdda.use_in_render = True
     armature_object.pose.bones["lower"].rotation_euler[0] = 0.7
-    # No update in between: the render evaluates the pose itself.
+    # The scene is not updated here, because the render must evaluate the pose itself.
     rendered = still(tmp_path / "still.png")
     bpy.context.view_layer.update()
     model = render_positions(bound, predicted(bound, elbow.model), tmp_path / "plain.png")

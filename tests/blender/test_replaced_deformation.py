@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a model stands in for is changed while it plays: the rig is shown with why, or nothing is seen of the change."""
+"""Changes of the deformation that a playing model replaces show the rig with a message; other changes do not."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ from .test_changed_rigs import trigger_check
 
 
 def add(kind: str, place: int | None, **settings: object) -> Callable[[bpy.types.Object], None]:
-    """Add a modifier at a place, None for the end."""
+    """Add a modifier at an index, or at the end for None."""
 
     def change(mesh_object: bpy.types.Object) -> None:
         modifier = mesh_object.modifiers.new(kind.title(), kind)
@@ -92,7 +92,7 @@ CHANGES = {
 
 
 def assert_shows_rig(mesh_object: bpy.types.Object, clause: str) -> np.ndarray:
-    """The rig is shown, as it is where nothing is bound, and the status says why."""
+    """Assert that the rig is shown as without a bound model, and that the status gives the reason."""
     assert clause in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
     shown = evaluated(mesh_object)
     modifier = playback_modifier.find_modifier(mesh_object)
@@ -104,7 +104,7 @@ def assert_shows_rig(mesh_object: bpy.types.Object, clause: str) -> np.ndarray:
 
 @pytest.mark.parametrize("when", ["view layer", "frame"])
 @pytest.mark.parametrize("what", CHANGES)
-def test_a_change_gives_the_rig_back(bound, what, when):
+def test_a_change_of_the_replaced_deformation_shows_the_rig(bound, what, when):
     change, clause = CHANGES[what]
     pose(angle=1.0)
     change(bound)
@@ -112,8 +112,8 @@ def test_a_change_gives_the_rig_back(bound, what, when):
     assert_shows_rig(bound, clause)
 
 
-def test_a_topology_that_only_renders_have(bound):
-    """A model that renders use too would be given to other vertices there."""
+def test_a_render_only_topology_change_shows_the_rig(bound):
+    """A model that is also used in renders would be applied to another topology there."""
     bound.fdda.use_in_render = True
     add("SUBSURF", 0, show_viewport=False)(bound)
     trigger_check("view layer")
@@ -132,7 +132,7 @@ ALLOWED = {
 
 
 @pytest.mark.parametrize("what", ALLOWED)
-def test_what_changes_nothing_that_was_recorded_plays_on(bound, elbow, what):
+def test_playback_continues_after_an_unrelated_change(bound, elbow, what):
     pose(angle=1.0)
     playing = evaluated(bound)
     ALLOWED[what](bound)
@@ -142,11 +142,11 @@ def test_what_changes_nothing_that_was_recorded_plays_on(bound, elbow, what):
         if bound.modifiers.find(modifier.name) > bound.modifiers.find("FDDA"):
             modifier.show_viewport = False
     assert np.abs(assert_plays(bound, elbow.model) - playing).max() < 1e-6
-    # The rig is as near as before.
+    # The rig differs from the model as little as before the change.
     assert np.abs(rig_positions(bound) - playing).max() < 5e-3
 
 
-def test_undone_it_plays_again(bound, elbow):
+def test_playback_resumes_after_the_change_is_undone(bound, elbow):
     pose(angle=1.0)
     add("SMOOTH", 0)(bound)
     trigger_check("view layer")
@@ -157,8 +157,8 @@ def test_undone_it_plays_again(bound, elbow):
     assert_plays(bound, elbow.model)
 
 
-def test_a_bound_rig_is_bound_again_with_what_stands_behind(bound, elbow):
-    """What deforms behind the model is not the model's, and stays behind it."""
+def test_binding_again_keeps_modifiers_after_the_playback_modifier(bound, elbow):
+    """Deforming modifiers after the playback modifier are not replaced and keep their position."""
     add("SMOOTH", None, iterations=5)(bound)
     bind(find_rig(), elbow.model)
     bpy.context.view_layer.update()
@@ -167,7 +167,7 @@ def test_a_bound_rig_is_bound_again_with_what_stands_behind(bound, elbow):
 
 
 def drive_key(mesh_object: bpy.types.Object) -> bpy.types.Driver:
-    """Let the lower bone drive a shape key, as a biceps."""
+    """Add a driver by which the lower bone sets a shape key, as for a biceps."""
     driver = add_key(mesh_object).driver_add("value").driver
     variable = driver.variables.new()
     variable.type = "TRANSFORMS"
@@ -200,7 +200,7 @@ DRIVEN = {
 
 def remove_driver(mesh_object: bpy.types.Object) -> None:
     mesh_object.data.shape_keys.key_blocks["bulge"].driver_remove("value")
-    # As the interface does: until then Blender evaluates the driver that was.
+    # The interface tags the object too. Without it, Blender still evaluates the removed driver.
     mesh_object.data.shape_keys.update_tag()
 
 
@@ -209,7 +209,7 @@ def sculpt(mesh_object: bpy.types.Object) -> None:
 
 
 @pytest.mark.parametrize("what", DRIVEN)
-def test_a_shape_key_that_was_recorded(rig, elbow, what):
+def test_a_change_of_a_recorded_shape_key_shows_the_rig(rig, elbow, what):
     driver = drive_key(rig.mesh_object)
     bpy.context.view_layer.update()
     bind(rig, with_deformation(elbow.model, read_deformation(rig)))
@@ -222,8 +222,8 @@ def test_a_shape_key_that_was_recorded(rig, elbow, what):
     assert_shows_rig(rig.mesh_object, clause)
 
 
-def test_a_character_that_is_copied_with_all_that_drives_it_plays(rig, elbow):
-    """Names of objects are no part of what is compared."""
+def test_a_copied_character_with_copied_drivers_plays(rig, elbow):
+    """Names of objects are not compared."""
     drive_key(rig.mesh_object)
     bpy.context.view_layer.update()
     bind(rig, with_deformation(elbow.model, read_deformation(rig)))

@@ -48,7 +48,7 @@ def limit(bone: bpy.types.PoseBone, kind: str, **values: float) -> bpy.types.Con
     return constraint
 
 
-def test_limits_narrow_what_an_action_keys_and_add_nothing(figure):
+def test_limits_narrow_the_keyed_ranges_and_add_no_channels(figure):
     add_wave(figure)
     spine = figure.armature_object.pose.bones["spine"]
     limit(spine, "LIMIT_SCALE", min_x=0.0, max_x=2.0)
@@ -65,12 +65,12 @@ def test_limits_narrow_what_an_action_keys_and_add_nothing(figure):
     assert rig_allows_ranges(figure, channels), "poses can be added to such a recording"
     spine.constraints["Limit Rotation"].max_y = 0.2
     assert not rig_allows_ranges(figure, channels)
-    # Whoever is chosen by name too moves in all of its limits.
+    # A bone that is also chosen by name moves in its whole range.
     both = ranges(sampled(figure, "bone:spine", f"action:{WAVE}"), "spine")
     assert both["scale", 0] == (0, 2) and both["rotation", 0] == (-1.5, 1.5)
 
 
-def test_what_is_muted_in_an_action_is_not_sampled(figure):
+def test_muted_curves_of_an_action_are_not_sampled(figure):
     action = add_wave(figure)
     curves = {(c.data_path, c.array_index): c for c in curves_of(action, figure.armature_object)}
     curves['pose.bones["spine"].rotation_euler', 1].mute = True
@@ -79,7 +79,7 @@ def test_what_is_muted_in_an_action_is_not_sampled(figure):
     assert select_bones(figure, [f"action:{WAVE}"]).controls == ()
 
 
-def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
+def test_a_channel_keyed_at_a_constant_value_keeps_the_value(figure):
     spine = figure.armature_object.pose.bones["spine"]
     figure.armature_object.animation_data_create().action = bpy.data.actions.new("lean")
     for frame, turn in ((1, -0.2), (9, 0.2)):
@@ -98,8 +98,8 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
     }
 
 
-def test_a_number_that_an_action_keys_at_one_value_has_it(figure):
-    """The switch from IK to FK, for example: poses are those of the action, whatever the file stands at."""
+def test_a_control_keyed_at_a_constant_value_keeps_the_value(figure):
+    """For example, a switch from IK to FK has the value of the action in all poses, whatever its value in the file."""
     arm = figure.armature_object.pose.bones[ARM]
     add_wave(figure)
     for frame in (1, 9):
@@ -130,7 +130,7 @@ MOTIONS = {
 
 @pytest.mark.parametrize("mode", ["QUATERNION", "AXIS_ANGLE"])
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_random_poses_are_near_what_actions_do(figure, motion, mode):
+def test_random_poses_are_close_to_the_poses_of_actions(figure, motion, mode):
     bone = figure.armature_object.pose.bones[ARM]
     bone.rotation_mode = mode
     for turns in MOTIONS[motion]:

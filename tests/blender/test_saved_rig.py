@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A saved file holds the true rig, and its models play as soon as the add-on is there."""
+"""A saved file contains the original rig, and its models play as soon as the add-on is enabled."""
 
 import bpy
 import numpy as np
@@ -15,7 +15,7 @@ from .conftest import ELBOW, assert_plays, evaluated, pose, without_deformation
 
 @pytest.fixture
 def keyed(bound):
-    """The bound elbow with a shape key, which a playing model pins away."""
+    """The bound elbow with a shape key that has no effect while the model plays."""
     bind(SceneRig(bound, armature_of(bound)), without_deformation(model_files.model_path(bound)))
     bound.fdda.mode = "RIG"
     bound.shape_key_add(name="Basis")
@@ -79,7 +79,7 @@ def test_a_save_that_fails_does_not_stop_the_playback(bound, elbow, tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["FDDA", "LINEAR", "RIG"])
-def test_the_mode_comes_back_with_the_file(bound, elbow, mode):
+def test_the_mode_is_restored_with_the_file(bound, elbow, mode):
     bound.fdda.mode = mode
     pose(angle=1.2)
     before, shown = evaluated(bound), state(bound)
@@ -92,7 +92,7 @@ def test_the_mode_comes_back_with_the_file(bound, elbow, mode):
     assert np.abs(evaluated(mesh_object) - before).max() < 1e-6
 
 
-def test_disabling_the_addon_gives_the_rig_back_and_enabling_it_plays(bound, elbow):
+def test_disabling_the_addon_shows_the_rig_and_enabling_it_resumes_playback(bound, elbow):
     pose(angle=1.0)
     fdda_addon.unregister()
     assert state(bound)[0] == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}

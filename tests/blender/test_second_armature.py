@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a second armature does to a surface is told to the model, or refused with the name of the bone."""
+"""A second armature that deforms the mesh is an input of the model, or is refused with the name of its bone."""
 
 import bpy
 import numpy as np
@@ -50,7 +50,7 @@ SENTENCES = {
 
 
 def move(bone: bpy.types.PoseBone) -> None:
-    """Move a bone in all that is not locked."""
+    """Change all unlocked transform channels of a bone."""
     turned = Euler((0.0 if all(bone.lock_rotation) else 0.5, 0.0, 0.0))
     bone.rotation_quaternion = turned.to_quaternion()
     axis, angle = turned.to_quaternion().to_axis_angle()
@@ -62,7 +62,7 @@ def move(bone: bpy.types.PoseBone) -> None:
 
 
 @pytest.mark.parametrize("build", SENTENCES, ids=lambda build: build.__name__)
-def test_what_a_model_is_not_told_is_named(build, loose_model, tmp_path):
+def test_a_bone_that_is_no_input_of_the_model_is_named(build, loose_model, tmp_path):
     rig = build_rig(build)
     before = scene_state(rig)
     assert SENTENCES[build] in check_recordable_rig(rig).problems
@@ -88,7 +88,7 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("build", EXPECTED, ids=lambda build: build.__name__)
-def test_what_a_model_is_told_is_recorded(build, tmp_path):
+def test_a_bone_that_is_an_input_of_the_model_is_recorded(build, tmp_path):
     rig = build_rig(build)
     assert check_recordable_rig(rig).problems == ()
     drain(record(rig, tmp_path / "recording", RecordingSettings(poses=6, influence_poses=1)))
@@ -111,5 +111,5 @@ def test_what_a_model_is_told_is_recorded(build, tmp_path):
     assert np.abs(moved_pose - pose).max() > 0.1 or (np.abs(moved_controls - controls) > 0.01).all()
 
 
-def test_every_character_has_its_sentence():
+def test_every_character_has_an_expected_message():
     assert set(SENTENCES) == set(second_armature.REFUSED) and set(EXPECTED) == set(second_armature.TOLD)

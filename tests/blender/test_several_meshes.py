@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Two meshes on one armature, one command each: recorded in the same poses, trained, bound, compared and timed."""
+"""Two meshes on one armature are recorded, trained, bound, evaluated and timed with one command each."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ POSES = 60
 
 @dataclass(frozen=True)
 class Files:
-    """Of the two meshes: rig, folder of recordings, folder of models, bound file."""
+    """The files of both meshes: rig, folder of recordings, folder of models and bound file."""
 
     rig: Path
     recordings: Path
@@ -42,7 +42,7 @@ class Files:
 
 @pytest.fixture(scope="module")
 def commands() -> dict[str, CommandOutput]:
-    """What `record` and `train` said."""
+    """The output of `record` and `train`."""
     return {}
 
 
@@ -108,7 +108,7 @@ def test_a_subdivided_body_is_recorded_after_the_sleeve_that_reads_it(two, tmp_p
 
 
 def test_each_mesh_has_its_own_shape_keys_as_controls(two, tmp_path):
-    """`shape_keys/…` is another number for each mesh; one that a single mesh has is no input of the other."""
+    """`shape_keys/…` names a separate property of each mesh. A key of one mesh is no input of the other mesh."""
 
     def add_keys() -> None:
         for name, keys in ((BODY, ("Basis", "puff")), (SLEEVE, ("Basis", "puff", "fold"))):
@@ -142,7 +142,7 @@ def test_an_interrupted_recording_goes_on_where_each_mesh_stopped(two, tmp_path)
             break
     steps.close()
     assert [read_index(path)["complete"] for _, path in rigs] == [7, 7]
-    # The body has been recorded as a whole, the sleeve has not.
+    # The recording of the body is complete, and the recording of the sleeve is not.
     shutil.rmtree(tmp_path / "r" / BODY)
     shutil.copytree(two.recordings / BODY, tmp_path / "r" / BODY)
     options = ("--all", "--poses", POSES, "--action", "elbow_wave", "--resume")
@@ -158,7 +158,7 @@ def test_each_mesh_has_a_model_and_a_report_of_its_own(two):
         }
 
 
-def test_record_says_what_it_takes_and_made(two, commands):
+def test_record_prints_its_requirements_and_results(two, commands):
     out, err = commands["record"].out, commands["record"].err
     poses = f"{POSES + 30} poses"
     assert out[0].startswith(f"{poses} of 600 vertices: less than 1 MB on the disk, about ")
@@ -167,7 +167,7 @@ def test_record_says_what_it_takes_and_made(two, commands):
     assert stages == ["influences of 'elbow'", "influences of 'sleeve'", "poses"]
 
 
-def test_train_says_what_it_takes_and_made(two, commands):
+def test_train_prints_its_requirements_and_results(two, commands):
     out, err = commands["train"].out, commands["train"].err
     starts = [*(f"{two.models / n / n}.onnx: trained in " for n in (BODY, SLEEVE)), f"{two.models}: 2 models in "]
     assert [line.startswith(start) for line, start in zip(out, starts, strict=True)] == [True] * 3
@@ -217,7 +217,7 @@ def changed(two: Files, path: Path, change) -> Path:
     return path
 
 
-def test_two_names_that_are_one_folder(two, tmp_path, capfd):
+def test_two_names_with_the_same_folder_are_refused(two, tmp_path, capfd):
     def rename() -> None:
         bpy.data.objects[BODY].name, bpy.data.objects[SLEEVE].name = "left arm", "Left_arm"
 
@@ -226,7 +226,7 @@ def test_two_names_that_are_one_folder(two, tmp_path, capfd):
     assert f"'left arm' and 'Left_arm' would both be recorded into '{tmp_path / 'r' / 'Left_arm'}'; rename" in sentence
 
 
-def test_meshes_of_two_armatures(two, tmp_path, capfd):
+def test_meshes_of_two_armatures_are_refused(two, tmp_path, capfd):
     def add_hat() -> None:
         other = link(bpy.data.objects["elbow_rig"].copy())
         other.name = "hat_rig"
@@ -237,13 +237,13 @@ def test_meshes_of_two_armatures(two, tmp_path, capfd):
     assert "'elbow' follows the armature 'elbow_rig' and 'hat' follows 'hat_rig'; record the meshes of each" in sentence
 
 
-def test_a_model_of_an_object_that_is_not_there(two, tmp_path, capfd):
+def test_a_model_of_a_missing_object_is_refused(two, tmp_path, capfd):
     rig = changed(two, tmp_path / "rig.blend", lambda: bpy.data.objects.remove(bpy.data.objects[SLEEVE]))
     sentence = Refusal(tmp_path, capfd)("bind", rig, two.models, tmp_path / "bound.blend")
     assert f"'{two.models / SLEEVE / SLEEVE}.onnx' is a model of the object 'sleeve', and '{rig}' has no" in sentence
 
 
-def test_folders_that_are_not_what_is_asked_for(two, tmp_path, capfd):
+def test_unsuitable_folders_are_refused(two, tmp_path, capfd):
     refuse = Refusal(tmp_path, capfd)
     (tmp_path / "empty").mkdir()
     assert "contains no model" in refuse("bind", two.rig, tmp_path / "empty", tmp_path / "b.blend")
@@ -275,7 +275,7 @@ def test_an_incomplete_recording_of_several_is_refused_before_the_first_training
         ("evaluate", ("--json", "e.json", "--heatmap", "h.png"), "--heatmap draws one mesh"),
     ],
 )
-def test_what_takes_one_mesh(two, tmp_path, monkeypatch, capfd, verb, options, text):
+def test_options_for_one_mesh_are_refused_for_several(two, tmp_path, monkeypatch, capfd, verb, options, text):
     monkeypatch.chdir(tmp_path)
     options = [two.rig if option == "rig" else option for option in options]
     first = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recordings in shards: joined, they are bit for bit the recording of one run, whatever the poses are made of."""
+"""Merged shards equal the recording of one run bit for bit, for every kind of pose."""
 
 import os
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def waving() -> None:
 
 
 def opened(rig: Path) -> SceneRig:
-    """The rig as a process of its own finds it."""
+    """Open the file and return its rig, as a separate process would."""
     bpy.ops.wm.open_mainfile(filepath=str(rig))
     return find_rig()
 
@@ -71,7 +71,7 @@ def test_shards_are_the_recording_of_one_run(tmp_path, case, count):
     found = tmp_path / "found"
     drain(record(opened(rig), found, replace(settings, detect_influences=True)))
     shards = [tmp_path / f"shard{number}" for number in range(1, count + 1)]
-    # The last first: what a machine recorded before does not matter.
+    # Record the last shard first: the result must not depend on what was recorded before.
     for number in range(count, 0, -1):
         own = replace(settings, shard=(number, count), influences=found)
         drain(record(opened(rig), shards[number - 1], own))
@@ -93,7 +93,7 @@ def test_shards_that_find_the_influences_themselves_are_the_same(tmp_path):
 
 @pytest.mark.parametrize("alone", [False, True])
 def test_shards_of_several_meshes(tmp_path, alone):
-    """Recorded in one pass, and, where one reads the subdivided other, in two."""
+    """The meshes are recorded in one pass, or in two if one mesh reads the subdivided other mesh."""
 
     def build() -> None:
         body_and_sleeve()
@@ -117,7 +117,7 @@ def test_shards_of_several_meshes(tmp_path, alone):
 
 
 @pytest.mark.parametrize("shard", [None, (2, 3)])
-def test_what_is_resumed_repeats_nothing(tmp_path, monkeypatch, shard):
+def test_a_resumed_shard_repeats_no_work(tmp_path, monkeypatch, shard):
     rig = saved(waving, tmp_path / "rig.blend")
     settings = RecordingSettings(poses=24, actions=(WAVE,), influence_poses=2, shard=shard)
     drain(record(opened(rig), tmp_path / "whole", settings))
@@ -138,7 +138,7 @@ def test_what_is_resumed_repeats_nothing(tmp_path, monkeypatch, shard):
     assert file_contents(tmp_path / "part") == file_contents(tmp_path / "whole")
 
 
-def test_the_verbs(elbow, tmp_path, capfd):
+def test_record_and_merge_recordings_use_shards(elbow, tmp_path, capfd):
     options = ("--poses", 10, "--action", "elbow_wave")
     assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
     for _ in range(2):
@@ -154,7 +154,7 @@ def test_the_verbs(elbow, tmp_path, capfd):
     assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
 
 
-def test_options_of_shards_that_make_no_sense(elbow, tmp_path, capfd):
+def test_invalid_options_of_shards_are_refused(elbow, tmp_path, capfd):
     for shard in ("0/2", "3/2", "1", "a/b", "1/2/3", "-1/2", "1/100001"):
         assert run("record", elbow.rig, tmp_path / "r", f"--shard={shard}") == 2
         assert "a shard is K/N, part K of N" in capfd.readouterr().err
@@ -162,7 +162,7 @@ def test_options_of_shards_that_make_no_sense(elbow, tmp_path, capfd):
     assert "leave --shard and --influences out" in capfd.readouterr().err
 
 
-def test_influences_of_something_else_are_refused(elbow, tmp_path, capfd):
+def test_influences_of_another_rig_are_refused(elbow, tmp_path, capfd):
     refusal = Refusal(tmp_path, capfd)
     found = tmp_path / "found"
     assert run("record", elbow.rig, found, "--poses", 10, "--detect-influences") == 0

@@ -21,5 +21,5 @@ from fdda_addon.panels.bone_names import common_prefix
         ([], ""),
     ],
 )
-def test_what_all_bones_begin_with_is_left_out(names, prefix):
+def test_the_common_prefix_of_bone_names_is_omitted(names, prefix):
     assert common_prefix(names) == prefix

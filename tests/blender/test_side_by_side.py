@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The rig shown together with what plays: where it stands, what it shows, and that nothing of it is left anywhere."""
+"""The rig can be displayed together with the playing model; the displayed copy is never saved."""
 
 import bpy
 import numpy as np
@@ -50,7 +50,7 @@ def test_beside_is_the_rig_to_the_side_in_every_pose(active, scale, turned):
     for angle in (1.3, 0.2):
         pose(angle=angle)
         apart = world(other) - rig_world(active)
-        # The box around the character, in its own axes, is a little wider where it is turned.
+        # The bounding box in local axes is slightly wider when the character is rotated.
         assert width < apart[0, 0] < 2 * width
         np.testing.assert_allclose(apart, np.tile([apart[0, 0], 0, 0], (len(apart), 1)), atol=2e-5)
     bpy.ops.fdda.show_rig(placement="BESIDE", distance=3.0)
@@ -85,14 +85,14 @@ def test_off_leaves_nothing(active):
     refused(bpy.ops.fdda.show_rig, "No model is bound")
 
 
-def test_it_is_no_character(active):
+def test_the_displayed_rig_is_no_character(active):
     bpy.ops.fdda.show_rig(placement="BESIDE")
     assert find_rig().mesh_object == active and [rig.mesh_object for rig in find_rigs()] == [active]
     bpy.context.view_layer.objects.active = armature_of(active)
     assert rigs_of_active_armature(bpy.context) == []
 
 
-def test_no_file_has_it_and_it_stays_in_view(active, elbow, tmp_path):
+def test_the_displayed_rig_is_not_saved_and_stays_visible(active, elbow, tmp_path):
     bpy.ops.fdda.pack_model()
     bpy.ops.fdda.show_rig(placement="BESIDE")
     name, links = side_by_side.find(active).name, len(bpy.context.scene.collection.objects)
@@ -109,7 +109,7 @@ def test_no_file_has_it_and_it_stays_in_view(active, elbow, tmp_path):
         assert sorted(there.objects) == [ELBOW, ELBOW_RIG]
 
 
-def test_undo_takes_it_back_and_redo_brings_it(active, elbow):
+def test_undo_and_redo_hide_and_show_the_displayed_rig(active, elbow):
     bpy.ops.ed.undo_push(message="bound")
     bpy.ops.fdda.show_rig(placement="BESIDE")
     bpy.ops.ed.undo_push(message="beside")
@@ -132,14 +132,14 @@ def test_undo_takes_it_back_and_redo_brings_it(active, elbow):
         assert_plays(mesh_object, elbow.model)
 
 
-def test_it_goes_with_the_character(active):
+def test_deleting_the_character_removes_the_displayed_rig(active):
     bpy.ops.fdda.show_rig(placement="OVERLAY")
     bpy.data.objects.remove(active)
     bpy.context.view_layer.update()
     assert not comparisons()
 
 
-def test_jobs_do_not_evaluate_it(active, tmp_path):
+def test_jobs_do_not_evaluate_the_displayed_rig(active, tmp_path):
     bpy.ops.fdda.show_rig(placement="BESIDE")
     other = side_by_side.find(active)
     with hidden_comparisons():
@@ -152,7 +152,7 @@ def test_jobs_do_not_evaluate_it(active, tmp_path):
     assert is_comparison(other)
 
 
-def test_of_an_override(pair):
+def test_the_rig_of_an_override_is_displayed(pair):
     for mesh_object in pair:
         bpy.ops.fdda.show_rig(object=mesh_object.name, placement="BESIDE")
     bpy.context.view_layer.update()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Linear skinning is what Blender's Armature modifier does, whatever the weights are like."""
+"""Linear skinning equals Blender's Armature modifier for all kinds of weights."""
 
 from collections.abc import Callable
 
@@ -20,7 +20,7 @@ EXACT = 2e-6
 
 @pytest.fixture
 def smooth() -> bpy.types.Object:
-    """The elbow with smooth weights of several bones a vertex and its Armature modifier alone."""
+    """The elbow with several weights per vertex and no modifier but its Armature modifier."""
     build_elbow()
     mesh_object = bpy.data.objects[ELBOW]
     for modifier in list(mesh_object.modifiers)[1:]:
@@ -111,7 +111,7 @@ CASES = (
 
 
 @pytest.mark.parametrize("change", CASES)
-def test_linear_skinning_is_blenders(smooth: bpy.types.Object, change: Callable):
+def test_linear_skinning_equals_the_armature_modifier(smooth: bpy.types.Object, change: Callable):
     change(smooth)
     scene_rig = find_rig()
     rig = read_rig(scene_rig)
@@ -129,7 +129,7 @@ def test_linear_skinning_is_blenders(smooth: bpy.types.Object, change: Callable)
 
 
 @pytest.mark.parametrize("change", [missing, mask, without_groups])
-def test_what_follows_no_bone_follows_the_unmoved_joint(smooth: bpy.types.Object, change: Callable):
+def test_vertices_without_weights_follow_the_static_joint(smooth: bpy.types.Object, change: Callable):
     change(smooth)
     rig = read_rig(find_rig())
     (unmoved,) = (number for number, joint in enumerate(rig.joints) if joint.name == STATIC_JOINT)
@@ -145,7 +145,7 @@ def test_a_rig_reads_the_same_with_the_joints_of_a_model(smooth: bpy.types.Objec
 
 
 def test_envelopes_are_those_of_blender(smooth: bpy.types.Object):
-    """The formula, point by point, against the function that Blender has for it."""
+    """Compare the formula with Blender's own function at each point."""
     from fdda_addon.scene.skin import _envelope
 
     envelopes(smooth)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A short run of `benchmarks/stress_playback.py`: characters show what their model says, whatever is done to them."""
+"""A short run of `benchmarks/stress_playback.py`: characters show the output of their model after any operation."""
 
 import sys
 
@@ -10,7 +10,7 @@ from benchmarks.stress_playback import MAX_DIFFERENCE_M, OPERATION_WEIGHTS, Play
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_whatever_is_done_at_random(bound, elbow, tmp_path, seed):
+def test_random_operations_leave_correct_playback_and_no_memory(bound, elbow, tmp_path, seed):
     bpy.context.scene.frame_set(1)
     outcome = PlaybackStress(bound, elbow.model, 6, tmp_path, seed).run(250)
     assert outcome.largest < MAX_DIFFERENCE_M, outcome.worst

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls that deform a target, or that are numbers of sampled bones: inputs where they move the surface."""
+"""Controls that deform a target, or that are channels of sampled bones, are inputs if they move the surface."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def test_a_control_that_moves_the_target_through_other_bones_is_an_input(tmp_pat
     assert list(recording.rig.joint_names) == ["upper", "lower"]
     partition = next(p for p in recording.partitions if recording.rig.joint_names[p.joint] == "lower")
     assert partition.controls == (0,)
-    # One number, in one range, that is sampled once.
+    # It is one control with one range and is sampled once.
     (sampled,) = [channel for channel in recording.info.sampling.channels if "slider" in channel.name]
     assert (sampled.name, sampled.kind) == ("slider", "location")
     assert (sampled.low, sampled.high) == pytest.approx(bounds)
@@ -64,7 +64,7 @@ def test_a_control_that_moves_the_target_through_other_bones_is_an_input(tmp_pat
 
 
 def test_a_control_of_a_bone_that_is_a_joint_is_an_input(tmp_path):
-    """The bend of the elbow as a number beside its joint; both are moved together."""
+    """The rotation of the elbow is a control in addition to its joint; both change together."""
     targets.target_copy()
     save_copy(tmp_path / "rig.blend")
     bend = 'armature_object/pose.bones["lower"].rotation_euler[0]'

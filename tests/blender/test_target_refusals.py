@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Objects to learn from that are refused, and those that differ without harm."""
+"""Targets that are refused, and harmless differences that are accepted."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from .test_targets import built, of_flesh
 
 
 def change(build, work, path: Path) -> Path:
-    """A character that something was done to."""
+    """Build a character, change it and save it; return the path of the file."""
 
     def both() -> None:
         build()
@@ -34,14 +34,14 @@ def add_vertices() -> None:
     bpy.data.objects["flesh"].data.vertices.add(3)
 
 
-def test_another_number_of_vertices(refusal, tmp_path):
+def test_a_target_with_another_number_of_vertices_is_refused(refusal, tmp_path):
     rig = change(targets.target_copy, add_vertices, tmp_path / "rig.blend")
     assert refused(refusal, rig) == (
         "The target 'flesh' has 303 vertices and 'elbow' has 300; a target needs the same vertices in the same order."
     )
 
 
-def test_other_faces(refusal, tmp_path):
+def test_a_target_with_other_faces_is_refused(refusal, tmp_path):
     def turn() -> None:
         mesh = bpy.data.objects["flesh"].data
         for loop in mesh.loops[:4]:
@@ -51,7 +51,7 @@ def test_other_faces(refusal, tmp_path):
     assert refused(refusal, rig).startswith("The target 'flesh' has as many vertices as 'elbow' and other faces, so")
 
 
-def test_the_same_faces_in_another_order_are_the_same(tmp_path):
+def test_faces_in_another_order_are_accepted(tmp_path):
     def reverse() -> None:
         mesh = bpy.data.objects["flesh"].data
         faces = [tuple(face.vertices)[::-1] for face in mesh.polygons][::-1]
@@ -63,7 +63,7 @@ def test_the_same_faces_in_another_order_are_the_same(tmp_path):
     assert len(of_flesh(rig, tmp_path / "recording").residuals) == FRAMES
 
 
-def test_frames_that_a_cache_does_not_have(refusal, tmp_path):
+def test_frames_outside_a_cache_are_refused(refusal, tmp_path):
     def later() -> None:
         bpy.data.objects["flesh"].modifiers["Cache"].frame_start = 5
 
@@ -75,7 +75,7 @@ def test_frames_that_a_cache_does_not_have(refusal, tmp_path):
 
 
 @pytest.mark.parametrize("build", [targets.target_alembic, targets.target_usd])
-def test_frames_that_a_file_does_not_have(build, refusal, tmp_path):
+def test_frames_outside_a_file_are_refused(build, refusal, tmp_path):
     def shift() -> None:
         bpy.data.cache_files[0].frame_offset = 3
 
@@ -85,7 +85,7 @@ def test_frames_that_a_file_does_not_have(build, refusal, tmp_path):
     )
 
 
-def test_a_file_that_is_missing(refusal, capfd, tmp_path):
+def test_a_missing_file_is_refused(refusal, capfd, tmp_path):
     gone = tmp_path.resolve() / "nowhere"
 
     def lose() -> None:
@@ -107,7 +107,7 @@ def test_a_file_that_is_missing(refusal, capfd, tmp_path):
     assert not (tmp_path / "recording").exists()
 
 
-def test_a_file_that_is_damaged(refusal, tmp_path):
+def test_a_damaged_file_is_refused(refusal, tmp_path):
     rig = built(targets.target_mdd, tmp_path / "rig.blend")
     path = Path(bpy.data.objects["flesh"].modifiers["Cache"].filepath)
     path.write_bytes(path.read_bytes()[:-5])
@@ -116,19 +116,19 @@ def test_a_file_that_is_damaged(refusal, tmp_path):
     )
 
 
-def test_the_mesh_itself(refusal, tmp_path):
+def test_the_mesh_itself_is_refused_as_target(refusal, tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
     assert refused(refusal, rig, target="elbow").startswith("'elbow' cannot be its own target: a target is another")
 
 
-def test_no_such_object(refusal, tmp_path):
+def test_an_unknown_target_is_refused(refusal, tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
     assert refused(refusal, rig, target="skin") == (
         "The scene has no mesh object 'skin' to be the target; its other mesh objects: 'flesh'."
     )
 
 
-def test_a_target_that_plays_a_model(refusal, elbow, tmp_path):
+def test_a_target_that_plays_a_model_is_refused(refusal, elbow, tmp_path):
     def bind() -> None:
         from fdda_addon.runtime.binding import bind as bind_model
         from fdda_addon.scene.scene_rig import find_rig
@@ -139,7 +139,7 @@ def test_a_target_that_plays_a_model(refusal, elbow, tmp_path):
     assert refused(refusal, rig).startswith("The target 'flesh' plays a model, so there is nothing to learn from it")
 
 
-def test_a_target_that_does_not_move(refusal, tmp_path):
+def test_a_target_that_does_not_move_is_refused(refusal, tmp_path):
     def hold() -> None:
         bpy.data.objects["flesh"].modifiers["Armature"].show_viewport = False
 
@@ -150,7 +150,7 @@ def test_a_target_that_does_not_move(refusal, tmp_path):
                          "another target.")  # fmt: skip
 
 
-def test_a_hidden_target(refusal, tmp_path):
+def test_a_hidden_target_is_refused(refusal, tmp_path):
     def hide() -> None:
         bpy.data.objects["flesh"].hide_viewport = True
 
@@ -160,7 +160,7 @@ def test_a_hidden_target(refusal, tmp_path):
     )
 
 
-def test_random_poses_of_a_cache(refusal, tmp_path):
+def test_random_poses_of_a_cache_are_refused(refusal, tmp_path):
     rig = built(targets.target_pc2, tmp_path / "rig.blend")
     assert refused(refusal, rig, "--poses", 5) == (
         "The target 'flesh' follows frames (the modifier 'Cache' of 'flesh'), so it cannot show random poses; record "
@@ -168,14 +168,14 @@ def test_random_poses_of_a_cache(refusal, tmp_path):
     )
 
 
-def test_mirrored_frames_of_a_cache(refusal, tmp_path):
+def test_mirrored_frames_of_a_cache_are_refused(refusal, tmp_path):
     rig = built(targets.target_pc2, tmp_path / "rig.blend")
     assert refused(refusal, rig, "--mirror").startswith(
         f"The target 'flesh' shows the frames of '{ACTION}' as they are, and not mirrored"
     )
 
 
-def test_settling_and_pre_roll_of_what_is_no_simulation(refusal, tmp_path):
+def test_settling_and_pre_roll_without_a_simulation_are_refused(refusal, tmp_path):
     rig = built(targets.target_pc2, tmp_path / "rig.blend")
     assert refused(refusal, rig, "--poses", 0, "--max-settle-frames", 5) == (
         "The target 'flesh' cannot settle: the modifier 'Cache' of 'flesh' has a fixed range of frames; leave settling "
@@ -186,7 +186,7 @@ def test_settling_and_pre_roll_of_what_is_no_simulation(refusal, tmp_path):
     assert "cannot settle: it follows the pose at once;" in refused(refusal, rig, "--max-settle-frames", 5)
 
 
-def test_one_target_is_of_one_mesh(refusal, tmp_path):
+def test_a_target_for_several_meshes_is_refused(refusal, tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
     assert refusal("record", rig, tmp_path / "out", "--all", "--target", "flesh").startswith(
         "A target belongs to one mesh; record the meshes one by one"

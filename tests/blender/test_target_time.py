@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Targets that depend on time: frames in their order, pre-roll, poses that are held until a simulation rests."""
+"""Targets that depend on time: frames are recorded in order, with a pre-roll, or poses are held until they settle."""
 
 import json
 import subprocess
@@ -43,29 +43,29 @@ def played(rig: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize("build", SIMULATIONS)
-def test_a_simulation_is_recorded_as_it_plays(build, tmp_path):
+def test_a_recorded_simulation_equals_its_playback(build, tmp_path):
     rig = built(build, tmp_path / "rig.blend")
     recording = of_flesh(rig, tmp_path / "recording")
     assert recording.info.target.follows == "simulation"
     assert np.abs(complex_positions(recording) - played(rig)).max() < 1e-5
-    # The second time what the simulation has kept is of the first.
+    # In the second recording, the simulation still caches the frames of the first one.
     again = of_flesh(rig, tmp_path / "again")
     assert np.array_equal(recording.residuals, again.residuals)
 
 
-def test_frames_after_the_first_of_a_cache_are_walked_to(tmp_path):
+def test_frames_of_a_cache_before_the_action_are_simulated(tmp_path):
     def start_earlier() -> None:
         targets.target_soft_body().modifiers["Softbody"].point_cache.frame_start = -9
 
     early = of_flesh(built(start_earlier, tmp_path / "early.blend"), tmp_path / "early")
     late = of_flesh(built(targets.target_soft_body, tmp_path / "late.blend"), tmp_path / "late")
-    # Ten frames in the first pose let the flesh sag.
+    # The flesh sags during the ten earlier frames in the first pose.
     lengths = [np.linalg.norm(recording.residuals[0], axis=1).max() for recording in (early, late)]
     assert lengths[0] > 0.003 and lengths[1] < 1e-5
 
 
 @pytest.mark.parametrize("build", SIMULATIONS[:2])
-def test_a_pre_roll_goes_from_rest_to_the_first_pose(build, tmp_path):
+def test_a_pre_roll_moves_from_the_rest_pose_to_the_first_pose(build, tmp_path):
     rig = built(build, tmp_path / "rig.blend")
     recording = of_flesh(rig, tmp_path / "recording", "--pre-roll", 20)
     assert recording.info.target.pre_roll == 20
@@ -73,7 +73,7 @@ def test_a_pre_roll_goes_from_rest_to_the_first_pose(build, tmp_path):
     assert np.array_equal(recording.pose_matrices, without.pose_matrices)
     assert np.linalg.norm(recording.residuals[0], axis=1).max() > 0.001
     assert np.linalg.norm(without.residuals[0], axis=1).max() < 1e-5
-    # What the pose is before does not matter: it begins at rest.
+    # The pre-roll begins in the rest pose, so the current pose does not matter.
     bpy.ops.wm.open_mainfile(filepath=str(rig))
     before = scene_state(find_rig("elbow"))
     settings = RecordingSettings(poses=0, actions=(ACTION,), target=TargetSettings("flesh", pre_roll=20))
@@ -84,7 +84,7 @@ def test_a_pre_roll_goes_from_rest_to_the_first_pose(build, tmp_path):
     assert np.array_equal(read_recording(tmp_path / "third").residuals, recording.residuals)
 
 
-def test_a_pre_roll_of_geometry_nodes_lacks_frames(refusal, tmp_path):
+def test_a_pre_roll_of_geometry_nodes_before_frame_0_is_refused(refusal, tmp_path):
     rig = built(targets.target_geometry_nodes, tmp_path / "rig.blend")
     assert refused(refusal, rig, "--pre-roll", 5) == (
         f"A pre-roll of 5 frames before frame 1 of '{ACTION}' begins before frame 0, where Blender simulates no "
@@ -92,7 +92,7 @@ def test_a_pre_roll_of_geometry_nodes_lacks_frames(refusal, tmp_path):
     )
 
 
-def test_frames_that_a_simulation_does_not_have(refusal, tmp_path):
+def test_frames_outside_a_simulation_are_refused(refusal, tmp_path):
     def end_early() -> None:
         targets.target_cloth().modifiers["Cloth"].point_cache.frame_end = 20
 
@@ -117,7 +117,7 @@ def test_random_poses_of_a_simulation_have_to_settle(refusal, tmp_path):
     )
 
 
-def test_a_simulation_that_does_not_move(refusal, tmp_path):
+def test_a_simulation_that_does_not_move_is_refused(refusal, tmp_path):
     def hold() -> None:
         targets.target_cloth().modifiers["Armature"].show_viewport = False
         bpy.data.objects["flesh"].modifiers["Cloth"].settings.effector_weights.gravity = 0
@@ -139,7 +139,7 @@ def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
         "max_settle_frames": 80,
         "rest_threshold_mm": 0.1,
     }
-    # Other poses before it, or none.
+    # A shard has fewer poses before each pose.
     assert run("record", rig, tmp_path / "half", "--object", "elbow", *SETTLED, "--poses", 6, "--shard", "2/2") == 0
     half = open_recording(tmp_path / "half")
     assert np.array_equal(half.pose_matrices, recording.pose_matrices[3:])
@@ -163,7 +163,7 @@ def test_settling_resumes_where_it_was_killed(tmp_path):
 
 
 def complete_poses(recording: Path) -> int:
-    """How many poses its index says are complete; 0 while there is none."""
+    """Return the number of complete poses in the index of a recording, 0 without an index."""
     try:
         return json.loads((recording / "recording.json").read_text())["complete"]
     except FileNotFoundError:
@@ -232,7 +232,7 @@ def test_repeatability_is_measured_once_and_only_where_it_is_missing(tmp_path):
     for _ in range(2):
         assert run("record", rig, tmp_path / "recording", *options, "--repeatability-poses", 2, "--resume") == 0
         repeatability = read_recording(tmp_path / "recording").info.repeatability
-        # It lags, and has no memory of the way once it rests.
+        # The target lags but has no hysteresis, so a settled pose does not depend on the approach.
         assert len(repeatability.poses) == 2 and repeatability.distance_mm["max"] < 0.5
 
 
@@ -278,12 +278,12 @@ def test_frames_of_an_action_are_repeated_on_the_way_back(options, tmp_path):
     assert np.array_equal(complex_positions(both)[: turn + 1], complex_positions(recording)[: turn + 1])
 
 
-def test_what_follows_the_pose_is_not_repeated(tmp_path):
+def test_repeatability_of_a_target_without_simulation_is_not_measured(tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
     assert of_flesh(rig, tmp_path / "recording").info.repeatability is None
 
 
-def test_other_simulations_are_not_disturbed(tmp_path):
+def test_other_simulations_keep_their_state(tmp_path):
     def with_flag() -> None:
         targets.target_cloth()
         mesh = bpy.data.meshes.new("flag")

@@ -18,7 +18,7 @@ from fdda_addon.scene.blend_file import save_copy
 from .conftest import run, train
 
 EXACT = 1e-5
-"""Part of the character's size by which a surface that went through a file may differ."""
+"""Tolerance for surfaces that are read from files, relative to the size of the character."""
 
 
 def built(build, path: Path) -> Path:
@@ -47,7 +47,7 @@ def complex_positions(recording: Recording) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory) -> Recording:
-    """A recording of the copy as a rig of its own, on its action."""
+    """A recording of the copy as a separate rig, with its action."""
     import fdda_addon
 
     fdda_addon.register()
@@ -61,11 +61,11 @@ FILES = (targets.target_alembic, targets.target_usd, targets.target_pc2, targets
 
 
 @pytest.mark.parametrize("build", [targets.target_copy, *FILES])
-def test_a_target_is_recorded_as_the_rig_that_it_shows(build, own, tmp_path):
+def test_a_target_has_the_recording_of_the_rig_that_it_copies(build, own, tmp_path):
     rig = built(build, tmp_path / "rig.blend")
     recording = of_flesh(rig, tmp_path / "recording", *(["--poses", 0] if build is targets.target_copy else []))
     assert len(recording.pose_matrices) == FRAMES
-    # Beside the bones is the joint that never moves, where the target may know which way is down.
+    # In addition to the bones there is a static joint, from which a target can derive the direction of gravity.
     names = ["upper", "lower"] if build is targets.target_copy else ["upper", "lower", STATIC_JOINT]
     assert list(recording.rig.joint_names) == names
     assert np.array_equal(recording.pose_matrices[:, :2], own.pose_matrices)
@@ -94,7 +94,7 @@ def test_sculpted_shapes_are_recorded(tmp_path):
     assert lengths[0].max() < 1e-5
 
 
-def test_a_target_in_another_place_and_unit_is_seen_in_the_space_of_the_mesh(own, tmp_path):
+def test_a_target_with_another_transform_is_recorded_in_the_space_of_the_mesh(own, tmp_path):
     def build() -> None:
         targets.target_alembic()
         mesh = bpy.data.objects["elbow"]
@@ -129,7 +129,7 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
     assert_plays(bpy.data.objects["elbow"], model)
 
 
-def test_the_times_of_alembic_files(tmp_path):
+def test_the_time_range_of_alembic_files_is_read(tmp_path):
     built(targets.target_alembic, tmp_path / "rig.blend")
     path = Path(bpy.data.cache_files[0].filepath)
     assert np.allclose(np.array(read_time_range(path)) * 24, (1, FRAMES))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surfaces that depend on time are refused with the name of the cause, or what moves them is a control."""
+"""Surfaces that depend on time are refused with the name of the cause, unless the cause is a control."""
 
 import bpy
 import numpy as np
@@ -83,11 +83,11 @@ HELD = {
     in_time.through_a_property,
     in_time.second_armature_whose_rotation_is_driven,
 }
-"""Here what moves is a number of the armature's own action, which is not played, or a control."""
+"""Characters whose changing property is keyed in the armature's action, which is not played, or is a control."""
 
 
 def shown_in_frames(rig: SceneRig) -> list[np.ndarray]:
-    """The surface of one bent pose at frames 1 and 30."""
+    """Return the surface of one bent pose at frames 1 and 30."""
     rig.armature_object.animation_data.action = None
     rig.armature_object.pose.bones["lower"].rotation_euler[0] = 1.0
     found = []
@@ -98,7 +98,7 @@ def shown_in_frames(rig: SceneRig) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("build", CASES, ids=lambda build: build.__name__)
-def test_what_changes_with_time_is_named(build, loose_model, tmp_path):
+def test_a_surface_that_changes_with_time_is_refused_with_the_cause(build, loose_model, tmp_path):
     rig, sentence = build_rig(build), SURFACE.format(*CASES[build])
     assert_refused(rig, loose_model, tmp_path / "recording", sentence)
     if build is not in_time.keyed_property_without_a_range:
@@ -106,8 +106,8 @@ def test_what_changes_with_time_is_named(build, loose_model, tmp_path):
 
 
 @pytest.mark.parametrize("build", [build for build in CASES if build not in HELD], ids=lambda build: build.__name__)
-def test_what_no_analysis_names_is_found_by_holding_a_pose(build, tmp_path, monkeypatch):
-    """The same characters, where keys, drivers and modifiers are not looked at."""
+def test_changes_with_time_are_also_detected_in_a_held_pose(build, tmp_path, monkeypatch):
+    """Use the same characters, but skip the analysis of keys, drivers and modifiers."""
     for analysis in ("time_inputs", "_time_modifiers"):
         monkeypatch.setattr(time_inputs, analysis, lambda *_: ())
     rig = build_rig(build)
@@ -137,8 +137,8 @@ PLAYED = {
 
 
 @pytest.mark.parametrize("build", PLAYED, ids=lambda build: build.__name__)
-def test_what_a_model_is_told_may_be_keyed(build, tmp_path):
-    """It is a control, by itself or by its name, it is sampled, and it is keyed afterwards as before."""
+def test_keyed_controls_are_accepted(build, tmp_path):
+    """The keyed property is detected or named as a control and sampled; recording does not change its keys."""
     rig, (named, expected) = build_rig(build), PLAYED[build]
     settings = RecordingSettings(poses=8, influence_poses=1, controls=named)
     assert check_recordable_rig(rig, settings).problems == ()
@@ -158,8 +158,8 @@ def test_what_a_model_is_told_may_be_keyed(build, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["action", "driver", "frame"])
-def test_a_target_that_moves_with_time_shows_frames(kind, tmp_path):
-    """Random poses of it are refused, and frames of an action are recorded as of a cache."""
+def test_a_target_that_moves_with_time_is_recorded_frame_by_frame(kind, tmp_path):
+    """Random poses of the target are refused; frames of an action are recorded as for a cache."""
     flesh = targets.target_copy()
     if kind == "action":
         second_armature_on(flesh)
@@ -183,7 +183,7 @@ def test_a_target_that_moves_with_time_shows_frames(kind, tmp_path):
 
 
 def second_armature_on(flesh: bpy.types.Object) -> None:
-    """Turn a second armature over a target, by an action."""
+    """Add a second armature that deforms a target and is rotated by an action."""
     muscles = link(bpy.data.objects.new("muscle_rig", bpy.data.armatures.new("muscle_rig")))
     add_bones(muscles, NewBone("muscle", (0.1, 0.0, 0.0), (0.1, 0.0, 0.1)))
     flesh.vertex_groups.new(name="muscle").add(range(60), 1.0, "REPLACE")
@@ -192,11 +192,11 @@ def second_armature_on(flesh: bpy.types.Object) -> None:
 
 
 @pytest.mark.parametrize("build", in_time.HARMLESS, ids=lambda build: build.__name__)
-def test_what_follows_the_pose_is_recorded(build, tmp_path):
+def test_surfaces_that_depend_on_the_pose_alone_are_recorded(build, tmp_path):
     rig = build_rig(build)
     assert check_recordable_rig(rig).problems == ()
     drain(record(rig, tmp_path / "recording", FEW_POSES))
 
 
-def test_every_character_has_its_sentence():
+def test_every_character_has_an_expected_message():
     assert set(CASES) == set(in_time.REFUSED) and set(in_time.TOLD) < set(PLAYED)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The environment that the add-on makes for the trainer: real virtual environments, from wheels of a few lines."""
+"""The training environment that the add-on creates: real virtual environments with tiny packages."""
 
 import os
 import shutil
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(autouse=True)
 def user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The add-on's own files lie in a folder of the test, and no variable names a Python."""
+    """Keep the files of the add-on in a folder of the test, and unset the variable that names a Python."""
     monkeypatch.setattr(folder, "user_folder", lambda: tmp_path / "user")
     monkeypatch.delenv(choice.PYTHON_VARIABLE, raising=False)
     stop("of another test", ENVIRONMENT)
@@ -62,13 +62,13 @@ def create(**options: str) -> set[str]:
 
 
 def refused(operator, **options: str) -> str:
-    """The sentence that an operator refuses with."""
+    """Run an operator that must fail and return its error message."""
     with pytest.raises(RuntimeError) as caught:
         operator(**options)
     return str(caught.value).removeprefix("Error: ").strip()
 
 
-def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
+def test_the_environment_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
     junk = folder.environment_folder() / "bin" / "left by one that was interrupted"
     junk.mkdir(parents=True)
     assert session.environment_state() is FolderState.INCOMPLETE
@@ -96,19 +96,19 @@ def test_preferences_and_variable_come_before_the_own_environment(
     assert choice.select_python() == (str(folder.interpreter_path(own)), Origin.PREFERENCES)
 
 
-def test_without_any_it_is_the_python_that_runs_this():
+def test_the_running_python_is_used_by_default():
     assert choice.select_python() == (sys.executable, Origin.THIS)
 
 
 @pytest.mark.slow
-def test_one_that_another_python_hides_says_so(user: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch):
+def test_creation_warns_if_another_python_is_used_instead(user: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(choice.PYTHON_VARIABLE, sys.executable)
     assert create(wheels=str(wheels)) == {"FINISHED"}
     assert session.check_result is None and session.notice.level == "WARNING"
     assert "FDDA_TRAINER_PYTHON names another Python, which is used instead" in session.notice.message
 
 
-def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
+def test_a_missing_wheel_is_named_and_the_environment_kept(own: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "fewer")
     next((tmp_path / "fewer").glob("onnx-*")).unlink()
     text = refused(create, wheels=str(tmp_path / "fewer"))
@@ -121,7 +121,7 @@ def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_wheel_of_a_package_that_those_need_is_missing(user: Path, wheels: Path, tmp_path: Path):
+def test_a_missing_wheel_of_a_dependency_is_named(user: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "fewer")
     write_wheel(tmp_path / "fewer", "onnx", requires="fdda-nowhere")
     text = refused(create, wheels=str(tmp_path / "fewer"))
@@ -134,7 +134,7 @@ def test_a_wheel_of_a_package_that_those_need_is_missing(user: Path, wheels: Pat
 
 
 @pytest.mark.slow
-def test_packages_that_do_not_work_are_no_environment(user: Path, wheels: Path, tmp_path: Path):
+def test_an_environment_with_broken_packages_is_removed(user: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "broken")
     write_wheel(tmp_path / "broken", "torch", "raise OSError('libcudart.so.13 is missing')\n")
     text = refused(create, wheels=str(tmp_path / "broken"))
@@ -143,14 +143,14 @@ def test_packages_that_do_not_work_are_no_environment(user: Path, wheels: Path, 
 
 
 @pytest.mark.one_blender_version
-def test_a_folder_without_wheels_leaves_what_is_there(own: Path, tmp_path: Path):
+def test_a_folder_without_wheels_keeps_the_environment(own: Path, tmp_path: Path):
     assert refused(create, wheels=str(tmp_path)).startswith(f"The folder '{tmp_path}' lacks the packages ")
     missing = tmp_path / "none"
     assert refused(create, wheels=str(missing)).startswith(f"'{missing}' is no folder; ")
     assert session.environment_state() is FolderState.READY
 
 
-def test_offline_it_asks_for_wheels(user: Path, preferences, tmp_path: Path):
+def test_without_online_access_wheels_are_required(user: Path, preferences, tmp_path: Path):
     assert not bpy.app.online_access
     assert refused(create) == (
         "Blender's online access is off: allow it in Preferences > System > Network, choose a folder under Offline "
@@ -161,14 +161,16 @@ def test_offline_it_asks_for_wheels(user: Path, preferences, tmp_path: Path):
 
 
 @pytest.mark.one_blender_version
-def test_a_full_disk_is_noticed_before(user: Path, own: Path, monkeypatch: pytest.MonkeyPatch):
+def test_too_little_disk_space_is_refused_before_the_installation(
+    user: Path, own: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(creation, "MIN_FREE_GB", 10**9)
     with pytest.raises(TrainerEnvironmentError, match=r"needs 1000000000 GB and '.*' has [\d.]+ GB left; make room"):
         list(EnvironmentCreation(own, folder.log_path()).steps())
     assert session.environment_state() is FolderState.READY
 
 
-def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path):
+def test_a_python_that_cannot_create_environments_is_refused(user: Path, wheels: Path, tmp_path: Path):
     said = [sys.version_info[:2], True, []]
     broken = write_program(
         tmp_path / "python",
@@ -187,7 +189,7 @@ def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path)
 
 
 @pytest.mark.one_blender_version
-def test_a_second_blender_waits(user: Path, own: Path):
+def test_a_folder_locked_by_another_blender_is_refused(user: Path, own: Path):
     code = "import sys; from pathlib import Path; from fdda_addon.training.environment.folder import creation_lock\n"
     code += "with creation_lock(Path(sys.argv[1])): print('mine', flush=True); sys.stdin.read()"
     with subprocess.Popen(
@@ -210,13 +212,13 @@ def wait_for(condition, seconds: float = 60.0) -> None:
 
 
 def begin_creation(job: EnvironmentCreation) -> JobRunner:
-    """As the button does in a window."""
+    """Start the creation as a background job, as its button does in a window."""
     return start_job(
         "create_trainer_environment", "Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.store_result
     )
 
 
-def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
+def test_a_canceled_creation_ends_its_process_and_removes_its_files(user: Path, wheels: Path):
     job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels, sys.executable)
     run = begin_creation(job)
     assert not bpy.ops.fdda.create_trainer_environment.poll() and not run.work(0)
@@ -232,7 +234,7 @@ def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
 
 
 @pytest.mark.one_blender_version
-def test_cancelled_before_it_begins_it_leaves_what_is_there(own: Path, wheels: Path):
+def test_a_creation_canceled_before_its_start_keeps_the_environment(own: Path, wheels: Path):
     job = EnvironmentCreation(own, folder.log_path(), wheels, sys.executable)
     job.cancel()
     with pytest.raises(TrainerEnvironmentError, match="was canceled; the previous environment was kept"):
@@ -240,7 +242,7 @@ def test_cancelled_before_it_begins_it_leaves_what_is_there(own: Path, wheels: P
     assert session.environment_state() is FolderState.READY
 
 
-def test_unregistering_ends_what_is_under_way(user: Path, wheels: Path):
+def test_unregistering_cancels_a_running_creation(user: Path, wheels: Path):
     import fdda_addon
 
     job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels, sys.executable)
@@ -250,7 +252,7 @@ def test_unregistering_ends_what_is_under_way(user: Path, wheels: Path):
     assert current(ENVIRONMENT) is None and choice.preferred_python is None and not folder.environment_folder().exists()
 
 
-def test_a_check_in_the_background_is_kept(own: Path):
+def test_the_result_of_a_background_check_is_stored(own: Path):
     python = choice.select_python()
     steps = (choice.check_trainer_python(python) for _ in range(1))
     run = start_job("check_trainer", "Check", steps, None, session.store_result)
@@ -260,7 +262,7 @@ def test_a_check_in_the_background_is_kept(own: Path):
     assert session.check_result.level == "INFO" and session.notice is None
 
 
-def test_an_environment_whose_python_is_gone(own: Path, elbow, tmp_path: Path, capfd: pytest.CaptureFixture):
+def test_an_environment_without_its_python_is_broken(own: Path, elbow, tmp_path: Path, capfd: pytest.CaptureFixture):
     folder.interpreter_path(own).unlink()
     assert session.environment_state() is FolderState.BROKEN
     assert run("train", elbow.recording, tmp_path / "m.onnx") == 1
@@ -271,7 +273,7 @@ def test_an_environment_whose_python_is_gone(own: Path, elbow, tmp_path: Path, c
     )
 
 
-def test_an_environment_whose_torch_is_gone(own: Path):
+def test_an_environment_without_torch_is_reported(own: Path):
     shutil.rmtree(own / "torch")
     text = refused(bpy.ops.fdda.check_trainer)
     assert text.endswith("lacks torch; reinstall the training environment in the add-on's preferences.")

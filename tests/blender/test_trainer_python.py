@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a Python answers when it is asked whether it can train, or be the base of an environment."""
+"""Checks whether a Python can train, or can be the base of a training environment."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def asked(python: object) -> CheckResult:
 
 @pytest.fixture
 def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that Python imports from before all others, with a module for each package."""
+    """The first folder of Python's import path, with a module for each package."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "packages"))
     for name in PACKAGES:
         (tmp_path / "packages" / name).mkdir(parents=True)
@@ -42,14 +42,14 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "packages"
 
 
-def test_it_can_train(packages: Path):
+def test_a_python_with_all_packages_can_train(packages: Path):
     answer = asked(sys.executable)
     version = ".".join(map(str, sys.version_info[:3]))
     assert answer.level == "INFO" and answer.message == f"Ready to train on the CPU: Python {version}, torch 9."
     assert answer.details[0] == f"Python {version}: {sys.executable}" and answer.details[-1] == "Device: the CPU"
 
 
-def test_the_command_line_says_it_too(packages: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture):
+def test_check_trainer_prints_the_result(packages: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture):
     monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
     assert run("check-trainer") == 0
     assert capfd.readouterr().out.splitlines()[-1].startswith("Ready to train on the CPU: ")
@@ -71,13 +71,13 @@ def test_the_device_is_named(packages: Path):
     assert "Ready to train on Card 0: " in answer.message and answer.details[-1] == "Device: Card 0 (CUDA)"
 
 
-def test_a_library_may_print(packages: Path):
+def test_output_of_imported_packages_is_ignored(packages: Path):
     with (packages / "torch/__init__.py").open("a") as file:
         file.write("print('[1, 2]', end='')\n")
     assert asked(sys.executable).level == "INFO"
 
 
-def test_packages_are_missing(packages: Path):
+def test_missing_packages_are_named(packages: Path):
     (packages / "sitecustomize.py").write_text(
         "import sys\nsys.modules.update(dict.fromkeys(['torch', 'onnx', 'numpy']))\n"
     )
@@ -85,7 +85,7 @@ def test_packages_are_missing(packages: Path):
     assert answer.level == "ERROR" and answer.message.endswith("lacks torch, onnx and numpy; do this.")
 
 
-def test_a_package_is_broken(packages: Path):
+def test_a_broken_package_is_named_with_its_error(packages: Path):
     (packages / "torch/__init__.py").write_text("raise OSError('libtorch.so: no such file')\n")
     answer = asked(sys.executable)
     assert answer.level == "ERROR" and "torch of " in answer.message and "libtorch.so: no such file" in answer.message
@@ -95,40 +95,40 @@ def test_a_package_is_broken(packages: Path):
     )
 
 
-def test_an_old_python(tmp_path: Path):
+def test_an_old_python_is_refused(tmp_path: Path):
     said = json.dumps({"version": [3, 9, 18], "packages": {}, "broken": {}})
     python = write_program(tmp_path / "python3.9", f"print({said!r})")
     assert asked(python).message == f"'{python}' is Python 3.9.18, and the trainer needs 3.11 or later; do this."
 
 
-def test_it_is_not_there():
+def test_a_missing_python_is_refused():
     sentence = r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); do this\."
     assert re.fullmatch(sentence, asked("/none/python").message)
 
 
 @pytest.mark.parametrize("said", ["", "hello", "5", "{}", '{"version": 3}'])
-def test_it_is_no_python(tmp_path: Path, said: str):
+def test_a_program_that_is_no_python_is_refused(tmp_path: Path, said: str):
     python = write_program(tmp_path / "program", f"print({said!r})")
     answer = asked(python)
     assert answer.level == "ERROR"
     assert answer.message.startswith(f"'{python}' does not answer as a Python does (status 0); do this.")
 
 
-def test_it_says_why_it_fails(tmp_path: Path):
+def test_the_error_of_a_failing_python_is_shown(tmp_path: Path):
     answer = asked(write_program(tmp_path / "program", "sys.exit('wrong machine of Jürgen 李')"))
     assert "(wrong machine of Jürgen 李)" in answer.message
     answer = asked(write_program(tmp_path / "crashes", "import faulthandler", "faulthandler._read_null()"))
     assert ("(crashed: access violation" if os.name == "nt" else "(was ended by signal 11") in answer.message
 
 
-def test_it_never_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_hanging_python_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(check, "TIMEOUT_SECONDS", 0.5)
     assert asked(write_program(tmp_path / "program", "time.sleep(5)")).message.endswith(
         "did not answer in 0 s; do this."
     )
 
 
-def test_a_base_is_run_and_not_just_found(tmp_path: Path):
+def test_candidates_are_run_to_find_the_usable_python(tmp_path: Path):
     shim = write_program(tmp_path / "python3.13", "sys.exit('this version is not selected')")
     hangs = write_program(tmp_path / "hangs")
     python, real = sys.executable, sys.executable
@@ -146,12 +146,12 @@ def test_a_base_is_run_and_not_just_found(tmp_path: Path):
         ([[3, 13], True, ["ensurepip", "venv"], "/p"], "lacks the module ensurepip"),
     ],
 )
-def test_what_a_base_lacks(tmp_path: Path, answer: list, lacks: str):
+def test_a_base_python_says_what_it_lacks(tmp_path: Path, answer: list, lacks: str):
     base = query_interpreter([write_program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
     assert base.problem == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
 
 
-def test_blenders_own_python_is_the_first(monkeypatch: pytest.MonkeyPatch):
+def test_blenders_python_is_the_first_candidate(monkeypatch: pytest.MonkeyPatch):
     assert next(interpreters.default_candidates()) == [sys.executable]
     assert next(find_interpreters()).path == sys.executable
 
@@ -220,8 +220,8 @@ def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.one_blender_version
-def test_pythons_of_windows_are_looked_for(windows_folders: Path):
-    """Of python.org for one and for all, the launcher, uv and pyenv-win; never the Store's, which opens the shop."""
+def test_pythons_are_searched_in_the_folders_of_windows(windows_folders: Path):
+    """Python.org, the launcher, uv and pyenv-win are searched; the alias of the Microsoft Store is skipped."""
     found = [
         (Path(path).relative_to(windows_folders).as_posix(), *rest)
         for path, *rest in interpreters._windows_candidates()
@@ -272,7 +272,7 @@ def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, 
 
 
 @pytest.mark.one_blender_version
-def test_the_packages_are_what_the_trainer_asks_for():
+def test_package_names_match_the_trainer_group_of_pyproject():
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
     assert sorted(folder.PACKAGES) == sorted(requirement.partition("==")[0] for requirement in groups["trainer"])
     assert all(path.is_file() for path in map(folder.requirements_file, folder.PINNED_REQUIREMENTS))

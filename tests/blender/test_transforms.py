@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters with any transforms, parents and units are recorded, trained, bound, and play what their model says."""
+"""Characters with various transforms, parents and units are recorded, trained and bound, and play their model."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -111,12 +111,12 @@ def test_linear_skinning_is_blenders_skinning(character):
         mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
         largest = np.abs(evaluated(mesh_object) - linear).max()
         mesh_object.modifiers["CorrectiveSmooth"].show_viewport = True
-        # Where Blender itself has no more than single precision.
+        # Blender itself computes in single precision here.
         assert largest < 1e-5 * size + 1e-6 * np.abs(mesh_object.matrix_world.translation).max()
 
 
-def test_an_animated_scale_of_zero(bound, elbow, capsys):
-    """Nothing is shown then; what else plays goes on, and the character comes back."""
+def test_a_character_survives_an_animated_scale_of_zero(bound, elbow, capsys):
+    """At scale 0 the character is invisible. Other characters play on, and it plays again afterwards."""
     armature_object = bpy.data.objects[ELBOW_RIG]
     hider = bpy.data.objects.new("hider", None)
     bpy.context.scene.collection.objects.link(hider)
