@@ -40,7 +40,7 @@ def drop_gravity_input(recording: Recording, split: Split) -> Recording:
     target = recording.info.target
     if target is None or target.follows == POSE:
         return recording
-    without_gravity = assume_nearby_influences(recording.rig, recording.partitions, sags=False)
+    without_gravity = assume_nearby_influences(recording.rig, recording.partitions, may_sag=False)
     poses = np.sort(np.concatenate([split.training, split.validation]))
     poses = poses[np.unique(np.linspace(0, len(poses) - 1, MAX_POSES).astype(np.int64))]
     features = joint_features_in_metres(recording.pose_matrices[poses], recording.rig).astype(np.float64)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Time range of an Alembic file, which Blender does not expose to Python.
 
-Only the container is read, Ogawa, which Alembic has written by default since 2013: "Ogawa", a byte that says whether
-the file is complete, two bytes of version, and the position of the root group. A group is a number of children and
-their positions, the highest bit set for data; data are a number of bytes and the bytes. The fifth child of the root is
-the table of time samplings: for each the number of samples, the seconds of a cycle, and the times of a cycle
-(Alembic's AbcCoreOgawa/WriteUtil, WriteTimeSampling).
+Only files in the container format Ogawa are read, which Alembic has written by default since 2013. Such a file begins
+with "Ogawa", a byte that tells whether the file is complete, two bytes of version, and the position of the root group.
+A group has the number of its children, then the position of each child; the highest bit of a position marks a data
+block. A data block has the number of its bytes, then the bytes. The fifth child of the root group is the table of time
+samplings. For each time sampling, the table has the number of samples, the duration of a cycle in seconds, the number
+of times in a cycle, and these times (Alembic's AbcCoreOgawa/WriteUtil, WriteTimeSampling).
 """
 
 import struct
@@ -16,58 +17,61 @@ from .input_file import open_input
 
 SIGNATURE = b"Ogawa"
 TIME_SAMPLINGS_INDEX = 4
-IS_DATA = 1 << 63
-MAX_CHILDREN, MAX_BYTES = 64, 1 << 20
-"""The root group has six children, and a table of time samplings has a few numbers for each rate."""
-ACYCLIC = 1e30
-"""Seconds of a cycle above which Alembic stores a time for each sample."""
+DATA_BLOCK_FLAG = 1 << 63
+MAX_GROUP_CHILDREN, MAX_TABLE_BYTES = 64, 1 << 20
+"""Limits against damaged files. The root group has six children; a table has a few numbers for each time sampling."""
+MAX_CYCLE_SECONDS = 1e30
+"""Seconds. For a longer cycle, Alembic stores a time for each sample."""
 
 
 def read_time_range(path: Path) -> tuple[float, float] | None:
-    """Read the first and last second of the animation in an Alembic file.
+    """Read the times at which the animation of an Alembic file begins and ends.
 
-    None where the file has another container (HDF5), is no Alembic file, is damaged, or has no animation.
+    Returns:
+        First and last time in seconds. None where the file has another container format (HDF5), is no Alembic file,
+        is damaged, or has no animation.
 
     Raises:
-        OSError: it cannot be opened.
+        OSError: the file cannot be opened.
     """
     with open_input(path) as file:
         try:
-            return _time_range(_time_samplings(file))
+            return _compute_time_range(_read_time_samplings(file))
         except (struct.error, ValueError, OverflowError):
             return None
 
 
-def _time_samplings(file: BinaryIO) -> bytes:
-    """Read the table of time samplings; raise ValueError or struct.error where there is none."""
-    head = file.read(16)
-    if head[:5] != SIGNATURE:
+def _read_time_samplings(file: BinaryIO) -> bytes:
+    """Read the table of time samplings; raise ValueError or struct.error where the file has none."""
+    header = file.read(16)
+    if header[:5] != SIGNATURE:
         raise ValueError("another container")
-    file.seek(struct.unpack("<8xQ", head)[0])
-    count = struct.unpack("<Q", file.read(8))[0]
-    if not TIME_SAMPLINGS_INDEX < count <= MAX_CHILDREN:
+    file.seek(struct.unpack("<8xQ", header)[0])
+    child_count = struct.unpack("<Q", file.read(8))[0]
+    if not TIME_SAMPLINGS_INDEX < child_count <= MAX_GROUP_CHILDREN:
         raise ValueError("another archive")
-    child = struct.unpack(f"<{count}Q", file.read(8 * count))[TIME_SAMPLINGS_INDEX]
-    if not child & IS_DATA:
+    position = struct.unpack(f"<{child_count}Q", file.read(8 * child_count))[TIME_SAMPLINGS_INDEX]
+    if not position & DATA_BLOCK_FLAG:
         raise ValueError("no data")
-    file.seek(child & ~IS_DATA)
+    file.seek(position & ~DATA_BLOCK_FLAG)
     size = struct.unpack("<Q", file.read(8))[0]
-    if size > MAX_BYTES:
+    if size > MAX_TABLE_BYTES:
         raise ValueError("too many samplings")
     return file.read(size)
 
 
-def _time_range(table: bytes) -> tuple[float, float] | None:
-    offset, found = 0, []
+def _compute_time_range(table: bytes) -> tuple[float, float] | None:
+    """Compute the earliest and the latest time of all time samplings in a table; None where none is animated."""
+    offset, time_ranges = 0, []
     while offset < len(table):
-        samples, cycle, count = struct.unpack_from("<IdI", table, offset)
-        times = struct.unpack_from(f"<{count}d", table, offset + 16)
-        offset += 16 + 8 * count
-        # A single sample is static; each table begins with one.
-        if samples > 1 and times:
-            last = times[min(samples, count) - 1] if cycle > ACYCLIC else 0.0
-            if cycle <= ACYCLIC:
-                cycles, rest = divmod(samples - 1, count)
-                last = times[rest] + cycles * cycle
-            found.append((times[0], last))
-    return (min(first for first, _ in found), max(last for _, last in found)) if found else None
+        sample_count, cycle_seconds, time_count = struct.unpack_from("<IdI", table, offset)
+        times = struct.unpack_from(f"<{time_count}d", table, offset + 16)
+        offset += 16 + 8 * time_count
+        # A time sampling with one sample is static. Each table begins with such a time sampling.
+        if sample_count > 1 and times:
+            last_time = times[min(sample_count, time_count) - 1] if cycle_seconds > MAX_CYCLE_SECONDS else 0.0
+            if cycle_seconds <= MAX_CYCLE_SECONDS:
+                cycles, remainder = divmod(sample_count - 1, time_count)
+                last_time = times[remainder] + cycles * cycle_seconds
+            time_ranges.append((times[0], last_time))
+    return (min(start for start, _ in time_ranges), max(end for _, end in time_ranges)) if time_ranges else None

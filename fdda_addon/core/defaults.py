@@ -9,25 +9,25 @@ POSES = 1000
 SPREAD = 1.0
 """Standard deviation of random poses, as a ratio of half the range of motion."""
 MARGIN = 1.0
-"""Scale of the range of motion for poses of the margin; 1 for no margin."""
+"""Factor by which the range of motion is scaled for poses of the margin (`core.poses.Margin`); 1 for no margin."""
 INFLUENCE_POSES = 10
-"""How many times each joint is moved alone to find the partitions that it influences."""
+"""Number of poses in which each joint is moved alone, to detect the partitions that it influences."""
 MIN_PARTITION_VERTICES = 8
 """Partitions with fewer vertices are merged into others."""
 REFINEMENT_POSES = 250
-"""Number of poses that are added where a model is worst."""
+"""Number of poses that a refinement adds where the error of a model is largest."""
 REST_THRESHOLD_MM = 0.1
 """Millimeters per frame. A target is at rest when no vertex moves by more between two frames."""
 REPEATABILITY_POSES = 10
 """Number of poses that a simulated target reaches a second time, from another direction."""
 
 TOLERANCE_MM = 0.04
-"""Rms distance over training poses and all vertices that the principal components may leave, mm."""
+"""Allowed rms error of the principal components alone, over training poses and all vertices, mm."""
 EPOCHS = 200
 
 EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100
-"""Numbers of random poses on which a model is compared; fewer in the sidebar, where the user waits."""
+"""Numbers of random poses in which a model is compared with its rig; fewer in the sidebar, where the user waits."""
 EVALUATION_SEED = 1
-"""Seed of these poses; it differs from the default seed of a recording."""
+"""Seed of the poses of an evaluation; it differs from the default seed of a recording."""
 MARKERS = 5
-"""Number of the worst frames that get a marker."""
+"""Number of frames that an evaluation marks in the timeline, those with the largest errors."""

@@ -23,7 +23,9 @@ MACHINE_ERRNOS = {
 }
 """Values of errno for failures of a disk, the memory or a shared folder, as opposed to a wrong path."""
 MACHINE_WINERRORS = {8, 14, 21, 32, 33, 39, 53, 59, 64, 112, 121, 1117, 1224, 1231, 1450, 1455}
-"""The same as Windows error numbers, with those of a file that another program has open; few have an `errno`."""
+"""Windows error numbers for the same failures, and for a file that another program has open.
+
+Python converts only a few of them to a value of errno."""
 _WINERROR_TEXTS = {
     **dict.fromkeys((32, 33, 1224), "another program has it open"),
     **dict.fromkeys((39, 112), os.strerror(errno.ENOSPC)),
@@ -31,30 +33,30 @@ _WINERROR_TEXTS = {
     206: os.strerror(errno.ENAMETOOLONG),
 }
 MAX_SENTENCE_LENGTH = 1000
-"""Characters. A message quotes text of files from elsewhere, which may be of any length."""
+"""Largest number of characters of a message, because it may quote text of any length from an untrusted file."""
 _CONTROL_CHARACTERS = r"[\x00-\x1f\x7f-\x9f\u2028\u2029]"
 
 
 def to_single_line(text: str) -> str:
     """Shorten a text and escape its control characters, so that a terminal shows it as one line."""
     if len(text) > MAX_SENTENCE_LENGTH:
-        half = MAX_SENTENCE_LENGTH // 2
-        text = f"{text[:half]} […] {text[-half:]}"
-    return re.sub(_CONTROL_CHARACTERS, lambda found: repr(found.group())[1:-1], text)
+        half_length = MAX_SENTENCE_LENGTH // 2
+        text = f"{text[:half_length]} […] {text[-half_length:]}"
+    return re.sub(_CONTROL_CHARACTERS, lambda match: repr(match.group())[1:-1], text)
 
 
 def os_error_text(error: OSError) -> str:
-    """Return the system's text of an error in English; Windows itself uses its own language."""
-    number = getattr(error, "winerror", None)
-    if not number:
+    """Return the operating system's description of an error, always in English; Windows would translate it."""
+    winerror = getattr(error, "winerror", None)
+    if not winerror:
         return error.strerror or str(error)
-    # Python reports Windows errors without an errno of their own as EINVAL.
-    words = f"error {number} of Windows" if error.errno == errno.EINVAL else os.strerror(error.errno)
-    return _WINERROR_TEXTS.get(number, words)
+    # Python reports EINVAL for a Windows error that has no equivalent errno.
+    default_text = f"error {winerror} of Windows" if error.errno == errno.EINVAL else os.strerror(error.errno)
+    return _WINERROR_TEXTS.get(winerror, default_text)
 
 
 class FDDAError(Exception):
-    """Base of all errors whose text is for the user; `exit_status` is the status of the command line."""
+    """Base of all errors whose text is shown to the user; the command line exits with `exit_status`."""
 
     exit_status = 1
 
@@ -90,7 +92,7 @@ def _is_machine_fault(error: OSError) -> bool:
 
 
 class WrongUsageError(FDDAError):
-    """Options are wrong or contradict each other. The text of the parser may have several lines."""
+    """Options are wrong or contradict each other. The argument parser writes the text, which may have several lines."""
 
     exit_status = 2
     __str__ = Exception.__str__
@@ -119,7 +121,7 @@ class TrainingError(FDDAError):
 
 
 class TrainingDiedError(TrainingError):
-    """The training was ended from outside, or memory or disk space ran out."""
+    """Another program ended the training, or memory or disk space ran out."""
 
     exit_status = TRY_AGAIN
 

@@ -11,7 +11,7 @@ from .skinning import LinearSkinning
 
 @dataclass(frozen=True)
 class Mask:
-    """Weight of the model at each vertex of a mesh; linear skinning has the rest.
+    """Weight of the model at each vertex of a mesh; linear skinning has the remaining weight.
 
     Attributes:
         weights: (V,) float32, 0 to 1.
@@ -23,15 +23,15 @@ class Mask:
 
     @staticmethod
     def from_weights(weights: np.ndarray) -> "Mask":
-        """Make a mask of (V,) weights, clamped to 0 and 1."""
+        """Make a mask from (V,) weights, which are clamped to the range 0 to 1."""
         weights = np.clip(np.asarray(weights, np.float32), 0, 1)
         return Mask(weights, np.flatnonzero(weights < 1))
 
-    def blend(self, linear: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Blend (V, 3) float32 positions of one pose: `linear` where the weight is 0, `positions` where it is 1."""
+    def blend(self, linear_positions: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Blend (V, 3) float32 positions of one pose: `linear_positions` at weight 0, `positions` at weight 1."""
         blended, weights = positions.copy(), self.weights[self.partial_vertices][:, None]
-        blended[self.partial_vertices] = linear[self.partial_vertices] + weights * (
-            positions[self.partial_vertices] - linear[self.partial_vertices]
+        blended[self.partial_vertices] = linear_positions[self.partial_vertices] + weights * (
+            positions[self.partial_vertices] - linear_positions[self.partial_vertices]
         )
         return blended
 
@@ -46,8 +46,8 @@ class SkinningBlend:
 
     def __init__(self, rig: Rig, mask: Mask | None = None):
         """Args:
-        rig: with the skin weights and the rest pose of the model.
-        mask: of the mesh; None for a weight of 1 everywhere.
+        rig: the rig, with the skin weights and the rest pose of the model.
+        mask: the mask; None for a weight of 1 everywhere.
         """
         self.mask = mask
         self._rig = rig
@@ -56,16 +56,16 @@ class SkinningBlend:
 
     def with_mask(self, mask: Mask | None) -> "SkinningBlend":
         """Return a copy with another mask."""
-        other = SkinningBlend(self._rig, mask)
-        other._full_skinning = self._full_skinning
-        return other
+        copy = SkinningBlend(self._rig, mask)
+        copy._full_skinning = self._full_skinning
+        return copy
 
     def apply(self, positions: np.ndarray, pose_matrices: np.ndarray, strengths: np.ndarray) -> np.ndarray:
-        """Blend some poses.
+        """Blend the positions of several poses.
 
         Args:
-            positions: (N, V, 3) float32 of the model, mesh-object space, mesh units; may be overwritten. Ignored
-                for poses of strength 0.
+            positions: (N, V, 3) float32, computed by the model, mesh-object space, mesh units; may be overwritten.
+                Positions of poses with strength 0 are ignored.
             pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
             strengths: (N,) float32, 0 for linear skinning alone, 1 for the model with its mask.
 
@@ -73,18 +73,22 @@ class SkinningBlend:
             (N, V, 3) float32, mesh-object space, mesh units; `positions` itself where it was overwritten.
         """
         if strengths.min() < 1:
-            linear = self._full_linear_skinning().positions(pose_matrices)
-            factors = strengths.astype(np.float32)[:, None]
+            linear_positions = self._full_linear_skinning().positions(pose_matrices)
+            model_weights = strengths.astype(np.float32)[:, None]
             if self.mask is not None:
-                factors = factors * self.mask.weights
-            blended = strengths > 0
-            linear[blended] += factors[blended][..., None] * (positions[blended] - linear[blended])
-            return linear
+                model_weights = model_weights * self.mask.weights
+            has_strength = strengths > 0
+            linear_positions[has_strength] += model_weights[has_strength][..., None] * (
+                positions[has_strength] - linear_positions[has_strength]
+            )
+            return linear_positions
         if self.mask is not None and len(self.mask.partial_vertices):
             partial_vertices = self.mask.partial_vertices
-            linear = self._partial_linear_skinning().positions(pose_matrices)
+            linear_positions = self._partial_linear_skinning().positions(pose_matrices)
             weights = self.mask.weights[partial_vertices][:, None]
-            positions[:, partial_vertices] = linear + weights * (positions[:, partial_vertices] - linear)
+            positions[:, partial_vertices] = linear_positions + weights * (
+                positions[:, partial_vertices] - linear_positions
+            )
         return positions
 
     def _full_linear_skinning(self) -> LinearSkinning:
@@ -93,7 +97,7 @@ class SkinningBlend:
         return self._full_skinning
 
     def _partial_linear_skinning(self) -> LinearSkinning:
-        """Return the linear skinning of the partial vertices alone, which costs less than that of all."""
+        """Return the linear skinning of the partial vertices alone, which is cheaper than to skin the whole mesh."""
         if self._partial_skinning is None:
             rig, partial_vertices = self._rig, self.mask.partial_vertices
             self._partial_skinning = LinearSkinning(

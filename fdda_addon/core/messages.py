@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Messages of the trainer to the add-on: one JSON object per line on stdout.
 
-Every training ends with exactly one of `FINISHED`, `CANCELLED` and `FAILED`. The add-on asks the trainer to stop by
-creating the file that `STOP_FILE_VARIABLE` names, because Windows has no signal for it.
+Every training ends with exactly one message of type `FINISHED`, `CANCELLED` or `FAILED`. The add-on asks the trainer
+to stop by creating the file that `STOP_FILE_VARIABLE` names, because Windows has no signal for this purpose.
 """
 
 import enum
@@ -16,7 +16,7 @@ WARNING_LINE = "Warning ({name}): {text}"
 
 
 class MessageType(enum.Enum):
-    """Types of messages, each with its keys beside `type`."""
+    """Types of messages. The docstring of each type lists its keys, apart from the key `type`."""
 
     STARTED = "started"
     """partitions: int, poses: int, vertices: int, device: str."""
@@ -24,27 +24,29 @@ class MessageType(enum.Enum):
     """done: int, total: int (partitions whose principal components are computed)."""
     PROGRESS = "progress"
     """epoch: int, epochs: int, training_mm: float, validation_mm: float (mean errors of the training and the validation
-    poses). Of a fit of skin weights: done: int, total: int (vertices)."""
+    poses). A fit of skin weights has other keys: done: int, total: int (vertices)."""
     PARTITION_FINISHED = "partition_finished"
     """joint: str, basis: int, held_out_mm: float (mean error of the held-out poses)."""
     LOG = "log"
     """text: str."""
     WARNING = "warning"
-    """name: str, text: str: something about the recording that makes a bad model likely (`core.checks.warning`)."""
+    """name: str, text: str. A property of the recording that makes a bad model likely (`core.checks.warning`)."""
     MODEL_FINISHED = "model_finished"
-    """As `FINISHED`, for one of several models that are trained one after the other, each with its own `STARTED`."""
+    """The keys of `FINISHED`, for one of several models that are trained one after the other. Each of these models
+    has its own `STARTED` message."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
-    verdict: str, "met", "missed" or "exhausted", where there is a goal. Of several models: model is their folder, the
-    errors are the largest of them, models: int. Of a fit of skin weights: seconds: float,
-    fit: dict (`SkinFit.to_json`)."""
+    verdict: str, "met", "missed" or "exhausted", where there is a goal. For several models, `model` is their folder,
+    the errors are the largest ones, and `models` is their number. A fit of skin weights has other keys:
+    seconds: float, fit: dict (`SkinFit.to_json`)."""
     CANCELLED = "cancelled"
     """No keys. The trainer was asked to stop and wrote no model."""
     FAILED = "failed"
-    """text: str, the sentence for the user."""
+    """text: str, the sentence that the user sees."""
 
     @property
     def is_last(self) -> bool:
+        """Whether a message of this type is the last of a training."""
         return self in (MessageType.FINISHED, MessageType.CANCELLED, MessageType.FAILED)
 
 
@@ -64,7 +66,7 @@ class Message:
         """Read a message from one line.
 
         Raises:
-            ValueError: the line is no message.
+            ValueError: the line is not a message.
         """
         values = json.loads(line)
         if not isinstance(values, dict):

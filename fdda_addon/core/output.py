@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Atomic writing of files: a reader finds the old file, the new one or none, but never an incomplete one."""
+"""Atomic writing of files: a reader finds the old file, the new file or no file, but never an incomplete file."""
 
 import errno
 import json
@@ -19,9 +19,9 @@ from .open_files import remove_file, replace_file
 from .path_limits import check_path, comparable_path, is_windows
 
 TEMPORARY_PREFIX = ".fdda-"
-KEPT_PREFIX = "new-"
-"""Prefix of a new file that could not replace the old one."""
-_TEMPORARY_NAME = r"\.fdda-[0-9a-f]{12}(\..*)?"
+KEPT_FILE_PREFIX = "new-"
+"""Prefix of the name of a new file that could not replace the old file."""
+_TEMPORARY_NAME_PATTERN = r"\.fdda-[0-9a-f]{12}(\..*)?"
 """Pattern of the temporary names of `atomic_write`."""
 
 
@@ -30,28 +30,30 @@ def check_outputs(
     inputs: Iterable[Path] = (),
     overwrite: bool = False,
 ) -> None:
-    """Check before the work that outputs can be written and replace no other data.
+    """Check before a long job that its outputs can be written and replace no other data.
 
     Args:
         outputs: the files to write, each with its kind.
         inputs: the files that are read.
-        overwrite: the user permits to overwrite inputs and files of another kind.
+        overwrite: whether the user permits to overwrite inputs and files of another kind.
 
     Raises:
-        OutputError: as `check_writable`; two outputs are the same file; or, unless `overwrite`, one is an input or a
-            file of another kind.
+        OutputError: `check_writable` refuses an output; two outputs are the same file; or, unless `overwrite`, an
+            output is an input or a file of another kind.
     """
     outputs = list(outputs.items() if isinstance(outputs, Mapping) else outputs)
     inputs, kind_names = list(inputs), {}
     for path, kind in outputs:
         check_writable(path)
-        key = comparable_path(path)
-        if key in kind_names:
-            raise OutputError(f"Cannot write '{path}': it would be {kind_names[key]} and {kind.name}; give two names.")
-        kind_names[key] = kind.name
+        path_key = comparable_path(path)
+        if path_key in kind_names:
+            raise OutputError(
+                f"Cannot write '{path}': it would be {kind_names[path_key]} and {kind.name}; give two names."
+            )
+        kind_names[path_key] = kind.name
         if overwrite or not os.path.exists(path):
             continue
-        if any(os.path.exists(other) and os.path.samefile(path, other) for other in inputs):
+        if any(os.path.exists(input_path) and os.path.samefile(path, input_path) for input_path in inputs):
             raise OutputError(f"Cannot write '{path}': it is read for this; give another name, or --overwrite.")
         if not _has_kind(path, kind):
             raise OutputError(
@@ -70,20 +72,20 @@ def _has_kind(path: Path, kind: FileKind) -> bool:
 
 
 def check_writable(path: Path) -> None:
-    """Check before the work that a file can be written.
+    """Check before a long job that a file can be written.
 
     Raises:
         OutputError: the folder does not exist or cannot be written, the path is a folder or a device, or `check_path`
             refuses it.
     """
-    # Blender also writes to a temporary file beside the file, whose name has one more character.
+    # Blender first writes to a temporary file whose name has one more character.
     check_path(path, path, path.parent / f"{_temporary_name(path)}@")
     # os.path, because methods of Path raise for a folder without permission.
     folder = path.parent
     if os.path.isdir(path):
         raise OutputError(f"Cannot write '{path}': it is a folder; give the name of a file.")
     if os.path.exists(path) and not os.path.isfile(path):
-        # A rename would replace /dev/null.
+        # Renaming a file to the path of a device, such as /dev/null, would replace the device.
         raise OutputError(f"Cannot write '{path}': it is not a regular file; give the name of a file.")
     if is_windows() and os.path.exists(path) and not os.access(path, os.W_OK):
         raise OutputError(f"Cannot write '{path}': it is write-protected; give another name, or remove the protection.")
@@ -93,15 +95,15 @@ def check_writable(path: Path) -> None:
 
 
 def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
-    """Check before the work that files can be written into a folder, which may not exist yet.
+    """Check before a long job that files can be written into a folder, which may not exist yet.
 
     Args:
         path: the folder.
-        names: of the files to write, relative to the folder.
+        names: names of the files to write, relative to the folder.
 
     Raises:
-        OutputError: the folder, or the nearest one above it that exists, cannot be written, or is a file; no folder
-            above it exists; or `check_path` refuses it.
+        OutputError: the folder or its nearest existing parent cannot be written, or is a file; no parent exists; or
+            `check_path` refuses a path.
     """
     files = [path / name for name in names]
     check_path(path, path, *files, *(file.with_name(_temporary_name(file)) for file in files))
@@ -112,10 +114,10 @@ def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
 
 
 def nearest_existing_folder(path: Path) -> Path:
-    """Return the path itself where it exists, else its nearest existing parent.
+    """Return a path itself where it exists, else its nearest existing parent.
 
     Raises:
-        OutputError: nothing exists, for instance because the drive is not connected.
+        OutputError: no parent exists either, for instance because the drive is not connected.
     """
     folder = path
     while not os.path.exists(folder):
@@ -127,79 +129,84 @@ def nearest_existing_folder(path: Path) -> Path:
 
 def _check_can_create_file(path: Path, folder: Path) -> None:
     try:
-        handle, probe = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, dir=folder)
+        handle, probe_path = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, dir=folder)
     except OSError as error:
         raise OutputError(
             f"Cannot write '{path}': {os_error_text(error)}; choose a folder that you may write."
         ) from error
     os.close(handle)
     with suppress(OSError):
-        remove_file(Path(probe))
+        remove_file(Path(probe_path))
 
 
 @contextmanager
-def atomic_write(path: Path, keep: bool = True) -> Iterator[Path]:
+def atomic_write(path: Path, keep_on_failure: bool = True) -> Iterator[Path]:
     """Yield a temporary file beside `path`, and rename it to `path` when the block ends without an error.
 
     Args:
-        path: the file.
-        keep: keep a file that is written but cannot be renamed under another name beside `path`.
+        path: path of the file.
+        keep_on_failure: whether a file that is written, but cannot be renamed to `path`, is kept beside `path` under
+            another name.
 
     Raises:
         OutputError: the file cannot be written or renamed, for instance because the disk is full.
     """
-    with atomic_write_all(path, keep=keep) as (temporary,):
+    with atomic_write_all(path, keep_on_failure=keep_on_failure) as (temporary,):
         yield temporary
 
 
 @contextmanager
-def atomic_write_all(*paths: Path, keep: bool = True) -> Iterator[tuple[Path, ...]]:
-    """Write several files as `atomic_write` does: when one cannot be written or renamed, none is changed.
+def atomic_write_all(*paths: Path, keep_on_failure: bool = True) -> Iterator[tuple[Path, ...]]:
+    """Write several files as `atomic_write` does. When one file cannot be written or renamed, no file is changed.
 
     Raises:
-        OutputError: one cannot be written or renamed.
+        OutputError: a file cannot be written or renamed.
     """
     temporaries: list[Path] = []
     try:
         for path in paths:
-            temporaries.append(_new_file(path))
+            temporaries.append(_create_temporary_file(path))
         yield tuple(temporaries)
         for temporary in temporaries:
-            with open(temporary, "r+b") as file:  # Windows flushes only what is open for writing
+            with open(temporary, "r+b") as file:  # Windows flushes only files that are open for writing
                 os.fsync(file.fileno())
     except OSError as error:
-        beside = f" with {_quoted(paths[1:])}" if len(paths) > 1 else ""
-        raise OutputError(f"Cannot write '{paths[0]}'{beside}: {os_error_text(error)}; nothing was changed.") from error
+        others_text = f" with {_format_names(paths[1:])}" if len(paths) > 1 else ""
+        raise OutputError(
+            f"Cannot write '{paths[0]}'{others_text}: {os_error_text(error)}; nothing was changed."
+        ) from error
     else:
-        _commit(temporaries, paths, keep)
+        _rename_all(temporaries, paths, keep_on_failure)
     finally:
         for temporary in temporaries:
             with suppress(OSError):
                 remove_file(temporary)
 
 
-def _commit(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> None:
-    """Rename all files or none."""
+def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failure: bool) -> None:
+    """Rename the temporary files to their paths: all files or none."""
     backups: dict[Path, Path | None] = {}
-    replaced: list[tuple[Path, Path]] = []
+    renamed: list[tuple[Path, Path]] = []
     try:
         for path in paths[:-1]:
-            backups[path] = _backup(path)
+            backups[path] = _back_up(path)
         for temporary, path in zip(temporaries, paths, strict=True):
             replace_file(temporary, path)
-            replaced.append((temporary, path))
+            renamed.append((temporary, path))
     except BaseException as error:
-        refused = paths[len(replaced) % len(paths)]
-        changed = [path for temporary, path in reversed(replaced) if not _restore(temporary, path, backups[path])]
+        failed_path = paths[len(renamed) % len(paths)]
+        changed_paths = [path for temporary, path in reversed(renamed) if not _restore(temporary, path, backups[path])]
         if not isinstance(error, OSError):
             raise
-        text = f"{_quoted(changed)} was replaced, and no other" if changed else "nothing was changed"
-        if keep and not changed and (kept := _keep_beside(temporaries, paths)):
-            rename = f"rename {'it' if len(kept) == 1 else 'them'}"
-            way = f"close the program that has '{refused.name}' open, and" if error.errno == errno.EBUSY else "then"
-            new_files = "the new file is" if len(kept) == 1 else "the new files are"
-            text += f", and {new_files} kept as {_quoted(kept)}; {way} {rename}"
-        raise OutputError(f"Cannot write '{refused}': {os_error_text(error)}; {text}.") from error
+        text = f"{_format_names(changed_paths)} was replaced, and no other" if changed_paths else "nothing was changed"
+        if keep_on_failure and not changed_paths and (kept_paths := _keep_beside(temporaries, paths)):
+            rename_text = f"rename {'it' if len(kept_paths) == 1 else 'them'}"
+            advice = (
+                f"close the program that has '{failed_path.name}' open, and" if error.errno == errno.EBUSY else "then"
+            )
+            new_files_text = "the new file is" if len(kept_paths) == 1 else "the new files are"
+            text += f", and {new_files_text} kept as {_format_names(kept_paths)}; {advice} {rename_text}"
+        raise OutputError(f"Cannot write '{failed_path}': {os_error_text(error)}; {text}.") from error
     finally:
         for path, backup in backups.items():
             if backup and os.path.lexists(path):
@@ -207,8 +214,8 @@ def _commit(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> Non
                     remove_file(backup)
 
 
-def _backup(path: Path) -> Path | None:
-    """Link or copy a file to a temporary name before it is replaced; None where it does not exist."""
+def _back_up(path: Path) -> Path | None:
+    """Link or copy a file to a temporary name before it is replaced; return None where the file does not exist."""
     if not os.path.lexists(path):
         return None
     backup = path.with_name(_temporary_name(path))
@@ -221,7 +228,7 @@ def _backup(path: Path) -> Path | None:
 
 
 def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
-    """Undo the renaming of a file to `path`; return whether that succeeded."""
+    """Undo the renaming of a file to `path`; return whether this succeeded."""
     try:
         replace_file(path, temporary)
         if backup:
@@ -232,28 +239,28 @@ def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
 
 
 def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
-    """Rename files that could not replace `paths` to names beside them; return these names."""
+    """Rename temporary files that could not replace `paths` to new names beside these paths; return the new paths."""
     for attempt in count(1):
-        prefix = KEPT_PREFIX if attempt == 1 else f"{KEPT_PREFIX}{attempt}-"
+        prefix = KEPT_FILE_PREFIX if attempt == 1 else f"{KEPT_FILE_PREFIX}{attempt}-"
         new_paths = [path.with_name(f"{prefix}{path.name}") for path in paths]
         if not any(os.path.lexists(new_path) for new_path in new_paths):
             break
-    kept = []
+    kept_paths = []
     for temporary, new_path in zip(temporaries, new_paths, strict=True):
         with suppress(OSError):
             replace_file(temporary, new_path)
-            kept.append(new_path)
-    return kept
+            kept_paths.append(new_path)
+    return kept_paths
 
 
-def _quoted(paths: Iterable[Path]) -> str:
+def _format_names(paths: Iterable[Path]) -> str:
     return ", ".join(f"'{path.name}'" for path in paths)
 
 
-def _new_file(path: Path) -> Path:
+def _create_temporary_file(path: Path) -> Path:
     """Create an empty file with an unpredictable name beside a path.
 
-    Unlike `tempfile.mkstemp`, the file gets the usual permissions.
+    Unlike a file of `tempfile.mkstemp`, it has the default permissions.
     """
     temporary = path.with_name(_temporary_name(path))
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666))
@@ -265,8 +272,8 @@ def _temporary_name(path: Path) -> str:
 
 
 def is_temporary_name(name: str) -> bool:
-    """Return whether a name is one of `atomic_write`, left by a process that was killed while writing."""
-    return re.fullmatch(_TEMPORARY_NAME, name, re.DOTALL) is not None
+    """Return whether a file has a temporary name of `atomic_write`, left by a process that was killed while writing."""
+    return re.fullmatch(_TEMPORARY_NAME_PATTERN, name, re.DOTALL) is not None
 
 
 def write_text(path: Path, text: str) -> None:

@@ -35,7 +35,9 @@ class Partition:
 
 
 def main_joints(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Find the joint with the largest weight of each vertex, the first on a tie (paper, section 3.1).
+    """Find the joint with the largest skin weight at each vertex; the first one on a tie.
+
+    Reference: Bailey et al. 2018, section 3.1.
 
     Args:
         skin_joints: (V, I) int32. skin_weights: (V, I) float32.
@@ -58,9 +60,9 @@ def make_partitions(
 
     Args:
         rig: the rig.
-        influencing: influencing joints by main joint; none for all partitions when left out.
-        controls: influencing controls by main joint; none for all partitions when left out.
-        merged: by main joint of a merged partition, the main joint of the partition that takes its vertices.
+        influencing: influencing joints of each partition, by main joint; None where no partition has any.
+        controls: influencing controls of each partition, by main joint; None where no partition has any.
+        merged: by main joint of a merged partition, the main joint of the partition into which it is merged.
         reassigned: by main joint, vertices with another main joint that belong to its partition.
     """
     main = main_joints(rig.skin_joints, rig.skin_weights)
@@ -92,72 +94,92 @@ def small_partition_merges(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES)
     """Choose the partitions into which small partitions are merged.
 
     The smallest partition is merged first, into the partition whose joint has the most weight on its vertices, else
-    into the one of the nearest ancestor or descendant. A partition without either stays, and so does the last one.
+    into the partition of its nearest ancestor or descendant. A small partition without any of these stays as it is, and
+    the last partition is never merged.
 
     Args:
         rig: the rig.
         min_vertices: partitions with fewer vertices are small; 0 merges none.
 
     Returns:
-        By main joint of a merged partition, the main joint of the partition that takes its vertices.
+        By main joint of a merged partition, the main joint of the partition into which it is merged.
     """
     main = main_joints(rig.skin_joints, rig.skin_weights)
     weights: dict[int, np.ndarray] = {}
     for joint in np.unique(main).tolist():
-        is_in = main == joint
+        in_partition = main == joint
         weights[joint] = np.bincount(
-            rig.skin_joints[is_in].ravel(), rig.skin_weights[is_in].ravel(), minlength=len(rig.joints)
+            rig.skin_joints[in_partition].ravel(), rig.skin_weights[in_partition].ravel(), minlength=len(rig.joints)
         )
-    counts = dict(zip(*(values.tolist() for values in np.unique(main, return_counts=True)), strict=True))
+    vertex_counts = dict(zip(*(values.tolist() for values in np.unique(main, return_counts=True)), strict=True))
     merged: dict[int, int] = {}
-    stays: set[int] = set()
-    while small := [joint for joint in counts if counts[joint] < min_vertices and joint not in stays]:
-        joint = min(small, key=lambda j: (counts[j], j))
-        other = _merge_target(rig, joint, weights)
-        if other is None:
-            stays.add(joint)
+    unmergeable_joints: set[int] = set()
+    while small_joints := [
+        joint for joint in vertex_counts if vertex_counts[joint] < min_vertices and joint not in unmergeable_joints
+    ]:
+        joint = min(small_joints, key=lambda source: (vertex_counts[source], source))
+        target_joint = _choose_merge_joint(rig, joint, weights)
+        if target_joint is None:
+            unmergeable_joints.add(joint)
             continue
-        counts[other] += counts.pop(joint)
-        weights[other] += weights.pop(joint)
-        stays.discard(other)
-        merged = {j: other if into == joint else into for j, into in merged.items()} | {joint: other}
+        vertex_counts[target_joint] += vertex_counts.pop(joint)
+        weights[target_joint] += weights.pop(joint)
+        unmergeable_joints.discard(target_joint)
+        merged = {source: target_joint if target == joint else target for source, target in merged.items()} | {
+            joint: target_joint
+        }
     return merged
 
 
-def _merge_target(rig: Rig, joint: int, weights: dict[int, np.ndarray]) -> int | None:
-    """Return the main joint of the partition that takes a small one; `weights` has the joints with a partition."""
-    others = [other for other in weights if other != joint]
-    heaviest = max(others, key=lambda other: weights[joint][other], default=None)
+def _choose_merge_joint(rig: Rig, joint: int, weights: dict[int, np.ndarray]) -> int | None:
+    """Choose the partition into which a small partition is merged, and return its main joint; None where there is none.
+
+    Args:
+        rig: the rig.
+        joint: main joint of the small partition.
+        weights: for each partition, by main joint, the sum of the skin weights of each joint over its vertices.
+    """
+    other_joints = [other for other in weights if other != joint]
+    heaviest = max(other_joints, key=lambda other: weights[joint][other], default=None)
     if heaviest is None or weights[joint][heaviest] > 0:
         return heaviest
-    generations = {other: _generations(rig, other, joint) or _generations(rig, joint, other) for other in others}
-    return min((other for other in others if generations[other]), key=lambda other: generations[other], default=None)
+    generation_counts = {
+        other: _count_generations(rig, other, joint) or _count_generations(rig, joint, other) for other in other_joints
+    }
+    return min(
+        (other for other in other_joints if generation_counts[other]),
+        key=lambda other: generation_counts[other],
+        default=None,
+    )
 
 
-def _generations(rig: Rig, ancestor: int, joint: int) -> int:
-    """Count the generations from an ancestor down to a joint; 0 where it is no ancestor."""
-    count = 0
+def _count_generations(rig: Rig, ancestor: int, joint: int) -> int:
+    """Count the generations from an ancestor down to a joint; 0 where `ancestor` is not an ancestor of the joint."""
+    generation_count = 0
     while joint >= 0 and joint != ancestor:
-        joint, count = rig.joints[joint].parent, count + 1
-    return count if joint >= 0 else 0
+        joint, generation_count = rig.joints[joint].parent, generation_count + 1
+    return generation_count if joint >= 0 else 0
 
 
-def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...], sags: bool = True) -> tuple[Partition, ...]:
-    """Give partitions the joints that are likely to influence them, where joints cannot be moved to detect it.
+def assume_nearby_influences(
+    rig: Rig, partitions: tuple[Partition, ...], may_sag: bool = True
+) -> tuple[Partition, ...]:
+    """Set the influences of partitions to those that are likely, where influences cannot be detected by moving joints.
 
     These are the main joint, the joints with a weight on a vertex of the partition or on a vertex that shares a face
     with it, their parents, and every control. A surface that sags depends on the direction of gravity, so all
-    ancestors are included. Otherwise a common root is left out, because it moves the partition as a whole.
+    ancestors of the main joint are included. Otherwise a common root joint is left out, because it moves the partition
+    as a whole.
 
     Args:
         rig: the rig.
         partitions: of the rig; their influences are ignored.
-        sags: the surface may depend on the direction of gravity.
+        may_sag: the surface may depend on the direction of gravity.
     """
     has_weight = np.zeros((rig.vertex_count, len(rig.joints)), bool)
     rows = np.repeat(np.arange(rig.vertex_count), rig.skin_joints.shape[1])
-    used = rig.skin_weights.ravel() > 0
-    has_weight[rows[used], rig.skin_joints.ravel()[used]] = True
+    is_used = rig.skin_weights.ravel() > 0
+    has_weight[rows[is_used], rig.skin_joints.ravel()[is_used]] = True
     face_of_corner = np.repeat(
         np.arange(len(rig.face_starts)), np.diff(np.append(rig.face_starts, len(rig.face_vertices)))
     )
@@ -165,41 +187,43 @@ def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...], sags: 
     for partition in partitions:
         is_near = np.zeros(rig.vertex_count, bool)
         is_near[partition.vertices] = True
-        touched = np.unique(face_of_corner[is_near[rig.face_vertices]])
-        is_near[rig.face_vertices[np.isin(face_of_corner, touched)]] = True
+        near_faces = np.unique(face_of_corner[is_near[rig.face_vertices]])
+        is_near[rig.face_vertices[np.isin(face_of_corner, near_faces)]] = True
         influences = {partition.joint, *np.flatnonzero(has_weight[is_near].any(axis=0)).tolist()}
         influences |= {rig.joints[joint].parent for joint in influences if rig.joints[joint].parent >= 0}
-        if sags:
+        if may_sag:
             ancestor = rig.joints[partition.joint].parent
             while ancestor >= 0:
                 influences.add(ancestor)
                 ancestor = rig.joints[ancestor].parent
-        elif len({_root_of(rig, joint) for joint in influences}) == 1:
-            influences -= {_root_of(rig, partition.joint)}
+        elif len({_root_joint(rig, joint) for joint in influences}) == 1:
+            influences -= {_root_joint(rig, partition.joint)}
         joints[partition.joint] = tuple(sorted(influences))
     controls = {partition.joint: tuple(range(len(rig.controls))) for partition in partitions}
     merged = {joint: partition.joint for partition in partitions for joint in partition.merged}
     return make_partitions(rig, joints, controls, merged)
 
 
-def _root_of(rig: Rig, joint: int) -> int:
+def _root_joint(rig: Rig, joint: int) -> int:
     while rig.joints[joint].parent >= 0:
         joint = rig.joints[joint].parent
     return joint
 
 
-def max_residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base: np.ndarray) -> np.ndarray:
+def max_residual_changes(
+    partitions: tuple[Partition, ...], residuals: np.ndarray, base_residuals: np.ndarray
+) -> np.ndarray:
     """Compute the largest change of a local residual in each partition.
 
     Args:
         partitions: P partitions.
-        moved: (N, V, 3) float32 local residuals, axes of the main joint, mesh units.
-        base: local residuals to compare with, of N poses or of one.
+        residuals: (N, V, 3) float32 local residuals, axes of the main joint, mesh units.
+        base_residuals: local residuals to compare with, of N poses or of one pose.
 
     Returns:
         (N, P) float64, mesh units.
     """
-    distances = np.linalg.norm(moved - base, axis=2)
+    distances = np.linalg.norm(residuals - base_residuals, axis=2)
     return np.stack([distances[:, p.vertices].max(axis=1, initial=0) for p in partitions], axis=1).astype(np.float64)
 
 
@@ -207,7 +231,7 @@ def partition_colors(partitions: tuple[Partition, ...], vertex_count: int) -> np
     """Choose a color for each partition; returns (V, 3) float32 sRGB by vertex, 0 to 1."""
     colors = np.zeros((vertex_count, 3), np.float32)
     for index, partition in enumerate(partitions):
-        # Steps of the golden ratio keep neighboring hues apart, whatever the count.
-        value = 0.95 if index % 2 else 0.75
-        colors[partition.vertices] = colorsys.hsv_to_rgb(index * GOLDEN_RATIO % 1, 0.62, value)
+        # Hues in steps of the golden ratio remain distinct for any number of partitions.
+        brightness = 0.95 if index % 2 else 0.75
+        colors[partition.vertices] = colorsys.hsv_to_rgb(index * GOLDEN_RATIO % 1, 0.62, brightness)
     return colors

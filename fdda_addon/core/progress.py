@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The progress of a job, which its generator yields."""
+"""Progress of a job; the generator that runs the job yields it."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ class Progress:
 
     Attributes:
         stage: name of the stage.
-        done, total: steps that are complete, and all steps of the stage.
+        done, total: number of complete steps, and of all steps of the stage.
         note: a sentence for the user; may be empty.
         detail: a few words about the last step; may be empty.
     """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The report of a training, `report.json` beside its model (docs/formats.md): its keys, reading and writing.
 
-The trainer writes it; its page and the sidebar show it.
+The trainer writes the report. The HTML page of the report and the sidebar show it.
 """
 
 import enum
@@ -22,24 +22,26 @@ MAX_ABSOLUTE_VALUE = 1e300
 
 
 class Verdict(enum.Enum):
-    """How a training meets its accuracy goal."""
+    """Result of a training with an accuracy goal."""
 
     MET = "met"
     MISSED = "missed"
-    """More poses may help."""
+    """The error is above the goal; more poses may help."""
     EXHAUSTED = "exhausted"
-    """More poses no longer help."""
+    """The error is above the goal, and more poses no longer help."""
 
 
-class _OrNull:
-    def __init__(self, kind: object):
-        self.kind = kind
+class _Nullable:
+    """Type of a value in a report that may also be null."""
+
+    def __init__(self, value_type: object):
+        self.value_type = value_type
 
 
-_ERRORS = dict.fromkeys(("mean", "rms", "p99", "p999", "max"), float)
-_ANGLES = dict.fromkeys(("mean", "p99", "max"), float)
-_EDGE_ERRORS = dict.fromkeys(("inside", "beside", "across"), _OrNull(float))
-_PARTITION = {
+_ERROR_STATISTICS = dict.fromkeys(("mean", "rms", "p99", "p999", "max"), float)
+_ANGLE_STATISTICS = dict.fromkeys(("mean", "p99", "max"), float)
+_EDGE_ERROR_KEYS = dict.fromkeys(("inside", "beside", "across"), _Nullable(float))
+_PARTITION_KEYS = {
     "joint": str,
     "vertices": int,
     "influencing": [str],
@@ -48,15 +50,15 @@ _PARTITION = {
     "features": int,
     "basis": int,
     "truncation": float,
-    "training": _ERRORS,
-    "held_out": _ERRORS,
-    "linear": _ERRORS,
+    "training": _ERROR_STATISTICS,
+    "held_out": _ERROR_STATISTICS,
+    "linear": _ERROR_STATISTICS,
     "histogram": [int],
     "largest_errors": {
         "poses": int,
         "vertices": int,
         "truncation": float,
-        "boundary": _OrNull(float),
+        "boundary": _Nullable(float),
         "joint": str,
         "extreme": float,
         "distance": float,
@@ -65,7 +67,7 @@ _PARTITION = {
     },
     "curve": {"training": [float], "validation": [float], "worst": [float], "best_epoch": int},
 }
-_REPORT = {
+_REPORT_KEYS = {
     "unit": str,
     "model": str,
     "model_bytes": int,
@@ -78,47 +80,47 @@ _REPORT = {
     "training": {"seconds": float, "device": str, "epochs": int, "training_poses": int, "held_out_poses": int},
     "parity": float,
     "constant_bytes?": int,
-    "fdda": {"training": _ERRORS, "held_out": _ERRORS},
-    "linear": {"held_out": _ERRORS},
-    "normals?": _OrNull({"fdda": _ANGLES, "linear": _ANGLES}),
-    "edges?": _OrNull({"fdda": _EDGE_ERRORS, "linear": _EDGE_ERRORS}),
+    "fdda": {"training": _ERROR_STATISTICS, "held_out": _ERROR_STATISTICS},
+    "linear": {"held_out": _ERROR_STATISTICS},
+    "normals?": _Nullable({"fdda": _ANGLE_STATISTICS, "linear": _ANGLE_STATISTICS}),
+    "edges?": _Nullable({"fdda": _EDGE_ERROR_KEYS, "linear": _EDGE_ERROR_KEYS}),
     "histogram": {"edges": [float], "fdda": [int], "linear": [int]},
-    "partitions": [_PARTITION],
+    "partitions": [_PARTITION_KEYS],
     "warnings?": [{"name": str, "text": str}],
-    "repeatability?": {"poses": [int], "distance_mm": _ERRORS, "linear_mm": float},
+    "repeatability?": {"poses": [int], "distance_mm": _ERROR_STATISTICS, "linear_mm": float},
     "goal?": {"goal": float, "p999": float, "verdict": Verdict},
 }
-"""Keys and types of their values; `?` marks an optional key, and further keys are permitted."""
+"""Keys of a report and the types of their values. `?` marks an optional key; further keys are permitted."""
 
 
-def report_path(model: Path) -> Path:
+def report_path(model_path: Path) -> Path:
     """Return the path of a model's report."""
-    return model.with_name(REPORT_JSON)
+    return model_path.with_name(REPORT_JSON)
 
 
-def page_path(model: Path) -> Path:
-    """Return the path of the page of a model's report."""
-    return model.with_name(REPORT_HTML)
+def page_path(model_path: Path) -> Path:
+    """Return the path of the HTML page of a model's report."""
+    return model_path.with_name(REPORT_HTML)
 
 
-def checkpoint_path(model: Path) -> Path:
+def checkpoint_path(model_path: Path) -> Path:
     """Return the path of a model's checkpoint, from which a training continues."""
-    return model.with_suffix(CHECKPOINT_SUFFIX)
+    return model_path.with_suffix(CHECKPOINT_SUFFIX)
 
 
 def write_report(path: Path, report: dict) -> None:
     """Write a report with `format` and `version`.
 
     Raises:
-        ValueError: it is not what `read_report` takes; a bug.
-        OutputError: it cannot be written.
+        ValueError: a required key is missing or a value has the wrong type, which is a bug.
+        OutputError: the file cannot be written.
     """
     write_text(path, report_text(report))
 
 
 def report_text(report: dict) -> str:
-    """Return the text that `write_report` writes; raises its ValueError."""
-    _check_value(report, _REPORT, "")
+    """Return the text that `write_report` writes; raise ValueError as `write_report` does."""
+    _check_value(report, _REPORT_KEYS, "")
     return to_json_text({"format": FORMAT, "version": VERSION, **report})
 
 
@@ -126,10 +128,10 @@ def read_report(path: Path) -> dict:
     """Read a report.
 
     Returns:
-        It, with all keys of docs/formats.md and values of their kinds.
+        The report. It has all required keys of docs/formats.md, and all values have the right types.
 
     Raises:
-        TrainingError: it cannot be read, is of another version, or damaged.
+        TrainingError: the report cannot be read, is of another version, or is damaged.
     """
     try:
         report = json.loads(read_input(path, MAX_BYTES))
@@ -140,38 +142,38 @@ def read_report(path: Path) -> dict:
     if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):
         raise TrainingError(f"'{path}' is not a training report of this version; train again.")
     try:
-        _check_value(report, _REPORT, "")
+        _check_value(report, _REPORT_KEYS, "")
     except ValueError as error:
         raise TrainingError(f"The report '{path}' is damaged: {error}; train again.") from error
     return report
 
 
-def _check_value(value: object, kind: object, key_path: str) -> None:
-    """Raise ValueError, with the path of the key, where a value is not of its kind."""
-    if isinstance(kind, _OrNull):
+def _check_value(value: object, expected_type: object, key_path: str) -> None:
+    """Raise ValueError, with the path of the key, where a value does not have the expected type."""
+    if isinstance(expected_type, _Nullable):
         if value is not None:
-            _check_value(value, kind.kind, key_path)
-    elif isinstance(kind, dict):
+            _check_value(value, expected_type.value_type, key_path)
+    elif isinstance(expected_type, dict):
         if not isinstance(value, dict):
             raise ValueError(f"{key_path or 'it'} is no object")
-        for key, value_kind in kind.items():
+        for key, key_type in expected_type.items():
             name = key.removesuffix("?")
             if name in value:
-                _check_value(value[name], value_kind, f"{key_path}.{name}".lstrip("."))
+                _check_value(value[name], key_type, f"{key_path}.{name}".lstrip("."))
             elif name == key:
                 raise ValueError(f"{key_path or 'it'} has no {name}")
-    elif isinstance(kind, list):
+    elif isinstance(expected_type, list):
         if not isinstance(value, list):
             raise ValueError(f"{key_path} is no list")
-        for number, entry in enumerate(value):
-            _check_value(entry, kind[0], f"{key_path}[{number}]")
-    elif kind is Verdict:
+        for index, entry in enumerate(value):
+            _check_value(entry, expected_type[0], f"{key_path}[{index}]")
+    elif expected_type is Verdict:
         if value not in [verdict.value for verdict in Verdict]:
             raise ValueError(f"{key_path} is no verdict")
-    elif kind is str:
+    elif expected_type is str:
         if not isinstance(value, str):
             raise ValueError(f"{key_path} is no text")
-    elif isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
-        raise ValueError(f"{key_path} is no {'whole ' * (kind is int)}number")
+    elif isinstance(value, bool) or not isinstance(value, int if expected_type is int else int | float):
+        raise ValueError(f"{key_path} is no {'whole ' * (expected_type is int)}number")
     elif not -MAX_ABSOLUTE_VALUE <= value <= MAX_ABSOLUTE_VALUE:
         raise ValueError(f"{key_path} is out of all bounds")

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Encoding of the terminal: names that it cannot show are escaped, so that printing never fails."""
+"""Output to a terminal whose encoding lacks characters of a name: they are escaped, so that printing never fails."""
 
 import os
 import sys
 
 
 def escape_unencodable_output() -> None:
-    """Let stdout and stderr escape characters that their encoding lacks: `\\xc4rmel` in ASCII."""
+    """Make stdout and stderr escape characters that their encoding lacks: "Ärmel" becomes `\\xc4rmel` in ASCII."""
     for stream in (sys.stdout, sys.stderr):
-        # A caller may have replaced the streams.
+        # A caller may have replaced the stream by an object without this method.
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
 

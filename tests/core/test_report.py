@@ -151,8 +151,8 @@ def test_the_formats_page_names_every_key():
     section = text.partition("\n## Training report\n")[2].partition("\n## ")[0]
 
     def key_names(kind: object) -> set[str]:
-        if isinstance(kind, report_format._OrNull):
-            return key_names(kind.kind)
+        if isinstance(kind, report_format._Nullable):
+            return key_names(kind.value_type)
         if isinstance(kind, list):
             return key_names(kind[0])
         if not isinstance(kind, dict):
@@ -162,4 +162,7 @@ def test_the_formats_page_names_every_key():
     documented_elsewhere = {"inside", "beside", "across"} | set(
         REPORT["training"]
     )  # chapter Evaluation, and the settings
-    assert sorted(name for name in key_names(report_format._REPORT) - documented_elsewhere if name not in section) == []
+    assert (
+        sorted(name for name in key_names(report_format._REPORT_KEYS) - documented_elsewhere if name not in section)
+        == []
+    )

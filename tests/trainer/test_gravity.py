@@ -76,5 +76,5 @@ def test_joints_of_several_roots_keep_their_influences():
         tuple(type(joint)(joint.name, -1) for joint in rig.joints), rig.rest_positions, rig.rest_matrices,
         rig.skin_joints, rig.skin_weights, rig.fingerprint, rig.face_starts, rig.face_vertices,
     )  # fmt: skip
-    found = assume_nearby_influences(apart, make_partitions(apart, {0: (), 1: ()}), sags=False)
+    found = assume_nearby_influences(apart, make_partitions(apart, {0: (), 1: ()}), may_sag=False)
     assert [partition.influencing for partition in found] == [(0, 1), (0, 1)]

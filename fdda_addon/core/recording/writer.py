@@ -288,7 +288,7 @@ def write_index(path: Path, index: dict) -> None:
         OSError: it cannot be written.
     """
     try:
-        with atomic_write(path / INDEX_NAME, keep=False) as temporary:
+        with atomic_write(path / INDEX_NAME, keep_on_failure=False) as temporary:
             temporary.write_text(to_json_text(index), encoding="utf-8")
     except OutputError as error:
         raise error.__cause__ from None
