@@ -70,30 +70,30 @@ def train(
     device = device or choose_device()
     # Inactive units lead to denormal numbers in the optimizer, which take twice the time.
     torch.set_flush_denormal(True)
-    learning = [index for index, partition in enumerate(partitions) if len(partition.basis.components)]
+    learning_indices = [index for index, partition in enumerate(partitions) if len(partition.basis.components)]
     curves = tuple(Curves() for _ in partitions)
     networks = [Network((np.zeros((len(p.columns), 0), np.float32),), (np.zeros(0, np.float32),)) for p in partitions]
-    if learning:
-        loop = _Loop([partitions[index] for index in learning], split, config, device)
+    if learning_indices:
+        loop = _Loop([partitions[index] for index in learning_indices], split, config, device)
         if initial is not None:
-            loop.start_from([initial[index] for index in learning])
-        loop.run([curves[index] for index in learning], on_epoch, should_stop, partitions)
-        for index, network in zip(learning, loop.best_networks(), strict=True):
+            loop.start_from([initial[index] for index in learning_indices])
+        loop.run([curves[index] for index in learning_indices], on_epoch, should_stop, partitions)
+        for index, network in zip(learning_indices, loop.best_networks(), strict=True):
             networks[index] = network
     return TrainingResult(tuple(networks), curves)
 
 
 class _Loop:
-    """State of a training of P partitions."""
+    """The state of a training of P partitions."""
 
     def __init__(self, partitions: list[PreparedPartition], split: Split, config: TrainingConfig, device: torch.device):
         self.partitions, self.config, self.device = partitions, config, device
         # Coefficients are divided by the residual of their partition, so that one loss and one learning rate suit all.
-        self.scales = [partition.residual_rms * np.sqrt(partition.vertex_count) for partition in partitions]
+        self.target_scales = [partition.residual_rms * np.sqrt(partition.vertex_count) for partition in partitions]
         inputs = [p.inputs for p in partitions]
-        targets = [p.coefficients / scale for p, scale in zip(partitions, self.scales, strict=True)]
-        self.x, self.y = (_padded(arrays, split.training, device) for arrays in (inputs, targets))
-        self.x_validation, self.y_validation = (
+        targets = [p.coefficients / scale for p, scale in zip(partitions, self.target_scales, strict=True)]
+        self.inputs, self.targets = (_padded(arrays, split.training, device) for arrays in (inputs, targets))
+        self.validation_inputs, self.validation_targets = (
             _padded(arrays, split.validation, device) for arrays in (inputs, targets)
         )
         self.to_mm = torch.tensor([p.residual_rms * p.mm_per_unit for p in partitions], device=device)[:, None]
@@ -102,21 +102,21 @@ class _Loop:
             dtype=torch.float32,
             device=device,
         )
-        truncation = [p.basis.truncation_rms * p.mm_per_unit for p in partitions]
-        self.truncation_mm = torch.tensor(truncation, device=device)[:, None]
+        truncation_rms_mm = [p.basis.truncation_rms * p.mm_per_unit for p in partitions]
+        self.truncation_mm = torch.tensor(truncation_rms_mm, device=device)[:, None]
         self.model = PartitionNetworks(
-            [a.shape[1] for a in inputs],
-            [a.shape[1] for a in targets],
+            [array.shape[1] for array in inputs],
+            [array.shape[1] for array in targets],
             config.hidden,
             config.activation,
             config.dropout,
             torch.Generator().manual_seed(config.seed),
         ).to(device)
         self._start_average()
-        self.best = [average.clone() for average in self.averaged]
+        self.best_parameters = [parameter.clone() for parameter in self.averaged_parameters]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
         # (P, F) product of all factors by which the standardized features were rescaled.
-        self.input_scales = torch.ones_like(self.x[:, 0])
+        self.input_scales = torch.ones_like(self.inputs[:, 0])
 
     @torch.enable_grad()
     def rescale_inputs_by_relevance(self) -> torch.Tensor:
@@ -126,23 +126,25 @@ class _Loop:
         relevance determination finds such factors for a kernel (MacKay, 1994).
 
         Returns:
-            (P, 1, F) the factors.
+            (P, 1, F) factors of the inputs.
         """
         generator = torch.Generator().manual_seed(self.config.seed + 3)
-        inputs = self.x[:, :: -(-self.x.shape[1] // RELEVANCE_POSES)].clone().requires_grad_(True)
+        inputs = self.inputs[:, :: -(-self.inputs.shape[1] // RELEVANCE_POSES)].clone().requires_grad_(True)
         outputs = self._averaged_outputs(inputs)
         # Along random directions the mean square over poses estimates the sum over all outputs.
         directions = torch.randn(outputs.shape, generator=generator).to(self.device)
         (gradients,) = torch.autograd.grad(outputs, inputs, directions)
-        squared = gradients.square().mean(dim=1, keepdim=True)
+        mean_squares = gradients.square().mean(dim=1, keepdim=True)
         input_counts = torch.tensor([p.inputs.shape[1] for p in self.partitions], device=self.device)[:, None, None]
-        mean = squared.sum(dim=2, keepdim=True) / input_counts
-        factors = torch.where(mean > 0, (squared / mean).sqrt(), 1.0).clamp(min=MIN_RELEVANCE)
-        self.x *= factors
-        self.x_validation *= factors
+        mean_over_inputs = mean_squares.sum(dim=2, keepdim=True) / input_counts
+        factors = torch.where(mean_over_inputs > 0, (mean_squares / mean_over_inputs).sqrt(), 1.0).clamp(
+            min=MIN_RELEVANCE
+        )
+        self.inputs *= factors
+        self.validation_inputs *= factors
         self.input_scales *= factors[:, 0]
-        # The outputs of the best weights stay the same.
-        self.best[0] /= factors.transpose(1, 2)
+        # The best weights are divided by the factors, so that their outputs stay the same.
+        self.best_parameters[0] /= factors.transpose(1, 2)
         return factors
 
     @torch.no_grad()
@@ -151,22 +153,22 @@ class _Loop:
 
         Inputs are rescaled once, and the first layer inversely, so that the outputs stay the same.
         """
-        for index, (network, scale) in enumerate(zip(networks, self.scales, strict=True)):
+        for index, (network, scale) in enumerate(zip(networks, self.target_scales, strict=True)):
             if network is None:
                 continue
-            last = len(network.weights) - 1
+            last_layer = len(network.weights) - 1
             for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-                factor = np.float32(1 / scale) if layer == last else np.float32(1)
+                factor = np.float32(1 / scale) if layer == last_layer else np.float32(1)
                 rows, columns = weight.shape
                 self.model.weights[layer][index, :rows, :columns] = torch.from_numpy(weight * factor)
                 self.model.biases[layer][index, 0, :columns] = torch.from_numpy(bias * factor)
         self._start_average()
         factors = self.rescale_inputs_by_relevance()
-        for first_layer in (self.model.weights[0], self.averaged[0]):
+        for first_layer in (self.model.weights[0], self.averaged_parameters[0]):
             first_layer /= factors.transpose(1, 2)
 
     def _start_average(self) -> None:
-        self.averaged = [parameter.detach().clone() for parameter in self.model.parameters()]
+        self.averaged_parameters = [parameter.detach().clone() for parameter in self.model.parameters()]
 
     def run(
         self,
@@ -178,11 +180,12 @@ class _Loop:
         """Train for all epochs.
 
         Args:
-            curves: learning curves of the P partitions; extended after each epoch.
+            curves: learning curves of the P partitions; each epoch adds its errors.
             on_epoch, should_stop: as in `train`.
-            all_partitions: the P partitions and the partitions without components; progress is a mean over all.
+            all_partitions: the P partitions and the partitions without components. The reported progress is a mean
+                over all of them.
         """
-        config, pose_count = self.config, self.x.shape[1]
+        config, pose_count = self.config, self.inputs.shape[1]
         step_count = -(-pose_count // config.batch_size)
         optimizer = OneCycleAdamW(
             self.model.parameters(),
@@ -194,24 +197,26 @@ class _Loop:
         order_generator = torch.Generator().manual_seed(config.seed + 1)
         dropout_generator = torch.Generator(self.device).manual_seed(config.seed + 2)
         vertex_counts = np.array([p.vertex_count for p in all_partitions])
-        constant = [p for p in all_partitions if not len(p.basis.components)]
-        constant_mm = sum(float(p.validation_truncation.mean()) * p.mm_per_unit * p.vertex_count for p in constant)
+        constant_partitions = [p for p in all_partitions if not len(p.basis.components)]
+        constant_mm = sum(
+            float(p.validation_truncation.mean()) * p.mm_per_unit * p.vertex_count for p in constant_partitions
+        )
         learning_vertex_counts = np.array([p.vertex_count for p in self.partitions])
-        rescaling_epochs = {round(part * config.epochs) for part in RELEVANCE_EPOCH_FRACTIONS} - {0}
+        rescaling_epochs = {round(fraction * config.epochs) for fraction in RELEVANCE_EPOCH_FRACTIONS} - {0}
         for epoch in range(1, config.epochs + 1):
             if epoch - 1 in rescaling_epochs:
                 self.rescale_inputs_by_relevance()
-            order = torch.randperm(pose_count, generator=order_generator).to(self.device)
+            pose_order = torch.randperm(pose_count, generator=order_generator).to(self.device)
             training_mm = torch.zeros(len(self.partitions), device=self.device)
             for step in range(step_count):
                 if should_stop():
                     raise Cancelled
-                batch = order[step * config.batch_size : (step + 1) * config.batch_size]
-                errors = self._step(optimizer, batch, dropout_generator)
+                batch_poses = pose_order[step * config.batch_size : (step + 1) * config.batch_size]
+                errors = self._step(optimizer, batch_poses, dropout_generator)
                 self._update_average((epoch - 1) * step_count + step)
                 training_mm += (errors * self.to_mm.square() + self.truncation_mm.square()).sqrt().sum(dim=1)
             validation_mm, worst_mm = self._validate()
-            self._keep_best(validation_mm, epoch, curves)
+            self._update_best(validation_mm, epoch, curves)
             validation = validation_mm.cpu().numpy()
             if not np.isfinite(validation).all():
                 raise TrainingError(
@@ -233,45 +238,45 @@ class _Loop:
             if config.patience and epoch - max(curve.best_epoch for curve in curves) >= config.patience:
                 break
 
-    def _step(self, optimizer: OneCycleAdamW, batch: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def _step(self, optimizer: OneCycleAdamW, poses: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Take one optimization step; returns (P, n) squared errors in units of each partition's residual."""
         optimizer.zero_grad()
-        difference = self.model(self.x[:, batch], generator) - self.y[:, batch]
-        errors = difference.square().sum(dim=2)
-        # The reported error is a mean distance, too. Unlike the mean square, it is robust to outliers.
+        differences = self.model(self.inputs[:, poses], generator) - self.targets[:, poses]
+        squared_errors = differences.square().sum(dim=2)
+        # The loss is a mean distance, like the reported error. Unlike a mean square, it is robust to outliers.
         # The sum over partitions gives each network the same gradient as if it were trained alone.
-        loss = (errors + LOSS_EPSILON).sqrt().mean(dim=1).sum()
+        loss = (squared_errors + LOSS_EPSILON).sqrt().mean(dim=1).sum()
         if self.config.l1:
             loss = loss + self.config.l1 * sum(weight.abs().sum() for weight in self.model.weights)
         if self.config.l2:
             loss = loss + self.config.l2 * sum(weight.square().sum() for weight in self.model.weights)
         loss.backward()
         optimizer.step()
-        return errors.detach()
+        return squared_errors.detach()
 
     @torch.no_grad()
     def _update_average(self, step: int) -> None:
         """Update the running average of the weights, faster in the first steps, where they change most."""
         decay = min(self.config.averaging, (1 + step) / (10 + step)) if self.config.averaging else 0.0
-        torch._foreach_lerp_(self.averaged, list(self.model.parameters()), 1 - decay)
+        torch._foreach_lerp_(self.averaged_parameters, list(self.model.parameters()), 1 - decay)
 
     def _averaged_outputs(self, inputs: torch.Tensor) -> torch.Tensor:
         names = [name for name, _ in self.model.named_parameters()]
-        return functional_call(self.model, dict(zip(names, self.averaged, strict=True)), (inputs,))
+        return functional_call(self.model, dict(zip(names, self.averaged_parameters, strict=True)), (inputs,))
 
     @torch.no_grad()
     def _validate(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (P,) mean and (P,) maximum error of the validation poses with the averaged weights, mm."""
-        difference = self._averaged_outputs(self.x_validation) - self.y_validation
-        squared = difference.square().sum(dim=2) * self.to_mm.square()
+        differences = self._averaged_outputs(self.validation_inputs) - self.validation_targets
+        squared = differences.square().sum(dim=2) * self.to_mm.square()
         errors = (squared + self.validation_truncation_mm.square()).sqrt()
         return errors.mean(dim=1), errors.max(dim=1).values
 
-    def _keep_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
+    def _update_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
         is_better = validation_mm < self.best_mm
         self.best_mm = torch.where(is_better, validation_mm, self.best_mm)
-        for best, average in zip(self.best, self.averaged, strict=True):
-            best[is_better] = average[is_better]
+        for best_parameter, averaged_parameter in zip(self.best_parameters, self.averaged_parameters, strict=True):
+            best_parameter[is_better] = averaged_parameter[is_better]
         for index in torch.nonzero(is_better).flatten().tolist():
             curves[index].best_epoch = epoch
 
@@ -279,12 +284,13 @@ class _Loop:
         """Return the best weights of each partition without padding, for coefficients in mesh units."""
         layer_count = len(self.model.weights)
         all_weights, all_biases = (
-            [t.cpu().numpy() for t in self.best[i * layer_count : (i + 1) * layer_count]] for i in range(2)
+            [tensor.cpu().numpy() for tensor in self.best_parameters[half * layer_count : (half + 1) * layer_count]]
+            for half in range(2)
         )
         input_scales = self.input_scales.cpu().numpy()
         networks = []
-        for index, (partition, scale) in enumerate(zip(self.partitions, self.scales, strict=True)):
-            weights, biases = ([a[index].copy() for a in arrays] for arrays in (all_weights, all_biases))
+        for index, (partition, scale) in enumerate(zip(self.partitions, self.target_scales, strict=True)):
+            weights, biases = ([array[index].copy() for array in arrays] for arrays in (all_weights, all_biases))
             output_count, input_count = len(partition.basis.components), partition.inputs.shape[1]
             weights[0] = weights[0][:input_count] * input_scales[index, :input_count, None]
             weights[-1] = weights[-1][:, :output_count] * np.float32(scale)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Graph nodes that compute the positions: one product with a constant matrix for each partition or small group."""
+"""Graph nodes that compute the positions: each partition, or group of small partitions, takes one matrix product."""
 
 from dataclasses import dataclass, replace
 
@@ -10,16 +10,17 @@ from fdda_addon.core.skinning import SkinBlock
 
 from .graph_builder import GraphBuilder
 from .network_nodes import Coefficients
-from .pose_nodes import COLUMNS, VECTOR, Features
+from .pose_nodes import MATRIX_COLUMNS, VECTOR_SIZE, Features
 from .trained_model import TrainedModel
 from .vertex_order import vertex_order
 
 MAX_PADDING_ELEMENTS = 6_000
-"""Reading more zeros than this in the matrix of several partitions takes longer than one more product."""
-LINEAR_PART = 3 * VECTOR
-"""Elements of the linear part of a matrix that is stored column by column: the first three columns. They are gathered
-together, as gathering takes the same time for each slice whatever its length. Translations are gathered three at a
-time, for the same reason."""
+"""Maximum number of zeros in a matrix of several partitions. Reading more takes longer than one more product."""
+LINEAR_PART_SIZE = 3 * VECTOR_SIZE
+"""Number of elements of a matrix's linear part, its first three columns. Matrices are stored column by column.
+
+The linear part is gathered as one slice, because gathering takes the same time for short and for long slices. For the
+same reason, translations are gathered in slices of three."""
 
 
 @dataclass(frozen=True)
@@ -28,32 +29,33 @@ class _RowLayout:
 
     Attributes:
         component_count: K.
-        half_rotation_joints: joints whose half-rotation matrices it is fitted to, as in `JointFit`.
-        joints: the joints of its skin weights, followed by the joints of its fit.
-        skin_joint_count: number of joints of its skin weights.
-        leading: number of joints whose translations come first, gathered with the last ones of the partition before.
-        padding: zero rows at the end.
+        half_rotation_joints: joints with half-rotation matrices in the partition's fit, as in `JointFit`.
+        joints: the joints of the partition's skin weights, followed by the joints of its fit.
+        skin_joint_count: number of joints of the skin weights.
+        leading_translation_count: number of joints whose translations are the first rows. They are gathered in one
+            slice with the last translations of the preceding partition.
+        padding: number of zero rows at the end.
     """
 
     component_count: int
     half_rotation_joints: tuple[int, ...]
     joints: tuple[int, ...]
     skin_joint_count: int
-    leading: int = 0
+    leading_translation_count: int = 0
     padding: int = 0
 
     @property
-    def size(self) -> int:
-        linear_only = self.component_count + len(self.half_rotation_joints)
-        return 3 * linear_only + COLUMNS * len(self.joints) + self.padding
+    def row_count(self) -> int:
+        linear_only_count = self.component_count + len(self.half_rotation_joints)
+        return 3 * linear_only_count + MATRIX_COLUMNS * len(self.joints) + self.padding
 
     def skin_mask(self) -> np.ndarray:
-        """Return (size,) bool, which rows are of the joints of the skin weights."""
+        """Return (row_count,) bool, which rows belong to the joints of the skin weights."""
         is_skin = np.arange(len(self.joints)) < self.skin_joint_count
-        leading, trailing = np.split(is_skin, [self.leading])
-        linear_only = np.zeros(3 * (self.component_count + len(self.half_rotation_joints)), bool)
-        padding = np.zeros(self.padding, bool)
-        return np.concatenate([leading, linear_only, np.repeat(is_skin, 3), trailing, padding])
+        leading_rows, trailing_rows = np.split(is_skin, [self.leading_translation_count])
+        linear_only_rows = np.zeros(3 * (self.component_count + len(self.half_rotation_joints)), bool)
+        padding_rows = np.zeros(self.padding, bool)
+        return np.concatenate([leading_rows, linear_only_rows, np.repeat(is_skin, 3), trailing_rows, padding_rows])
 
 
 def add_skinning(
@@ -65,51 +67,63 @@ def add_skinning(
 ) -> None:
     """Add the nodes from the coefficients to the output `positions`.
 
-    With t the confidence of partition p and m its main joint, the rows of p are made of the matrices
-    [ t c_k P_m | t Q_j A_j of the joints j of its half rotations | P_j of its skin joints | t P_j of its fit's joints
-    ]. In this order: translations of the `leading` joints, linear parts of all matrices, translations of the other
-    joints. Components and half rotations have no translation. The constant matrix has in the same order [ components
-    rotated by B_m^-1 | B_j^-1 u_vj | w_vj B_j^-1 (x_v, 1) | B_j^-1 u_vj, for m with the mean ]: the inverse rest
-    matrices are in the constants. In a large partition everything but the skin joints is factorized (`low_rank`), and a
-    matrix with few columns comes first.
+    The positions of a partition are the product of its rows, which depend on the pose, and a constant matrix. With the
+    confidence t of the partition and its main joint m, rows and constants are:
+
+    | element | rows | constants |
+    |---|---|---|
+    | each component k | t c_k P_m | the component, rotated by B_m^-1 |
+    | each joint j with a half rotation | t Q_j A_j | B_j^-1 u_vj |
+    | each joint j of the skin weights | P_j | w_vj B_j^-1 (x_v, 1) |
+    | each joint j of the fit | t P_j | B_j^-1 u_vj, for m including the mean residual |
+
+    The translations of the first joints come first, then the linear parts of all matrices, then the translations of the
+    other joints. Components and half rotations have no translation. In a large partition all constants except those of
+    the skin joints are factorized (`low_rank`). The rows are then multiplied by a matrix with few columns first.
 
     Args:
-        graph: to add the nodes to.
-        features: with the pose matrices.
-        coefficients: of the networks times the confidence, if there are any.
-        outside: name of (N, 3 B'), as from `add_range`; one of its elements is a constant 1.
-        trained_model: to export.
+        graph: graph to which the nodes are added.
+        features: features in the graph, with the table of pose matrices.
+        coefficients: coefficients of the networks, multiplied by the confidence; None without components.
+        outside: name of the (N, 3 B') values that `add_range` returns. One of their elements is a constant 1.
+        trained_model: model to export.
     """
     partitions = trained_model.partitions
     skins = [SkinBlock(trained_model.rig, partition) for partition in partitions]
     layouts = [_row_layout(trained_model, index, skin) for index, skin in enumerate(skins)]
-    sizes = [(layout.size, len(partition.vertices)) for layout, partition in zip(layouts, partitions, strict=True)]
-    products = _group_products(sizes)
-    ordered = [index for product in products for index in product]
-    layouts = dict(zip(ordered, _pack_translations([layouts[index] for index in ordered]), strict=True))
-    slices, slice_order = _add_row_slices(graph, features, coefficients, outside, trained_model, layouts)
-    gathered = graph.add("Gather", [slices, graph.integers("row_slice_order", slice_order)], "ordered_slices", axis=1)
-    gathered = graph.reshape(gathered, [0, 3 * len(slice_order), VECTOR], "rows")
-    gathered = graph.add("Transpose", [gathered], "rows_by_axis", perm=[0, 2, 1])
-    lengths = [sum(layouts[index].size for index in product) for product in products]
-    row_blocks = graph.split(gathered, lengths, [f"rows_{number}" for number in range(len(products))], axis=2)
-    order = vertex_order([partitions[index].vertices for index in ordered])
-    columns = dict(zip(ordered, order.columns, strict=True))
-    blocks = []
-    for number, (rows, product) in enumerate(zip(row_blocks, products, strict=True)):
+    matrix_shapes = [
+        (layout.row_count, len(partition.vertices)) for layout, partition in zip(layouts, partitions, strict=True)
+    ]
+    products = _group_products(matrix_shapes)
+    ordered_partitions = [index for product in products for index in product]
+    layouts = dict(
+        zip(ordered_partitions, _pack_translations([layouts[index] for index in ordered_partitions]), strict=True)
+    )
+    row_slices, slice_order = _add_row_slices(graph, features, coefficients, outside, trained_model, layouts)
+    rows = graph.add("Gather", [row_slices, graph.integers("row_slice_order", slice_order)], "ordered_slices", axis=1)
+    rows = graph.reshape(rows, [0, 3 * len(slice_order), VECTOR_SIZE], "rows")
+    rows = graph.add("Transpose", [rows], "rows_by_axis", perm=[0, 2, 1])
+    row_counts = [sum(layouts[index].row_count for index in product) for product in products]
+    row_blocks = graph.split(
+        rows, row_counts, [f"rows_{product_index}" for product_index in range(len(products))], axis=2
+    )
+    order = vertex_order([partitions[index].vertices for index in ordered_partitions])
+    column_order = dict(zip(ordered_partitions, order.columns, strict=True))
+    position_blocks = []
+    for product_index, (product_rows, product) in enumerate(zip(row_blocks, products, strict=True)):
         matrices = [_partition_matrix(trained_model, index, skins[index], layouts[index]) for index in product]
         vertex_factors = trained_model.prepared[product[0]].vertex_factors
         if len(product) == 1 and vertex_factors is not None:
             left_factor, matrices[0] = _factorized_matrix(matrices[0], layouts[product[0]], vertex_factors)
-            left_factor = graph.floats(f"left_factor_{number}", left_factor)
-            rows = graph.add("MatMul", [rows, left_factor], f"low_rank_{number}")
+            left_factor = graph.floats(f"left_factor_{product_index}", left_factor)
+            product_rows = graph.add("MatMul", [product_rows, left_factor], f"low_rank_{product_index}")
         for slot, index in enumerate(product):
-            matrices[slot] = _reorder_columns(matrices[slot], partitions[index].vertices, columns[index])
-        matrix = graph.floats(f"matrix_{number}", _block_diagonal(matrices))
-        blocks.append(graph.add("MatMul", [rows, matrix], f"block_{number}"))
-    joined = graph.join(blocks, "blocks", axis=2)
-    joined = graph.add("Transpose", [joined], "positions_by_partition", perm=[0, 2, 1])
-    order.add(graph, joined, POSITIONS_OUTPUT)
+            matrices[slot] = _reorder_columns(matrices[slot], partitions[index].vertices, column_order[index])
+        matrix = graph.floats(f"matrix_{product_index}", _block_diagonal(matrices))
+        position_blocks.append(graph.add("MatMul", [product_rows, matrix], f"block_{product_index}"))
+    joined_positions = graph.join(position_blocks, "blocks", axis=2)
+    joined_positions = graph.add("Transpose", [joined_positions], "positions_by_partition", perm=[0, 2, 1])
+    order.add(graph, joined_positions, POSITIONS_OUTPUT)
 
 
 def _row_layout(trained_model: TrainedModel, index: int, skin: SkinBlock) -> _RowLayout:
@@ -124,14 +138,18 @@ def _row_layout(trained_model: TrainedModel, index: int, skin: SkinBlock) -> _Ro
 
 
 def _pack_translations(layouts: list[_RowLayout]) -> list[_RowLayout]:
-    """Pack translations in threes: the last of a partition share a slice with the first of the next one."""
-    packed, leading = [], 0
+    """Pack translations into slices of three; a slice may span the end of one partition and the start of the next."""
+    packed_layouts, leading_translation_count = [], 0
     for index, layout in enumerate(layouts):
-        missing = (leading - len(layout.joints)) % 3
-        is_shared = index + 1 < len(layouts) and missing <= len(layouts[index + 1].joints)
-        packed.append(replace(layout, leading=leading, padding=0 if is_shared else missing))
-        leading = missing if is_shared else 0
-    return packed
+        missing_count = (leading_translation_count - len(layout.joints)) % 3
+        is_shared = index + 1 < len(layouts) and missing_count <= len(layouts[index + 1].joints)
+        packed_layouts.append(
+            replace(
+                layout, leading_translation_count=leading_translation_count, padding=0 if is_shared else missing_count
+            )
+        )
+        leading_translation_count = missing_count if is_shared else 0
+    return packed_layouts
 
 
 def _add_row_slices(
@@ -142,95 +160,110 @@ def _add_row_slices(
     trained_model: TrainedModel,
     layouts: dict[int, _RowLayout],
 ) -> tuple[str, list[int]]:
-    """Add the scaled matrices that the rows of all partitions are made of, in slices of nine elements.
+    """Add the scaled matrices that the rows of all partitions consist of, in slices of nine elements.
 
     Args:
-        layouts: by partition index, in the order of the products; the others as in `add_skinning`.
+        graph, features, coefficients, outside, trained_model: as in `add_skinning`.
+        layouts: layout of each partition, by partition index, in the order of the products.
 
     Returns:
-        Name of the (N, ·, 9) slices, and the order in which the rows take them.
+        Name of the (N, ·, 9) slices, and their order in the rows.
     """
-    # The constant 1 is the last element of `outside`, directly before the confidence; the coefficients follow.
-    one, confidence = VECTOR * features.one, VECTOR * (features.one + 1)
-    # Pairs of the index of a matrix and the index of its factor among the scalars.
-    terms: list[tuple[int, int]] = []
-    starts = {}
+    # The scalars are `outside`, whose last element is the constant 1, then the confidence, then the coefficients.
+    ones_index, confidence_start = VECTOR_SIZE * features.ones_vector, VECTOR_SIZE * (features.ones_vector + 1)
+    # Each pair is the index of a matrix and the index of its factor among the scalars.
+    scaled_matrices: list[tuple[int, int]] = []
+    joint_starts = {}
     for index, layout in layouts.items():
-        starts[index] = len(terms)
-        terms += [(joint, one) for joint in layout.joints[: layout.skin_joint_count]]
-        terms += [(joint, confidence + index) for joint in layout.joints[layout.skin_joint_count :]]
-        terms += layout.padding * [(0, one)]
-    # Negative values are slices of translations, whose offset is known only at the end.
-    order = []
+        joint_starts[index] = len(scaled_matrices)
+        scaled_matrices += [(joint, ones_index) for joint in layout.joints[: layout.skin_joint_count]]
+        scaled_matrices += [(joint, confidence_start + index) for joint in layout.joints[layout.skin_joint_count :]]
+        scaled_matrices += layout.padding * [(0, ones_index)]
+    # Slices of translations have negative values here, because their offset is known only at the end.
+    slice_order = []
     for index, layout in layouts.items():
-        linear_start = len(terms)
+        linear_start = len(scaled_matrices)
         if layout.component_count:
-            first = confidence + len(layouts) + coefficients.first[index]
+            first_coefficient = confidence_start + len(layouts) + coefficients.start_by_partition[index]
             main_joint = trained_model.partitions[index].joint
-            terms += [(main_joint, first + component) for component in range(layout.component_count)]
-        terms += [(joint, confidence + index) for joint in layout.half_rotation_joints]
-        end = starts[index] + len(layout.joints)
-        order += [*range(linear_start, len(terms)), *range(starts[index], end)]
-        order += [~(term // 3) for term in range(starts[index] + layout.leading, end, 3)]
-    terms += -len(terms) % 3 * [(0, one)]
-    order = [len(terms) + ~position if position < 0 else position for position in order]
-    joints, factors = zip(*terms, strict=True)
-    scalars = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
-    scale = graph.integers("row_factors", np.array(factors)[:, None])
-    scale = graph.add("Gather", [graph.join(scalars, "scalars", axis=1), scale], "factors", axis=1)
+            scaled_matrices += [
+                (main_joint, first_coefficient + component) for component in range(layout.component_count)
+            ]
+        scaled_matrices += [(joint, confidence_start + index) for joint in layout.half_rotation_joints]
+        joint_end = joint_starts[index] + len(layout.joints)
+        slice_order += [*range(linear_start, len(scaled_matrices)), *range(joint_starts[index], joint_end)]
+        slice_order += [
+            ~(matrix_index // 3)
+            for matrix_index in range(joint_starts[index] + layout.leading_translation_count, joint_end, 3)
+        ]
+    scaled_matrices += -len(scaled_matrices) % 3 * [(0, ones_index)]
+    slice_order = [
+        len(scaled_matrices) + ~slice_index if slice_index < 0 else slice_index for slice_index in slice_order
+    ]
+    joint_of_matrix, factor_of_matrix = zip(*scaled_matrices, strict=True)
+    scalar_values = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
+    factors = graph.integers("row_factors", np.array(factor_of_matrix)[:, None])
+    factors = graph.add("Gather", [graph.join(scalar_values, "scalars", axis=1), factors], "factors", axis=1)
     # A product repeats each factor twelve times: broadcasting the multiplication takes three times as long.
-    scale = graph.add("MatMul", [scale, graph.floats("twelve_ones", np.ones((1, 12)))], "factors_of_poses")
-    poses = graph.integers("row_poses", features.pose_rows[list(joints)])
-    poses = graph.add("Gather", [features.table, poses], "unscaled", axis=1)
-    poses = graph.add("Mul", [poses, scale], "scaled")
-    linear, translations = graph.split(poses, [LINEAR_PART, VECTOR], ["linear_parts", "translations"], axis=2)
-    translations = graph.reshape(translations, [0, -1, LINEAR_PART], "translations_by_three")
-    return graph.add("Concat", [linear, translations], "row_slices", axis=1), order
+    factors = graph.add("MatMul", [factors, graph.floats("twelve_ones", np.ones((1, 12)))], "factors_of_poses")
+    matrices = graph.integers("row_poses", features.pose_rows[list(joint_of_matrix)])
+    matrices = graph.add("Gather", [features.table, matrices], "unscaled", axis=1)
+    matrices = graph.add("Mul", [matrices, factors], "scaled")
+    linear_parts, translations = graph.split(
+        matrices, [LINEAR_PART_SIZE, VECTOR_SIZE], ["linear_parts", "translations"], axis=2
+    )
+    translations = graph.reshape(translations, [0, -1, LINEAR_PART_SIZE], "translations_by_three")
+    return graph.add("Concat", [linear_parts, translations], "row_slices", axis=1), slice_order
 
 
-def _group_products(sizes: list[tuple[int, int]]) -> list[list[int]]:
-    """Group matrices into products: small matrices share a block-diagonal one while it has few zeros.
+def _group_products(matrix_shapes: list[tuple[int, int]]) -> list[list[int]]:
+    """Group matrices into products: small matrices share a block-diagonal matrix as long as it has few zeros.
 
     Args:
-        sizes: number of rows and columns of each matrix.
+        matrix_shapes: numbers of rows and columns of each matrix.
 
     Returns:
         Indices of the matrices of each product.
     """
     products: list[list[int]] = []
-    rows = columns = 0
-    for index in sorted(range(len(sizes)), key=lambda index: (sizes[index][0] * sizes[index][1], index)):
-        if products and sizes[index][0] * columns + sizes[index][1] * rows < MAX_PADDING_ELEMENTS:
+    row_count = column_count = 0
+    for index in sorted(
+        range(len(matrix_shapes)), key=lambda index: (matrix_shapes[index][0] * matrix_shapes[index][1], index)
+    ):
+        if (
+            products
+            and matrix_shapes[index][0] * column_count + matrix_shapes[index][1] * row_count < MAX_PADDING_ELEMENTS
+        ):
             products[-1].append(index)
         else:
             products.append([index])
-            rows = columns = 0
-        rows, columns = rows + sizes[index][0], columns + sizes[index][1]
+            row_count = column_count = 0
+        row_count, column_count = row_count + matrix_shapes[index][0], column_count + matrix_shapes[index][1]
     return products
 
 
 def _block_diagonal(matrices: list[np.ndarray]) -> np.ndarray:
-    rows, columns = np.cumsum([(0, 0), *(matrix.shape for matrix in matrices)], axis=0).T
-    joined = np.zeros((rows[-1], columns[-1]))
+    row_starts, column_starts = np.cumsum([(0, 0), *(matrix.shape for matrix in matrices)], axis=0).T
+    joined = np.zeros((row_starts[-1], column_starts[-1]))
     for index, matrix in enumerate(matrices):
-        joined[rows[index] : rows[index + 1], columns[index] : columns[index + 1]] = matrix
+        joined[row_starts[index] : row_starts[index + 1], column_starts[index] : column_starts[index + 1]] = matrix
     return joined
 
 
 def _reorder_columns(matrix: np.ndarray, vertices: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Reorder the columns of a matrix of some vertices; `columns` are vertices, or -1 for zeros."""
+    """Reorder the columns of a matrix, one for each of `vertices`; `columns` has vertices, or -1 for a zero column."""
     return np.where(columns >= 0, matrix[:, np.searchsorted(vertices, np.maximum(columns, vertices[0]))], 0)
 
 
 def _factorized_matrix(
     matrix: np.ndarray, layout: _RowLayout, vertex_factors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Replace a partition's matrix by a product of two; the first passes the rows of the skin joints unchanged."""
+    """Replace a partition's matrix by a product of two; the first leaves the rows of the skin joints unchanged."""
     is_skin = layout.skin_mask()
-    count, vertex_factors = is_skin.sum(), vertex_factors.astype(np.float64)
-    left_factor = np.zeros((len(matrix), count + len(vertex_factors)))
-    left_factor[is_skin, :count] = np.eye(count)
-    left_factor[~is_skin, count:] = matrix[~is_skin] @ vertex_factors.T
+    skin_row_count, vertex_factors = is_skin.sum(), vertex_factors.astype(np.float64)
+    left_factor = np.zeros((len(matrix), skin_row_count + len(vertex_factors)))
+    left_factor[is_skin, :skin_row_count] = np.eye(skin_row_count)
+    left_factor[~is_skin, skin_row_count:] = matrix[~is_skin] @ vertex_factors.T
     return left_factor, np.concatenate([matrix[is_skin], vertex_factors])
 
 
@@ -239,20 +272,27 @@ def _partition_matrix(trained_model: TrainedModel, index: int, skin: SkinBlock, 
     inverse_rest = np.linalg.inv(trained_model.rig.rest_matrices.astype(np.float64))
     partition, prepared = trained_model.partitions[index], trained_model.prepared[index]
     basis, fit = prepared.basis, prepared.fit
-    count = len(partition.vertices)
+    vertex_count = len(partition.vertices)
     weighted_rest = skin.weighted_rest.reshape(len(skin.joints), 4, -1).astype(np.float64)
-    factors = fit.factors.reshape(-1, 4, count).astype(np.float64)
+    fit_factors = fit.factors.reshape(-1, 4, vertex_count).astype(np.float64)
     mean = basis.mean.astype(np.float64)
     if layout.component_count:
         # The last bias of the network is a constant residual.
         mean = mean + trained_model.networks[index].biases[-1].astype(np.float64) @ basis.components
-    factors[np.flatnonzero(fit.joints == partition.joint), :3] += mean.reshape(count, 3).T
-    fitted = inverse_rest[fit.joints % len(inverse_rest)] @ factors
+    fit_factors[np.flatnonzero(fit.joints == partition.joint), :3] += mean.reshape(vertex_count, 3).T
+    fit_rows = inverse_rest[fit.joints % len(inverse_rest)] @ fit_factors
     has_translation = fit.joints < len(inverse_rest)
-    components = basis.components.reshape(-1, count, 3)
-    components = np.einsum("ab,kvb->kav", inverse_rest[partition.joint, :3, :3], components)
-    joints = np.concatenate([inverse_rest[skin.joints] @ weighted_rest, fitted[has_translation]])
-    leading, trailing = np.split(joints[:, 3], [layout.leading])
-    padding = np.zeros((layout.padding, count))
-    parts = [leading, components, fitted[~has_translation, :3], joints[:, :3], trailing, padding]
-    return np.concatenate([part.reshape(-1, count) for part in parts])
+    component_rows = basis.components.reshape(-1, vertex_count, 3)
+    component_rows = np.einsum("ab,kvb->kav", inverse_rest[partition.joint, :3, :3], component_rows)
+    joint_rows = np.concatenate([inverse_rest[skin.joints] @ weighted_rest, fit_rows[has_translation]])
+    leading_translations, trailing_translations = np.split(joint_rows[:, 3], [layout.leading_translation_count])
+    padding_rows = np.zeros((layout.padding, vertex_count))
+    row_blocks = [
+        leading_translations,
+        component_rows,
+        fit_rows[~has_translation, :3],
+        joint_rows[:, :3],
+        trailing_translations,
+        padding_rows,
+    ]
+    return np.concatenate([rows.reshape(-1, vertex_count) for rows in row_blocks])

@@ -159,20 +159,23 @@ def test_only_small_partitions_share_a_product():
 
 
 def test_translations_are_packed_by_three():
-    def rows(joints: int) -> skinning_nodes._RowLayout:
+    def make_layout(joints: int) -> skinning_nodes._RowLayout:
         return skinning_nodes._RowLayout(
             component_count=2, half_rotation_joints=(), joints=tuple(range(joints)), skin_joint_count=1
         )
 
     for counts in ([4], [3, 6], [4, 5, 2, 2, 7], [2, 2, 2]):
-        packed = skinning_nodes._pack_translations([rows(count) for count in counts])
-        assert packed[0].leading == 0 and all(own.padding == 0 for own in packed[:-1])
-        assert packed[-1].padding == -sum(counts) % 3
-        assert [own.size for own in packed] == [6 + 4 * own for own in counts[:-1]] + [
-            6 + 4 * counts[-1] + packed[-1].padding
+        layouts = skinning_nodes._pack_translations([make_layout(count) for count in counts])
+        assert layouts[0].leading_translation_count == 0 and all(layout.padding == 0 for layout in layouts[:-1])
+        assert layouts[-1].padding == -sum(counts) % 3
+        assert [layout.row_count for layout in layouts] == [6 + 4 * count for count in counts[:-1]] + [
+            6 + 4 * counts[-1] + layouts[-1].padding
         ]
     # The first rows of the next partition complete the slice, so it needs as many joints.
-    assert [(own.leading, own.padding) for own in skinning_nodes._pack_translations([rows(4), rows(1), rows(4)])] == [
+    assert [
+        (layout.leading_translation_count, layout.padding)
+        for layout in skinning_nodes._pack_translations([make_layout(4), make_layout(1), make_layout(4)])
+    ] == [
         (0, 2),
         (0, 0),
         (2, 1),
