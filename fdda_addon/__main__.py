@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`python -m fdda_addon VERB …`: the verbs with the bpy module, without Blender's program."""
+"""Runs the command line as `python -m fdda_addon VERB …`, with the bpy module instead of Blender's program."""
 
 import sys
 

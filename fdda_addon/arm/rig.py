@@ -6,7 +6,7 @@ import math
 import bpy
 import numpy as np
 
-from ..scene.arrays import COORDINATE_ELEMENT, MATERIAL_INDEX, write
+from ..scene.arrays import COORDINATE_ELEMENT, MATERIAL_INDEX_ELEMENT, write
 from .action import assign_drive_action
 from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED, RIG_OBJECT, ROTATION_MODE
 from .surface import Surface, sculpt_arm
@@ -86,7 +86,7 @@ def _mesh_object(surface: Surface) -> bpy.types.Object:
     mesh.shade_smooth()
     for name, look in (("arm_skin", _SKIN), ("arm_nail", _NAIL)):
         mesh.materials.append(_material(name, *look))
-    write(mesh.polygons, MATERIAL_INDEX, surface.nails.astype(np.int32))
+    write(mesh.polygons, MATERIAL_INDEX_ELEMENT, surface.nails.astype(np.int32))
     mesh.update()
     arm = bpy.data.objects.new(ARM_OBJECT, mesh)
     bpy.context.scene.collection.objects.link(arm)

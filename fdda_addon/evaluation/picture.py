@@ -17,7 +17,7 @@ from mathutils import Matrix
 from ..core.errors import OutputError
 from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
 from ..core.output import atomic_write
-from ..scene.arrays import COLOR_ELEMENT, LOOP_START, VERTEX_INDEX, write
+from ..scene.arrays import COLOR_ELEMENT, LOOP_START_ELEMENT, VERTEX_INDEX_ELEMENT, write
 from ..scene.blend_file import blender_path
 from ..scene.mesh import set_mesh_positions, topology
 
@@ -252,8 +252,8 @@ class _MeshFactory:
         mesh.loops.add(len(self._loop_vertices))
         mesh.polygons.add(len(self._loop_starts))
         set_mesh_positions(mesh, np.ascontiguousarray(positions, np.float32))
-        write(mesh.loops, VERTEX_INDEX, self._loop_vertices)
-        write(mesh.polygons, LOOP_START, self._loop_starts)
+        write(mesh.loops, VERTEX_INDEX_ELEMENT, self._loop_vertices)
+        write(mesh.polygons, LOOP_START_ELEMENT, self._loop_starts)
         mesh.update(calc_edges=True)
         mesh.shade_smooth()
         _set_colors(mesh, colors)

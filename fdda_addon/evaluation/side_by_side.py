@@ -10,7 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Vector
 
-from ..scene.comparison import COMPARISON_KEY, comparisons
+from ..scene.comparison import COMPARISON_KEY, comparison_objects
 from ..scene.draw_cache import draw_cached
 
 BESIDE, OVERLAY, NONE = "BESIDE", "OVERLAY", "NONE"
@@ -24,7 +24,11 @@ _checked_object_count = -1
 def find(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     """Find the comparison object of a mesh object; return None if there is none."""
     return next(
-        (comparison_object for comparison_object in comparisons() if comparison_object[COMPARISON_KEY] == mesh_object),
+        (
+            comparison_object
+            for comparison_object in comparison_objects()
+            if comparison_object[COMPARISON_KEY] == mesh_object
+        ),
         None,
     )
 
@@ -73,7 +77,7 @@ def hide(mesh_object: bpy.types.Object) -> None:
 
 def hide_all() -> None:
     """Remove all comparison objects of the open file."""
-    for comparison_object in comparisons():
+    for comparison_object in comparison_objects():
         _remove(comparison_object)
 
 
@@ -105,7 +109,7 @@ def _on_depsgraph_update_post(*_: object) -> None:
     global _checked_object_count
     if _checked_object_count == len(bpy.data.objects):
         return
-    for comparison_object in comparisons():
+    for comparison_object in comparison_objects():
         compared_object = comparison_object[COMPARISON_KEY]
         if compared_object is None or not compared_object.users_scene:
             _remove(comparison_object)

@@ -86,7 +86,7 @@ def _drawn_values() -> dict[int, tuple]:
 
 def _change_signature(scene_rig: SceneRig) -> tuple:
     """Return values that are cheap to read and change when a check may change; the first are those of the rest pose."""
-    from ..scene.arrays import REST_MATRIX, read
+    from ..scene.arrays import REST_MATRIX_ELEMENT, read
 
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     mesh, bones = mesh_object.data, armature_object.data.bones
@@ -96,7 +96,7 @@ def _change_signature(scene_rig: SceneRig) -> tuple:
         len(mesh_object.vertex_groups),
         armature_object.name,
         len(bones),
-        read(bones, REST_MATRIX).tobytes(),
+        read(bones, REST_MATRIX_ELEMENT).tobytes(),
         tuple(mesh_object.scale),
         tuple(armature_object.scale),
     )

@@ -9,7 +9,7 @@ from ..core.rig import Rig
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer, clip_actions, clip_player
 from ..scene.armature import clear_pose
-from ..scene.comparison import hidden_comparisons
+from ..scene.comparison import hidden_comparison_objects
 from ..scene.controls import temporary_controls
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import temporary_pose
@@ -49,7 +49,7 @@ def temporary_rig_states(
     controlled = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *beside)]
     with ExitStack() as stack:
         player = stack.enter_context(clip_player(controlled, clips))
-        stack.enter_context(hidden_comparisons())
+        stack.enter_context(hidden_comparison_objects())
         for scene_rig, _, _ in rigs:
             stack.enter_context(downstream_disabled(scene_rig.mesh_object))
         stack.enter_context(temporary_pose(armature_object, clip_actions(armature_object, clips)))

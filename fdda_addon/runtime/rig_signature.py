@@ -14,7 +14,7 @@ from ..core.errors import ModelError
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
 from ..rig.deformation import read_b_bones, read_deformation
 from ..rig.reading import read_model_rig
-from ..scene.arrays import Element, read
+from ..scene.arrays import ElementProperty, read
 from ..scene.mesh import rest_positions
 from ..scene.scene_rig import SceneRig, armature_modifier
 from .network import Network
@@ -23,14 +23,14 @@ STABLE_MODES = ("OBJECT", "POSE")
 """Modes of an object in which its mesh does not change; in the other modes the user is editing the mesh."""
 
 _BONE_PROPERTIES = (
-    Element("matrix_local", np.float32, (16,)),
-    Element("use_deform", np.bool_),
-    Element("envelope_distance", np.float32),
-    Element("envelope_weight", np.float32),
-    Element("head_radius", np.float32),
-    Element("tail_radius", np.float32),
-    Element("use_envelope_multiply", np.bool_),
-    Element("bbone_segments", np.int32),
+    ElementProperty("matrix_local", np.float32, (16,)),
+    ElementProperty("use_deform", np.bool_),
+    ElementProperty("envelope_distance", np.float32),
+    ElementProperty("envelope_weight", np.float32),
+    ElementProperty("head_radius", np.float32),
+    ElementProperty("tail_radius", np.float32),
+    ElementProperty("use_envelope_multiply", np.bool_),
+    ElementProperty("bbone_segments", np.int32),
 )
 _SEGMENTS_INDEX = len(_BONE_PROPERTIES) - 1
 _ARMATURE_MODIFIER_PROPERTIES = ("use_vertex_groups", "use_bone_envelopes", "vertex_group", "invert_vertex_group")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The border between Blender's data and arrays: everything here needs bpy, and nothing here decides anything."""
+"""Access to the open scene: converts Blender's data to arrays and back, finds rigs, and changes state temporarily."""

@@ -11,44 +11,45 @@ from .draw_cache import draw_cached
 from .scene_rig import SceneRig, armature_of, find_rig, parenting_message
 
 
-def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
+def active_rig(context: bpy.types.Context, mesh_object_name: str = "") -> SceneRig:
     """Find the rig of a mesh object or of the active object, without evaluating anything.
 
-    The active object is a mesh that an armature deforms, or its armature. Of several meshes of the armature, the
-    selected one is taken, else the one that was chosen in the sidebar, else the bound one, else the first.
+    The active object is a mesh that an armature deforms, or its armature. If the armature deforms several meshes, the
+    rig is that of the selected mesh. If not exactly one mesh is selected, it is that of the mesh chosen in the sidebar,
+    then of the only bound mesh, then of the first mesh.
 
     Args:
         context: the context with the active object.
-        name: name of the mesh object; empty for the active object.
+        mesh_object_name: name of the mesh object; empty for the active object.
 
     Raises:
         RigError: there is no rig.
     """
-    if name:
-        return find_rig(name)
-    active = context.view_layer.objects.active
-    if active is None or active.type not in {"MESH", "ARMATURE"}:
+    if mesh_object_name:
+        return find_rig(mesh_object_name)
+    active_object = context.view_layer.objects.active
+    if active_object is None or active_object.type not in {"MESH", "ARMATURE"}:
         raise RigError("Nothing with a rig is active; select the mesh of a character, or its armature.")
-    if active.type == "MESH":
-        armature_object = armature_of(active)
+    if active_object.type == "MESH":
+        armature_object = armature_of(active_object)
         if armature_object is None:
             raise RigError(
-                parenting_message(active)
-                or f"'{active.name}' has no Armature modifier with an armature; add one, or select another mesh."
+                parenting_message(active_object)
+                or f"'{active_object.name}' has no Armature modifier with an armature; add one, or select another mesh."
             )
-        return SceneRig(active, armature_object)
-    return SceneRig(_mesh_of(context, active), active)
+        return SceneRig(active_object, armature_object)
+    return SceneRig(_choose_mesh(context, active_object), active_object)
 
 
 def cached_active_rig(context: bpy.types.Context) -> SceneRig | None:
     """Find the active rig, cached for drawing; return None if there is none."""
-    active = context.view_layer.objects.active
-    return None if active is None else _cached_active_rig(context, active, context.scene)
+    active_object = context.view_layer.objects.active
+    return None if active_object is None else _cached_active_rig(context, active_object, context.scene)
 
 
 @draw_cached
 def _cached_active_rig(
-    context: bpy.types.Context, _active: bpy.types.Object, _scene: bpy.types.Scene
+    context: bpy.types.Context, _active_object: bpy.types.Object, _scene: bpy.types.Scene
 ) -> SceneRig | None:
     try:
         return active_rig(context)
@@ -63,7 +64,7 @@ def cached_rigs_of_active_armature(context: bpy.types.Context) -> tuple[SceneRig
 
 @draw_cached
 def _cached_rigs(
-    context: bpy.types.Context, _active: bpy.types.Object, _scene: bpy.types.Scene
+    context: bpy.types.Context, _active_object: bpy.types.Object, _scene: bpy.types.Scene
 ) -> tuple[SceneRig, ...]:
     return tuple(rigs_of_active_armature(context))
 
@@ -73,7 +74,7 @@ def any_mesh_object(context: bpy.types.Context, predicate: Callable[[bpy.types.O
 
     Args:
         context: the context with the scene.
-        predicate: a function of a module: a lambda would be another key of the cache in each call.
+        predicate: a function at module level, because a lambda would be a new cache key in each call.
     """
     return _any_mesh_object(context.scene, predicate) is True
 
@@ -85,32 +86,32 @@ def _any_mesh_object(scene: bpy.types.Scene, predicate: Callable[[bpy.types.Obje
 
 def rigs_of_active_armature(context: bpy.types.Context) -> list[SceneRig]:
     """Find the rigs of all meshes of the active armature; empty if no armature is active or it has a single mesh."""
-    active = context.view_layer.objects.active
-    if active is None or active.type != "ARMATURE":
+    active_object = context.view_layer.objects.active
+    if active_object is None or active_object.type != "ARMATURE":
         return []
-    meshes = _meshes_of(context, active)
-    return [SceneRig(mesh_object, active) for mesh_object in meshes] if len(meshes) > 1 else []
+    meshes = _meshes_of(context, active_object)
+    return [SceneRig(mesh_object, active_object) for mesh_object in meshes] if len(meshes) > 1 else []
 
 
 def _meshes_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> list[bpy.types.Object]:
-    meshes = [o for o in context.scene.objects if o.type == "MESH" and _follows(o, armature_object)]
+    meshes = [o for o in context.scene.objects if o.type == "MESH" and _is_deformed_by(o, armature_object)]
     return [o for o in meshes if not is_comparison(o)]
 
 
-def _mesh_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> bpy.types.Object:
+def _choose_mesh(context: bpy.types.Context, armature_object: bpy.types.Object) -> bpy.types.Object:
     meshes = _meshes_of(context, armature_object)
     if not meshes:
         for child in armature_object.children:
-            if child.type == "MESH" and (sentence := parenting_message(child)):
-                raise RigError(sentence)
+            if child.type == "MESH" and (message := parenting_message(child)):
+                raise RigError(message)
         raise RigError(f"No mesh follows the armature '{armature_object.name}'; give one an Armature modifier.")
-    name = context.window_manager.fdda.mesh
-    predicates = (lambda o: o.select_get(), lambda o: o.name == name, lambda o: o.fdda.is_bound)
+    chosen_name = context.window_manager.fdda.mesh
+    predicates = (lambda o: o.select_get(), lambda o: o.name == chosen_name, lambda o: o.fdda.is_bound)
     for matches in ([o for o in meshes if predicate(o)] for predicate in predicates):
         if len(matches) == 1:
             return matches[0]
     return meshes[0]
 
 
-def _follows(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
+def _is_deformed_by(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
     return armature_of(mesh_object) == armature_object

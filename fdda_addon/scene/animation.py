@@ -9,49 +9,52 @@ import numpy as np
 from .arrays import KEYFRAME_ELEMENTS, read
 from .compatibility import curves_of, curves_of_slot
 
-MIN_CHANGE = 1e-6
-"""Keyframes whose values differ by no more than this hold one value."""
+MIN_VALUE_CHANGE = 1e-6
+"""Keyframes whose values differ by no more than this count as equal."""
 
 
 def active_curves(datablock: bpy.types.ID) -> list[bpy.types.FCurve]:
-    """Find the F-curves that animate a datablock: those of its action and of its NLA that are not muted."""
+    """Find the F-curves that animate a datablock: the unmuted F-curves of its action and of its NLA strips."""
     animation = datablock.animation_data
     if animation is None:
         return []
     owners = [animation]
     if animation.use_nla:
         tracks = [track for track in animation.nla_tracks if track.is_solo] or animation.nla_tracks
-        owners += [strip for track in tracks if not track.mute for strip in _flat_strips(track.strips)]
-    pairs = [(owner.action, owner.action_slot) for owner in owners]
-    curves = [curve for action, slot in pairs if action and slot for curve in curves_of_slot(action, slot)]
+        owners += [strip for track in tracks if not track.mute for strip in _unmuted_strips(track.strips)]
+    actions_and_slots = [(owner.action, owner.action_slot) for owner in owners]
+    curves = [curve for action, slot in actions_and_slots if action and slot for curve in curves_of_slot(action, slot)]
     return [curve for curve in curves if not curve.mute]
 
 
-def _flat_strips(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.NlaStrip]:
+def _unmuted_strips(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.NlaStrip]:
+    """Yield the unmuted strips, with those inside of meta strips."""
     for strip in strips:
         if not strip.mute:
             yield strip
-            yield from _flat_strips(strip.strips)
+            yield from _unmuted_strips(strip.strips)
 
 
 def curves_with_actions(datablock: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> list[bpy.types.FCurve]:
-    """Find the F-curves that animate a datablock, and those that would if these actions were assigned to it."""
+    """Find the F-curves that animate a datablock, and those that would animate it if it had one of these actions."""
     return [*active_curves(datablock), *(curve for action in actions for curve in curves_of(action, datablock))]
 
 
 def changes_value(curve: bpy.types.FCurve) -> bool:
-    """Return whether the values of an F-curve differ, as far as its keyframes tell."""
+    """Return whether the value of an F-curve changes, judging by its keyframes, samples and modifiers."""
     if any(not modifier.mute for modifier in curve.modifiers) or len(curve.sampled_points):
         return True
-    points = curve.keyframe_points
-    if len(points) < 2 and curve.extrapolation == "CONSTANT":
+    keyframes = curve.keyframe_points
+    if len(keyframes) < 2 and curve.extrapolation == "CONSTANT":
         return False
-    values = np.concatenate([read(points, element).reshape(len(points), -1)[:, 1] for element in KEYFRAME_ELEMENTS[:3]])
-    return bool(len(points)) and float(np.ptp(values)) > MIN_CHANGE
+    values = np.concatenate(
+        [read(keyframes, element).reshape(len(keyframes), -1)[:, 1] for element in KEYFRAME_ELEMENTS[:3]]
+    )
+    return bool(len(keyframes)) and float(np.ptp(values)) > MIN_VALUE_CHANGE
 
 
 def value_range(curve: bpy.types.FCurve) -> tuple[float, float]:
     """Return the lowest and highest value of an F-curve at its whole frames."""
-    first, last = curve.range()
-    values = [curve.evaluate(frame) for frame in range(int(first), int(last) + 1)]
+    first_frame, last_frame = curve.range()
+    values = [curve.evaluate(frame) for frame in range(int(first_frame), int(last_frame) + 1)]
     return min(values), max(values)

@@ -7,7 +7,7 @@ from mathutils import Euler, Quaternion
 
 from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import STATIC_JOINT
-from .arrays import POSE_CHANNELS, POSE_MATRIX, Reader, write
+from .arrays import POSE_CHANNELS, POSE_MATRIX_ELEMENT, PropertyReader, write
 from .controls import set_control
 from .scene_rig import SceneRig
 
@@ -23,12 +23,12 @@ def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.nd
     return np.array(matrices, np.float64).reshape(-1, 4, 4)
 
 
-_REST_POSE = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
+_REST_CHANNEL_VALUES = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
 """The values of `POSE_CHANNELS` in the rest pose."""
 
 
 class PoseMatrixReader:
-    """Reads the pose matrices of bones into the same memory each time."""
+    """Reads the pose matrices of bones into an array that it reuses."""
 
     def __init__(self, armature_object: bpy.types.Object, names: tuple[str, ...]):
         """Prepare to read bones.
@@ -40,51 +40,53 @@ class PoseMatrixReader:
         Raises:
             KeyError: the armature lacks a bone.
         """
-        index = {bone.name: bone_index for bone_index, bone in enumerate(armature_object.pose.bones)}
-        self._count = len(index)
-        # An identity follows the bones, for the static joint.
-        order = np.array([index[name] if name != STATIC_JOINT else self._count for name in names], np.int32)
-        is_consecutive = np.array_equal(order, np.arange(len(order)))
-        self._order = slice(0, len(order)) if is_consecutive else order
-        self._matrices = np.empty((self._count + 1, 4, 4), np.float32)
+        bone_indices = {bone.name: bone_index for bone_index, bone in enumerate(armature_object.pose.bones)}
+        self._bone_count = len(bone_indices)
+        # The matrix after those of the bones is the identity, for the static joint.
+        matrix_indices = np.array(
+            [bone_indices[name] if name != STATIC_JOINT else self._bone_count for name in names], np.int32
+        )
+        is_consecutive = np.array_equal(matrix_indices, np.arange(len(matrix_indices)))
+        self._matrix_indices = slice(0, len(matrix_indices)) if is_consecutive else matrix_indices
+        self._matrices = np.empty((self._bone_count + 1, 4, 4), np.float32)
         self._matrices[-1] = np.eye(4)
-        self._bone_reader = Reader(POSE_MATRIX, self._matrices[:-1])
+        self._bone_reader = PropertyReader(POSE_MATRIX_ELEMENT, self._matrices[:-1])
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
         """Return whether the armature still has the same number of bones."""
-        return len(armature_object.pose.bones) == self._count
+        return len(armature_object.pose.bones) == self._bone_count
 
     def read(self, armature_object: bpy.types.Object) -> np.ndarray:
         """Read the pose matrices of an evaluated armature object, whose number of bones must not have changed (`fits`).
 
         Returns:
-            (J, 4, 4) float32, armature space, armature units. The next call overwrites the memory.
+            (J, 4, 4) float32, armature space, armature units. The next call may overwrite the array.
         """
         self._bone_reader.read(armature_object.pose.bones)
         # Blender stores matrices in column-major order.
-        return self._matrices[self._order].transpose(0, 2, 1)
+        return self._matrices[self._matrix_indices].transpose(0, 2, 1)
 
 
 def clear_pose(armature_object: bpy.types.Object) -> None:
     """Set every bone to its rest pose."""
     bones = armature_object.pose.bones
-    for channel, values in zip(POSE_CHANNELS, _REST_POSE, strict=True):
+    for channel, values in zip(POSE_CHANNELS, _REST_CHANNEL_VALUES, strict=True):
         write(bones, channel, np.tile(np.float32(values), (len(bones), 1)))
     armature_object.update_tag(refresh={"DATA"})
 
 
 class Poser:
-    """Sets poses that are given as values of channels. Everything else must be in the rest pose (`clear_pose`)."""
+    """Sets the channels of a pose. All other channels must be in the rest pose (`clear_pose`)."""
 
     def __init__(self, scene_rig: SceneRig, channels: tuple[Channel, ...]):
         self._scene_rig = scene_rig
         self._channels: dict[str, dict[str, list[tuple[int, int]]]] = {}
-        """By kind and name: the index and the axis of each channel."""
+        """Index and axis of each channel, by its kind and by the name of its bone or control."""
         for index, channel in enumerate(channels):
             self._channels.setdefault(channel.kind, {}).setdefault(channel.name, []).append((index, channel.axis))
 
     def set(self, values: np.ndarray) -> None:
-        """Set a pose without evaluating it.
+        """Set the channels, without an evaluation.
 
         Args:
             values: (C,) values in the order of the channels, each in its unit.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reads and writes properties of RNA collections as numpy arrays.
 
-`foreach_get` and `foreach_set` also accept an array of another type, a hundred times slower, and in some cases one that
-is too long. Here both are errors.
+`foreach_get` and `foreach_set` also accept an array of another type, which is a hundred times slower, and sometimes an
+array that is too long. The functions of this module raise an error in both cases.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Element:
+class ElementProperty:
     """A property of the elements of a collection.
 
     Attributes:
@@ -30,52 +30,52 @@ class Element:
         return np.empty((count, *self.shape), self.dtype)
 
 
-COORDINATE_ELEMENT = Element("co", np.float32, (3,))
-"""Of vertices and of the points of shape keys; object space."""
-VECTOR_ELEMENT = Element("vector", np.float32, (3,))
-"""Of vector attributes and of vertex normals."""
-COLOR_ELEMENT = Element("color", np.float32, (4,))
-"""Of color attributes: linear RGBA."""
-MUTE_ELEMENT = Element("mute", np.bool_)
-"""Of shape keys."""
-LOOP_START = Element("loop_start", np.int32)
-VERTEX_INDEX = Element("vertex_index", np.int32)
-MATERIAL_INDEX = Element("material_index", np.int32)
-TRIANGLE_ELEMENT = Element("vertices", np.int32, (3,))
-"""Of loop triangles."""
-POSE_MATRIX = Element("matrix", np.float32, (4, 4))
-"""Of pose bones: armature space, column-major."""
-REST_MATRIX = Element("matrix_local", np.float32, (4, 4))
-"""Of bones: armature space, column-major."""
+COORDINATE_ELEMENT = ElementProperty("co", np.float32, (3,))
+"""Position of a vertex or of a point of a shape key; object space."""
+VECTOR_ELEMENT = ElementProperty("vector", np.float32, (3,))
+"""Value of a vector attribute, or a vertex normal."""
+COLOR_ELEMENT = ElementProperty("color", np.float32, (4,))
+"""Value of a color attribute: linear RGBA."""
+MUTE_ELEMENT = ElementProperty("mute", np.bool_)
+"""Whether a shape key is muted."""
+LOOP_START_ELEMENT = ElementProperty("loop_start", np.int32)
+VERTEX_INDEX_ELEMENT = ElementProperty("vertex_index", np.int32)
+MATERIAL_INDEX_ELEMENT = ElementProperty("material_index", np.int32)
+TRIANGLE_ELEMENT = ElementProperty("vertices", np.int32, (3,))
+"""Vertices of a loop triangle."""
+POSE_MATRIX_ELEMENT = ElementProperty("matrix", np.float32, (4, 4))
+"""Matrix of a pose bone: armature space, column-major."""
+REST_MATRIX_ELEMENT = ElementProperty("matrix_local", np.float32, (4, 4))
+"""Rest matrix of a bone: armature space, column-major."""
 POSE_CHANNELS = (
-    Element("location", np.float32, (3,)),
-    Element("rotation_euler", np.float32, (3,)),
-    Element("rotation_quaternion", np.float32, (4,)),
-    Element("rotation_axis_angle", np.float32, (4,)),
-    Element("scale", np.float32, (3,)),
+    ElementProperty("location", np.float32, (3,)),
+    ElementProperty("rotation_euler", np.float32, (3,)),
+    ElementProperty("rotation_quaternion", np.float32, (4,)),
+    ElementProperty("rotation_axis_angle", np.float32, (4,)),
+    ElementProperty("scale", np.float32, (3,)),
 )
-"""Of pose bones: all properties that define a pose; angles in radians."""
+"""All properties of a pose bone that define its pose; angles in radians."""
 KEYFRAME_ELEMENTS = (
-    Element("co", np.float32, (2,)),
-    Element("handle_left", np.float32, (2,)),
-    Element("handle_right", np.float32, (2,)),
-    Element("interpolation", np.int32),
-    Element("easing", np.int32),
-    Element("amplitude", np.float32),
-    Element("back", np.float32),
-    Element("period", np.float32),
+    ElementProperty("co", np.float32, (2,)),
+    ElementProperty("handle_left", np.float32, (2,)),
+    ElementProperty("handle_right", np.float32, (2,)),
+    ElementProperty("interpolation", np.int32),
+    ElementProperty("easing", np.int32),
+    ElementProperty("amplitude", np.float32),
+    ElementProperty("back", np.float32),
+    ElementProperty("period", np.float32),
 )
-"""Of keyframe points: all properties that define the values of an F-curve."""
+"""All properties of a keyframe that define the values of an F-curve."""
 
 
-def read(collection: bpy.types.bpy_prop_collection, element: Element) -> np.ndarray:
+def read(collection: bpy.types.bpy_prop_collection, element: ElementProperty) -> np.ndarray:
     """Read the values of all elements of a collection, (n, *element.shape) of element.dtype."""
     values = element.empty(len(collection))
     collection.foreach_get(element.name, values.reshape(-1))
     return values
 
 
-def write(collection: bpy.types.bpy_prop_collection, element: Element, values: np.ndarray) -> None:
+def write(collection: bpy.types.bpy_prop_collection, element: ElementProperty, values: np.ndarray) -> None:
     """Set the values of all elements of a collection.
 
     Args:
@@ -86,52 +86,52 @@ def write(collection: bpy.types.bpy_prop_collection, element: Element, values: n
     Raises:
         ValueError: the array has another shape or type, or is not contiguous.
     """
-    if not _holds(values, element) or len(values) != len(collection):
-        raise _mismatch(collection, element, values)
+    if not _has_layout(values, element) or len(values) != len(collection):
+        raise _layout_error(collection, element, values)
     collection.foreach_set(element.name, values.reshape(-1))
 
 
-class Reader:
-    """Reads a property of a collection into the same memory each time.
+class PropertyReader:
+    """Reads a property of a collection into an array that it reuses.
 
     Attributes:
         element: the property.
-        values: (n, *element.shape) of element.dtype, as they were read last.
+        values: (n, *element.shape) of element.dtype, as of the last call of `read`.
     """
 
-    def __init__(self, element: Element, values: np.ndarray):
+    def __init__(self, element: ElementProperty, values: np.ndarray):
         """Prepare to read a property.
 
         Args:
             element: the property.
-            values: memory to read into, (n, *element.shape) of element.dtype, contiguous.
+            values: the array to read into, (n, *element.shape) of element.dtype, contiguous.
 
         Raises:
             ValueError: the array has another shape or type, or is not contiguous.
         """
-        if not _holds(values, element):
-            raise _mismatch("the memory to read into", element, values)
-        self.element, self.values, self._flat = element, values, values.reshape(-1)
+        if not _has_layout(values, element):
+            raise _layout_error("the array to read into", element, values)
+        self.element, self.values, self._flat_values = element, values, values.reshape(-1)
 
     def read(self, collection: bpy.types.bpy_prop_collection) -> None:
         """Read the values of a collection into `values`.
 
-        A collection with fewer than n elements is not noticed: counting bones takes Blender as long as reading them.
+        A collection with fewer than n elements raises no error, because counting bones takes as long as reading them.
 
         Raises:
             ValueError: the collection has more than n elements.
         """
         try:
-            collection.foreach_get(self.element.name, self._flat)
+            collection.foreach_get(self.element.name, self._flat_values)
         except (RuntimeError, TypeError) as error:
-            raise _mismatch(collection, self.element, self.values) from error
+            raise _layout_error(collection, self.element, self.values) from error
 
 
 def write_pixels(preview: bpy.types.ImagePreview, pixels: np.ndarray) -> None:
     """Write the pixels of a preview image.
 
     Args:
-        preview: the preview, of the size of the pixels.
+        preview: the preview; its size must be that of the pixels.
         pixels: (height, width, 4) float32, linear RGBA, rows from the bottom.
 
     Raises:
@@ -145,12 +145,13 @@ def write_pixels(preview: bpy.types.ImagePreview, pixels: np.ndarray) -> None:
     preview.image_pixels_float.foreach_set(pixels.ravel())
 
 
-def _holds(values: np.ndarray, element: Element) -> bool:
+def _has_layout(values: np.ndarray, element: ElementProperty) -> bool:
+    """Return whether an array has the dtype and shape of a property, and is contiguous."""
     return values.dtype == element.dtype and values.shape[1:] == element.shape and values.flags.c_contiguous
 
 
-def _mismatch(collection: object, element: Element, values: np.ndarray) -> ValueError:
-    expected = f"{element.shape} {np.dtype(element.dtype)} each"
-    order = "" if values.flags.c_contiguous else ", not contiguous"
-    actual = f"{values.shape} {values.dtype}{order}"
-    return ValueError(f"'{element.name}' of {collection} is {expected}, the array is {actual}.")
+def _layout_error(collection: object, element: ElementProperty, values: np.ndarray) -> ValueError:
+    expected_layout = f"{element.shape} {np.dtype(element.dtype)} each"
+    contiguity = "" if values.flags.c_contiguous else ", not contiguous"
+    actual_layout = f"{values.shape} {values.dtype}{contiguity}"
+    return ValueError(f"'{element.name}' of {collection} is {expected_layout}, the array is {actual_layout}.")

@@ -19,37 +19,37 @@ SEEK_TABLE_END = bytes.fromhex("b1ea928f")
 
 
 def save_copy(path: Path) -> None:
-    """Save a copy of the open file, completely or not at all; Blender remaps relative paths in it.
+    """Save a copy of the open file atomically; Blender remaps the relative paths in the copy.
 
     Raises:
         OutputError: the copy cannot be written.
     """
     check_writable(path)
-    with atomic_write(path) as temporary:
+    with atomic_write(path) as temporary_path:
         # Blender keeps a backup of a file that it overwrites.
-        remove_file(temporary)
+        remove_file(temporary_path)
         try:
             with silenced_stdout():
                 bpy.ops.wm.save_as_mainfile(
-                    filepath=blender_path(temporary), copy=True, compress=True, check_existing=False
+                    filepath=blender_path(temporary_path), copy=True, compress=True, check_existing=False
                 )
         except RuntimeError as error:
             raise OSError(report_message(error)) from error
         # On a full disk Blender 4.5 saves half of a compressed file and reports success.
-        if temporary.read_bytes()[-len(SEEK_TABLE_END) :] != SEEK_TABLE_END:
+        if temporary_path.read_bytes()[-len(SEEK_TABLE_END) :] != SEEK_TABLE_END:
             raise OSError("Blender wrote only a part of it, the disk may be full")
 
 
 def blender_path(path: Path) -> str:
-    """Return a path for Blender, which would truncate one that is too long and use another file.
+    """Return an absolute path for Blender, which would truncate a path that is too long.
 
     Raises:
         FDDAError: the path is too long.
     """
-    absolute = path.absolute()
-    if limit := path_length_problem(absolute):
-        raise FDDAError(f"Blender cannot open or write '{path}': {limit}; choose a shorter folder.")
-    return str(absolute)
+    absolute_path = path.absolute()
+    if problem := path_length_problem(absolute_path):
+        raise FDDAError(f"Blender cannot open or write '{path}': {problem}; choose a shorter folder.")
+    return str(absolute_path)
 
 
 def report_message(error: RuntimeError) -> str:
@@ -59,7 +59,7 @@ def report_message(error: RuntimeError) -> str:
 
 @contextlib.contextmanager
 def silenced_stdout() -> Iterator[None]:
-    """Discard Blender's own output ("Read blend: …"), so that stdout has only the results of a verb."""
+    """Discard Blender's own output ("Read blend: …"), so that stdout contains only the results of a verb."""
     sys.stdout.flush()
     stdout_copy = os.dup(1)
     try:

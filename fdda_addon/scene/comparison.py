@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Identifies comparison objects: copies of a character's mesh that show its rig beside or over it."""
+"""Identifies comparison objects: copies of a character's mesh object that show the rig beside or over it."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 import bpy
 
 COMPARISON_KEY = "fdda_compared"
-"""Custom property of a comparison object: the mesh object that it is compared with."""
+"""Custom property of a comparison object that refers to the mesh object with which it is compared."""
 
 
 def is_comparison(scene_object: bpy.types.Object) -> bool:
@@ -15,17 +15,17 @@ def is_comparison(scene_object: bpy.types.Object) -> bool:
     return scene_object.is_runtime_data and COMPARISON_KEY in scene_object
 
 
-def comparisons() -> list[bpy.types.Object]:
+def comparison_objects() -> list[bpy.types.Object]:
     """Return all comparison objects of the open file."""
     return [o for o in bpy.data.objects if is_comparison(o)]
 
 
 @contextmanager
-def hidden_comparisons() -> Iterator[None]:
+def hidden_comparison_objects() -> Iterator[None]:
     """Hide all comparison objects, so that Blender does not evaluate them."""
     from .temporary_state import temporary_attributes  # Blender starts without numpy.
 
     with ExitStack() as stack:
-        for other in comparisons():
-            stack.enter_context(temporary_attributes(other, hide_viewport=True))
+        for comparison_object in comparison_objects():
+            stack.enter_context(temporary_attributes(comparison_object, hide_viewport=True))
         yield

@@ -8,16 +8,16 @@ def animation_curves(action: bpy.types.Action) -> list[bpy.types.FCurve]:
     """Return the F-curves of all slots of an action (4.4 and later have layers and slots)."""
     if getattr(action, "layers", None):
         strips = (strip for layer in action.layers for strip in layer.strips)
-        return [curve for strip in strips for bag in strip.channelbags for curve in bag.fcurves]
+        return [curve for strip in strips for channelbag in strip.channelbags for curve in channelbag.fcurves]
     return list(getattr(action, "fcurves", ()))
 
 
 def slot_of(action: bpy.types.Action, datablock: bpy.types.ID) -> "bpy.types.ActionSlot | None":
     """Choose the slot with which an action animates a datablock; None if there is none (4.4 and later have slots).
 
-    It is the slot with the datablock's name, else the only slot. An armature object also takes another slot that
-    animates bones, so that it plays actions of other characters. The slot that it used last is ignored: the choice must
-    not depend on what was played before.
+    The slot is the one with the datablock's name, or else the only one. An armature object also accepts a slot with
+    another name that animates bones, so that it can play actions of other characters. The slot that the datablock used
+    last is ignored, because the choice must not depend on the action that was played before.
     """
     all_slots = getattr(action, "slots", ())
     slots = [slot for slot in all_slots if slot.target_id_type in {datablock.id_type, "UNSPECIFIED"}]
@@ -39,8 +39,8 @@ def curves_of(action: bpy.types.Action, datablock: bpy.types.ID) -> list[bpy.typ
 
 def curves_of_slot(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> list[bpy.types.FCurve]:
     """Return the F-curves of a slot of an action."""
-    bags = (strip.channelbag(slot) for layer in action.layers for strip in layer.strips)
-    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
+    channelbags = (strip.channelbag(slot) for layer in action.layers for strip in layer.strips)
+    return [curve for channelbag in channelbags if channelbag is not None for curve in channelbag.fcurves]
 
 
 def set_node_input(modifier: bpy.types.NodesModifier, identifier: str, value: object) -> None:
@@ -59,7 +59,7 @@ def node_input(modifier: bpy.types.NodesModifier, identifier: str) -> object:
 
 
 def is_selected(bone: bpy.types.PoseBone) -> bool:
-    """Return whether a bone is selected (5.0 and later store that in the pose bone)."""
+    """Return whether a bone is selected (5.0 and later store the selection in the pose bone)."""
     return selection_owner(bone).select
 
 

@@ -22,40 +22,40 @@ _FULL_DATA_PATH = re.compile(r'bpy\.data\.(?P<collection>\w+)\["(?P<name>(?:[^"\
 _SHAPE_KEY = re.compile(r'key_blocks\["(?P<name>(?:[^"\\]|\\.)*)"\]\.value')
 
 
-def control_at(scene_rig: SceneRig, text: str) -> str:
-    """Return the name of the control at a full data path, as Copy Full Data Path of Blender gives it.
+def control_at(scene_rig: SceneRig, full_data_path: str) -> str:
+    """Return the name of the control at a full data path, as Blender's operator Copy Full Data Path writes it.
 
     Args:
         scene_rig: the rig.
-        text: for example `bpy.data.objects["arm"].data.shape_keys.key_blocks["smile"].value`.
+        full_data_path: for example `bpy.data.objects["arm"].data.shape_keys.key_blocks["smile"].value`.
 
     Returns:
-        The name of a shape key, or OWNER/PATH; the text itself where it leads to no number of the rig.
+        The name of a shape key, or OWNER/PATH; the text itself if it is not the path of a number of the rig.
     """
-    match = _FULL_DATA_PATH.fullmatch(text.strip())
+    match = _FULL_DATA_PATH.fullmatch(full_data_path.strip())
     collection = getattr(bpy.data, match["collection"], None) if match else None
     if not isinstance(collection, bpy.types.bpy_prop_collection):
-        return text
+        return full_data_path
     datablock = collection.get(bpy.utils.unescape_identifier(match["name"]))
     if not is_number(datablock, match["path"]):
-        return text
+        return full_data_path
     struct_owner, path, _ = fcurve_target(datablock, match["path"])
     index = parent_and_name(datablock, match["path"])[2]
     owner = owner_name(scene_rig, struct_owner)
     shape_key = _SHAPE_KEY.fullmatch(path) if owner == SHAPE_KEYS else None
     if shape_key:
         return bpy.utils.unescape_identifier(shape_key["name"])
-    return f"{owner}/{path}{'' if index is None else f'[{index}]'}" if owner else text
+    return f"{owner}/{path}{'' if index is None else f'[{index}]'}" if owner else full_data_path
 
 
 def suggested_controls(scene_rig: SceneRig) -> list[str]:
     """Suggest the shape keys and custom properties that no driver sets, in the form that `parse_controls` reads."""
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     names = []
-    if keys := mesh_object.data.shape_keys:
-        blocks = [block for block in keys.key_blocks if block != keys.reference_key]
-        undriven = [block.name for block in blocks if not is_driven(keys, block.path_from_id("value"))]
-        names += [SHAPE_KEYS, *undriven] if undriven else []
+    if shape_keys := mesh_object.data.shape_keys:
+        key_blocks = [block for block in shape_keys.key_blocks if block != shape_keys.reference_key]
+        undriven_names = [block.name for block in key_blocks if not is_driven(shape_keys, block.path_from_id("value"))]
+        names += [SHAPE_KEYS, *undriven_names] if undriven_names else []
     for owner, datablock in ((ARMATURE_OBJECT, armature_object), (MESH_OBJECT, mesh_object)):
         names += [f"{owner}/{path}" for path in _custom_properties(datablock, "")]
     for bone in armature_object.pose.bones:

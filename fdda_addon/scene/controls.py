@@ -14,11 +14,11 @@ from ..core.errors import RigError
 from .scene_rig import SceneRig
 
 MAX_RANGE_WIDTH = 1e4
-"""A property with a wider range counts as one without a range."""
+"""A property with a wider range is treated as a property without a range."""
 
 _CONTROL_TEXT = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
-_CUSTOM = re.compile(r'(?P<owner>.*)\["(?P<name>(?:[^"\\]|\\.)*)"\]')
-_ELEMENT = re.compile(r"(?P<array>.+)\[(?P<index>\d+)\]")
+_CUSTOM_PROPERTY_PATH = re.compile(r'(?P<owner>.*)\["(?P<name>(?:[^"\\]|\\.)*)"\]')
+_ARRAY_ELEMENT_PATH = re.compile(r"(?P<array>.+)\[(?P<index>\d+)\]")
 
 
 def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
@@ -35,7 +35,7 @@ def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
 
 
 def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID) -> str:
-    """Return the inverse of `owner_of`; empty for a datablock that cannot have controls."""
+    """Return the name of a datablock as `Control.owner`; empty for a datablock that cannot have controls."""
     for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
         if owner_of(scene_rig, owner) == datablock:
             return owner
@@ -55,8 +55,8 @@ def make_control(
         scene_rig: the rig.
         owner, path: as in `Control`.
         bounds: the range of the control; None for the range of its property.
-        sampled_ranges: ranges of numbers that random poses set anyway, by the names of controls. They take precedence
-            over the ranges of properties.
+        sampled_ranges: ranges of the numbers that random poses set, by the names of their controls. They take
+            precedence over the ranges of properties.
 
     Raises:
         RigError: there is no such number, or it has no range.
@@ -106,13 +106,13 @@ def parse_controls(
 
 
 def _resolve_name(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
-    """Return the owners and paths that a name stands for."""
-    keys = scene_rig.mesh_object.data.shape_keys
-    blocks = [b for b in keys.key_blocks if b != keys.reference_key] if keys else []
+    """Return the owner and path of each control that a name refers to."""
+    shape_keys = scene_rig.mesh_object.data.shape_keys
+    key_blocks = [b for b in shape_keys.key_blocks if b != shape_keys.reference_key] if shape_keys else []
     if name == SHAPE_KEYS:
-        paths = [f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value' for block in blocks]
-        return [(SHAPE_KEYS, path) for path in paths if not is_driven(keys, path)]
-    if any(block.name == name for block in blocks):
+        paths = [f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value' for block in key_blocks]
+        return [(SHAPE_KEYS, path) for path in paths if not is_driven(shape_keys, path)]
+    if any(block.name == name for block in key_blocks):
         return [(SHAPE_KEYS, f'key_blocks["{bpy.utils.escape_identifier(name)}"].value')]
     owner, _, path = name.partition("/")
     return [(owner, path)]
@@ -120,10 +120,10 @@ def _resolve_name(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
 
 def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     """Return whether a driver sets a number."""
-    owner, array, index = fcurve_target(datablock, path)
+    owner, array_path, index = fcurve_target(datablock, path)
     animation = owner.animation_data
     return animation is not None and any(
-        (curve.data_path, curve.array_index) == (array, index) for curve in animation.drivers
+        (curve.data_path, curve.array_index) == (array_path, index) for curve in animation.drivers
     )
 
 
@@ -133,8 +133,8 @@ def is_number(datablock: bpy.types.ID | None, path: str) -> bool:
 
 
 def _split_index(path: str) -> tuple[str, int | None]:
-    """Split a path into that of an array and the index in it; the index is None if there is none."""
-    match = _ELEMENT.fullmatch(path)
+    """Split the path of an array element into array path and index; the index of another path is None."""
+    match = _ARRAY_ELEMENT_PATH.fullmatch(path)
     return (match["array"], int(match["index"])) if match else (path, None)
 
 
@@ -143,40 +143,40 @@ def parent_and_name(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.bpy_s
 
     The name of a custom property is `["NAME"]`.
     """
-    array, index = _split_index(path)
-    if match := _CUSTOM.fullmatch(array):
-        owner, name = match["owner"], array[len(match["owner"]) :]
+    array_path, index = _split_index(path)
+    if match := _CUSTOM_PROPERTY_PATH.fullmatch(array_path):
+        owner_path, name = match["owner"], array_path[len(match["owner"]) :]
     else:
-        owner, _, name = array.rpartition(".")
-    return datablock.path_resolve(owner) if owner else datablock, name, index
+        owner_path, _, name = array_path.rpartition(".")
+    return datablock.path_resolve(owner_path) if owner_path else datablock, name, index
 
 
 def fcurve_target(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.ID, str, int]:
-    """Return what an F-curve of a number refers to: the datablock that has it, its path there, and its array index.
+    """Return the datablock, the property path and the array index with which an F-curve animates a number.
 
-    A path may lead to another datablock, such as from a lattice object to the shape keys of its data.
+    The datablock may be another one than the given one: a path of a lattice object may lead to its shape keys.
     """
-    array, index = _split_index(path)
+    array_path, index = _split_index(path)
     try:
         struct, name, _ = parent_and_name(datablock, path)
         prefix = "" if struct == struct.id_data else struct.path_from_id()
     except ValueError:
-        return datablock, array, index or 0
+        return datablock, array_path, index or 0
     return struct.id_data, prefix + name if is_custom_property(name) or not prefix else f"{prefix}.{name}", index or 0
 
 
 def is_custom_property(name: str) -> bool:
-    """Return whether a name of `parent_and_name` is that of a custom property."""
+    """Return whether a property name from `parent_and_name` names a custom property."""
     return name.startswith('["')
 
 
 def custom_property_key(name: str) -> str:
-    """Return the key of a custom property from such a name."""
+    """Return the key of a custom property, given its name from `parent_and_name`."""
     return bpy.utils.unescape_identifier(name[2:-2])
 
 
 def write_value(datablock: bpy.types.ID, path: str, value: object) -> None:
-    """Set the value that `path_resolve` reads; a custom property does not tag its datablock."""
+    """Set the value at a path. Setting a custom property does not tag its datablock."""
     struct, name, index = parent_and_name(datablock, path)
     if index is not None:
         datablock.path_resolve(_split_index(path)[0])[index] = value
@@ -202,17 +202,17 @@ def _property_range(datablock: bpy.types.ID, path: str) -> tuple[float, float]:
         if isinstance(struct[key], bool):
             return 0.0, 1.0
         settings = struct.id_properties_ui(key).as_dict()
-        return _narrower(*((settings[f"{prefix}min"], settings[f"{prefix}max"]) for prefix in ("soft_", "")))
+        return _narrower_range(*((settings[f"{prefix}min"], settings[f"{prefix}max"]) for prefix in ("soft_", "")))
     if isinstance(struct, bpy.types.ShapeKey) and name == "value":
         return struct.slider_min, struct.slider_max
     prop = struct.bl_rna.properties[name]
     if prop.type == "BOOLEAN":
         return 0.0, 1.0
-    return _narrower((prop.soft_min, prop.soft_max), (prop.hard_min, prop.hard_max))
+    return _narrower_range((prop.soft_min, prop.soft_max), (prop.hard_min, prop.hard_max))
 
 
-def _narrower(soft: tuple[float, float], hard: tuple[float, float]) -> tuple[float, float]:
-    return soft if soft[1] - soft[0] <= hard[1] - hard[0] else hard
+def _narrower_range(soft_range: tuple[float, float], hard_range: tuple[float, float]) -> tuple[float, float]:
+    return soft_range if soft_range[1] - soft_range[0] <= hard_range[1] - hard_range[0] else hard_range
 
 
 class ControlReader:
@@ -244,7 +244,7 @@ class ControlReader:
         return self.values([owner and owner.evaluated_get(depsgraph) for owner in owners])
 
     def values(self, owners: Sequence[bpy.types.ID | None]) -> np.ndarray:
-        """Read the values as `read` does, from the evaluated owner of each control."""
+        """Read the values as `read` does, given the owner of each control, which may be an evaluated datablock."""
         values = np.zeros(len(self._controls), np.float32)
         for index, (owner, control) in enumerate(zip(owners, self._controls, strict=True)):
             value = None if owner is None else _value(owner, control.path)
@@ -274,17 +274,19 @@ def temporary_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[No
     `temporary_state.temporary_pose` does the same for the animation of the armature object.
     """
     names = list(names)
-    paths = [(owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)]
-    owners = {fcurve_target(*owner_and_path)[0] for owner_and_path in paths} - {scene_rig.armature_object}
+    owners_and_paths = [
+        (owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)
+    ]
+    owners = {fcurve_target(*owner_and_path)[0] for owner_and_path in owners_and_paths} - {scene_rig.armature_object}
     animations = [a for a in (owner.animation_data for owner in owners) if a is not None]
-    previous = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
+    previous_animations = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
     values = {name: owner_of(scene_rig, name.partition("/")[0]).path_resolve(name.partition("/")[2]) for name in names}
     for animation in animations:
         animation.use_nla, animation.action = False, None
     try:
         yield
     finally:
-        for animation, action, slot, use_nla in previous:
+        for animation, action, slot, use_nla in previous_animations:
             animation.action = action
             if action is not None and slot is not None:
                 animation.action_slot = slot

@@ -2,9 +2,9 @@
 """Caches values that panels and the polls of buttons need for every redraw.
 
 While an animation plays, Blender redraws the sidebar in every frame. A cached value lasts until Blender evaluates a
-change, loads a file or an undo step, or a job clears the cache. It lasts a second at most, because files change without
-notice; while an animation plays, it lasts until the animation stops. Without a window nothing is cached: scripts read
-values right after they have changed something.
+change, loads a file or an undo step, or a job clears the cache. It lasts a second at most, because Blender does not
+report changes of files; while an animation plays, it lasts until the animation stops. Without a window nothing is
+cached: scripts read values right after they have changed something.
 """
 
 import functools
@@ -21,25 +21,25 @@ _expires_at = 0.0
 
 def draw_cached(function: Callable) -> Callable:
     """Cache the results of a function by its arguments, which must be hashable; None is not cached."""
-    values: dict[tuple, object] = {}
-    _caches.append(values)
+    cached_results: dict[tuple, object] = {}
+    _caches.append(cached_results)
 
     @functools.wraps(function)
-    def look_up(*key: object) -> object:
+    def cached_function(*arguments: object) -> object:
         global _expires_at
         now = time.monotonic()
         if now > _expires_at or bpy.app.background:
             if bpy.app.background or not _is_animation_playing():
                 clear()
             _expires_at = now + MAX_AGE_SECONDS
-        value = values.get(key)
-        if value is None:
-            value = function(*key)
-            if value is not None:
-                values[key] = value
-        return value
+        result = cached_results.get(arguments)
+        if result is None:
+            result = function(*arguments)
+            if result is not None:
+                cached_results[arguments] = result
+        return result
 
-    return look_up
+    return cached_function
 
 
 def _is_animation_playing() -> bool:

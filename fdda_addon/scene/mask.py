@@ -20,15 +20,16 @@ def read_mask(mesh_object: bpy.types.Object) -> Mask | None:
     """Read the mask of a mesh object; return None if the model applies to the whole mesh.
 
     Args:
-        mesh_object: the original object, not an evaluated one. In edit mode the weights are those before the edit.
+        mesh_object: the original object, not an evaluated one. In edit mode, the weights are those before
+            the edit.
     """
-    group, is_inverted = mask_key(mesh_object)
-    if group < 0:
+    group_index, is_inverted = mask_key(mesh_object)
+    if group_index < 0:
         return None
     weights = np.zeros(len(mesh_object.data.vertices), np.float32)
     for vertex in mesh_object.data.vertices:
-        for element in vertex.groups:
-            if element.group == group:
-                weights[vertex.index] = element.weight
+        for group_element in vertex.groups:
+            if group_element.group == group_index:
+                weights[vertex.index] = group_element.weight
                 break
     return Mask.from_weights(1 - weights if is_inverted else weights)

@@ -5,11 +5,11 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from .arrays import COORDINATE_ELEMENT, LOOP_START, VECTOR_ELEMENT, VERTEX_INDEX, read, write
+from .arrays import COORDINATE_ELEMENT, LOOP_START_ELEMENT, VECTOR_ELEMENT, VERTEX_INDEX_ELEMENT, read, write
 
 
 def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Read the positions of a mesh before any deformation: those of the reference shape key, if there are keys.
+    """Read the undeformed positions of a mesh, from the reference shape key if the mesh has shape keys.
 
     Returns:
         (V, 3) float32, mesh-object space, mesh units.
@@ -25,7 +25,7 @@ def topology(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
         loop_starts: (F,) int32, index of the first element of each face in `loop_vertices`.
         loop_vertices: (L,) int32, vertex indices, face by face.
     """
-    return read(mesh.polygons, LOOP_START), read(mesh.loops, VERTEX_INDEX)
+    return read(mesh.polygons, LOOP_START_ELEMENT), read(mesh.loops, VERTEX_INDEX_ELEMENT)
 
 
 def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
@@ -37,11 +37,12 @@ def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Deps
     Raises:
         RigError: the evaluated mesh has another number of vertices.
     """
-    mesh, count = mesh_object.evaluated_get(depsgraph).data, len(mesh_object.data.vertices)
-    if len(mesh.vertices) != count:
+    mesh, vertex_count = mesh_object.evaluated_get(depsgraph).data, len(mesh_object.data.vertices)
+    if len(mesh.vertices) != vertex_count:
         raise RigError(
-            f"In some pose the modifiers of '{mesh_object.name}' turn {count} vertices into {len(mesh.vertices)}; look "
-            "for Geometry Nodes that make or remove vertices depending on the pose, and switch them off."
+            f"In some pose the modifiers of '{mesh_object.name}' turn {vertex_count} vertices into "
+            f"{len(mesh.vertices)}; look for Geometry Nodes that make or remove vertices depending on the pose, and "
+            "switch them off."
         )
     return mesh_positions(mesh)
 
@@ -68,6 +69,6 @@ def set_mesh_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:
         positions: (V, 3) float32, object space, mesh units.
     """
     if not len(positions):
-        # A mesh without vertices has no such attribute.
+        # A mesh without vertices has no position attribute.
         return
     write(mesh.attributes["position"].data, VECTOR_ELEMENT, positions)

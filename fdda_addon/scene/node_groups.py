@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Analyzes the nodes of Geometry Nodes groups, without evaluating them, for their effect on a mesh."""
+"""Determines the possible effect of Geometry Nodes groups on a mesh from their nodes, without an evaluation."""
 
 from collections.abc import Iterator
 from enum import Enum, auto
@@ -16,7 +16,8 @@ ATTRIBUTE_NODES = {
 POSITION_NODE = "GeometryNodeSetPosition"
 SIMULATION_NODES = {"GeometryNodeSimulationInput", "GeometryNodeSimulationOutput"}
 TIME_NODES = {"GeometryNodeInputSceneTime", *SIMULATION_NODES}
-UNLINKED = "unlinked"
+UNLINKED_GEOMETRY = "unlinked"
+"""Stands for a geometry input without a link, in place of a node type."""
 
 
 class GeometryEffect(Enum):
@@ -27,7 +28,7 @@ class GeometryEffect(Enum):
     POSITIONS = auto()
     """They move vertices, and keep their number and order."""
     ANY = auto()
-    """Their effect cannot be told without an evaluation."""
+    """Only an evaluation shows their effect."""
 
 
 def geometry_effect(tree: bpy.types.NodeTree | None) -> GeometryEffect:
@@ -53,13 +54,13 @@ def find_time_node(tree: bpy.types.NodeTree | None) -> bpy.types.Node | None:
 
 
 def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:
-    """Yield the types of the nodes that the output geometry passes, including those of nested groups."""
-    open_nodes = [n for n in tree.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output]
-    if not open_nodes:
-        yield UNLINKED
-    seen = {node.name for node in open_nodes}
-    while open_nodes:
-        node = open_nodes.pop()
+    """Yield the types of the nodes through which the output geometry passes, including nodes of nested groups."""
+    nodes_to_visit = [n for n in tree.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output]
+    if not nodes_to_visit:
+        yield UNLINKED_GEOMETRY
+    visited_names = {node.name for node in nodes_to_visit}
+    while nodes_to_visit:
+        node = nodes_to_visit.pop()
         if node.bl_idname != "NodeGroupOutput" and not node.mute:
             yield from _node_types(node)
         for socket in node.inputs:
@@ -67,10 +68,10 @@ def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:
                 continue
             links = [link for link in socket.links if not link.is_muted]
             if not links:
-                yield UNLINKED
-            sources = {link.from_node.name: link.from_node for link in links}
-            open_nodes += [source for name, source in sources.items() if name not in seen]
-            seen.update(sources)
+                yield UNLINKED_GEOMETRY
+            source_nodes = {link.from_node.name: link.from_node for link in links}
+            nodes_to_visit += [source for name, source in source_nodes.items() if name not in visited_names]
+            visited_names.update(source_nodes)
 
 
 def _node_types(node: bpy.types.Node) -> Iterator[str]:

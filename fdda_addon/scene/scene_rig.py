@@ -10,10 +10,10 @@ from ..core.errors import RigError
 from .comparison import is_comparison
 
 MODIFIER_NAME = "FDDA"
-"""Name of the Geometry Nodes modifier that shows a model's positions; it is never part of the rig."""
+"""Name of the FDDA modifier, which shows a model's positions with Geometry Nodes and is never part of the rig."""
 
 MIN_VOLUME = 1e-15
-"""An object whose matrix has a smaller determinant is flat: the inverse that positions need does not exist."""
+"""An object whose matrix has a smaller determinant is flat. The inverse that positions need does not exist."""
 
 
 @dataclass(frozen=True)
@@ -35,25 +35,25 @@ def find_rig(name: str = "") -> SceneRig:
     """
     meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
     if name:
-        named = bpy.context.scene.objects.get(name)
-        if named is None or named.type != "MESH":
+        named_object = bpy.context.scene.objects.get(name)
+        if named_object is None or named_object.type != "MESH":
             names = ", ".join(f"'{o.name}'" for o in meshes) or "none"
             raise RigError(f"The scene has no mesh object '{name}'; its mesh objects: {names}.")
-        meshes = [named]
+        meshes = [named_object]
     if not meshes:
         raise RigError("The scene has no mesh; open a file with a character that an armature deforms.")
-    rigged = [o for o in meshes if armature_modifier(o) is not None] or [
+    rigged_objects = [o for o in meshes if armature_modifier(o) is not None] or [
         o for o in meshes if armature_of(o) is not None
     ]
-    if not rigged:
-        if parented := [sentence for o in meshes if (sentence := parenting_message(o))]:
-            raise RigError(parented[0])
+    if not rigged_objects:
+        if messages := [message for o in meshes if (message := parenting_message(o))]:
+            raise RigError(messages[0])
         subject = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
         raise RigError(f"{subject} Armature modifier with an armature; add one, or choose another object.")
-    if len(rigged) > 1:
-        names = ", ".join(f"'{o.name}'" for o in rigged)
-        raise RigError(f"{len(rigged)} meshes have an Armature modifier ({names}); choose one with --object.")
-    return SceneRig(rigged[0], armature_of(rigged[0]))
+    if len(rigged_objects) > 1:
+        names = ", ".join(f"'{o.name}'" for o in rigged_objects)
+        raise RigError(f"{len(rigged_objects)} meshes have an Armature modifier ({names}); choose one with --object.")
+    return SceneRig(rigged_objects[0], armature_of(rigged_objects[0]))
 
 
 def find_rigs() -> list[SceneRig]:
@@ -63,8 +63,8 @@ def find_rigs() -> list[SceneRig]:
         RigError: there is no rig.
     """
     meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
-    rigged = [o for o in meshes if armature_modifier(o) is not None]
-    return [SceneRig(o, armature_of(o)) for o in rigged] or [find_rig()]
+    rigged_objects = [o for o in meshes if armature_modifier(o) is not None]
+    return [SceneRig(o, armature_of(o)) for o in rigged_objects] or [find_rig()]
 
 
 def is_flat(scene_object: bpy.types.Object) -> bool:
@@ -104,8 +104,9 @@ def parenting_message(mesh_object: bpy.types.Object) -> str:
 def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     """Find the armature object that deforms a mesh; return None if there is none.
 
-    It is the armature of the first Armature modifier. Without one, it is the first armature that the objects that the
-    modifiers read depend on: a cage or a lattice may have an Armature modifier, an empty may be the child of a bone.
+    It is the armature of the first Armature modifier. Without such a modifier, the search follows the objects that the
+    modifiers read, such as a cage with an Armature modifier or an empty that is the child of a bone. It returns the
+    first armature on which these objects depend.
     """
     modifier = armature_modifier(mesh_object)
     if modifier is not None:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Computes the skin weights that Blender's Armature modifier uses.
 
-The rules of the modifier (Blender's manual, Armature Modifier; blenkernel/intern/armature_deform.cc): It takes the
-weights of the vertex groups of deforming bones, times the bone's envelope where that multiplies. If it uses envelopes,
-a vertex in none of these groups gets the envelopes of all deforming bones. It divides the weights by their sum, and
-does not move a vertex whose sum is nearly zero. Its own vertex group scales the deformation.
+The modifier computes them as follows (Blender's manual, Armature Modifier; blenkernel/intern/armature_deform.cc). It
+reads the weights of the vertex groups of deforming bones, and multiplies them by the envelope of each bone that is set
+to Multiply Vertex Group with Envelope. If the modifier uses envelopes, a vertex in none of these groups is weighted by
+the envelopes of all deforming bones. The modifier divides the weights of each vertex by their sum, and does not move a
+vertex whose sum is nearly zero. The vertex group of the modifier itself scales the deformation.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from ..core.rig import STATIC_JOINT
 from .mesh import rest_positions
 
 MIN_INFLUENCES = 4
-"""Least number of columns of skin weight arrays (docs/formats.md)."""
+"""Smallest number of columns of skin weight arrays (docs/formats.md)."""
 MIN_WEIGHT_SUM = 1e-4
 """The modifier does not move a vertex whose weights have a smaller sum."""
 
@@ -26,7 +27,7 @@ class Skin:
     """Skin weights of a mesh, one entry for each pair of a vertex and a bone with a weight.
 
     Attributes:
-        bones: names of the bones that have weights; `STATIC_JOINT` if something follows no bone.
+        bones: names of the bones that have weights; includes `STATIC_JOINT` if a vertex does not follow bones entirely.
         vertices: (n,) int64, ascending.
         bone_indices: (n,) int64 indices into `bones`.
         weights: (n,) float32; those of a vertex sum to 1.
@@ -51,12 +52,16 @@ class Skin:
         Raises:
             KeyError: a bone that has weights is no joint.
         """
-        counts = np.bincount(self.vertices, minlength=self.vertex_count)
-        shape = (self.vertex_count, max(MIN_INFLUENCES, int(counts.max(initial=0))))
+        influence_counts = np.bincount(self.vertices, minlength=self.vertex_count)
+        shape = (self.vertex_count, max(MIN_INFLUENCES, int(influence_counts.max(initial=0))))
         skin_joints, skin_weights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
-        slots = np.arange(len(self.vertices)) - np.repeat(np.cumsum(counts) - counts, counts)
-        skin_joints[self.vertices, slots] = np.array([joints[name] for name in self.bones], np.int32)[self.bone_indices]
-        skin_weights[self.vertices, slots] = self.weights
+        columns = np.arange(len(self.vertices)) - np.repeat(
+            np.cumsum(influence_counts) - influence_counts, influence_counts
+        )
+        skin_joints[self.vertices, columns] = np.array([joints[name] for name in self.bones], np.int32)[
+            self.bone_indices
+        ]
+        skin_weights[self.vertices, columns] = self.weights
         return skin_joints, skin_weights
 
 
@@ -68,56 +73,61 @@ def read_skin(
     Args:
         mesh_object: the mesh object.
         armature_object: the armature object that deforms it.
-        modifier: the Armature modifier; None if there is none, so that nothing follows a bone.
+        modifier: the Armature modifier; None if there is none, so that no vertex follows a bone.
     """
-    count = len(mesh_object.data.vertices)
+    vertex_count = len(mesh_object.data.vertices)
     bones = [bone for bone in armature_object.data.bones if bone.use_deform]
-    entries = _Entries(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))
+    entries = _SkinEntries(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))
     if modifier is not None:
-        has_group = np.zeros(count, bool)
+        has_group = np.zeros(vertex_count, bool)
         if modifier.use_vertex_groups:
             entries, has_group = _group_weights(mesh_object, armature_object, bones)
         if modifier.use_bone_envelopes and not has_group.all():
             ungrouped = np.flatnonzero(~has_group)
             entries = entries.concatenated(_envelope_weights(mesh_object, armature_object, bones, ungrouped))
-    factors = _modifier_factors(mesh_object, modifier, count)
-    sums = np.bincount(entries.vertices, entries.weights, count)
-    factors[sums <= MIN_WEIGHT_SUM] = 0
-    entries = entries.selected((entries.weights > 0) & (factors[entries.vertices] > 0))
+    deformation_factors = _modifier_factors(mesh_object, modifier, vertex_count)
+    weight_sums = np.bincount(entries.vertices, entries.weights, vertex_count)
+    deformation_factors[weight_sums <= MIN_WEIGHT_SUM] = 0
+    entries = entries.selected((entries.weights > 0) & (deformation_factors[entries.vertices] > 0))
     weights = (
-        entries.weights / np.bincount(entries.vertices, entries.weights, count).astype(np.float32)[entries.vertices]
+        entries.weights
+        / np.bincount(entries.vertices, entries.weights, vertex_count).astype(np.float32)[entries.vertices]
     )
-    entries = _Entries(entries.vertices, entries.bone_indices, weights * factors[entries.vertices].astype(np.float32))
-    static = np.flatnonzero(factors < 1)
-    static_joint = np.full(len(static), len(bones))
-    entries = entries.concatenated(_Entries(static, static_joint, (1 - factors[static]).astype(np.float32))).sorted()
-    names = np.array([*(bone.name for bone in bones), STATIC_JOINT], object)
-    used, bone_indices = np.unique(entries.bone_indices, return_inverse=True)
-    return Skin(tuple(names[used]), entries.vertices, bone_indices, entries.weights, count)
+    entries = _SkinEntries(
+        entries.vertices, entries.bone_indices, weights * deformation_factors[entries.vertices].astype(np.float32)
+    )
+    static_vertices = np.flatnonzero(deformation_factors < 1)
+    static_joint = np.full(len(static_vertices), len(bones))
+    entries = entries.concatenated(
+        _SkinEntries(static_vertices, static_joint, (1 - deformation_factors[static_vertices]).astype(np.float32))
+    ).sorted()
+    bone_names = np.array([*(bone.name for bone in bones), STATIC_JOINT], object)
+    used_bone_indices, bone_indices = np.unique(entries.bone_indices, return_inverse=True)
+    return Skin(tuple(bone_names[used_bone_indices]), entries.vertices, bone_indices, entries.weights, vertex_count)
 
 
 @dataclass(frozen=True)
-class _Entries:
+class _SkinEntries:
     """Weights as in `Skin`, with indices into all deforming bones, not yet divided by their sum."""
 
     vertices: np.ndarray
     bone_indices: np.ndarray
     weights: np.ndarray
 
-    def concatenated(self, other: "_Entries") -> "_Entries":
+    def concatenated(self, other: "_SkinEntries") -> "_SkinEntries":
         fields = ("vertices", "bone_indices", "weights")
-        return _Entries(*(np.concatenate([getattr(self, field), getattr(other, field)]) for field in fields))
+        return _SkinEntries(*(np.concatenate([getattr(self, field), getattr(other, field)]) for field in fields))
 
-    def selected(self, mask: np.ndarray) -> "_Entries":
-        return _Entries(self.vertices[mask], self.bone_indices[mask], self.weights[mask])
+    def selected(self, mask: np.ndarray) -> "_SkinEntries":
+        return _SkinEntries(self.vertices[mask], self.bone_indices[mask], self.weights[mask])
 
-    def sorted(self) -> "_Entries":
+    def sorted(self) -> "_SkinEntries":
         return self.selected(np.argsort(self.vertices, kind="stable"))
 
 
 def _group_weights(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone]
-) -> tuple[_Entries, np.ndarray]:
+) -> tuple[_SkinEntries, np.ndarray]:
     """Read the weights of vertex groups.
 
     Returns:
@@ -128,13 +138,13 @@ def _group_weights(
         group.index: bone_indices[group.name] for group in mesh_object.vertex_groups if group.name in bone_indices
     }
     rows = [
-        (vertex.index, group_bones[g.group], g.weight)
+        (vertex.index, group_bones[element.group], element.weight)
         for vertex in mesh_object.data.vertices
-        for g in vertex.groups
-        if g.group in group_bones
+        for element in vertex.groups
+        if element.group in group_bones
     ]
     vertices, indices, weights = zip(*rows, strict=True) if rows else ((), (), ())
-    entries = _Entries(np.array(vertices, np.int64), np.array(indices, np.int64), np.array(weights, np.float32))
+    entries = _SkinEntries(np.array(vertices, np.int64), np.array(indices, np.int64), np.array(weights, np.float32))
     has_group = np.zeros(len(mesh_object.data.vertices), bool)
     has_group[entries.vertices] = True
     if any(bone.use_envelope_multiply for bone in bones):
@@ -143,8 +153,8 @@ def _group_weights(
 
 
 def _multiply_envelopes(
-    mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone], entries: _Entries
-) -> _Entries:
+    mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone], entries: _SkinEntries
+) -> _SkinEntries:
     """Multiply the weights by the envelopes of the bones that are set to multiply."""
     weights = entries.weights.copy()
     points = _rest_points(mesh_object, armature_object, np.arange(len(mesh_object.data.vertices)))
@@ -152,21 +162,21 @@ def _multiply_envelopes(
         if bone.use_envelope_multiply:
             rows = np.flatnonzero(entries.bone_indices == bone_index)
             weights[rows] *= _envelope(bone, points[entries.vertices[rows]])
-    return _Entries(entries.vertices, entries.bone_indices, weights)
+    return _SkinEntries(entries.vertices, entries.bone_indices, weights)
 
 
 def _envelope_weights(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone], vertices: np.ndarray
-) -> _Entries:
+) -> _SkinEntries:
     """Compute the weights of the envelopes of all bones for some vertices, given by their (n,) int64 indices."""
     points = _rest_points(mesh_object, armature_object, vertices)
     bone_weights = [_envelope(bone, points) * bone.envelope_weight for bone in bones]
-    inside = [np.flatnonzero(weights > 0) for weights in bone_weights]
-    positive = [weights[rows] for weights, rows in zip(bone_weights, inside, strict=True)]
-    return _Entries(
-        np.concatenate([np.zeros(0, np.int64), *(vertices[rows] for rows in inside)]),
-        np.repeat(np.arange(len(bones)), [len(rows) for rows in inside]),
-        np.concatenate([np.zeros(0), *positive]).astype(np.float32),
+    rows_inside = [np.flatnonzero(weights > 0) for weights in bone_weights]
+    positive_weights = [weights[rows] for weights, rows in zip(bone_weights, rows_inside, strict=True)]
+    return _SkinEntries(
+        np.concatenate([np.zeros(0, np.int64), *(vertices[rows] for rows in rows_inside)]),
+        np.repeat(np.arange(len(bones)), [len(rows) for rows in rows_inside]),
+        np.concatenate([np.zeros(0), *positive_weights]).astype(np.float32),
     )
 
 
@@ -200,15 +210,15 @@ def _rest_points(mesh_object: bpy.types.Object, armature_object: bpy.types.Objec
 
 
 def _modifier_factors(
-    mesh_object: bpy.types.Object, modifier: bpy.types.ArmatureModifier | None, count: int
+    mesh_object: bpy.types.Object, modifier: bpy.types.ArmatureModifier | None, vertex_count: int
 ) -> np.ndarray:
     """Return the factor by which the modifier's vertex group scales the deformation of each vertex, (V,) float64."""
     if modifier is None:
-        return np.zeros(count)
+        return np.zeros(vertex_count)
     group = mesh_object.vertex_groups.get(modifier.vertex_group) if modifier.vertex_group else None
     if group is None:
-        return np.ones(count)
-    weights = np.zeros(count)
+        return np.ones(vertex_count)
+    weights = np.zeros(vertex_count)
     for vertex in mesh_object.data.vertices:
-        weights[vertex.index] = next((g.weight for g in vertex.groups if g.group == group.index), 0.0)
+        weights[vertex.index] = next((element.weight for element in vertex.groups if element.group == group.index), 0.0)
     return 1 - weights if modifier.invert_vertex_group else weights

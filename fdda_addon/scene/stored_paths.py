@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Stores the paths of models and recordings in the open file, and remaps them when it is saved into another folder.
 
-Blender remaps the paths of its own data then, but not those of an add-on.
+Blender then remaps the paths of its own data, but not the paths that an add-on stores.
 """
 
 import os
@@ -11,10 +11,11 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-RELATIVE = "//"
+RELATIVE_PREFIX = "//"
+"""Start of a path that is relative to the folder of the .blend file."""
 
-_remapped: list[tuple[bpy.types.PropertyGroup, str, str]] = []
-"""During a save: property groups, property names and previous values of the remapped paths."""
+_remapped_paths: list[tuple[bpy.types.PropertyGroup, str, str]] = []
+"""Property groups, property names and previous values of the paths that are remapped during a save."""
 _path_before_save = ""
 
 
@@ -26,14 +27,14 @@ def resolve_path(stored: str, library: bpy.types.Library | None = None) -> Path:
         library: the linked file that has the path; None for the open file.
     """
     folder = resolve_path(library.filepath).parent if library else Path(bpy.data.filepath).parent
-    if stored.startswith(RELATIVE):
+    if stored.startswith(RELATIVE_PREFIX):
         # Blender writes backslashes on Windows, and reads both separators on every system.
         stored = stored.replace("\\", "/")
     return Path(bpy.path.abspath(stored, start=str(folder)))
 
 
 def absolute_path(mesh_object: bpy.types.Object, stored: str) -> Path:
-    """Make a path absolute that is stored with an object, whether it may be followed or not."""
+    """Make a path that is stored with an object absolute, without checking whether its folder is trusted."""
     return Path(os.path.normpath(resolve_path(stored, path_owner(mesh_object, stored).library)))
 
 
@@ -47,12 +48,16 @@ def stored_path_for(mesh_object: bpy.types.Object, path: Path) -> str:
     for stored in _inherited_paths(mesh_object):
         if stored and absolute_path(mesh_object, stored) == Path(os.path.normpath(path.absolute())):
             return stored
-    return _unlike_inherited(mesh_object, stored_path(path))
+    return _distinct_from_inherited(mesh_object, stored_path(path))
 
 
-def _unlike_inherited(mesh_object: bpy.types.Object, stored: str) -> str:
-    """Return a path in a form that differs from the library's paths, which are relative to the library."""
-    return f"{RELATIVE}./{stored.removeprefix(RELATIVE)}" if stored in _inherited_paths(mesh_object) else stored
+def _distinct_from_inherited(mesh_object: bpy.types.Object, stored: str) -> str:
+    """Return a path in a form that differs from all inherited paths, because those are relative to the library."""
+    return (
+        f"{RELATIVE_PREFIX}./{stored.removeprefix(RELATIVE_PREFIX)}"
+        if stored in _inherited_paths(mesh_object)
+        else stored
+    )
 
 
 def path_owner(mesh_object: bpy.types.Object, stored: str) -> bpy.types.Object:
@@ -63,7 +68,7 @@ def path_owner(mesh_object: bpy.types.Object, stored: str) -> bpy.types.Object:
 
 
 def _inherited_paths(mesh_object: bpy.types.Object) -> list[str]:
-    """Return the paths that a library override inherits; none for another object."""
+    """Return the paths that a library override inherits; empty for an object that is not a library override."""
     override = mesh_object.override_library
     if override is None or override.reference is None:
         return []
@@ -93,29 +98,29 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 @persistent
-def _on_save_pre(file: str = "", *_: object) -> None:
+def _on_save_pre(file_path: str = "", *_: object) -> None:
     global _path_before_save
-    _remapped.clear()
+    _remapped_paths.clear()
     _path_before_save = bpy.data.filepath
-    folder = Path(os.path.abspath(file)).parent
-    if not file or (_path_before_save and folder == Path(os.path.normpath(_path_before_save)).parent):
+    folder = Path(os.path.abspath(file_path)).parent
+    if not file_path or (_path_before_save and folder == Path(os.path.normpath(_path_before_save)).parent):
         return
     for mesh_object, owner, name in _own_paths():
         stored = getattr(owner, name)
         path = Path(os.path.normpath(resolve_path(stored)))
-        # Absolute paths stay absolute, except those into the folder that the file is saved into.
-        if (stored.startswith(RELATIVE) and _path_before_save) or path.is_relative_to(folder):
-            _remapped.append((owner, name, stored))
-            setattr(owner, name, _unlike_inherited(mesh_object, _relative(path, folder)))
+        # Absolute paths stay absolute, except paths into the folder into which the file is saved.
+        if (stored.startswith(RELATIVE_PREFIX) and _path_before_save) or path.is_relative_to(folder):
+            _remapped_paths.append((owner, name, stored))
+            setattr(owner, name, _distinct_from_inherited(mesh_object, _relative(path, folder)))
 
 
 @persistent
 def _on_save_post(*_: object) -> None:
-    # After a copy was saved, or a save has failed, the open file is the same as before.
+    # If a copy was saved or the save failed, the open file still has its previous path.
     if bpy.data.filepath == _path_before_save:
-        for owner, name, stored in _remapped:
+        for owner, name, stored in _remapped_paths:
             setattr(owner, name, stored)
-    _remapped.clear()
+    _remapped_paths.clear()
 
 
 HANDLERS = {"save_pre": _on_save_pre, "save_post": _on_save_post, "save_post_fail": _on_save_post}

@@ -18,17 +18,17 @@ def temporary_pose(
 
     Args:
         armature_object: the armature object, not in the NLA's tweak mode, in which its action cannot be changed.
-        actions: actions that will be assigned to it. Everything else that they animate is restored too: transforms of
-            the object, custom properties.
-        keep_animation: keep its own action and NLA.
+        actions: actions that will be assigned to the armature object. All other properties that they animate are
+            restored too, such as transforms of the object and custom properties.
+        keep_animation: keep the action and the NLA of the armature object.
     """
     scene = bpy.context.scene
     bones = armature_object.pose.bones
     frame, subframe = scene.frame_current, scene.frame_subframe
-    pose = {channel: read(bones, channel) for channel in POSE_CHANNELS}
+    pose_values = {channel: read(bones, channel) for channel in POSE_CHANNELS}
     animation = armature_object.animation_data
     kept_actions = driving_actions(animation) if keep_animation and animation is not None else ()
-    animated = animated_values(armature_object, [*actions, *kept_actions])
+    animated_before = animated_values(armature_object, [*actions, *kept_actions])
     if animation is not None:
         action, use_nla = animation.action, animation.use_nla
         slot = getattr(animation, "action_slot", None)
@@ -44,14 +44,14 @@ def temporary_pose(
         else:
             animation.action = action
             if action is not None and hasattr(animation, "action_slot"):
-                # Blender chooses a slot when an action is assigned, also where there was none.
+                # Blender chooses a slot when an action is assigned, even if there was none before.
                 animation.action_slot = slot
             animation.use_nla = use_nla
-        # The frame first: evaluating it sets animated channels, and the restored pose may differ from the keyframes.
+        # Set the frame first: it sets animated channels, and the restored pose may differ from the keyframes.
         scene.frame_set(frame, subframe=subframe)
-        for path, value in animated.items():
+        for path, value in animated_before.items():
             set_value(armature_object, path, value)
-        for channel, values in pose.items():
+        for channel, values in pose_values.items():
             write(bones, channel, values)
         armature_object.update_tag(refresh={"DATA"})
         bpy.context.view_layer.update()
@@ -88,7 +88,7 @@ def read_value(owner: bpy.types.ID, path: str) -> object:
     """Return the number at an RNA path, or a copy of an array.
 
     Raises:
-        ValueError: the path leads nowhere.
+        ValueError: the path does not exist.
     """
     value = owner.path_resolve(path)
     return value[:] if hasattr(value, "__len__") else value
@@ -106,13 +106,13 @@ def set_value(owner: bpy.types.ID, path: str, value: object) -> None:
 @contextmanager
 def temporary_attributes(owner: object, **values: object) -> Iterator[None]:
     """Set attributes of an RNA struct, and restore the previous values afterwards."""
-    previous = {name: getattr(owner, name) for name in values}
+    previous_values = {name: getattr(owner, name) for name in values}
     try:
         for name, value in values.items():
             setattr(owner, name, value)
         yield
     finally:
-        for name, value in previous.items():
+        for name, value in previous_values.items():
             setattr(owner, name, value)
 
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Adds undo steps for changes that Blender adds no step for: those that a property of the window manager makes."""
+"""Adds undo steps for changes that properties of the window manager make, for which Blender adds none."""
 
 import bpy
 from bpy.app.handlers import persistent
 
 PUSH_DELAY_SECONDS = 0.3
-"""Time without a change before a step is added, because a number that is dragged changes many times."""
+"""Time without a change before a step is added, because dragging a number changes it many times."""
 
-_message = ""
+_pending_message = ""
 
 
 def push_undo_soon(message: str) -> None:
@@ -16,8 +16,8 @@ def push_undo_soon(message: str) -> None:
     Args:
         message: name of the step in Blender's undo history.
     """
-    global _message
-    _message = message
+    global _pending_message
+    _pending_message = message
     if bpy.app.background:
         return
     cancel_push()
@@ -28,12 +28,12 @@ def _push_undo() -> None:
     windows = bpy.context.window_manager.windows
     if windows:
         with bpy.context.temp_override(window=windows[0]):
-            bpy.ops.ed.undo_push(message=_message)
+            bpy.ops.ed.undo_push(message=_pending_message)
 
 
 @persistent
 def cancel_push(*_: object) -> None:
-    """Cancel the step that is to be added."""
+    """Cancel the pending undo step."""
     if bpy.app.timers.is_registered(_push_undo):
         bpy.app.timers.unregister(_push_undo)
 

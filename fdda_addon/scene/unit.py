@@ -11,7 +11,7 @@ def metres_per_unit(scene_object: bpy.types.Object) -> float:
     For an object with different scales along its axes, it uses their geometric mean.
 
     Returns:
-        The length, rounded to six digits, which is Blender's single precision, so that a meter is exactly 1.
+        The length, rounded to the six digits of Blender's numbers, so that the length of a meter is exactly 1.
     """
     settings = bpy.context.scene.unit_settings
     scale = settings.scale_length if settings.system != "NONE" else 1.0

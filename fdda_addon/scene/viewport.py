@@ -7,7 +7,8 @@ import bpy
 from mathutils import Vector
 
 VIEW_DISTANCE_RADII = 2.0
-"""Distance of the viewer in radii of the framed objects: these fill most of the view with Blender's default lens."""
+"""Distance of the viewer from framed objects, relative to their radius. With Blender's default lens, the objects fill
+most of the view."""
 DEFAULT_LENS_MM = 50
 
 
@@ -24,12 +25,14 @@ def frame_objects(objects: Iterable[bpy.types.Object]) -> None:
     corners = [o.matrix_world @ Vector(corner) for o in objects for corner in o.bound_box]
     if not corners:
         return
-    low, high = (Vector([pick(axis) for axis in zip(*corners, strict=True)]) for pick in (min, max))
-    radius = max((high - low).length / 2, 1e-6)
+    low_corner, high_corner = (
+        Vector([min_or_max(axis) for axis in zip(*corners, strict=True)]) for min_or_max in (min, max)
+    )
+    radius = max((high_corner - low_corner).length / 2, 1e-6)
     for screen in bpy.data.screens:
         for space in (area.spaces.active for area in screen.areas if area.type == "VIEW_3D"):
             if space.region_3d.view_perspective == "CAMERA":
                 space.region_3d.view_perspective = "PERSP"
-            space.region_3d.view_location = (low + high) / 2
+            space.region_3d.view_location = (low_corner + high_corner) / 2
             space.region_3d.view_distance = VIEW_DISTANCE_RADII * radius * max(1.0, space.lens / DEFAULT_LENS_MM)
             space.clip_start = min(space.clip_start, radius / 10)

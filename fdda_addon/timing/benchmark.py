@@ -27,7 +27,7 @@ from ..runtime import model_files, playback
 from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
-from ..scene.comparison import hidden_comparisons
+from ..scene.comparison import hidden_comparison_objects
 from ..scene.scene_rig import SceneRig, armature_modifier
 from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose
 from .frame_times import FrameTimes, compare_times
@@ -184,7 +184,10 @@ def temporary_animation(scene_rig: SceneRig, channels: tuple[Channel, ...] = ())
     """
     animation = scene_rig.armature_object.animation_data
     original_action = animation.action if animation else None
-    with hidden_comparisons(), temporary_pose(scene_rig.armature_object, [original_action] if original_action else []):
+    with (
+        hidden_comparison_objects(),
+        temporary_pose(scene_rig.armature_object, [original_action] if original_action else []),
+    ):
         action = original_action or key_random_poses(scene_rig, channels)
         assign_action(scene_rig.armature_object, action)
         try:

@@ -9,11 +9,11 @@ import pytest
 from fdda_addon.scene import arrays
 from fdda_addon.scene.arrays import (
     COORDINATE_ELEMENT,
-    LOOP_START,
+    LOOP_START_ELEMENT,
     POSE_CHANNELS,
-    POSE_MATRIX,
+    POSE_MATRIX_ELEMENT,
     VECTOR_ELEMENT,
-    Element,
+    ElementProperty,
     Reader,
 )
 from fdda_addon.scene.mesh import mesh_positions, set_mesh_positions
@@ -25,11 +25,11 @@ ELEMENTS_BY_OWNER = {
     "MeshNormalValue": (VECTOR_ELEMENT,),
     "FloatColorAttributeValue": (arrays.COLOR_ELEMENT,),
     "ShapeKey": (arrays.MUTE_ELEMENT,),
-    "MeshPolygon": (LOOP_START, arrays.MATERIAL_INDEX),
-    "MeshLoop": (arrays.VERTEX_INDEX,),
+    "MeshPolygon": (LOOP_START_ELEMENT, arrays.MATERIAL_INDEX_ELEMENT),
+    "MeshLoop": (arrays.VERTEX_INDEX_ELEMENT,),
     "MeshLoopTriangle": (arrays.TRIANGLE_ELEMENT,),
-    "PoseBone": (POSE_MATRIX, *POSE_CHANNELS),
-    "Bone": (arrays.REST_MATRIX,),
+    "PoseBone": (POSE_MATRIX_ELEMENT, *POSE_CHANNELS),
+    "Bone": (arrays.REST_MATRIX_ELEMENT,),
     "Keyframe": arrays.KEYFRAME_ELEMENTS,
 }
 """Declared elements by the RNA type that has them."""
@@ -64,7 +64,7 @@ def test_written_arrays_are_read_back(mesh):
         assert read_positions.dtype == np.float32 and np.array_equal(read_positions, positions)
     set_mesh_positions(mesh, -positions)
     assert [tuple(vertex.co) for vertex in mesh.vertices] == [tuple(row) for row in (-positions).tolist()]
-    assert arrays.read(mesh.polygons, LOOP_START).shape == (0,)
+    assert arrays.read(mesh.polygons, LOOP_START_ELEMENT).shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_reader_refuses_data_of_another_size(mesh):
 
 def test_a_missing_property_raises_attribute_error(mesh):
     with pytest.raises(AttributeError, match="nope"):
-        arrays.read(mesh.vertices, Element("nope", np.float32))
+        arrays.read(mesh.vertices, ElementProperty("nope", np.float32))
 
 
 def test_written_pixels_must_have_the_size_of_the_picture():

@@ -7,7 +7,7 @@ import pytest
 
 from fdda_addon.evaluation import side_by_side
 from fdda_addon.scene.active_rig import rigs_of_active_armature
-from fdda_addon.scene.comparison import comparisons, hidden_comparisons, is_comparison
+from fdda_addon.scene.comparison import comparison_objects, hidden_comparison_objects, is_comparison
 from fdda_addon.scene.scene_rig import armature_of, find_rig, find_rigs
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
@@ -55,7 +55,7 @@ def test_beside_is_the_rig_to_the_side_in_every_pose(active, scale, turned):
         np.testing.assert_allclose(apart, np.tile([apart[0, 0], 0, 0], (len(apart), 1)), atol=2e-5)
     bpy.ops.fdda.show_rig(placement="BESIDE", distance=3.0)
     bpy.context.view_layer.update()
-    assert len(comparisons()) == 1
+    assert len(comparison_objects()) == 1
     apart = world(side_by_side.find(active)) - rig_world(active)
     np.testing.assert_allclose(apart[:, 0], 3.0, atol=2e-5)
 
@@ -78,10 +78,10 @@ def test_off_leaves_nothing(active):
     for placement in ("BESIDE", "OVERLAY", "NONE"):
         bpy.ops.fdda.show_rig(placement=placement)
     assert before == counts()
-    assert side_by_side.display_mode(active) == "NONE" and not comparisons()
+    assert side_by_side.display_mode(active) == "NONE" and not comparison_objects()
     bpy.ops.fdda.show_rig(placement="BESIDE")
     bpy.ops.fdda.unbind()
-    assert not comparisons()
+    assert not comparison_objects()
     refused(bpy.ops.fdda.show_rig, "No model is bound")
 
 
@@ -101,7 +101,7 @@ def test_the_displayed_rig_is_not_saved_and_stays_visible(active, elbow, tmp_pat
     pose(angle=0.5)
     assert_plays(active, elbow.model)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    assert name not in bpy.data.objects and not comparisons()
+    assert name not in bpy.data.objects and not comparison_objects()
     assert len(bpy.context.scene.collection.objects) == links - 1
     assert bpy.data.objects[ELBOW].data.users == 1
     bpy.ops.wm.read_homefile(app_template="")
@@ -117,11 +117,11 @@ def test_undo_and_redo_hide_and_show_the_displayed_rig(active, elbow):
     bpy.ops.ed.undo_push(message="posed")
     for _ in range(3):
         bpy.ops.ed.undo()
-        assert len(comparisons()) == 1
+        assert len(comparison_objects()) == 1
         bpy.context.view_layer.update()
         assert_plays(bpy.data.objects[ELBOW], elbow.model)
         bpy.ops.ed.undo()
-        assert not comparisons()
+        assert not comparison_objects()
         bpy.context.view_layer.update()
         assert_plays(bpy.data.objects[ELBOW], elbow.model)
         bpy.ops.ed.redo()
@@ -136,13 +136,13 @@ def test_deleting_the_character_removes_the_displayed_rig(active):
     bpy.ops.fdda.show_rig(placement="OVERLAY")
     bpy.data.objects.remove(active)
     bpy.context.view_layer.update()
-    assert not comparisons()
+    assert not comparison_objects()
 
 
 def test_jobs_do_not_evaluate_the_displayed_rig(active, tmp_path):
     bpy.ops.fdda.show_rig(placement="BESIDE")
     other = side_by_side.find(active)
-    with hidden_comparisons():
+    with hidden_comparison_objects():
         assert other.hide_viewport
     assert not other.hide_viewport
     seen = []
@@ -159,4 +159,4 @@ def test_the_rig_of_an_override_is_displayed(pair):
     for mesh_object in pair:
         apart = world(side_by_side.find(mesh_object)) - rig_world(mesh_object)
         assert np.ptp(apart, axis=0).max() < 2e-5 and apart[:, 0].min() > 0.1
-    assert len(comparisons()) == 2
+    assert len(comparison_objects()) == 2
