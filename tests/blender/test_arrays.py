@@ -14,7 +14,7 @@ from fdda_addon.scene.arrays import (
     POSE_MATRIX_ELEMENT,
     VECTOR_ELEMENT,
     ElementProperty,
-    Reader,
+    PropertyReader,
 )
 from fdda_addon.scene.mesh import mesh_positions, set_mesh_positions
 
@@ -85,7 +85,7 @@ def test_an_array_of_the_wrong_type_is_named_and_not_written(mesh, values, shape
 
 
 def test_a_reader_refuses_data_of_another_size(mesh):
-    reader = Reader(VECTOR_ELEMENT, np.empty((3, 3), np.float32))
+    reader = PropertyReader(VECTOR_ELEMENT, np.empty((3, 3), np.float32))
     set_mesh_positions(mesh, np.full((3, 3), 2, np.float32))
     reader.read(mesh.attributes["position"].data)
     assert (reader.values == 2).all()
@@ -93,7 +93,7 @@ def test_a_reader_refuses_data_of_another_size(mesh):
     with pytest.raises(ValueError, match=r"'vector' of .*\[4\], FloatVectorAttribute.* the array is \(3, 3\) float32"):
         reader.read(mesh.attributes["position"].data)
     with pytest.raises(ValueError, match=r"'vector' of the memory to read into is .* the array is \(3, 3\) float64"):
-        Reader(VECTOR_ELEMENT, np.empty((3, 3)))
+        PropertyReader(VECTOR_ELEMENT, np.empty((3, 3)))
 
 
 def test_a_missing_property_raises_attribute_error(mesh):
