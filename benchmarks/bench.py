@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""All figures of speed with one command: `python benchmarks/bench.py OUT [--rig FILE.blend …]`.
+"""Measure all speed figures with one command: `python benchmarks/bench.py OUT [--rig FILE.blend …]`.
 
-Builds the arm at its three densities, records, trains and binds each, and measures; the same for every rig given.
-Writes OUT/bench.json and prints the results as a table, then the times as parts of those of the last run in OUT.
+Builds the arm at its three densities, records, trains and binds each arm, and measures it. Does the same for every rig
+that `--rig` names. Writes OUT/bench.json and prints the results as a table. Then prints each time divided by the same
+time of the previous run in OUT.
 """
 
 import argparse
@@ -22,7 +23,7 @@ POSES = 1000
 
 
 class ProcessCost(NamedTuple):
-    """What a command took."""
+    """Time and memory that a command took."""
 
     seconds: float
     peak_mb: float
@@ -34,7 +35,7 @@ def run(*arguments: object) -> ProcessCost:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
-    # Of this process alone; what the resource module says of all children never falls.
+    # wait4 gives the peak of this process alone. The resource module gives one maximum for all children.
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
@@ -43,19 +44,20 @@ def run(*arguments: object) -> ProcessCost:
 
 
 def measure(*arguments: object) -> dict:
-    """One measurement of `measure.py`, in a process of its own."""
+    """Run one measurement of `measure.py` in its own process and return its figures."""
     command = [sys.executable, str(ROOT / "benchmarks" / "measure.py"), *map(str, arguments)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return json.loads(done.stdout.strip().splitlines()[-1])
+    finished = subprocess.run(command, check=True, capture_output=True, text=True)
+    return json.loads(finished.stdout.strip().splitlines()[-1])
 
 
 def bench(name: str, rig: Path, folder: Path, poses: int) -> dict:
-    """Everything that is measured of one rig.
+    """Record, train and bind one rig, and return all its figures.
 
     Args:
-        name: of the rig. rig: its .blend file.
-        folder: where recording and model go.
-        poses: to record.
+        name: name of the rig.
+        rig: .blend file of the rig.
+        folder: folder for the recording and the model.
+        poses: number of poses to record.
     """
     recording, model, bound = folder / f"{name}_recording", folder / f"{name}.onnx", folder / f"{name}_bound.blend"
     shutil.rmtree(recording, ignore_errors=True)
@@ -83,47 +85,53 @@ def bench(name: str, rig: Path, folder: Path, poses: int) -> dict:
     }
 
 
-ROWS = (
+TABLE_ROWS = (
     ("rig, ms", lambda r: f"{_median(r, 'rig'):.2f}"),
     ("Armature modifier alone, ms", lambda r: f"{_median(r, 'linear'):.2f}"),
     ("FDDA, ms", lambda r: f"{_median(r, 'fdda'):.2f}"),
-    ("floor: FDDA with constant positions, ms", lambda r: f"{_median(r, 'floor'):.2f}"),
+    ("lower bound: FDDA with constant positions, ms", lambda r: f"{_median(r, 'floor'):.2f}"),
     ("the model alone, one pose, ms", lambda r: f"{_median(r, 'inference'):.2f}"),
     ("**rig / FDDA**", lambda r: f"**{r['frame']['ratio']:.2f}**"),
-    ("FDDA / (floor + model)", lambda r: f"{_median(r, 'fdda') / (_median(r, 'floor') + _median(r, 'inference')):.2f}"),
-    ("a character of a crowd of 20, ms", lambda r: f"{r['crowd']['ms_a_character']:.2f}"),
-    ("… as a part of one alone", lambda r: f"{100 * r['crowd']['ratio']:.0f} %"),
-    ("opening a bound file to its first right frame, s", lambda r: f"{r['cold_start']['seconds']:.2f}"),
-    ("recording, poses a second", lambda r: f"{r['recording']['poses_a_second']:.0f}"),
-    ("… as a part of a bare loop's", lambda r: f"{100 * r['recording']['ratio']:.0f} %"),
+    (
+        "FDDA / (lower bound + model)",
+        lambda r: f"{_median(r, 'fdda') / (_median(r, 'floor') + _median(r, 'inference')):.2f}",
+    ),
+    ("per character in a crowd of 20, ms", lambda r: f"{r['crowd']['ms_a_character']:.2f}"),
+    ("… in percent of a single character", lambda r: f"{100 * r['crowd']['ratio']:.0f} %"),
+    ("from opening a bound file to its first correct frame, s", lambda r: f"{r['cold_start']['seconds']:.2f}"),
+    ("recording, poses per second", lambda r: f"{r['recording']['poses_a_second']:.0f}"),
+    ("… in percent of a bare loop's", lambda r: f"{100 * r['recording']['ratio']:.0f} %"),
     ("`record`, s / MB", lambda r: f"{r['seconds']['record']:.0f} / {r['peak_memory_mb']['record']:.0f}"),
     ("`train`, s / MB", lambda r: f"{r['seconds']['train']:.0f} / {r['peak_memory_mb']['train']:.0f}"),
     ("model, MB", lambda r: f"{r['model_mb']:.1f}"),
     ("held-out error, mean / max, mm", lambda r: _format_errors(r["errors_mm"]["fdda"])),
     ("… of linear skinning", lambda r: _format_errors(r["errors_mm"]["linear"])),
-    ("… FDDA's part", lambda r: " / ".join(f"{100 * _part(r, figure):.1f} %" for figure in ("mean", "max"))),
+    (
+        "… FDDA / linear skinning",
+        lambda r: " / ".join(f"{100 * _error_ratio(r, statistic):.1f} %" for statistic in ("mean", "max")),
+    ),
 )
 
 
-def _median(result: dict, way: str) -> float:
-    return result["frame"][way]["median"]
+def _median(result: dict, timing: str) -> float:
+    return result["frame"][timing]["median"]
 
 
-def _part(result: dict, figure: str) -> float:
-    return result["errors_mm"]["fdda"][figure] / result["errors_mm"]["linear"][figure]
+def _error_ratio(result: dict, statistic: str) -> float:
+    return result["errors_mm"]["fdda"][statistic] / result["errors_mm"]["linear"][statistic]
 
 
 def _format_errors(errors: dict) -> str:
     return f"{errors['mean']:.3f} / {errors['max']:.1f}"
 
 
-def table(results: list[dict]) -> str:
-    """The results as Markdown, a column a rig."""
+def format_table(results: list[dict]) -> str:
+    """Format the results as a Markdown table with one column per rig."""
     lines = [
         "| | " + " | ".join(f"{r['name']}, {r['frame']['vertices']:,} vertices" for r in results) + " |",
         "|---" * (len(results) + 1) + "|",
     ]
-    lines += [f"| {label} | " + " | ".join(show(r) for r in results) + " |" for label, show in ROWS]
+    lines += [f"| {label} | " + " | ".join(format_cell(r) for r in results) + " |" for label, format_cell in TABLE_ROWS]
     return "\n".join(lines)
 
 
@@ -136,25 +144,25 @@ COMPARED_TIMES = (
 )
 
 
-def compare_with_last_run(last: list[dict], results: list[dict]) -> str:
-    """The times of each rig as parts of those of the last run, a line a rig; empty where none was measured before."""
-    before = {result["name"]: result for result in last}
+def compare_with_last_run(last_results: list[dict], results: list[dict]) -> str:
+    """Divide the times of each rig by those of the last run; one line per rig that both runs measured."""
+    previous = {result["name"]: result for result in last_results}
     return "\n".join(
         f"{r['name']}, now / last run: "
-        + ", ".join(f"{label} {show(r) / show(before[r['name']]):.2f}" for label, show in COMPARED_TIMES)
+        + ", ".join(f"{label} {get_time(r) / get_time(previous[r['name']]):.2f}" for label, get_time in COMPARED_TIMES)
         for r in results
-        if r["name"] in before
+        if r["name"] in previous
     )
 
 
-def machine() -> dict:
-    """What the figures were measured on."""
-    model = next(
+def describe_machine() -> dict:
+    """Describe the machine that the figures were measured on."""
+    processor = next(
         (line.partition(":")[2].strip() for line in _cpu_lines() if line.startswith("model name")), platform.machine()
     )
     return {
         "date": date.today().isoformat(),
-        "processor": model,
+        "processor": processor,
         "cores": os.cpu_count(),
         "python": sys.version.split()[0],
     }
@@ -166,30 +174,32 @@ def _cpu_lines() -> list[str]:
 
 
 def main() -> None:
-    """Measure what the command line asks for."""
+    """Measure the rigs that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("out", type=Path, help="folder for all that is made")
-    parser.add_argument("--densities", type=int, nargs="*", default=[1, 2, 3], help="of the arm (default 1 2 3)")
-    parser.add_argument("--rig", type=Path, action="append", default=[], help="a .blend file to measure as well")
+    parser.add_argument("out", type=Path, help="folder for all output")
+    parser.add_argument(
+        "--densities", type=int, nargs="*", default=[1, 2, 3], help="densities of the arm (default 1 2 3)"
+    )
+    parser.add_argument("--rig", type=Path, action="append", default=[], help="another .blend file to measure")
     parser.add_argument("--poses", type=int, default=POSES)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rigs = {f"arm{density}": options.out / f"arm{density}.blend" for density in options.densities}
     for density, rig in zip(options.densities, rigs.values(), strict=True):
         run("-m", "fdda_addon", "build-arm", rig, "--density", density)
-    path = options.out / "bench.json"
-    last = json.loads(path.read_text(encoding="utf-8"))["rigs"] if path.exists() else []
+    results_path = options.out / "bench.json"
+    last_results = json.loads(results_path.read_text(encoding="utf-8"))["rigs"] if results_path.exists() else []
     results = []
     for name, rig in (rigs | {rig.stem: rig for rig in options.rig}).items():
         results.append(bench(name, rig, options.out, options.poses))
-        about = machine() | {"blender": results[0]["frame"]["blender"]}
-        # After every rig: what one of them fails at costs only that one.
-        content = json.dumps({"machine": about, "rigs": results}, indent=1)
-        path.write_text(content, encoding="utf-8")
-    print(f"{about['date']}, Blender {about['blender']}, {about['processor']}, {about['cores']} cores\n")
-    print(table(results))
-    if compared := compare_with_last_run(last, results):
-        print(f"\n{compared}")
+        machine = describe_machine() | {"blender": results[0]["frame"]["blender"]}
+        # Write after every rig: when one rig fails, the results of the others are kept.
+        content = json.dumps({"machine": machine, "rigs": results}, indent=1)
+        results_path.write_text(content, encoding="utf-8")
+    print(f"{machine['date']}, Blender {machine['blender']}, {machine['processor']}, {machine['cores']} cores\n")
+    print(format_table(results))
+    if comparison := compare_with_last_run(last_results, results):
+        print(f"\n{comparison}")
 
 
 if __name__ == "__main__":

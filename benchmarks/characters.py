@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How well models stand in for many kinds of characters: `python benchmarks/characters.py OUT [NAME …]`.
+"""Measure how well models replace many kinds of rigs: `python benchmarks/characters.py OUT [NAME …]`.
 
-Builds the rows of `blend_fixtures.characters.rows`, records, trains, binds and compares each in the Blender whose
-Python runs it, writes OUT/LINE.json, and puts the results of all lines in OUT into the table of docs/characters.md.
+Builds each row of `blend_fixtures.characters.rows`, then records, trains, binds and compares it in the Blender whose
+Python runs this file. Writes OUT/VERSION.json, for example OUT/4.5.json. Then writes the results of all Blender
+versions in OUT to the tables of docs/characters.md.
 """
 
 import argparse
@@ -25,12 +26,12 @@ from blend_fixtures.characters.rows import ROWS, Row  # noqa: E402
 from blend_fixtures.characters.training import SMALL, Trainings  # noqa: E402
 
 PAGE = ROOT / "docs" / "characters.md"
-START, END = "<!-- make characters writes what follows -->", "<!-- until here -->"
-LINES = ("4.5", "5.2")
+START_MARKER, END_MARKER = "<!-- make characters writes what follows -->", "<!-- until here -->"
+BLENDER_VERSIONS = ("4.5", "5.2")
 
 
 def compare(rows: tuple[Row, ...], folder: Path) -> list[dict]:
-    """Record, train, bind and compare rows; a result for each mesh."""
+    """Record, train, bind and compare rows; return one result per mesh."""
     with Trainings() as trainings:
         for row in rows:
             print(f"{row.name}: record", file=sys.stderr)
@@ -38,52 +39,56 @@ def compare(rows: tuple[Row, ...], folder: Path) -> list[dict]:
             for recording, model in record_row(row, folder / row.name):
                 trainings.add(recording, model, "--epochs", row.epochs, *SMALL)
         print("train", file=sys.stderr)
-    found = []
+    results = []
     for row in rows:
         for result in compare_row(row, folder / row.name):
-            found.append({"row": row.name, **asdict(result)})
-            print(found[-1], file=sys.stderr)
-    return found
+            results.append({"row": row.name, **asdict(result)})
+            print(results[-1], file=sys.stderr)
+    return results
 
 
-def write_table(folder: Path) -> None:
-    """Put what the lines in a folder have come to into the page."""
-    files = [folder / f"{line}.json" for line in LINES]
-    lines = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()}
+def write_tables(folder: Path) -> None:
+    """Write the results of all Blender versions in a folder to the tables of the page."""
+    files = [folder / f"{version}.json" for version in BLENDER_VERSIONS]
+    runs = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()}
     text = PAGE.read_text(encoding="utf-8")
-    before, after = text.partition(START)[0], text.partition(END)[2]
-    PAGE.write_text(f"{before}{START}\n\n{table(lines)}\n\n{END}{after}", encoding="utf-8")
+    before, after = text.partition(START_MARKER)[0], text.partition(END_MARKER)[2]
+    PAGE.write_text(f"{before}{START_MARKER}\n\n{format_tables(runs)}\n\n{END_MARKER}{after}", encoding="utf-8")
 
 
-def table(lines: dict[str, dict]) -> str:
-    """The results of some lines as Markdown, by topic."""
-    header = "".join(f" {line}: linear skinning / FDDA, mm | part |" for line in lines)
-    parts = ["; ".join(f"{own['date']}, Blender {own['blender']}" for own in lines.values()) + "."]
+def format_tables(runs: dict[str, dict]) -> str:
+    """Format the results of some Blender versions as one Markdown table per topic."""
+    header = "".join(f" {version}: linear skinning / FDDA, mm | FDDA / linear |" for version in runs)
+    lines = ["; ".join(f"{run['date']}, Blender {run['blender']}" for run in runs.values()) + "."]
     for topic, rows in groupby(ROWS, lambda row: row.topic):
-        parts += ["", f"### {topic}", "", f"| |{header} played, m |", "|---" * (2 * len(lines) + 2) + "|"]
+        lines += ["", f"### {topic}", "", f"| |{header} played, m |", "|---" * (2 * len(runs) + 2) + "|"]
         for row in rows:
             for mesh in row.meshes:
-                own = [
-                    next(r for r in line["results"] if (r["row"], r["mesh"]) == (row.name, mesh))
-                    for line in lines.values()
+                results = [
+                    next(r for r in run["results"] if (r["row"], r["mesh"]) == (row.name, mesh))
+                    for run in runs.values()
                 ]
                 name = row.text + (f": `{mesh}`" if len(row.meshes) > 1 else "")
-                cells = "".join(_cells(row, result) for result in own)
-                parts.append(f"| {name} |{cells} {max(result['difference'] for result in own):.1g} |")
-    return "\n".join(parts)
+                cells = "".join(_format_cells(row, result) for result in results)
+                lines.append(f"| {name} |{cells} {max(result['difference'] for result in results):.1g} |")
+    return "\n".join(lines)
 
 
-def _cells(row: Row, result: dict) -> str:
+def _format_cells(row: Row, result: dict) -> str:
     linear, fdda = result["linear_mm"], result["fdda_mm"]
-    part = "exact" if row.is_linear else f"{100 * fdda / linear:.1f} %"
-    return f" {linear:.3f} / {fdda:.3f} | {part} |"
+    ratio = "exact" if row.is_linear else f"{100 * fdda / linear:.1f} %"
+    return f" {linear:.3f} / {fdda:.3f} | {ratio} |"
 
 
 def main() -> None:
-    """Compare the rows of the command line, or all."""
+    """Compare the rows that the command line names, or all rows."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("out", type=Path, help="folder for the results")
-    parser.add_argument("names", nargs="*", help="rows to compare and print, with no table; all when there are none")
+    parser.add_argument(
+        "names",
+        nargs="*",
+        help="rows to compare and print without writing the table; by default all rows, with the table",
+    )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rows = tuple(row for row in ROWS if row.name in options.names) or ROWS
@@ -94,10 +99,10 @@ def main() -> None:
     finally:
         fdda_addon.unregister()
     if rows is ROWS:
-        line = ".".join(map(str, bpy.app.version[:2]))
+        version = ".".join(map(str, bpy.app.version[:2]))
         content = {"blender": bpy.app.version_string, "date": date.today().isoformat(), "results": results}
-        (options.out / f"{line}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-        write_table(options.out)
+        (options.out / f"{version}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+        write_tables(options.out)
 
 
 if __name__ == "__main__":

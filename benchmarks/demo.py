@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`python benchmarks/demo.py FOLDER`: the arm from rig to playback, and how good it is, in one go."""
+"""Build, record, train, evaluate and bind the arm with one command: `python benchmarks/demo.py FOLDER`."""
 
 import math
 import shutil
@@ -25,30 +25,33 @@ from fdda_addon.training.process import trainer_command
 POSES, REFINED_POSES, HELD_OUT_POSES = 3000, 1000, 200
 MARGIN = 2.0
 EPOCHS = 50
-"""As many steps as 200 epochs of a quarter of the poses: to record the arm costs little, to train it does."""
+"""Four times the default number of poses for a quarter of the default epochs: as many training steps.
+
+Recording the arm is cheap compared with training it.
+"""
 VIEW = View(azimuth=15, elevation=50)
-FRAMES = {52: "reach", 110: "flex", 132: "fist", 190: "spread"}
-METACARPAL_RANGE = 20.0
+PICTURED_FRAMES = {52: "reach", 110: "flex", 132: "fist", 190: "spread"}
+METACARPAL_RANGE_DEGREES = 20.0
 
 
-def _degrees(*angles: float) -> tuple[float, float, float]:
+def _radians(*angles: float) -> tuple[float, float, float]:
     return tuple(math.radians(angle) for angle in angles)
 
 
-def _metacarpals(factor: float) -> dict[str, tuple[float, float, float]]:
-    """All four at `factor` times their range, neighbors one against the other."""
-    angle = factor * METACARPAL_RANGE
-    return {f"{finger}_0": _degrees(angle * (-1) ** i, 0, angle * (-1) ** i) for i, finger in enumerate(FINGERS)}
+def _metacarpal_rotations(factor: float) -> dict[str, tuple[float, float, float]]:
+    """Rotate all four metacarpals by `factor` times their range; neighbors rotate in opposite directions."""
+    angle = factor * METACARPAL_RANGE_DEGREES
+    return {f"{finger}_0": _radians(angle * (-1) ** i, 0, angle * (-1) ** i) for i, finger in enumerate(FINGERS)}
 
 
 EXTREME_POSES = (
-    NamedPose("elbow 3x its range, off its axis", {"elbow": _degrees(70, 0, 3 * ELBOW_FLEXION)}),
-    NamedPose("metacarpals 2.5x their range", _metacarpals(2.5)),
+    NamedPose("elbow 3x its range, off its axis", {"elbow": _radians(70, 0, 3 * ELBOW_FLEXION)}),
+    NamedPose("metacarpals 2.5x their range", _metacarpal_rotations(2.5)),
 )
 
 
 def main(folder: Path) -> int:
-    """Run the demo; everything it makes lies in the folder, what it made before is replaced.
+    """Run the demo. It writes all its files to the folder and replaces those of an earlier run.
 
     Returns:
         The exit status.
@@ -61,9 +64,9 @@ def main(folder: Path) -> int:
     refine = ["record", rig, recording, "--refine", model]
     for title, arguments in (
         ("1. The rig", ["build-arm", rig]),
-        ("2. Poses and recording", ["record", rig, recording, "--poses", POSES, "--margin", MARGIN]),
+        ("2. Recording", ["record", rig, recording, "--poses", POSES, "--margin", MARGIN]),
         ("3. Training", ["train", recording, model, "--epochs", EPOCHS]),
-        ("… and on, with more poses where the model is worst", [*refine, "--poses", REFINED_POSES]),
+        ("Refinement: more poses where the error is largest", [*refine, "--poses", REFINED_POSES]),
         ("", ["train", recording, model, "--epochs", EPOCHS, "--warm-start"]),
     ):
         if title:
@@ -73,11 +76,11 @@ def main(folder: Path) -> int:
 
     print("\n== 4. Evaluation", flush=True)
     evaluation = _evaluate(rig, model, evaluation_path, pictures)
-    # The report's page again, now with the held-out errors and the pictures.
-    page = ["-P", "-m", "trainer.report", str(folder / "report.json")]
+    # Write the report page again, now with the held-out errors and the pictures.
+    report_options = ["-P", "-m", "trainer.report", str(folder / "report.json")]
     command, environment = trainer_command([])
     subprocess.run(
-        [command[0], *page, "--pictures", str(pictures), "--evaluation", str(evaluation_path)],
+        [command[0], *report_options, "--pictures", str(pictures), "--evaluation", str(evaluation_path)],
         env=environment,
         check=True,
     )
@@ -86,17 +89,17 @@ def main(folder: Path) -> int:
     if status := run_verb(["bind", str(rig), str(model), str(bound)], "python -m fdda_addon"):
         return status
     print(f"\n{table(evaluation)}\n\nDone in {time.monotonic() - start:.0f} s:")
-    for path, what in (
+    for path, description in (
         (rig, "the rig"),
         (recording, f"{POSES + REFINED_POSES} poses and their residuals"),
         (model, "the model"),
-        (folder / "report.json", "the training in figures"),
-        (folder / "report.html", "the training, the errors and the pictures as a page"),
-        (evaluation_path, "the errors above, and those of each partition"),
-        (bound, "the model in place of the rig: open it and play"),
+        (folder / "report.json", "figures of the training"),
+        (folder / "report.html", "a page with the training, the errors and the pictures"),
+        (evaluation_path, "the errors above and the errors of each partition"),
+        (bound, "the character bound to the model: open it and play"),
         (pictures, "partitions, comparisons and heat maps"),
     ):
-        print(f"  {path}{'/' if path.is_dir() else ''}  {what}")
+        print(f"  {path}{'/' if path.is_dir() else ''}  {description}")
     return 0
 
 
@@ -108,15 +111,18 @@ def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
     write_json(out, evaluation.to_json())
 
     pictures.mkdir(exist_ok=True)
-    drive = evaluation.actions[0]
-    action_poses = [make_pictured_pose(drive, frame - 1, f"{name}, frame {frame}") for frame, name in FRAMES.items()]
-    beyond = [make_pictured_pose(errors, 0, errors.name) for errors in evaluation.named]
+    action_errors = evaluation.actions[0]
+    action_poses = [
+        make_pictured_pose(action_errors, frame - 1, f"{name}, frame {frame}")
+        for frame, name in PICTURED_FRAMES.items()
+    ]
+    outside_poses = [make_pictured_pose(errors, 0, errors.name) for errors in evaluation.named]
     draw_partitions(scene_rig, pictures / "1_partitions.png", VIEW)
-    for heat, prefix, kind in ((False, 2, "comparison"), (True, 3, "heat_map")):
-        draw_comparison(scene_rig, model, action_poses, pictures / f"{prefix}_{kind}.png", heat, view=VIEW)
-    for heat, prefix, kind in ((False, 4, "beyond"), (True, 5, "beyond_heat_map")):
-        title = "Beyond the range of motion" + (": distance from the true rig" if heat else "")
-        draw_comparison(scene_rig, model, beyond, pictures / f"{prefix}_{kind}.png", heat, title, VIEW)
+    for is_heat_map, prefix, kind in ((False, 2, "comparison"), (True, 3, "heat_map")):
+        draw_comparison(scene_rig, model, action_poses, pictures / f"{prefix}_{kind}.png", is_heat_map, view=VIEW)
+    for is_heat_map, prefix, kind in ((False, 4, "beyond"), (True, 5, "beyond_heat_map")):
+        title = "Outside the range of motion" + (": distance from the rig" if is_heat_map else "")
+        draw_comparison(scene_rig, model, outside_poses, pictures / f"{prefix}_{kind}.png", is_heat_map, title, VIEW)
     return evaluation
 
 

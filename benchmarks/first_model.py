@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How long a first model takes in the window: `blender --python benchmarks/first_model.py -- RIG.blend OUT`.
+"""Measure how long a first model takes in the window: `blender --python benchmarks/first_model.py -- RIG.blend OUT`.
 
-Goes the way of the manual with the mouse, from opening a file of the user's own to a model that plays: the section Rig,
-Human Ranges where the rig states none, Record, Train, Bind, the space bar. Needs a window, xdotool and imagemagick,
-and the installed extension with a Python that trains, as `make test-gui` does. Buttons are pressed as soon as they may
-be: a person adds the reading. Writes pictures and times.json into OUT, and ends Blender.
+Follows the manual with the mouse, from opening the user's file to playing the model: the section Rig, Human Ranges if
+the rig has no limits, Record, Train, Bind, the space bar. Needs a window, xdotool and imagemagick, and the installed
+extension with a Python that trains, as `make test-gui` does. Presses each button as soon as it is enabled; a person
+also needs time to read. Writes pictures and OUT/times.json, and quits Blender.
 """
 
 import json
@@ -25,44 +25,44 @@ from path_story import job_done, main_screen, part
 from window import check, over, picture, press, rest_mouse, until
 
 RIG, OUT = (Path(argument).resolve() for argument in sys.argv[sys.argv.index("--") + 1 :][:2])
-LIMIT = 300
-"""Seconds that it may take."""
+TIME_LIMIT_S = 300
+"""Time limit from opening the file to playing, seconds."""
 
-times: dict[str, float] = {}
+step_times: dict[str, float] = {}
 
 
-def character() -> bpy.types.Object:
-    """The mesh: the one with the most vertices that an armature deforms."""
+def find_character() -> bpy.types.Object:
+    """Return the mesh object with the most vertices that an armature deforms."""
     rigged = [
         o for o in bpy.context.scene.objects if o.type == "MESH" and any(m.type == "ARMATURE" for m in o.modifiers)
     ]
     return max(rigged, key=lambda o: len(o.data.vertices))
 
 
-def way() -> Iterator[float]:
-    """From the file to playing; seconds to wait."""
-    own = OUT / RIG.name
+def make_first_model() -> Iterator[float]:
+    """Go from opening the file to playing the model; yield the seconds to wait."""
+    user_file = OUT / RIG.name
     OUT.mkdir(parents=True, exist_ok=True)
-    shutil.copy(RIG, own)
-    own.chmod(0o644)
-    began = time.monotonic()
+    shutil.copy(RIG, user_file)
+    user_file.chmod(0o644)
+    start_time = time.monotonic()
 
-    def done(step: str) -> None:
-        times[step] = round(time.monotonic() - began, 1)
-        print(f"{times[step]:6.1f} s  {step}", flush=True)
+    def note_time(step: str) -> None:
+        step_times[step] = round(time.monotonic() - start_time, 1)
+        print(f"{step_times[step]:6.1f} s  {step}", flush=True)
 
-    bpy.ops.wm.open_mainfile(filepath=str(own), load_ui=False)
+    bpy.ops.wm.open_mainfile(filepath=str(user_file), load_ui=False)
     yield 1.0
     with over("WINDOW"):
         bpy.ops.object.select_all(action="DESELECT")
-        character().select_set(True)
-        bpy.context.view_layer.objects.active = character()
+        find_character().select_set(True)
+        bpy.context.view_layer.objects.active = find_character()
         bpy.ops.view3d.view_selected()
     yield from sidebar.show()
     yield 1.0
     yield from sidebar.open_section("rig")
     yield from picture(OUT / "1_rig.png")
-    done("opened, Rig read")
+    note_time("opened, rig read")
     yield from sidebar.open_section("poses")
     yield from picture(OUT / "2_poses.png")
     if not part("panels.poses").has_any_limits(part("scene.active_rig").cached_active_rig(bpy.context)):
@@ -72,46 +72,46 @@ def way() -> Iterator[float]:
     yield 0.5
     yield from picture(OUT / "3_pose.png")
     yield from sidebar.push("fdda.rest_pose", across=0.85)
-    done("ranges, a pose looked at")
+    note_time("ranges set, a pose previewed")
     yield from sidebar.open_section("recording")
     yield from sidebar.push("fdda.record(")
-    yield from job_done("record", LIMIT)
+    yield from job_done("record", TIME_LIMIT_S)
     yield from picture(OUT / "4_recorded.png")
-    done("recorded")
+    note_time("recorded")
     yield from sidebar.open_section("training")
     session = part("training.environment.session")
     if session.check_result is None:
         yield from sidebar.push("fdda.check_trainer", across=0.2)
-        yield from until(lambda: session.check_result is not None, 60, "the check does not end")
+        yield from until(lambda: session.check_result is not None, 60, "the check of the trainer does not end")
     yield 0.3
     yield from sidebar.push("fdda.train(")
-    yield from job_done("train", LIMIT)
+    yield from job_done("train", TIME_LIMIT_S)
     yield from picture(OUT / "5_trained.png")
-    done("trained")
+    note_time("trained")
     yield from sidebar.open_section("playback")
     yield from sidebar.push("fdda.bind(")
-    yield from until(lambda: character().fdda.is_bound, 20, "the button binds nothing")
-    check(not character().fdda.status, character().fdda.status)
-    done("bound")
+    yield from until(lambda: find_character().fdda.is_bound, 20, "the button does not bind the character")
+    check(not find_character().fdda.status, find_character().fdda.status)
+    note_time("bound")
     yield from rest_mouse()
     yield from press("space")
-    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar plays nothing")
-    done("playing")
+    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not start playback")
+    note_time("playing")
     yield 2.0
     yield from picture(OUT / "6_playing.png")
     yield from press("space")
-    check(character().fdda.mode == "FDDA" and not character().fdda.status, character().fdda.status)
-    (OUT / "times.json").write_text(json.dumps(times, indent=1))
-    check(times["playing"] < LIMIT, f"it took {times['playing']:.0f} s")
+    check(find_character().fdda.mode == "FDDA" and not find_character().fdda.status, find_character().fdda.status)
+    (OUT / "times.json").write_text(json.dumps(step_times, indent=1))
+    check(step_times["playing"] < TIME_LIMIT_S, f"the first model took {step_times['playing']:.0f} s")
 
 
-def tick(path: Iterator[float] = way()) -> float | None:  # noqa: B008
-    """The timer: one piece of the way."""
+def tick(steps: Iterator[float] = make_first_model()) -> float | None:  # noqa: B008
+    """Run the next step, as a timer of Blender."""
     try:
-        return next(path)
+        return next(steps)
     except StopIteration:
         bpy.ops.wm.quit_blender()
-    except Exception:  # Blender would print it and stay open.
+    except Exception:  # Blender would print the error and stay open.
         traceback.print_exc()
         for _ in picture(OUT / "failed.png"):
             pass

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gives a human with a Mixamo-style rig the range of motion of a person: `human_limits.py IN.blend OUT.blend`.
+"""Limit a human with a Mixamo-style rig to the range of motion of a person: `human_limits.py IN.blend OUT.blend`.
 
-Written as Limit Rotation constraints in local space. A person's ranges are about directions of the body, bones have
-axes of their own: every direction is given to the bone's axis that lies nearest to it, with the sign that fits.
+Writes the limits as Limit Rotation constraints in local space. A person's ranges are defined about directions of the
+body, and each bone has different axes. Each range applies to the axis of the bone that is nearest to the direction; the
+range is mirrored if that axis points the opposite way.
 """
 
 import math
@@ -14,10 +15,10 @@ from mathutils import Vector
 
 PREFIX = "mixamorig:"
 X, Y, Z = Vector((1, 0, 0)), Vector((0, 1, 0)), Vector((0, 0, 1))
-"""Directions of a character that stands along Z and looks along -Y; X points to its left."""
+"""Directions of the body: the character stands upright along Z and faces -Y, so that X points to its left."""
 
-# Bone: ranges in degrees about two directions of the body and about the bone itself (twist). Arms in a T pose, the
-# left side; the right one is its mirror image.
+# By bone: ranges in degrees about two directions of the body and about the bone itself (twist). They are for the left
+# side with the arms in a T-pose; the right side is mirrored.
 RANGES = {
     "Hips": ((X, -20, 20), (Y, -15, 15), (-20, 20)),
     "Spine": ((X, -10, 20), (Y, -12, 12), (-12, 12)),
@@ -42,50 +43,50 @@ RANGES = {
 }
 
 
-def ranges_of(name: str) -> tuple | None:
-    """The ranges of a bone, mirrored for the right side; None for one that is not in the list."""
+def body_ranges(name: str) -> tuple | None:
+    """Return the ranges of a bone, mirrored for the right side, or None if the bone is not in the list."""
     side = next((side for side in ("Left", "Right") if name.startswith(side)), "")
-    part = name.removeprefix(side)
-    part = part if part in RANGES else part.removeprefix("Hand")
-    key = part if part in RANGES else part[-1:]
-    found = RANGES.get(key)
-    if found is None or side != "Right":
-        return found
-    first, second, (low, high) = found
-    # Mirrored at the plane of Y and Z: rotations about X stay, the others turn round.
-    about = [(axis, *((low, high) if axis is X else (-high, -low))) for axis, low, high in (first, second)]
-    return (*about, (-high, -low))
+    base_name = name.removeprefix(side)
+    base_name = base_name if base_name in RANGES else base_name.removeprefix("Hand")
+    key = base_name if base_name in RANGES else base_name[-1:]
+    ranges = RANGES.get(key)
+    if ranges is None or side != "Right":
+        return ranges
+    first, second, (low, high) = ranges
+    # Mirroring at the YZ plane keeps rotations about X and reverses the others.
+    direction_ranges = [(axis, *((low, high) if axis is X else (-high, -low))) for axis, low, high in (first, second)]
+    return (*direction_ranges, (-high, -low))
 
 
 def local_ranges(bone: bpy.types.Bone, ranges: tuple) -> list[tuple[float, float]]:
-    """Ranges about the bone's own axes x, y and z, degrees."""
+    """Convert the ranges of a bone to rotations about the bone's x, y and z axes, degrees."""
     axes = bone.matrix_local.to_3x3().transposed()
-    (first, *bounds), (_, *others), twist = ranges
-    dots = {place: Vector(axes[place]).dot(first) for place in (0, 2)}
-    place = max(dots, key=lambda candidate: abs(dots[candidate]))
-    found = [None, twist, None]
-    found[place] = bounds if dots[place] > 0 else [-bounds[1], -bounds[0]]
-    other = 2 - place
-    sign = Vector(axes[other]).dot(ranges[1][0])
-    found[other] = others if sign > 0 else [-others[1], -others[0]]
-    return found
+    (first_direction, *first_range), (second_direction, *second_range), twist = ranges
+    dots = {axis: Vector(axes[axis]).dot(first_direction) for axis in (0, 2)}
+    first_axis = max(dots, key=lambda axis: abs(dots[axis]))
+    second_axis = 2 - first_axis
+    axis_ranges = [None, twist, None]
+    axis_ranges[first_axis] = first_range if dots[first_axis] > 0 else [-first_range[1], -first_range[0]]
+    second_dot = Vector(axes[second_axis]).dot(second_direction)
+    axis_ranges[second_axis] = second_range if second_dot > 0 else [-second_range[1], -second_range[0]]
+    return axis_ranges
 
 
-def main(source: Path, target: Path) -> None:
-    """Set the limits of every bone of the only armature, and save."""
-    bpy.ops.wm.open_mainfile(filepath=str(source.absolute()))
+def main(source_path: Path, output_path: Path) -> None:
+    """Limit the rotation of every bone of the only armature, and save."""
+    bpy.ops.wm.open_mainfile(filepath=str(source_path.absolute()))
     (armature_object,) = (o for o in bpy.data.objects if o.type == "ARMATURE")
     for bone in armature_object.pose.bones:
-        ranges = ranges_of(bone.name.removeprefix(PREFIX))
+        ranges = body_ranges(bone.name.removeprefix(PREFIX))
         if ranges is None:
-            sys.exit(f"The bone '{bone.name}' has no range here; add it to the list.")
+            sys.exit(f"The bone '{bone.name}' is not in RANGES of this file; add its ranges there.")
         limit = bone.constraints.new("LIMIT_ROTATION")
         limit.owner_space = "LOCAL"
         for axis, (low, high) in zip("xyz", local_ranges(bone.bone, ranges), strict=True):
             setattr(limit, f"use_limit_{axis}", True)
             setattr(limit, f"min_{axis}", math.radians(low))
             setattr(limit, f"max_{axis}", math.radians(high))
-    bpy.ops.wm.save_as_mainfile(filepath=str(target.absolute()), copy=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(output_path.absolute()), copy=True)
 
 
 if __name__ == "__main__":

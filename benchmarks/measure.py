@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One measurement of one rig, in a process of its own: `measure.py frames|recording|crowd|cold-start FILES…`.
+"""Run one measurement of one rig: `measure.py frames|recording|crowd|cold-start|inference FILES…`.
 
-Prints one line of JSON. `bench.py` starts it for every figure that it shows; what is compared is timed in one process,
-in turn.
+Prints one line of JSON. `bench.py` starts this script for every figure of its table. Times that are compared with each
+other are measured alternately in the same process.
 """
 
 import json
@@ -32,56 +32,56 @@ from fdda_addon.scene.temporary_state import temporary_pose
 from fdda_addon.timing.benchmark import benchmark, key_random_poses
 
 ROUNDS = 5
-CROWD = 20
+CROWD_SIZE = 20
 
 
 def frames(rig: str, model: str, count: str = "100") -> dict:
-    """A whole frame of rig, linear skinning, model and floor, as the verb `benchmark` times it."""
+    """Time a frame with the rig, linear skinning, the model and constant positions, as the verb `benchmark` does."""
     bpy.ops.wm.open_mainfile(filepath=rig)
-    *_, measured = benchmark(find_rig(), Path(model), int(count))
-    return measured.to_json()
+    *_, frame_times = benchmark(find_rig(), Path(model), int(count))
+    return frame_times.to_json()
 
 
 def recording(rig: str, poses: str = "60") -> dict:
-    """Poses a second of a recording, and of a loop that only poses and evaluates."""
+    """Return the poses per second of a recording, and of a loop that only sets poses and evaluates them."""
     bpy.ops.wm.open_mainfile(filepath=rig)
     scene_rig = find_rig()
     count = int(poses)
-    pairs = [(_bare_loop(scene_rig, count), _recording(scene_rig, count)) for _ in range(ROUNDS)]
-    bare, recorded = (statistics.median(pair[i] for pair in pairs) for i in (0, 1))
-    ratio = statistics.median(bare_s / recorded_s for bare_s, recorded_s in pairs)
-    return {"bare_poses_a_second": count / bare, "poses_a_second": count / recorded, "ratio": ratio}
+    pairs = [(_time_bare_loop(scene_rig, count), _time_recording(scene_rig, count)) for _ in range(ROUNDS)]
+    bare_loop_s, recording_s = (statistics.median(pair[i] for pair in pairs) for i in (0, 1))
+    ratio = statistics.median(pair[0] / pair[1] for pair in pairs)
+    return {"bare_poses_a_second": count / bare_loop_s, "poses_a_second": count / recording_s, "ratio": ratio}
 
 
-def _bare_loop(scene_rig: SceneRig, count: int) -> float:
+def _time_bare_loop(scene_rig: SceneRig, count: int) -> float:
     channels = sampled_channels(scene_rig, read_rig(scene_rig))
     poser = Poser(scene_rig, channels)
     with temporary_pose(scene_rig.armature_object):
         clear_pose(scene_rig.armature_object)
         values = [sample_pose(channels, 0, index) for index in range(count)]
-        return _seconds(lambda: [(poser.set(pose), bpy.context.view_layer.update()) for pose in values])
+        return _time_call(lambda: [(poser.set(pose), bpy.context.view_layer.update()) for pose in values])
 
 
-def _recording(scene_rig: SceneRig, count: int) -> float:
-    """Seconds of the stage "poses"; the influences are found once, whatever the number of poses."""
+def _time_recording(scene_rig: SceneRig, count: int) -> float:
+    """Time the stage "poses" alone: the stage before it takes the same time for any number of poses."""
     with tempfile.TemporaryDirectory() as folder:
-        started = 0.0
+        start_time = 0.0
         for step in record(scene_rig, Path(folder) / "recording", RecordingSettings(poses=count, influence_poses=1)):
-            if step.stage == "poses" and not started:
-                started = time.perf_counter()
-        return time.perf_counter() - started
+            if step.stage == "poses" and not start_time:
+                start_time = time.perf_counter()
+        return time.perf_counter() - start_time
 
 
 def crowd(bound: str) -> dict:
-    """A frame of one bound character and of a crowd, each in a pose of its own; and without the characters."""
+    """Time a frame with one bound character, with a crowd of differently posed copies, and with no character."""
     bpy.ops.wm.open_mainfile(filepath=bound)
     first = next(o for o in bpy.data.objects if o.fdda.is_bound)
     armature_object = armature_modifier(first).object
     if armature_object.animation_data is None or armature_object.animation_data.action is None:
         key_random_poses(SceneRig(first, armature_object))
-    one = _frame_times(60)
-    empty = _without_play(first)
-    for number in range(1, CROWD):
+    single_ms = _median_frame_ms(60)
+    hidden_ms = _median_hidden_frame_ms(first)
+    for number in range(1, CROWD_SIZE):
         mesh_copy, armature_copy = first.copy(), armature_object.copy()
         for copy in (mesh_copy, armature_copy):
             bpy.context.scene.collection.objects.link(copy)
@@ -90,64 +90,64 @@ def crowd(bound: str) -> dict:
         mesh_copy.parent = armature_copy if first.parent else None
         armature_modifier(mesh_copy).object = armature_copy
         _shift_action(armature_copy, number * 7)
-    many = _frame_times(60)
+    crowd_ms = _median_frame_ms(60)
     return {
-        "one_ms": one,
-        "switched_off_ms": empty,
-        "characters": CROWD,
-        "crowd_ms": many,
-        "ms_a_character": many / CROWD,
-        "ratio": many / CROWD / one,
+        "one_ms": single_ms,
+        "switched_off_ms": hidden_ms,
+        "characters": CROWD_SIZE,
+        "crowd_ms": crowd_ms,
+        "ms_a_character": crowd_ms / CROWD_SIZE,
+        "ratio": crowd_ms / CROWD_SIZE / single_ms,
     }
 
 
 def _redirect_drivers(
     keys: bpy.types.Key | None, armature_object: bpy.types.Object, armature_copy: bpy.types.Object
 ) -> None:
-    """Let the drivers of shape keys read the armature of their own character."""
+    """Point the drivers of shape keys at the copied armature."""
     for curve in keys.animation_data.drivers if keys is not None and keys.animation_data else ():
         for target in (target for variable in curve.driver.variables for target in variable.targets):
             if target.id == armature_object:
                 target.id = armature_copy
 
 
-def _without_play(mesh_object: bpy.types.Object) -> float:
+def _median_hidden_frame_ms(mesh_object: bpy.types.Object) -> float:
     mesh_object.hide_viewport = True
     try:
-        return _frame_times(60)
+        return _median_frame_ms(60)
     finally:
         mesh_object.hide_viewport = False
 
 
-def _shift_action(armature_object: bpy.types.Object, frames_later: int) -> None:
-    """Play the action later, through the NLA: every character of the crowd is in another pose."""
+def _shift_action(armature_object: bpy.types.Object, delay_frames: int) -> None:
+    """Delay the action with an NLA strip, so that every character of the crowd is in a different pose."""
     animation = armature_object.animation_data
     action = animation.action
     animation.action = None
     strip = animation.nla_tracks.new().strips.new("shifted", 1, action)
-    strip.frame_start_ui = 1 - frames_later
+    strip.frame_start_ui = 1 - delay_frames
     strip.repeat = 3
 
 
-def _frame_times(count: int) -> float:
+def _median_frame_ms(count: int) -> float:
     scene = bpy.context.scene
-    times = [_seconds(lambda frame=frame: scene.frame_set(frame)) for frame in range(1, count + 1)]
+    times = [_time_call(lambda frame=frame: scene.frame_set(frame)) for frame in range(1, count + 1)]
     return statistics.median(times[5:]) * 1000
 
 
 def cold_start(bound: str) -> dict:
-    """Seconds from opening a bound file to its next frame, ONNX Runtime's import and the model's load included.
+    """Time opening a bound file and evaluating its next frame, with importing ONNX Runtime and loading the model.
 
-    Whether that frame shows what the model says is looked at afterwards.
+    Checks afterwards, untimed, that the frame shows the output of the model.
     """
 
-    def start() -> None:
+    def open_and_evaluate() -> None:
         bpy.ops.wm.open_mainfile(filepath=bound)
         bpy.context.scene.frame_set(bpy.context.scene.frame_current + 1)
 
-    imported_before = "onnxruntime" in sys.modules
-    seconds = _seconds(start)
-    return {"seconds": seconds, "onnxruntime_at_start_up": imported_before, "is_right": _is_model_shown()}
+    was_imported = "onnxruntime" in sys.modules
+    seconds = _time_call(open_and_evaluate)
+    return {"seconds": seconds, "onnxruntime_at_start_up": was_imported, "is_right": _is_model_shown()}
 
 
 def _is_model_shown() -> bool:
@@ -161,24 +161,24 @@ def _is_model_shown() -> bool:
         network.info.rest_matrices,
     )
     pose = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))
-    shown = evaluated_positions(mesh_object, depsgraph)
-    return bool(abs(shown - network.positions(pose[None])[0]).max() < 1e-5)
+    shown_positions = evaluated_positions(mesh_object, depsgraph)
+    return bool(abs(shown_positions - network.positions(pose[None])[0]).max() < 1e-5)
 
 
 def inference(model: str) -> dict:
-    """Milliseconds of the model alone, at one pose and at a crowd's, a character."""
+    """Time the model alone on one pose and on the poses of a crowd; return milliseconds per character."""
     network = Network(Path(model))
     result = {}
-    for characters in (1, CROWD):
-        poses = network.info.rest_matrices[None].repeat(characters, axis=0)
-        times = [_seconds(lambda poses=poses: network.positions(poses)) for _ in range(200)]
-        result[f"ms_at_{characters}"] = statistics.median(times[20:]) * 1000 / characters
+    for pose_count in (1, CROWD_SIZE):
+        poses = network.info.rest_matrices[None].repeat(pose_count, axis=0)
+        times = [_time_call(lambda poses=poses: network.positions(poses)) for _ in range(200)]
+        result[f"ms_at_{pose_count}"] = statistics.median(times[20:]) * 1000 / pose_count
     return result
 
 
-def _seconds(call: Callable[[], object]) -> float:
+def _time_call(function: Callable[[], object]) -> float:
     start = time.perf_counter()
-    call()
+    function()
     return time.perf_counter() - start
 
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What models cost by themselves: `python benchmarks/model_cost.py MODEL.onnx … [--json OUT.json]`.
+"""Measure the cost of models without Blender: `python benchmarks/model_cost.py MODEL.onnx … [--json OUT.json]`.
 
-Prints the nodes of each, the bytes of constants that a frame reads, and the milliseconds a character of one pose and of
-twenty in a call: hot, in a loop, and cold, after other memory has been read, as Blender does in a frame. Medians, the
-models in turns. Nothing is trained, Blender is not needed, and no file that is given is changed.
+Prints for each model the number of nodes, the bytes of constants that each frame reads, and the milliseconds per
+character of a call with one pose and of a call with twenty. Hot calls run in a loop. Before each cold call, other
+memory is read, as Blender does in a frame. The times are medians; the models are measured alternately. The script
+trains no model and changes none of the given files.
 """
 
 import argparse
@@ -21,50 +22,55 @@ sys.path.insert(0, str(ROOT))
 from fdda_addon.core.errors import FDDAError  # noqa: E402
 from fdda_addon.runtime.network import Network  # noqa: E402
 
-CROWD = 20
+CROWD_SIZE = 20
 CACHE_FLUSH_BYTES = 32 << 20
-"""Read between two cold calls."""
-ROUNDS, RUNS = 7, 40
-"""Of every model and way; the first few runs of a turn only warm up."""
+"""Bytes to read before each cold call, to empty the caches of the processor."""
+ROUNDS, TIMED_CALLS, WARM_UP_CALLS = 7, 40, 5
+"""Per model and kind of call: rounds, and in each round the calls that are timed and those that come before them."""
 
 
-def time_calls(network: Network, count: int, swept: np.ndarray | None) -> list[float]:
-    """Times of one turn: `RUNS` calls of so many poses each, with a sweep before each where there is one."""
-    poses = np.repeat(network.info.rest_matrices[None], count, axis=0)
-    values = np.float32([[(control.low + control.high) / 2 for control in network.info.controls]] * count)
+def time_calls(network: Network, pose_count: int, flushing_memory: np.ndarray | None) -> list[float]:
+    """Time the calls of one round, in milliseconds; read `flushing_memory` before each call unless it is None."""
+    poses = np.repeat(network.info.rest_matrices[None], pose_count, axis=0)
+    control_values = np.float32([[(control.low + control.high) / 2 for control in network.info.controls]] * pose_count)
     times = []
-    for _ in range(RUNS + 5):
-        if swept is not None:
-            swept.sum()
+    for _ in range(WARM_UP_CALLS + TIMED_CALLS):
+        if flushing_memory is not None:
+            flushing_memory.sum()
         start = time.perf_counter()
-        network.positions(poses, values if network.info.controls else None)
+        network.positions(poses, control_values if network.info.controls else None)
         times.append((time.perf_counter() - start) * 1000)
-    return times[5:]
+    return times[WARM_UP_CALLS:]
 
 
 def measure(networks: list[Network]) -> list[dict[str, float]]:
-    """Median milliseconds a call of each model, by `hot`, `cold` and the same of a crowd."""
-    swept = np.ones(CACHE_FLUSH_BYTES // 4, np.float32)
-    ways = {"hot": (1, None), "cold": (1, swept), "hot_crowd": (CROWD, None), "cold_crowd": (CROWD, swept)}
-    times = [{way: [] for way in ways} for _ in networks]
+    """Return the median milliseconds per call of each model, by kind of call: hot, cold, hot_crowd, cold_crowd."""
+    flushing_memory = np.ones(CACHE_FLUSH_BYTES // 4, np.float32)
+    call_kinds = {
+        "hot": (1, None),
+        "cold": (1, flushing_memory),
+        "hot_crowd": (CROWD_SIZE, None),
+        "cold_crowd": (CROWD_SIZE, flushing_memory),
+    }
+    times = [{kind: [] for kind in call_kinds} for _ in networks]
     for _ in range(ROUNDS):
-        for network, own in zip(networks, times, strict=True):
-            for way, (count, memory) in ways.items():
-                own[way] += time_calls(network, count, memory)
-    return [{way: float(np.median(values)) for way, values in own.items()} for own in times]
+        for network, network_times in zip(networks, times, strict=True):
+            for kind, (pose_count, memory) in call_kinds.items():
+                network_times[kind] += time_calls(network, pose_count, memory)
+    return [{kind: float(np.median(values)) for kind, values in model_times.items()} for model_times in times]
 
 
 def count_constants(path: Path) -> tuple[int, int]:
-    """Nodes of a model, and bytes of its constants."""
+    """Return the number of nodes of a model and the bytes of its constants."""
     graph = onnx.load(path).graph
     return len(graph.node), sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in graph.initializer)
 
 
 def main() -> int:
-    """Measure and print; returns the exit status."""
+    """Measure the models and print the figures; return the exit status."""
     parser = argparse.ArgumentParser("model_cost", description=__doc__.partition("\n")[0])
-    parser.add_argument("models", type=Path, nargs="+", help="files that train made")
-    parser.add_argument("--json", type=Path, help="where the figures go too")
+    parser.add_argument("models", type=Path, nargs="+", help="model files that `train` wrote")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     options = parser.parse_args()
     try:
         networks = [Network(path) for path in options.models]
@@ -72,18 +78,31 @@ def main() -> int:
         print(error, file=sys.stderr)
         return 1
     rows = []
-    heads = f"{'vertices':>8} {'nodes':>5} {'MB':>6} {'hot':>7} {'cold':>7} {'ratio':>5} {'of 20: hot':>10} {'cold':>7}"
-    print(heads, " model")
+    header = (
+        f"{'vertices':>8} {'nodes':>5} {'MB':>6} {'hot':>7} {'cold':>7} {'ratio':>5} {'of 20: hot':>10} {'cold':>7}"
+    )
+    print(header, " model")
     for path, network, times in zip(options.models, networks, measure(networks), strict=True):
-        nodes, read = count_constants(path)
-        rows.append({"model": str(path), "vertices": network.info.vertex_count, "nodes": nodes, "bytes": read, **times})
+        node_count, constant_bytes = count_constants(path)
+        rows.append(
+            {
+                "model": str(path),
+                "vertices": network.info.vertex_count,
+                "nodes": node_count,
+                "bytes": constant_bytes,
+                **times,
+            }
+        )
         print(
-            f"{network.info.vertex_count:8} {nodes:5} {read / 1e6:6.2f} {times['hot']:7.3f} {times['cold']:7.3f} "
-            f"{times['cold'] / times['hot']:5.2f} {times['hot_crowd'] / CROWD:10.3f} {times['cold_crowd'] / CROWD:7.3f}"
+            f"{network.info.vertex_count:8} {node_count:5} {constant_bytes / 1e6:6.2f} "
+            f"{times['hot']:7.3f} {times['cold']:7.3f} {times['cold'] / times['hot']:5.2f} "
+            f"{times['hot_crowd'] / CROWD_SIZE:10.3f} {times['cold_crowd'] / CROWD_SIZE:7.3f}"
             f"  {path}"
         )
     if options.json:
-        options.json.write_text(json.dumps({"unit": "ms", "crowd": CROWD, "models": rows}, indent=1), encoding="utf-8")
+        options.json.write_text(
+            json.dumps({"unit": "ms", "crowd": CROWD_SIZE, "models": rows}, indent=1), encoding="utf-8"
+        )
     return 0
 
 

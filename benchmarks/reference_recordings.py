@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The trainer on the reference recordings of a Maya arm, beside the published networks trained on the same poses.
+"""Compare the trainer with the published networks on the reference recordings of a Maya arm.
 
     python -m benchmarks.reference_recordings [DATA] [--json OUT.json] [--choose] [--listed] [training settings]
 
-The recordings list the joints that influence a partition, as the reference work found them, and leave some out. Here
-every network is offered all joints that were recorded, and finds out which matter; with `--listed` those of its list
-alone.
+For each partition, the recordings list the joints that the reference work chose as inputs; these lists leave out some
+joints. By default every network gets all recorded joints as inputs and learns which of them matter. With `--listed`,
+each network gets only the joints of its list.
 
-Trains on poses 0 to 699 of eight partitions and measures on poses 700 to 1000, which no setting was chosen on: with
-`--choose` it measures on a fifth of the 700 instead, the rest of which it trains on. Errors are in centimeters, as
-published. Exits with 0 and says so where the data is missing.
+Trains on poses 0 to 699 of eight partitions and measures on poses 700 to 1000, which were not used to choose settings.
+To choose settings, use `--choose`: it measures on a fifth of the 700 poses and trains on the rest. Errors are in
+centimeters, as published. If the data is missing, prints that and exits with status 0.
 """
 
 import argparse
@@ -32,17 +32,20 @@ from trainer.loop import train
 from trainer.networks import Network
 from trainer.splitting import split_poses
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
+DATA_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
 TRAINING_POSES = 700
-CM = 0.01
+METERS_PER_CM = 0.01
 SETTINGS = {
     "hidden": (256, 256),
     "batch_size": 32,
     "weight_decay": 1.0,
     "validation_fraction": 0.05,
 }
-"""Differences from the defaults: the largest published networks, and more regularization for few, noisy poses."""
-RELU = {
+"""Settings that differ from the defaults.
+
+The hidden layers are those of the largest published networks. The poses are few and noisy, so weight decay is larger.
+"""
+PUBLISHED_ERRORS_CM = {
     "wrist": (0.0801, 0.4991),
     "index_1": (0.0594, 0.6329),
     "middle_2": (0.0188, 0.3216),
@@ -52,11 +55,11 @@ RELU = {
     "pinky_1": (0.0408, 0.7063),
     "thumb_2": (0.0060, 0.1011),
 }
-"""Published 2x128 ReLU networks: mean and largest distance over the held-out poses, cm."""
+"""Errors of the published 2x128 ReLU networks: mean and largest distance over the held-out poses, cm."""
 
 
 def parent_of(joint: str) -> str | None:
-    """The parent of a joint of that arm, by its name."""
+    """Return the parent of a joint of the Maya arm, derived from the joint's name."""
     if joint in ("elbow", "wrist"):
         return "elbow" if joint == "wrist" else None
     finger, number = joint.rsplit("_", 1)
@@ -68,9 +71,9 @@ class ReferencePartition:
     """A partition of the recordings.
 
     Attributes:
-        data: as the trainer takes it.
+        data: features and residuals in the form that the trainer reads.
         joint: index of the main joint.
-        poses: (N, J, 4, 4) float64 pose matrices of the joints that are known, meters.
+        poses: (N, J, 4, 4) float64 pose matrices of all joints, meters.
     """
 
     data: PartitionData
@@ -79,24 +82,24 @@ class ReferencePartition:
 
 
 def recorded_joints(arrays: dict, entries: list[dict]) -> dict[str, np.ndarray]:
-    """(N, 3, 4) float32 local matrices of all joints that are listed for any partition, cm."""
+    """Return the local matrices of all joints that any partition lists, by name: (N, 3, 4) float32, cm."""
     joints = {}
     for entry in entries:
         matrices = arrays[f"{entry['partition']}.local_matrices"]
-        joints |= {joint: matrices[:, number] for number, joint in enumerate(entry["joints"])}
+        joints |= {joint: matrices[:, index] for index, joint in enumerate(entry["joints"])}
     return joints
 
 
 def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarray) -> ReferencePartition:
-    """One partition with the features that the trainer makes of a recording.
+    """Compute the features of one partition as the trainer does for a recording.
 
     Args:
-        name: of the main joint.
-        joints: the joints to see, and the (N, 3, 4) local matrices of each, cm.
+        name: name of the main joint.
+        joints: (N, 3, 4) local matrices of each input joint, by name, cm.
         residuals: (N, Vp, 3) float32, cm.
 
-    Not every joint was recorded. Those between others stay at the identity: their motion is unknown, and the inputs
-    leave out every pair that depends on it.
+    Not every joint was recorded. The motion of an unrecorded joint is unknown: its local matrix is the identity, and
+    the inputs leave out every pair of joints that depends on it.
     """
     names = ["elbow"]
     for joint in [name, *joints]:
@@ -106,71 +109,74 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
             joint = parent_of(joint)
         names += reversed(chain)
     poses = np.tile(np.eye(4), (len(residuals), len(names), 1, 1))
-    # Where the surface is was not recorded: three points, a centimeter from each joint, stand in for it.
-    points = np.tile(np.eye(3) * CM, (len(names), 1, 1))
+    # The rest positions of the surface were not recorded: three points, a centimeter from each joint, replace them.
+    points = np.tile(np.eye(3) * METERS_PER_CM, (len(names), 1, 1))
     for joint, local in joints.items():
-        place = names.index(joint)
-        poses[:, place, :3] = local
-        poses[:, place, :3, 3] *= CM
-        # Half-way to the joint that it carries is the middle of what a joint moves.
-        points[names.index(parent_of(joint))] += local[0, :, 3] / 2 * CM
+        index = names.index(joint)
+        poses[:, index, :3] = local
+        poses[:, index, :3, 3] *= METERS_PER_CM
+        # Move the points of the parent halfway to this joint, to the middle of the surface that the parent moves.
+        points[names.index(parent_of(joint))] += local[0, :, 3] / 2 * METERS_PER_CM
     parents = np.array([names.index(parent_of(joint)) if parent_of(joint) else -1 for joint in names])
-    for place in range(1, len(names)):
-        poses[:, place] = poses[:, parents[place]] @ poses[:, place]
-    own = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
-    inputs: NetworkInputs = make_inputs(parents, points, [own])
+    for index in range(1, len(names)):
+        poses[:, index] = poses[:, parents[index]] @ poses[:, index]
+    partition = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
+    inputs: NetworkInputs = make_inputs(parents, points, [partition])
     features = inputs.features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
-    residuals = residuals * np.float32(CM)
+    residuals = residuals * np.float32(METERS_PER_CM)
     data = PartitionData(
         name,
         features[:, inputs.columns[0]],
         lambda: residuals,
         residuals.shape[1],
-        # The rest pose is not known: the identity stands in for it.
-        lambda: make_joint_regression(parents, own, poses, np.zeros(3)),
+        # The rest pose is not known: the identity replaces it.
+        lambda: make_joint_regression(parents, partition, poses, np.zeros(3)),
     )
-    return ReferencePartition(data, own.joint, poses)
+    return ReferencePartition(data, partition.joint, poses)
 
 
 def measure(
-    partition: ReferencePartition, prepared: PreparedPartition, network: Network, activation: str, chosen: np.ndarray
+    partition: ReferencePartition, prepared: PreparedPartition, network: Network, activation: str, measured: np.ndarray
 ) -> tuple[float, float, float]:
-    """Mean and largest distance over the chosen poses, and the mean of the residuals themselves, cm."""
-    truth, poses = partition.data.read_residuals()[chosen], partition.poses[chosen]
-    coefficients = network.coefficients(prepared.inputs[chosen], activation)
-    turned = prepared.fit.offsets(poses) @ np.linalg.inv(poses[:, partition.joint, :3, :3]).transpose(0, 2, 1)
-    errors = np.linalg.norm(turned + prepared.basis.residuals(coefficients).reshape(truth.shape) - truth, axis=2)
-    return float(errors.mean() / CM), float(errors.max() / CM), float(np.linalg.norm(truth, axis=2).mean() / CM)
+    """Return the mean and largest error over the measured poses and the mean length of their residuals, cm."""
+    true_residuals, poses = partition.data.read_residuals()[measured], partition.poses[measured]
+    coefficients = network.coefficients(prepared.inputs[measured], activation)
+    fitted = prepared.fit.offsets(poses) @ np.linalg.inv(poses[:, partition.joint, :3, :3]).transpose(0, 2, 1)
+    learned = prepared.basis.residuals(coefficients).reshape(true_residuals.shape)
+    errors_cm = np.linalg.norm(fitted + learned - true_residuals, axis=2) / METERS_PER_CM
+    linear_errors_cm = np.linalg.norm(true_residuals, axis=2) / METERS_PER_CM
+    return float(errors_cm.mean()), float(errors_cm.max()), float(linear_errors_cm.mean())
 
 
-def run(folder: Path, config: TrainingConfig, choose: bool, listed: bool) -> dict:
-    """Train, measure, and compare; what `--json` writes."""
+def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bool) -> dict:
+    """Train and measure; return the comparison with the published errors, which `--json` writes."""
     entries = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["partitions"]
     with np.load(folder / "recording.npz", allow_pickle=False) as arrays:
         arrays = dict(arrays)
-    started = time.perf_counter()
-    known = recorded_joints(arrays, entries)
-    every = []
+    start_time = time.perf_counter()
+    joint_matrices = recorded_joints(arrays, entries)
+    partitions = []
     for entry in entries:
-        name, own = entry["partition"], {joint: known[joint] for joint in entry["joints"]}
-        every.append(read_partition(name, own if listed else own | known, arrays[f"{name}.residuals"]))
-    poses = len(every[0].poses)
-    if choose:
+        name, listed_joints = entry["partition"], {joint: joint_matrices[joint] for joint in entry["joints"]}
+        input_joints = listed_joints if only_listed else listed_joints | joint_matrices
+        partitions.append(read_partition(name, input_joints, arrays[f"{name}.residuals"]))
+    pose_count = len(partitions[0].poses)
+    if is_choosing:
         order = np.random.default_rng(config.seed + 1000).permutation(TRAINING_POSES)
         measured, trained_on = np.sort(order[: TRAINING_POSES // 5]), np.sort(order[TRAINING_POSES // 5 :])
     else:
-        measured, trained_on = np.arange(TRAINING_POSES, poses), np.arange(TRAINING_POSES)
+        measured, trained_on = np.arange(TRAINING_POSES, pose_count), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
-    prepared = [prepare_partition(partition.data, split, config.tolerance_mm, config.seed) for partition in every]
+    prepared = [prepare_partition(partition.data, split, config.tolerance_mm, config.seed) for partition in partitions]
     result = train(prepared, split, config)
     rows = []
-    for partition, ready, network in zip(every, prepared, result.networks, strict=True):
-        mean, largest, linear = measure(partition, ready, network, config.activation, measured)
-        published = RELU[ready.name]
+    for partition, prepared_partition, network in zip(partitions, prepared, result.networks, strict=True):
+        mean, largest, linear = measure(partition, prepared_partition, network, config.activation, measured)
+        published = PUBLISHED_ERRORS_CM[prepared_partition.name]
         rows.append(
             {
-                "partition": ready.name,
-                "components": len(ready.basis.components),
+                "partition": prepared_partition.name,
+                "components": len(prepared_partition.basis.components),
                 "linear_mean": linear,
                 "mean": mean,
                 "max": largest,
@@ -182,12 +188,12 @@ def run(folder: Path, config: TrainingConfig, choose: bool, listed: bool) -> dic
     totals |= {key: max(row[key] for row in rows) for key in ("max", "relu_max")}
     return {
         "unit": "cm",
-        "joints": "listed" if listed else "all",
-        "poses": "a fifth of 0-699" if choose else "700-1000",
+        "joints": "listed" if only_listed else "all",
+        "poses": "a fifth of 0-699" if is_choosing else "700-1000",
         "partitions": rows,
         "all": totals,
         "mean_of_relu": totals["mean"] / totals["relu_mean"],
-        "seconds": time.perf_counter() - started,
+        "seconds": time.perf_counter() - start_time,
         "settings": config.to_json(),
     }
 
@@ -208,11 +214,11 @@ def print_table(result: dict) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser("reference_recordings", description="The trainer on the reference recordings.")
-    parser.add_argument("data", type=Path, nargs="?", default=DATA, help="folder of recording.npz")
-    parser.add_argument("--json", type=Path, help="write the result here")
-    parser.add_argument("--choose", action="store_true", help="measure on a part of the 700 training poses")
-    parser.add_argument("--listed", action="store_true", help="see the joints listed for a partition alone")
+    parser = argparse.ArgumentParser("reference_recordings", description=__doc__.partition("\n")[0])
+    parser.add_argument("data", type=Path, nargs="?", default=DATA_FOLDER, help="folder of recording.npz")
+    parser.add_argument("--json", type=Path, help="write the result to this file")
+    parser.add_argument("--choose", action="store_true", help="measure on a fifth of the 700 training poses")
+    parser.add_argument("--listed", action="store_true", help="use only the joints that a partition lists as inputs")
     add_options(parser)
     parser.set_defaults(**SETTINGS)
     options = parser.parse_args()

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the tab FDDA costs while an action plays: `blender BOUND.blend --python benchmarks/sidebar.py -- OUT.json
-[SECONDS [all]]`.
+"""Measure how much time the tab FDDA takes while an action plays.
 
-Plays the scene in the window as fast as it goes, the character out of view, in turn with the sidebar at its tab FDDA,
-at Blender's own tab View, and closed. Of each the time of a frame, and what the code of the sections, of their lists
-and of the polls of their buttons took of it: as Blender is at first, when it draws no sidebar while it plays, and with
-*Properties Editors* ticked in its menu *Playback*. Sections are open as they are at first, or all of them. Writes
-medians to OUT.json, prints them, and ends Blender.
+    blender BOUND.blend --python benchmarks/sidebar.py -- OUT.json [SECONDS [all]]
+
+Plays the scene in the window at the highest possible rate, with the character out of view. Alternates between the tab
+FDDA of the sidebar, Blender's tab View, and a closed sidebar. For each, measures the time of a frame and the time in
+the code of the add-on: in the sections, in their lists, and in the polls of their buttons.
+
+Measures all of this twice: with Blender's defaults, which do not redraw the sidebar during playback, and with
+*Properties Editors* enabled in the menu *Playback*. The sections are open as by default; with `all`, every section is
+open. Writes the medians to OUT.json, prints them, and quits Blender.
 """
 
 import json
@@ -23,65 +26,68 @@ ROUNDS = 6
 SECONDS = 3.0
 SETTLE_SECONDS = 1.5
 TABS = ("FDDA", "View", "")
-"""Tabs of the sidebar; empty where it is closed."""
+"""Tabs of the sidebar; the empty name means that the sidebar is closed."""
 UNREACHABLE_FPS = 1000
-"""Frames a second that are asked for: more than there can be."""
+"""Frame rate of the scene: higher than Blender can reach, so that it never waits."""
 
-taken: dict[str, list[float]] = {}
-"""Calls and seconds in the code of classes, by class and function, since it was emptied."""
+code_times: dict[str, list[float]] = {}
+"""Number of calls and seconds, by class and function; cleared before each measurement."""
 
 
-def _timed_call(key: str, work: object, arguments: tuple) -> object:
+def _timed_call(key: str, function: object, arguments: tuple) -> object:
     start = time.perf_counter()
     try:
-        return work(*arguments)
+        return function(*arguments)
     finally:
-        entry = taken.setdefault(key, [0, 0.0])
+        entry = code_times.setdefault(key, [0, 0.0])
         entry[0] += 1
         entry[1] += time.perf_counter() - start
 
 
 def time_methods(cls: type) -> None:
-    """Count the time in a class. Blender looks at how many arguments a function has, so each is written out."""
+    """Replace the drawing and polling methods of a class with timed ones.
 
-    def drawing(name: str, work: object) -> object:
-        return lambda self, context: _timed_call(f"{cls.__name__}.{name}", work, (self, context))
+    Blender checks the number of arguments of each method, so the wrappers list every argument.
+    """
 
-    def polling(work: object) -> object:
-        return classmethod(lambda own, context: _timed_call(f"{cls.__name__}.poll", work, (own, context)))
+    def wrap_draw(name: str, function: object) -> object:
+        return lambda self, context: _timed_call(f"{cls.__name__}.{name}", function, (self, context))
 
-    def listing(work: object) -> object:
-        count = work.__code__.co_argcount
+    def wrap_poll(function: object) -> object:
+        return classmethod(lambda poll_cls, context: _timed_call(f"{cls.__name__}.poll", function, (poll_cls, context)))
+
+    def wrap_draw_item(function: object) -> object:
+        argument_count = function.__code__.co_argcount
         key = f"{cls.__name__}.draw_item"
-        if count == 9:
-            return lambda self, c, layout, data, item, icon, active, name, index: _timed_call(
-                key, work, (self, c, layout, data, item, icon, active, name, index)
+        if argument_count == 9:
+            return lambda self, context, layout, data, item, icon, active, name, index: _timed_call(
+                key, function, (self, context, layout, data, item, icon, active, name, index)
             )
-        return lambda self, c, layout, data, item, icon, active, name: _timed_call(
-            key, work, (self, c, layout, data, item, icon, active, name)
+        return lambda self, context, layout, data, item, icon, active, name: _timed_call(
+            key, function, (self, context, layout, data, item, icon, active, name)
         )
 
-    def filtering(work: object) -> object:
+    def wrap_filter_items(function: object) -> object:
         return lambda self, context, data, name: _timed_call(
-            f"{cls.__name__}.filter_items", work, (self, context, data, name)
+            f"{cls.__name__}.filter_items", function, (self, context, data, name)
         )
 
     if issubclass(cls, bpy.types.Panel):
         for name in ("draw", "draw_header_preset"):
-            setattr(cls, name, drawing(name, getattr(cls, name)))
+            setattr(cls, name, wrap_draw(name, getattr(cls, name)))
     if issubclass(cls, bpy.types.UIList):
-        cls.draw_item = listing(cls.draw_item)
+        cls.draw_item = wrap_draw_item(cls.draw_item)
         if "filter_items" in cls.__dict__:
-            cls.filter_items = filtering(cls.filter_items)
+            cls.filter_items = wrap_filter_items(cls.filter_items)
     elif hasattr(cls, "poll"):
-        cls.poll = polling(cls.poll.__func__)
+        cls.poll = wrap_poll(cls.poll.__func__)
 
 
 def addon_classes() -> list[type]:
-    """The panels, lists and operators of the add-on."""
-    found = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith(("FDDA_PT_", "FDDA_UL_"))]
+    """Return the panels, lists and operators of the add-on."""
+    classes = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith(("FDDA_PT_", "FDDA_UL_"))]
     operators = [cls for cls in bpy.types.Operator.__subclasses__() if cls.__name__.startswith("FDDA_OT_")]
-    return [*found, *operators]
+    return [*classes, *operators]
 
 
 def find_sidebar() -> tuple[bpy.types.Area, bpy.types.Region]:
@@ -93,7 +99,7 @@ def find_sidebar() -> tuple[bpy.types.Area, bpy.types.Region]:
 
 
 def show_tab(tab: str) -> Iterator[float]:
-    """Show a tab of the sidebar, or none."""
+    """Show a tab of the sidebar, or close the sidebar if `tab` is empty."""
     area, region = find_sidebar()
     area.spaces.active.show_region_ui = bool(tab)
     yield 0.5
@@ -108,65 +114,66 @@ def toggle_animation() -> None:
         bpy.ops.screen.animation_play()
 
 
-def measure(seconds: float, found: dict[str, dict]) -> Iterator[float]:
-    """Alternate between the tabs; what is found goes into a dictionary."""
-    scene, times = bpy.context.scene, []
-    bpy.app.handlers.frame_change_post.append(lambda _scene, _graph: times.append(time.perf_counter()))
+def measure(seconds: float, times_by_tab: dict[str, dict]) -> Iterator[float]:
+    """Play with each tab alternately and add the measured times to `times_by_tab`."""
+    scene, frame_end_times = bpy.context.scene, []
+    bpy.app.handlers.frame_change_post.append(lambda _scene, _graph: frame_end_times.append(time.perf_counter()))
     scene.render.fps, scene.sync_mode = UNREACHABLE_FPS, "NONE"
     for tab in TABS:
-        found[tab or "closed"] = {"frames": [], "code": [], "by": {}}
-    for number in range(ROUNDS):
-        # Each is first as often as the others.
-        for tab in (*TABS[number % len(TABS) :], *TABS[: number % len(TABS)]):
+        times_by_tab[tab or "closed"] = {"frames": [], "code": [], "by": {}}
+    for round_index in range(ROUNDS):
+        # Start each round with the next tab, so that no tab is always first.
+        first = round_index % len(TABS)
+        for tab in (*TABS[first:], *TABS[:first]):
             yield from show_tab(tab)
-            of = found[tab or "closed"]
+            tab_times = times_by_tab[tab or "closed"]
             toggle_animation()
             yield 0.3
-            times.clear()
-            taken.clear()
+            frame_end_times.clear()
+            code_times.clear()
             yield seconds
-            frames, now = len(times), dict(taken)
+            frame_count, measured_code = len(frame_end_times), dict(code_times)
             toggle_animation()
-            of["frames"] += [(b - a) * 1000 for a, b in pairwise(times)]
-            of["code"].append(sum(entry[1] for entry in now.values()) * 1000 / frames)
-            for key, (count, spent) in now.items():
-                entry = of["by"].setdefault(key, [0.0, 0.0])
-                entry[0] += count / frames / ROUNDS
-                entry[1] += spent * 1000 / frames / ROUNDS
+            tab_times["frames"] += [(b - a) * 1000 for a, b in pairwise(frame_end_times)]
+            tab_times["code"].append(sum(entry[1] for entry in measured_code.values()) * 1000 / frame_count)
+            for key, (count, code_seconds) in measured_code.items():
+                entry = tab_times["by"].setdefault(key, [0.0, 0.0])
+                entry[0] += count / frame_count / ROUNDS
+                entry[1] += code_seconds * 1000 / frame_count / ROUNDS
             yield 0.2
 
 
-def main(out: Path, seconds: float, all_open: bool) -> Iterator[float]:
-    """Measure, write and print."""
+def main(out: Path, seconds: float, open_all: bool) -> Iterator[float]:
+    """Measure with both settings of Blender, write the medians to a file and print them."""
     space = find_sidebar()[0].spaces.active
     space.shading.type, space.overlay.show_overlays, space.show_gizmo = "WIREFRAME", False, False
     mesh_object = next(o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound)
     bpy.context.view_layer.objects.active = mesh_object
-    # Evaluated, and not drawn: a processor that draws is busy with nothing else.
+    # Out of view, the character is evaluated but not drawn: without a GPU, drawing takes all processor time.
     space.region_3d.view_location.x += 1000
     for cls in addon_classes():
         time_methods(cls)
-        if all_open and issubclass(cls, bpy.types.Panel):
+        if open_all and issubclass(cls, bpy.types.Panel):
             bpy.utils.unregister_class(cls)
-            # Under another name: Blender remembers which were closed.
+            # Register the panel under a different name, because Blender remembers which panels were closed.
             cls.bl_idname, cls.bl_options = f"{cls.bl_idname}_open", set()
             bpy.utils.register_class(cls)
-    said = {"unit": "ms", "blender": bpy.app.version_string, "as at first": {}, "drawn at every frame": {}}
-    for when in ("as at first", "drawn at every frame"):
+    results = {"unit": "ms", "blender": bpy.app.version_string, "as at first": {}, "drawn at every frame": {}}
+    for setting in ("as at first", "drawn at every frame"):
         screen = bpy.context.window_manager.windows[0].screen
-        screen.use_play_properties_editors = when != "as at first"
-        found: dict[str, dict] = {}
-        yield from measure(seconds, found)
-        print(f"Sidebar {when}")
-        for way, of in found.items():
-            by = sorted(of["by"].items(), key=lambda pair: -pair[1][1])
-            frame, code = statistics.median(of["frames"]), statistics.median(of["code"])
-            by = {key: {"calls": round(count, 2), "ms": round(ms, 4)} for key, (count, ms) in by}
-            said[when][way] = {"frame": frame, "code": code, "by": by}
-            print(f"  {way}: a frame {frame:.2f} ms, of which code {code:.3f}")
-            for key, entry in by.items():
+        screen.use_play_properties_editors = setting != "as at first"
+        times_by_tab: dict[str, dict] = {}
+        yield from measure(seconds, times_by_tab)
+        print(f"Sidebar {setting}")
+        for tab, tab_times in times_by_tab.items():
+            entries = sorted(tab_times["by"].items(), key=lambda pair: -pair[1][1])
+            frame, code = statistics.median(tab_times["frames"]), statistics.median(tab_times["code"])
+            times_by_method = {key: {"calls": round(count, 2), "ms": round(ms, 4)} for key, (count, ms) in entries}
+            results[setting][tab] = {"frame": frame, "code": code, "by": times_by_method}
+            print(f"  {tab}: a frame {frame:.2f} ms, of which code of the add-on {code:.3f}")
+            for key, entry in times_by_method.items():
                 print(f"    {key}: {entry['ms']:.4f} ({entry['calls']})")
-    out.write_text(json.dumps(said, indent=1))
+    out.write_text(json.dumps(results, indent=1))
     sys.stdout.flush()
     bpy.ops.wm.quit_blender()
 
@@ -174,5 +181,5 @@ def main(out: Path, seconds: float, all_open: bool) -> Iterator[float]:
 if __name__ == "__main__":
     bpy.context.preferences.view.show_splash = False
     arguments = sys.argv[sys.argv.index("--") + 1 :]
-    path = main(Path(arguments[0]), float(arguments[1]) if len(arguments) > 1 else SECONDS, "all" in arguments)
-    bpy.app.timers.register(lambda: next(path, None), first_interval=SETTLE_SECONDS, persistent=True)
+    steps = main(Path(arguments[0]), float(arguments[1]) if len(arguments) > 1 else SECONDS, "all" in arguments)
+    bpy.app.timers.register(lambda: next(steps, None), first_interval=SETTLE_SECONDS, persistent=True)

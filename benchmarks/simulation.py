@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is learned of a simulation: `python benchmarks/simulation.py OUT`, the figures of docs/simulations.md.
+"""Train on a simulation and measure the errors: `python benchmarks/simulation.py OUT`, for docs/simulations.md.
 
-Gives the arm flesh that sags and bulges, held to the skin of its bones: a soft body of Blender's own. Records settled
-poses, trains, and compares model and linear skinning with settled poses that training never saw, beside how far two
-ways to the same pose lie apart and what a frame costs. Writes OUT/simulation.json, and the files of each step.
+Gives the arm flesh that sags and bulges: a soft body of Blender whose goal is the skinned surface. Records settled
+poses and trains on them. Compares the model and linear skinning with held-out settled poses. Also measures the time of
+a frame, and how repeatable a settled pose is. Writes OUT/simulation.json and the files of each step.
 """
 
 import argparse
@@ -23,42 +23,41 @@ from fdda_addon.arm.rig import build_arm  # noqa: E402
 from fdda_addon.cli.main import main as run_verb  # noqa: E402
 from fdda_addon.scene.blend_file import save_copy  # noqa: E402
 
-FLESHY = ("shoulder", "elbow")
-"""Upper arm and forearm. There is little flesh on a hand; `--kind whole-arm` is soft there as well."""
-FRAMES = 60
-"""Frames that are timed."""
-PICTURED = 20
-"""Held-out poses, of another seed, of which three are drawn."""
+SOFT_GROUPS = ("shoulder", "elbow")
+"""Vertex groups of the upper arm and forearm. With `--kind whole-arm` the hand is soft as well."""
+TIMED_FRAMES = 60
+PICTURED_POSES = 20
+"""Number of held-out poses for the heat map, with a different seed; the three worst are drawn."""
 
 
 def build(path: Path, kind: str) -> None:
-    """The arm, which keeps its Armature modifier alone, and a copy of it that is flesh."""
+    """Build the arm with only its Armature modifier, and a copy of it that is simulated flesh."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     build_arm()
     flesh = add_flesh(next(o for o in bpy.context.scene.objects if o.type == "MESH"))
     if kind == "cloth":
         make_cloth(flesh)
     else:
-        make_soft_body(flesh, FLESHY if kind == "soft-body" else [group.name for group in flesh.vertex_groups])
+        make_soft_body(flesh, SOFT_GROUPS if kind == "soft-body" else [group.name for group in flesh.vertex_groups])
     bpy.context.scene.frame_set(1)
     save_copy(path)
 
 
 def frame_ms(path: Path, shown: str, hidden: str) -> float:
-    """Median time of a frame of the action with one object shown, ms; its simulation is not cached yet."""
+    """Return the median time of a frame of the action with only one of two objects shown, ms; the cache is empty."""
     bpy.ops.wm.open_mainfile(filepath=str(path))
     bpy.data.objects[hidden].hide_viewport = True
     scene, times = bpy.context.scene, []
     scene.frame_set(1)
-    for frame in range(2, FRAMES + 2):
+    for frame in range(2, TIMED_FRAMES + 2):
         start = time.perf_counter()
         scene.frame_set(frame)
         times.append((time.perf_counter() - start) * 1000)
     return sorted(times)[len(times) // 2]
 
 
-def verb(*arguments: object) -> float:
-    """Run a verb of the command line; returns its seconds."""
+def time_verb(*arguments: object) -> float:
+    """Run a verb of the command line; return the seconds that it took."""
     start = time.perf_counter()
     if status := run_verb([str(argument) for argument in arguments], "fdda"):
         raise SystemExit(status)
@@ -75,31 +74,39 @@ def main() -> None:
     options = parser.parse_args()
     out = options.out
     out.mkdir(parents=True, exist_ok=True)
-    rig, recording, model, bound, errors = (
+    rig, recording, model, bound, errors_path = (
         out / name for name in ("rig.blend", "recording", "model/arm.onnx", "bound.blend", "errors.json")
     )
     fdda_addon.register()
     build(rig, options.kind)
-    of_target = ["--object", "arm", "--target", FLESH, "--max-settle-frames", options.max_settle_frames]
-    seconds = {"record": verb("record", rig, recording, *of_target, "--poses", options.poses, "--resume")}
+    target_options = ["--object", "arm", "--target", FLESH, "--max-settle-frames", options.max_settle_frames]
+    seconds = {"record": time_verb("record", rig, recording, *target_options, "--poses", options.poses, "--resume")}
     model.parent.mkdir(exist_ok=True)
-    seconds["train"] = verb("train", recording, model)
-    evaluated = [*of_target, "--poses", options.held_out, "--json", errors, "--overwrite"]
-    seconds["evaluate"] = verb("evaluate", rig, model, *evaluated)
-    pictured = [*of_target, "--poses", PICTURED, "--json", out / "pictured.json", "--heatmap", out / "heat_map.png"]
-    verb("evaluate", rig, model, *pictured, "--seed", 2, "--overwrite")
-    verb("bind", rig, model, bound, "--object", "arm", "--overwrite")
-    found = json.loads(errors.read_text(encoding="utf-8"))
-    index = json.loads((recording / "recording.json").read_text(encoding="utf-8"))
+    seconds["train"] = time_verb("train", recording, model)
+    evaluate_options = [*target_options, "--poses", options.held_out, "--json", errors_path, "--overwrite"]
+    seconds["evaluate"] = time_verb("evaluate", rig, model, *evaluate_options)
+    picture_options = [
+        *target_options,
+        "--poses",
+        PICTURED_POSES,
+        "--json",
+        out / "pictured.json",
+        "--heatmap",
+        out / "heat_map.png",
+    ]
+    time_verb("evaluate", rig, model, *picture_options, "--seed", 2, "--overwrite")
+    time_verb("bind", rig, model, bound, "--object", "arm", "--overwrite")
+    errors_mm = json.loads(errors_path.read_text(encoding="utf-8"))
+    recording_info = json.loads((recording / "recording.json").read_text(encoding="utf-8"))
     result = {
         "blender": bpy.app.version_string,
         "kind": options.kind,
         "poses": options.poses,
-        "unsettled": len(index.get("unsettled", ())),
-        "linear_mm": found["linear"],
-        "fdda_mm": found["fdda"],
-        "part": found["fdda"]["mean"] / found["linear"]["mean"],
-        "repeatability": index.get("repeatability"),
+        "unsettled": len(recording_info.get("unsettled", ())),
+        "linear_mm": errors_mm["linear"],
+        "fdda_mm": errors_mm["fdda"],
+        "part": errors_mm["fdda"]["mean"] / errors_mm["linear"]["mean"],
+        "repeatability": recording_info.get("repeatability"),
         "simulation_ms": frame_ms(rig, FLESH, "arm"),
         "model_ms": frame_ms(bound, "arm", FLESH),
         "seconds": seconds,

@@ -161,11 +161,11 @@ def build_elbow_files(folder: Path) -> None:
     import bpy
 
     import fdda_addon
-    from benchmarks.stress_playback import _bound_elbow
+    from benchmarks.stress_playback import bind_elbow
     from fdda_addon.cli.main import main as run_verb
 
     fdda_addon.register()
-    _bound_elbow(folder)
+    bind_elbow(folder)
     recording = folder / "short recording"
     command = ["record", str(folder / "elbow.blend"), str(recording), "--poses", "40"]
     if not recording.exists() and run_verb(command, "fdda"):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Does to playing characters whatever users do, at random, and compares what Blender shows with the models' output:
+"""Apply random operations of users to playing characters and compare the shown meshes with the models' output.
 
     python benchmarks/stress_playback.py out/stress [--evaluations 20000] [--characters 10] [--seed 0]
 
-Frames, subframes, poses, undo and redo, renders, modes and strengths, duplicates, deletions, saves, another view layer.
-Prints how often each was done, the largest difference, and the memory that the process takes; exit status 1 where a
-character showed anything else.
+The operations are frame changes, subframes, poses, undo and redo, renders, modes and strengths, duplicates, deletions,
+saves, and another view layer. Prints how often each operation ran, the largest difference, and the memory that the
+process uses. The exit status is 1 if a character differed from the output of its model.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from fdda_addon.runtime.network import Network  # noqa: E402
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier  # noqa: E402
 
 MAX_DIFFERENCE_M = 1e-5
-"""Meters. What Blender shows may be so far from what the model says."""
+"""Largest allowed difference between the shown mesh and the output of the model, meters."""
 BONES = ("upper", "lower")
 OPERATION_WEIGHTS = {
     "frame": 30, "subframe": 6, "pose": 30, "pose of several": 6, "undo": 5, "redo": 4, "render": 2, "mode": 6,
@@ -38,100 +38,115 @@ OPERATION_WEIGHTS = {
 
 @dataclass
 class Outcome:
-    """What happened: how often each operation, the largest difference in meters, memory in MB at its times."""
+    """Results of a run.
+
+    Attributes:
+        operations: how often each operation ran.
+        compared_count: number of comparisons.
+        largest_difference: largest difference between a shown mesh and the model's output, meters.
+        worst_case: the character and operation with the largest difference.
+        memory_mb: memory of the process at regular intervals, MB.
+    """
 
     operations: Counter = field(default_factory=Counter)
-    compared: int = 0
-    largest: float = 0.0
-    worst: str = ""
-    memory: list[float] = field(default_factory=list)
+    compared_count: int = 0
+    largest_difference: float = 0.0
+    worst_case: str = ""
+    memory_mb: list[float] = field(default_factory=list)
 
-    def table(self) -> str:
-        """One line an operation, and what came of all."""
+    def format_table(self) -> str:
+        """Format one line per operation, the largest difference and the memory."""
         lines = [f"  {name:<18}{count:>8,}" for name, count in self.operations.most_common()]
         lines.append(f"  {'all':<18}{self.operations.total():>8,}")
-        lines.append(f"{self.compared:,} characters compared, largest difference {self.largest:.1e} m {self.worst}")
-        lines.append("memory in MB: " + ", ".join(f"{value:.0f}" for value in self.memory))
+        lines.append(
+            f"{self.compared_count:,} characters compared, "
+            f"largest difference {self.largest_difference:.1e} m {self.worst_case}"
+        )
+        lines.append("memory in MB: " + ", ".join(f"{value:.0f}" for value in self.memory_mb))
         return "\n".join(lines)
 
 
 class PlaybackStress:
-    """Characters of the open file, and operations on them at random."""
+    """Apply random operations to the characters of the open file."""
 
-    def __init__(self, first: bpy.types.Object, model: Path, characters: int, folder: Path, seed: int):
-        """Args:
-        first: a bound object; the others are copies of it.
-        model: its model.
-        characters: how many there are at first.
-        folder: for renders and saves.
-        seed: what is done depends on nothing else.
+    def __init__(self, first_object: bpy.types.Object, model: Path, characters: int, folder: Path, seed: int):
+        """Duplicate the first character and set up the scene.
+
+        Args:
+            first_object: a bound object; the other characters are copies of it.
+            model: model file of the first character.
+            characters: number of characters at the start.
+            folder: folder for renders and saves.
+            seed: seed of the random operations.
         """
-        self._random = np.random.default_rng(seed)
-        self._folder, self._most = folder, characters + 2
-        self._first = first.name
+        self._random_generator = np.random.default_rng(seed)
+        self._folder, self._max_characters = folder, characters + 2
+        self._first_name = first_object.name
         self._network = Network(model)
-        rig = read_model_rig(SceneRig(first, armature_modifier(first).object), self._network.info)
+        rig = read_model_rig(SceneRig(first_object, armature_modifier(first_object).object), self._network.info)
         rest = self._network.info.rest_matrices
-        self._linear = LinearSkinning(replace(self._network.linear_rig(rig), rest_matrices=rest))
-        self._second = bpy.context.scene.view_layers.new("second").name
+        self._linear_skinning = LinearSkinning(replace(self._network.linear_rig(rig), rest_matrices=rest))
+        self._second_layer_name = bpy.context.scene.view_layers.new("second").name
         self._set_up_renders()
         for _ in range(characters - 1):
             self._duplicate()
-        for number, mesh_object in enumerate(self._characters()):
-            armature_object = armature_modifier(mesh_object).object
-            if number % 2:
-                armature_object.animation_data_clear()
+        # Half of the characters keep the animation; the others keep the poses that the operations set.
+        for mesh_object in self._characters()[1::2]:
+            armature_modifier(mesh_object).object.animation_data_clear()
         self.outcome = Outcome()
         bpy.ops.ed.undo_push(message="start")
 
     def run(self, evaluations: int) -> Outcome:
-        """Do so many operations, each followed by an evaluation and a comparison."""
+        """Run `evaluations` random operations; after each, evaluate the scene and compare all characters."""
         names, weights = list(OPERATION_WEIGHTS), np.array([*OPERATION_WEIGHTS.values()], float)
         bpy.context.view_layer.update()
         for number in range(evaluations):
-            name = names[self._random.choice(len(names), p=weights / weights.sum())]
+            name = names[self._random_generator.choice(len(names), p=weights / weights.sum())]
             getattr(self, "_" + name.replace(" ", "_"))()
             bpy.context.view_layer.update()
             self.outcome.operations[name] += 1
-            self._compare(f"({name}, operation {number})")
+            self._compare_characters(f"({name}, operation {number})")
             if number % max(1, evaluations // 8) == 0:
-                self.outcome.memory.append(_memory_mb())
-        self.outcome.memory.append(_memory_mb())
+                self.outcome.memory_mb.append(_memory_mb())
+        self.outcome.memory_mb.append(_memory_mb())
         return self.outcome
 
     def _characters(self) -> list[bpy.types.Object]:
         return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
 
-    def _any(self) -> bpy.types.Object:
-        found = self._characters()
-        return found[self._random.integers(len(found))]
+    def _random_character(self) -> bpy.types.Object:
+        characters = self._characters()
+        return characters[self._random_generator.integers(len(characters))]
 
-    def _compare(self, what: str) -> None:
+    def _compare_characters(self, after_operation: str) -> None:
         layers = bpy.context.scene.view_layers
         for depsgraph in [layer.depsgraph for layer in layers if layer == bpy.context.view_layer]:
             for mesh_object in self._characters():
                 binding = mesh_object.fdda
                 if binding.status:
-                    raise AssertionError(f"{mesh_object.name} {what}: {binding.status}")
+                    raise AssertionError(f"{mesh_object.name} {after_operation}: {binding.status}")
                 if binding.mode == "RIG":
                     continue
-                shown = _positions(mesh_object.evaluated_get(depsgraph).data)
-                off = float(np.abs(shown - self._expected(mesh_object, depsgraph)).max())
-                self.outcome.compared += 1
-                if off > self.outcome.largest:
-                    self.outcome.largest, self.outcome.worst = off, f"{mesh_object.name} {what}"
+                shown_positions = _positions(mesh_object.evaluated_get(depsgraph).data)
+                difference = float(np.abs(shown_positions - self._expected_positions(mesh_object, depsgraph)).max())
+                self.outcome.compared_count += 1
+                if difference > self.outcome.largest_difference:
+                    self.outcome.largest_difference, self.outcome.worst_case = (
+                        difference,
+                        f"{mesh_object.name} {after_operation}",
+                    )
 
-    def _expected(self, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
+    def _expected_positions(self, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
         info, armature_object = self._network.info, armature_modifier(mesh_object).object
         reader = PoseReader(SceneRig(mesh_object, armature_object), info.joint_names, info.rest_matrices)
         pose = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))[None]
         binding = mesh_object.fdda
         strength = binding.strength if binding.mode == "FDDA" else 0.0
-        model = self._network.positions(pose)[0]
+        model_positions = self._network.positions(pose)[0]
         if strength == 1:
-            return model
-        linear = self._linear.positions(pose)[0]
-        return linear + np.float32(strength) * (model - linear)
+            return model_positions
+        linear_positions = self._linear_skinning.positions(pose)[0]
+        return linear_positions + np.float32(strength) * (model_positions - linear_positions)
 
     def _set_up_renders(self) -> None:
         scene = bpy.context.scene
@@ -143,20 +158,22 @@ class PlaybackStress:
         scene.camera = camera
 
     def _frame(self) -> None:
-        bpy.context.scene.frame_set(int(self._random.integers(1, 30)))
+        bpy.context.scene.frame_set(int(self._random_generator.integers(1, 30)))
 
     def _subframe(self) -> None:
-        bpy.context.scene.frame_set(int(self._random.integers(1, 30)), subframe=float(self._random.random()))
+        bpy.context.scene.frame_set(
+            int(self._random_generator.integers(1, 30)), subframe=float(self._random_generator.random())
+        )
 
     def _pose(self) -> None:
-        armature_object = armature_modifier(self._any()).object
-        bone = armature_object.pose.bones[BONES[self._random.integers(len(BONES))]]
-        bone.rotation_euler = self._random.uniform(-1, 1, 3)
-        if self._random.random() < 0.2:
-            self._push("pose")
+        armature_object = armature_modifier(self._random_character()).object
+        bone = armature_object.pose.bones[BONES[self._random_generator.integers(len(BONES))]]
+        bone.rotation_euler = self._random_generator.uniform(-1, 1, 3)
+        if self._random_generator.random() < 0.2:
+            self._push_undo_step("pose")
 
     def _pose_of_several(self) -> None:
-        for _ in range(int(self._random.integers(2, 9))):
+        for _ in range(int(self._random_generator.integers(2, 9))):
             self._pose()
 
     def _undo(self) -> None:
@@ -172,49 +189,56 @@ class PlaybackStress:
         bpy.ops.render.render(write_still=False)
 
     def _mode(self) -> None:
-        self._any().fdda.mode = str(self._random.choice(["FDDA", "FDDA", "FDDA", "LINEAR", "RIG"]))
+        self._random_character().fdda.mode = str(
+            self._random_generator.choice(["FDDA", "FDDA", "FDDA", "LINEAR", "RIG"])
+        )
 
     def _strength(self) -> None:
-        self._any().fdda.strength = float(self._random.choice([0.0, 0.5, 1.0, 1.0]))
+        self._random_character().fdda.strength = float(self._random_generator.choice([0.0, 0.5, 1.0, 1.0]))
 
     def _use_in_render(self) -> None:
-        self._any().fdda.use_in_render = bool(self._random.integers(2))
+        self._random_character().fdda.use_in_render = bool(self._random_generator.integers(2))
 
     def _duplicate(self) -> None:
-        source = self._any() if self._characters() else bpy.data.objects[self._first]
-        if len(self._characters()) >= self._most:
+        source = self._random_character() if self._characters() else bpy.data.objects[self._first_name]
+        if len(self._characters()) >= self._max_characters:
             return
         mesh_object, armature_object = source.copy(), armature_modifier(source).object.copy()
         for copy in (mesh_object, armature_object):
             bpy.context.scene.collection.objects.link(copy)
         armature_modifier(mesh_object).object = mesh_object.parent = armature_object
-        self._push("duplicate")
+        self._push_undo_step("duplicate")
 
     def _delete(self) -> None:
         if len(self._characters()) > 3:
-            mesh_object = self._any()
+            mesh_object = self._random_character()
             armature_object = armature_modifier(mesh_object).object
             for deleted in (mesh_object, armature_object):
                 bpy.data.objects.remove(deleted)
-            self._push("delete")
+            self._push_undo_step("delete")
 
-    def _push(self, what: str) -> None:
-        """As an operator does: Blender's undo must know of every object that came or went."""
+    def _push_undo_step(self, message: str) -> None:
+        """Push an undo step, as an operator does, so that undo includes every added or removed object."""
         bpy.context.view_layer.update()
-        bpy.ops.ed.undo_push(message=what)
+        bpy.ops.ed.undo_push(message=message)
 
     def _save(self) -> None:
         bpy.ops.wm.save_as_mainfile(filepath=str(self._folder / "copy.blend"), copy=True)
 
     def _view_layer(self) -> None:
-        layer = bpy.context.scene.view_layers[self._second]
+        layer = bpy.context.scene.view_layers[self._second_layer_name]
         layer.update()
         for mesh_object in self._characters():
             if mesh_object.fdda.mode != "RIG":
-                shown = _positions(mesh_object.evaluated_get(layer.depsgraph).data)
-                off = float(np.abs(shown - self._expected(mesh_object, layer.depsgraph)).max())
-                if off > self.outcome.largest:
-                    self.outcome.largest, self.outcome.worst = off, f"{mesh_object.name} in the other view layer"
+                shown_positions = _positions(mesh_object.evaluated_get(layer.depsgraph).data)
+                difference = float(
+                    np.abs(shown_positions - self._expected_positions(mesh_object, layer.depsgraph)).max()
+                )
+                if difference > self.outcome.largest_difference:
+                    self.outcome.largest_difference, self.outcome.worst_case = (
+                        difference,
+                        f"{mesh_object.name} in the other view layer",
+                    )
 
 
 def _positions(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -224,7 +248,7 @@ def _positions(mesh: bpy.types.Mesh) -> np.ndarray:
 
 
 def _memory_mb() -> float:
-    """MB that the process holds in memory now; NaN where the system is not Linux."""
+    """Return the resident memory of the process in MB, or NaN if the system is not Linux."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6 if sys.platform == "linux" else np.nan
 
 
@@ -237,7 +261,7 @@ def main() -> int:
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     fdda_addon.register()
-    bound, model = _bound_elbow(options.folder)
+    bound, model = bind_elbow(options.folder)
     bpy.ops.wm.open_mainfile(filepath=str(bound))
     fdda_addon.register()
     first = next(o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound)
@@ -245,15 +269,15 @@ def main() -> int:
     stress = PlaybackStress(first, model, options.characters, options.folder, options.seed)
     outcome = stress.run(options.evaluations)
     print(f"Blender {bpy.app.version_string}, seed {options.seed}, {time.perf_counter() - start:.0f} s")
-    print(outcome.table())
+    print(outcome.format_table())
     fdda_addon.unregister()
-    return int(outcome.largest > MAX_DIFFERENCE_M)
+    return int(outcome.largest_difference > MAX_DIFFERENCE_M)
 
 
-def _bound_elbow(folder: Path) -> tuple[Path, Path]:
-    """The elbow's bound file and model, made where they are not there."""
+def bind_elbow(folder: Path) -> tuple[Path, Path]:
+    """Return the bound file and the model of the elbow; create them if they do not exist."""
     from blend_fixtures.elbow import build_elbow
-    from fdda_addon.cli.main import main as run
+    from fdda_addon.cli.main import main as run_verb
     from fdda_addon.scene.blend_file import save_copy
 
     rig, recording, model, bound = (folder / n for n in ("elbow.blend", "recording", "elbow.onnx", "bound.blend"))
@@ -267,7 +291,7 @@ def _bound_elbow(folder: Path) -> tuple[Path, Path]:
             ("train", recording, model, "--epochs", 40),
             ("bind", rig, model, bound),
         ):
-            if status := run([str(argument) for argument in arguments], "fdda"):
+            if status := run_verb([str(argument) for argument in arguments], "fdda"):
                 sys.exit(status)
     return bound, model
 

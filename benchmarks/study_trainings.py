@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The trainings of `study.py`: parts of a recording, through the trainer's own steps, kept in a folder."""
+"""Train some partitions of a recording for `study.py`, with the steps of the trainer; keep the results in a folder."""
 
 import json
 import time
@@ -29,34 +29,36 @@ from trainer.trained_model import TrainedModel, is_sheared
 
 
 @dataclass(frozen=True)
-class Material:
-    """What every training shares.
+class StudyData:
+    """Data that all trainings share.
 
     Attributes:
-        whole: the training recording.
-        training, held_out: both recordings, cut down to the partitions.
-        inputs: of the networks, without surface frames, which depend on the split.
+        whole_training: the training recording with all partitions.
+        training, held_out: both recordings with only the partitions of the study.
+        inputs: inputs of the networks without surface frames, which depend on the split.
     """
 
-    whole: Recording
+    whole_training: Recording
     training: Recording
     held_out: Recording
     inputs: NetworkInputs
 
 
-def cut(recording: Recording, names: tuple[str, ...]) -> Recording:
-    """A recording of some partitions alone; their vertices keep their order.
+def select_partitions(recording: Recording, names: tuple[str, ...]) -> Recording:
+    """Return a copy of a recording with only the named partitions; their vertices keep their order.
 
     Raises:
-        RecordingError: it has no such partition.
+        RecordingError: the recording has no partition of that name.
     """
     rig = recording.rig
-    own = {rig.joints[partition.joint].name: partition for partition in recording.partitions}
-    if missing := [name for name in names if name not in own]:
-        raise RecordingError(f"'{recording.path}' has no partition '{missing[0]}'; it has {', '.join(own)}.")
-    chosen = [own[name] for name in names]
-    vertices = np.sort(np.concatenate([partition.vertices for partition in chosen]))
-    small = Rig(
+    partitions_by_name = {rig.joints[partition.joint].name: partition for partition in recording.partitions}
+    if missing := [name for name in names if name not in partitions_by_name]:
+        raise RecordingError(
+            f"'{recording.path}' has no partition '{missing[0]}'; it has {', '.join(partitions_by_name)}."
+        )
+    selected = [partitions_by_name[name] for name in names]
+    vertices = np.sort(np.concatenate([partition.vertices for partition in selected]))
+    small_rig = Rig(
         rig.joints,
         rig.rest_positions[vertices],
         rig.rest_matrices,
@@ -65,49 +67,57 @@ def cut(recording: Recording, names: tuple[str, ...]) -> Recording:
         rig.fingerprint,
         controls=rig.controls,
     )
-    partitions = read_partitions(small, partitions_to_json(tuple(chosen)))
+    partitions = read_partitions(small_rig, partitions_to_json(tuple(selected)))
     residuals = np.array(recording.residuals[:, vertices])
     return Recording(
-        recording.path, recording.info, small, partitions, recording.pose_matrices, residuals, recording.controls
+        recording.path, recording.info, small_rig, partitions, recording.pose_matrices, residuals, recording.controls
     )
 
 
-def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Material:
-    """Read both recordings.
+def read_study_data(training: Path, held_out: Path, names: tuple[str, ...]) -> StudyData:
+    """Read both recordings and select the partitions.
 
     Raises:
-        RecordingError: they are of different rigs or of the same poses, or lack a partition.
+        RecordingError: the recordings are of different rigs or of the same poses, or have no partition of a name.
     """
-    whole, other = read_recording(training), read_recording(held_out)
-    if whole.rig.fingerprint != other.rig.fingerprint or whole.rig.joints != other.rig.joints:
-        raise RecordingError(f"'{held_out}' is of another rig than '{training}'; record both of the same file.")
-    if whole.info.sampling.seed == other.info.sampling.seed:
+    whole_training, whole_held_out = read_recording(training), read_recording(held_out)
+    if (
+        whole_training.rig.fingerprint != whole_held_out.rig.fingerprint
+        or whole_training.rig.joints != whole_held_out.rig.joints
+    ):
         raise RecordingError(
-            f"'{held_out}' has seed {other.info.sampling.seed}, as '{training}' has: its poses are no held-out ones; "
+            f"'{held_out}' is a recording of a different rig than '{training}'; record both from the same file."
+        )
+    if whole_training.info.sampling.seed == whole_held_out.info.sampling.seed:
+        raise RecordingError(
+            f"'{held_out}' has seed {whole_held_out.info.sampling.seed}, like '{training}', "
+            "so its poses are not held-out poses; "
             "record it with another --seed."
         )
-    small = cut(whole, names)
-    # The centers of neighbors are those of the whole mesh, as when all partitions train.
-    inputs = inputs_of_rig(whole.rig, partition_centers(whole.rig, whole.partitions), small.partitions)
-    return Material(whole, small, cut(other, names), inputs)
+    training_data = select_partitions(whole_training, names)
+    # Compute the centers from all partitions, as in a training of the whole character.
+    inputs = inputs_of_rig(
+        whole_training.rig, partition_centers(whole_training.rig, whole_training.partitions), training_data.partitions
+    )
+    return StudyData(whole_training, training_data, select_partitions(whole_held_out, names), inputs)
 
 
-def train_once(material: Material, config: TrainingConfig, model_path: Path) -> dict:
-    """Train, export and measure; writes the model and returns what is known of it, as docs/experiments.md has it."""
-    recording = material.training
-    wall, processor = time.perf_counter(), time.process_time()
+def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) -> dict:
+    """Train, export and measure one configuration; write its model and return its entry of study.json."""
+    recording = study_data.training
+    wall_start, processor_start = time.perf_counter(), time.process_time()
     split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
-    # Chosen among those of all partitions, as when all of them train.
-    surface_frames = select_surface_frames(material.whole, split, config.tolerance_mm)
-    own = np.isin(surface_frames.main_joints, [partition.joint for partition in recording.partitions])
-    inputs = material.inputs.with_surface_frames(surface_frames.subset(own), recording.partitions)
+    # Select among the surface frames of all partitions, as in a training of the whole character.
+    surface_frames = select_surface_frames(study_data.whole_training, split, config.tolerance_mm)
+    is_selected = np.isin(surface_frames.main_joints, [partition.joint for partition in recording.partitions])
+    inputs = study_data.inputs.with_surface_frames(surface_frames.subset(is_selected), recording.partitions)
     data = partition_data(recording, recording.partitions, inputs)
     prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
-    seconds = {"processor": time.process_time() - processor, "wall": time.perf_counter() - wall}
+    seconds = {"processor": time.process_time() - processor_start, "wall": time.perf_counter() - wall_start}
     poses, controls = (np.array(a[split.training]) for a in (recording.pose_matrices, recording.controls))
-    seen = inputs.features(poses, recording.rig.rest_matrices, controls)
-    training_range = measure_training_range(seen, recording.rig, recording.partitions)
+    training_features = inputs.features(poses, recording.rig.rest_matrices, controls)
+    training_range = measure_training_range(training_features, recording.rig, recording.partitions)
     trained_model = TrainedModel(
         recording.rig,
         recording.partitions,
@@ -120,7 +130,7 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
     )
     exported = build_model(recording, trained_model, split.validation, config.to_json())
     held_out = measure(
-        exported.session, material.held_out, trained_model, np.arange(len(material.held_out.pose_matrices))
+        exported.session, study_data.held_out, trained_model, np.arange(len(study_data.held_out.pose_matrices))
     )
     with atomic_write(model_path) as temporary:
         write_model(temporary, exported.content)
@@ -129,30 +139,30 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
         "model_bytes": len(exported.content),
         "parameters": sum(a.size for network in trained.networks for a in (*network.weights, *network.biases)),
         "partitions": {
-            prepared[n].name: {
+            prepared[index].name: {
                 "basis_left": {
-                    "validation": float(prepared[n].validation_truncation.mean()) * 1000,
-                    "held_out": _basis_left(trained_model, n, material.held_out),
+                    "validation": float(prepared[index].validation_truncation.mean()) * 1000,
+                    "held_out": _truncation_error_mm(trained_model, index, study_data.held_out),
                 },
-                **_partition(trained_model, n, exported.held_out, held_out, curves),
+                **_partition_entry(trained_model, index, exported.held_out, held_out, curves),
             }
-            for n, curves in enumerate(trained.curves)
+            for index, curves in enumerate(trained.curves)
         },
     }
 
 
-def _partition(
-    trained_model: TrainedModel, number: int, validation: PositionErrors, held_out: PositionErrors, curves: Curves
+def _partition_entry(
+    trained_model: TrainedModel, index: int, validation: PositionErrors, held_out: PositionErrors, curves: Curves
 ) -> dict:
-    vertices = trained_model.partitions[number].vertices
+    vertices = trained_model.partitions[index].vertices
 
     def errors(distances: np.ndarray) -> dict:
         return error_statistics(distances[:, vertices]).to_json()
 
     return {
         "vertices": len(vertices),
-        "features": len(trained_model.prepared[number].columns),
-        "basis": trained_model.component_counts()[number],
+        "features": len(trained_model.prepared[index].columns),
+        "basis": trained_model.component_counts()[index],
         "validation": errors(validation.fdda),
         "validation_linear": errors(validation.linear),
         "held_out": errors(held_out.fdda),
@@ -165,57 +175,57 @@ def _partition(
     }
 
 
-def _basis_left(trained_model: TrainedModel, number: int, recording: Recording) -> float:
-    """Mean distance that the basis leaves where its best coefficients are known, mm: what a perfect network leaves."""
-    partition, prepared = trained_model.partitions[number], trained_model.prepared[number]
+def _truncation_error_mm(trained_model: TrainedModel, index: int, recording: Recording) -> float:
+    """Return the mean error with the best coefficients of the basis, mm: the error of a network without error."""
+    partition, prepared = trained_model.partitions[index], trained_model.prepared[index]
     skin = skin_matrices(recording.pose_matrices, recording.rig.rest_matrices).astype(np.float64)
     fitted = prepared.fit.offsets(skin) @ np.linalg.inv(skin[:, partition.joint, :3, :3]).transpose(0, 2, 1)
-    learned = (recording.residuals[:, partition.vertices] - fitted).reshape(len(skin), -1).astype(np.float32)
-    left = prepared.basis.residuals(prepared.basis.coefficients(learned)) - learned
-    return error_statistics(np.linalg.norm(left.reshape(fitted.shape), axis=2)).mean
+    residuals = (recording.residuals[:, partition.vertices] - fitted).reshape(len(skin), -1).astype(np.float32)
+    truncation = prepared.basis.residuals(prepared.basis.coefficients(residuals)) - residuals
+    return error_statistics(np.linalg.norm(truncation.reshape(fitted.shape), axis=2)).mean
 
 
 def validation_score(training: dict) -> float:
-    """What a learning rate is chosen by: validation error as a part of linear skinning's, mean over the partitions."""
+    """Return validation error / error of linear skinning, mean over the partitions; it chooses the learning rate."""
     partitions = training["partitions"].values()
     return float(np.mean([p["validation"]["mean"] / p["validation_linear"]["mean"] for p in partitions]))
 
 
 class Trainings:
-    """The trainings in a folder, each made when it is first asked for.
+    """The trainings in a folder; each is trained on the first request.
 
     Attributes:
-        made: how many were trained, the others were there already.
+        trained_count: number of trainings in this process; the others were in the folder.
     """
 
-    def __init__(self, material: Material, folder: Path, say: Callable[[str], None]):
-        self.material, self.folder, self.say, self.made = material, folder, say, 0
+    def __init__(self, study_data: StudyData, folder: Path, report: Callable[[str], None]):
+        self.study_data, self.folder, self.report, self.trained_count = study_data, folder, report, 0
         folder.mkdir(parents=True, exist_ok=True)
         self.origin = [
             {**asdict(r.rig.fingerprint), "poses": r.info.poses, "seed": r.info.sampling.seed}
-            for r in (material.training, material.held_out)
+            for r in (study_data.training, study_data.held_out)
         ]
 
     def get(self, config: TrainingConfig) -> dict:
-        """What `train_once` says of a configuration; `model` is the name of the model in the folder."""
+        """Return the result of `train_once` for a configuration, with the name of the model file as `model`."""
         units, layers = config.hidden[0], len(config.hidden)
         name = f"{units}x{layers}-{config.activation}-{config.learning_rate:g}-seed{config.seed}"
-        model, notes = self.folder / f"{name}.onnx", self.folder / f"{name}.json"
+        model_path, notes_path = self.folder / f"{name}.onnx", self.folder / f"{name}.json"
         origin = {"settings": config.to_json(), "recordings": self.origin}
-        if model.exists() and notes.exists():
-            known = json.loads(notes.read_text(encoding="utf-8"))
-            # Other poses or epochs under the same name: train again.
-            if known.pop("origin") == origin:
-                return known
+        if model_path.exists() and notes_path.exists():
+            saved_entry = json.loads(notes_path.read_text(encoding="utf-8"))
+            # Train again if other poses or epochs have the same name.
+            if saved_entry.pop("origin") == origin:
+                return saved_entry
         try:
-            if not self.made:
-                # The first training of a process pays for what torch loads then.
-                train_once(self.material, replace(config, epochs=1), model)
-            training = train_once(self.material, config, model)
+            if not self.trained_count:
+                # Train one epoch untimed, because torch loads modules in the first training of a process.
+                train_once(self.study_data, replace(config, epochs=1), model_path)
+            training = train_once(self.study_data, config, model_path)
         except TrainingError as error:
             raise TrainingError(f"{name}: {error}") from error
-        self.made += 1
-        training |= {"model": model.name}
-        write_json(notes, training | {"origin": origin})
-        self.say(f"{name}: {100 * validation_score(training):.2f} %, {training['seconds']['wall']:.1f} s")
+        self.trained_count += 1
+        training |= {"model": model_path.name}
+        write_json(notes_path, training | {"origin": origin})
+        self.report(f"{name}: {100 * validation_score(training):.2f} %, {training['seconds']['wall']:.1f} s")
         return training

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames a second in a window: `blender BOUND.blend --python benchmarks/viewport.py -- OUT.json [FRAMES]`.
+"""Measure frames per second in a window: `blender BOUND.blend --python benchmarks/viewport.py -- OUT.json [FRAMES]`.
 
-Plays the scene's frames with the rig and with the model in turn, all bound characters of the file at once, with the
-sidebar closed. A frame is timed twice: evaluated and drawn, as an animator sees it, and drawn alone. Writes the medians
-to OUT.json, prints them, and ends Blender.
+Plays the frames of the scene alternately with the rig and with the model, for all bound characters at once, with the
+sidebar closed. Times each frame twice: first evaluated and drawn, as during playback, then only drawn again. Writes the
+medians to OUT.json, prints them, and quits Blender.
 """
 
 import json
@@ -15,60 +15,60 @@ from pathlib import Path
 import bpy
 
 ROUNDS = 3
-"""How often rig and model take turns."""
-WARM_UP = 5
+"""How often rig and model alternate."""
+WARM_UP_FRAMES = 5
 SETTLE_SECONDS = 2.0
-"""A window needs this before what it draws is what it will draw."""
+"""Time from the start until the drawing time of the window is steady, seconds."""
 MODES = ("RIG", "FDDA")
 
 
-def characters() -> list[bpy.types.Object]:
-    """The bound mesh objects of the file."""
+def bound_characters() -> list[bpy.types.Object]:
+    """Return the bound mesh objects of the file."""
     return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
 
 
-def draw_ms(kind: str) -> float:
-    """What Blender's own timer of redraws says of one, in milliseconds."""
+def time_redraw_ms(kind: str) -> float:
+    """Time one iteration of Blender's operator `wm.redraw_timer`, in milliseconds."""
     start = time.perf_counter()
     bpy.ops.wm.redraw_timer(type=kind, iterations=1)
     return (time.perf_counter() - start) * 1000
 
 
 def measure(frames: int) -> dict[str, dict[str, float]]:
-    """Medians in milliseconds, by mode: a frame played, one drawn again as it stands, and the difference."""
+    """Return, by mode, the median milliseconds to play a frame and to draw it again, and the frames per second."""
     scene = bpy.context.scene
-    played: dict[str, list[float]] = {mode: [] for mode in MODES}
-    still: dict[str, list[float]] = {mode: [] for mode in MODES}
+    frame_ms: dict[str, list[float]] = {mode: [] for mode in MODES}
+    drawing_ms: dict[str, list[float]] = {mode: [] for mode in MODES}
     for _ in range(ROUNDS):
         for mode in MODES:
-            for mesh_object in characters():
+            for mesh_object in bound_characters():
                 mesh_object.fdda.mode = mode
             scene.frame_set(scene.frame_start)
-            for number in range(WARM_UP + frames):
-                step = draw_ms("ANIM_STEP") + draw_ms("DRAW_WIN_SWAP")
-                again = draw_ms("DRAW_WIN_SWAP")
-                if number >= WARM_UP:
-                    played[mode].append(step)
-                    still[mode].append(again)
+            for frame_index in range(WARM_UP_FRAMES + frames):
+                played_ms = time_redraw_ms("ANIM_STEP") + time_redraw_ms("DRAW_WIN_SWAP")
+                redrawn_ms = time_redraw_ms("DRAW_WIN_SWAP")
+                if frame_index >= WARM_UP_FRAMES:
+                    frame_ms[mode].append(played_ms)
+                    drawing_ms[mode].append(redrawn_ms)
     return {
         mode: {
-            "frame": statistics.median(played[mode]),
-            "drawing": statistics.median(still[mode]),
-            "frames_per_second": 1000 / statistics.median(played[mode]),
+            "frame": statistics.median(frame_ms[mode]),
+            "drawing": statistics.median(drawing_ms[mode]),
+            "frames_per_second": 1000 / statistics.median(frame_ms[mode]),
         }
         for mode in MODES
     }
 
 
 def main(out: Path, frames: int) -> None:
-    """Measure, write and print."""
+    """Measure both modes, write the medians to a file and print them."""
     for area in bpy.context.screen.areas:
         if area.type == "VIEW_3D":
             area.spaces.active.show_region_ui = False
     results = {
         "unit": "ms",
         "blender": bpy.app.version_string,
-        "characters": {o.name: len(o.data.vertices) for o in characters()},
+        "characters": {o.name: len(o.data.vertices) for o in bound_characters()},
         "modes": measure(frames),
     }
     out.write_text(json.dumps(results, indent=1))

@@ -8,7 +8,7 @@ when the goal is met. All engines use the same graph: they run a task by its nam
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from fdda_addon.core.report import CHECKPOINT_SUFFIX, REPORT_HTML, REPORT_JSON
@@ -88,16 +88,6 @@ class Task:
     def lock(self) -> Path:
         """Path of the lock, which is held while a process of the task runs."""
         return self.folder.with_name(f"{self.folder.name}.lock")
-
-    def to_json(self) -> dict:
-        """Return the JSON of the task, with paths as strings."""
-        return asdict(self, dict_factory=lambda items: {key: _to_plain(value) for key, value in items})
-
-
-def _to_plain(value: object) -> object:
-    if isinstance(value, Path):
-        return str(value)
-    return [_to_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 def make_tasks(plan: Plan) -> dict[str, Task]:

@@ -13,9 +13,9 @@ from benchmarks.stress_playback import MAX_DIFFERENCE_M, OPERATION_WEIGHTS, Play
 def test_random_operations_leave_correct_playback_and_no_memory(bound, elbow, tmp_path, seed):
     bpy.context.scene.frame_set(1)
     outcome = PlaybackStress(bound, elbow.model, 6, tmp_path, seed).run(250)
-    assert outcome.largest < MAX_DIFFERENCE_M, outcome.worst
-    assert outcome.compared > 750 and len(outcome.operations) == len(OPERATION_WEIGHTS)
+    assert outcome.largest_difference < MAX_DIFFERENCE_M, outcome.worst_case
+    assert outcome.compared_count > 750 and len(outcome.operations) == len(OPERATION_WEIGHTS)
     # What was allocated once stays; a character more or less is below a megabyte.
-    half = len(outcome.memory) // 2
+    half = len(outcome.memory_mb) // 2
     # Only Linux says what a process holds.
-    assert sys.platform != "linux" or outcome.memory[-1] - outcome.memory[half] < 10
+    assert sys.platform != "linux" or outcome.memory_mb[-1] - outcome.memory_mb[half] < 10

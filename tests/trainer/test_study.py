@@ -8,8 +8,8 @@ import onnx
 import pytest
 
 from benchmarks.study import Plan, main, study
-from benchmarks.study_tables import tables
-from benchmarks.study_trainings import Material, Trainings, cut, read_material, train_once
+from benchmarks.study_tables import format_tables
+from benchmarks.study_trainings import StudyData, Trainings, read_study_data, select_partitions, train_once
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.recording.reader import read_recording
@@ -28,7 +28,7 @@ PLAN = Plan(
     units=(8, 24),
     layers=(2,),
     activations=("silu", "relu"),
-    beside=(),
+    extra_configurations=(),
     learning_rates=(0.001, 0.02),
     seeds=(0, 1),
     epochs=10,
@@ -75,10 +75,10 @@ def test_every_configuration_is_trained_with_every_seed(result):
 def test_networks_see_surface_frames_where_the_rig_smooths(tmp_path):
     tube = write_tube(tmp_path / "tube")
     names = ("bone_1",)
-    small = cut(tube, names)
+    small = select_partitions(tube, names)
     inputs = inputs_of_rig(tube.rig, partition_centers(tube.rig, tube.partitions), small.partitions)
     model = tmp_path / "tube.onnx"
-    train_once(Material(tube, small, small, inputs), TrainingConfig(epochs=1, hidden=(8, 8)), model)
+    train_once(StudyData(tube, small, small, inputs), TrainingConfig(epochs=1, hidden=(8, 8)), model)
     seen = next(info for info in onnx.load(model).graph.initializer if info.name == "main_joint_axes").dims
     split = split_poses(np.arange(len(tube.pose_matrices)), 0.05, 0)
     of_all = select_surface_frames(tube, split, TrainingConfig().tolerance_mm)
@@ -96,7 +96,7 @@ def test_the_learning_rate_is_the_one_of_the_least_validation_error(studied, res
 
 
 def test_the_errors_are_those_of_the_model_on_the_held_out_poses(studied, result, held_out):
-    small = cut(read_recording(held_out), NAMES)
+    small = select_partitions(read_recording(held_out), NAMES)
     truth = LinearSkinning(small.rig).complex_positions(small.pose_matrices, small.residuals)
     training = result["configurations"][0]["trainings"][1]
     played = Network(studied / "trainings" / training["model"]).positions(small.pose_matrices)
@@ -111,15 +111,15 @@ def test_the_networks_see_what_they_see_when_all_partitions_train(recording, hel
     whole = read_recording(recording)
     inputs = inputs_of_rig(whole.rig, partition_centers(whole.rig, whole.partitions), whole.partitions)
     features = inputs.features(whole.pose_matrices, whole.rig.rest_matrices)
-    material = read_material(recording, held_out, NAMES)
-    own = material.inputs.features(material.training.pose_matrices, material.training.rig.rest_matrices)
-    for columns, all_columns in zip(material.inputs.columns, inputs.columns[1:], strict=True):
+    study_data = read_study_data(recording, held_out, NAMES)
+    own = study_data.inputs.features(study_data.training.pose_matrices, study_data.training.rig.rest_matrices)
+    for columns, all_columns in zip(study_data.inputs.columns, inputs.columns[1:], strict=True):
         assert np.array_equal(own[:, columns], features[:, all_columns])
 
 
 def test_tables_and_pictures(studied, result):
     text = (studied / "tables.md").read_text(encoding="utf-8")
-    assert text == tables(result)
+    assert text == format_tables(result)
     for configuration in result["configurations"]:
         hidden = f"{configuration['units']} {configuration['units']}"
         assert f"| {hidden} | {configuration['activation']} | {configuration['learning_rate']:g} |" in text
@@ -133,7 +133,7 @@ def test_a_factor_is_the_ratio_of_what_differs_in_it_alone(result):
         for seed, training in enumerate(configuration["trainings"]):
             for partition in training["partitions"].values():
                 partition["held_out"]["mean"] = (2.0 if configuration["units"] == 24 else 4.0) * (1 + seed)
-    (row,) = [line for line in tables(result).splitlines() if line.startswith("| 24 units")]
+    (row,) = [line for line in format_tables(result).splitlines() if line.startswith("| 24 units")]
     assert row.split(" | ")[1] == "0.50 (0.50 to 0.50), less in 4 of 4"
 
 
@@ -151,11 +151,11 @@ def test_an_interrupted_study_resumes(studied, recording, held_out, capsys):
 
 
 def test_other_settings_train_again(recording, held_out, tmp_path, capsys):
-    material = read_material(recording, held_out, NAMES)
+    study_data = read_study_data(recording, held_out, NAMES)
     for epochs in (2, 3):
-        trainings = Trainings(material, tmp_path, print)
+        trainings = Trainings(study_data, tmp_path, print)
         training = trainings.get(TrainingConfig(hidden=(8, 8), epochs=epochs))
-        assert trainings.made == 1
+        assert trainings.trained_count == 1
         assert len(training["partitions"]["bone_1"]["curve"]["validation"]) == epochs
 
 
