@@ -51,7 +51,7 @@ def measure_repeatability(
             before = skinning.complex_positions(pose[None], np.array(recorded[number])[None])[0]
             target_distances.append(distances(positions, before, rig.metres_per_unit))
             linear_distances.append(distances(before, skinning.positions(pose[None])[0], rig.metres_per_unit))
-            yield Progress("repeatability", done, len(numbers), detail=str(settler.last) if settler else "")
+            yield Progress("repeatability", done, len(numbers), detail=str(settler.last_rest_state) if settler else "")
     statistics = {
         name: round(value, 6) for name, value in error_statistics(np.stack(target_distances)).to_json().items()
     }

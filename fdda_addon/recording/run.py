@@ -223,7 +223,7 @@ def _record_poses(
     with ExitStack() as stack:
         appenders = []
         for mesh in meshes:
-            info = replace(_make_info(mesh, settings, plan, pose_indices), target=plan.pose_setter.recorded)
+            info = replace(_make_info(mesh, settings, plan, pose_indices), target=plan.pose_setter.recorded_target)
             writer = RecordingWriter(
                 mesh.fitted.planned.path,
                 *(mesh.fitted.rig, mesh.partitions, info),
@@ -232,7 +232,7 @@ def _record_poses(
             skinning = LinearSkinning(mesh.fitted.rig, mesh.partitions)
             appenders.append(PoseAppender(mesh.evaluator, skinning, stack.enter_context(writer), plan.pose_setter))
         first, settler = min(appender.pose_count for appender in appenders), plan.pose_setter.settler
-        seconds = settler.last.seconds if settler and settler.last else None
+        seconds = settler.last_rest_state.seconds if settler and settler.last_rest_state else None
         yield Progress(
             "poses",
             first,
@@ -243,7 +243,7 @@ def _record_poses(
         # Closed before the writers, so that evaluated poses are kept when the recording is interrupted.
         with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as steps:
             for done in steps:
-                yield Progress("poses", done, len(pose_indices), detail=str(settler.last) if settler else "")
+                yield Progress("poses", done, len(pose_indices), detail=str(settler.last_rest_state) if settler else "")
         if plan.repeatable_poses and settings.target.repeatability_poses and len(pose_indices) == plan.total:
             yield from measure_repeatability(meshes[0], plan, player, writer, settings.target.repeatability_poses)
             yield Progress("poses", len(pose_indices), len(pose_indices))

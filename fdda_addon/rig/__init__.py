@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads the rig of a scene: joints, skin, controls, replaced modifiers; refuses rigs that no model can represent."""
+"""Reads the rig of a scene: joints, skin weights, controls and modifiers. Rejects rigs that no model can represent."""

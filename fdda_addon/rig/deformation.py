@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads what deforms a mesh besides its skin weights, and what its model therefore replaces (`core.deformation`)."""
+"""Reads the modifiers, shape keys and drivers that deform a mesh besides its skin weights (`core.deformation`)."""
 
 import json
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ _SIGNIFICANT_DIGITS = 6
 
 
 def read_deformation(scene_rig: SceneRig) -> dict:
-    """Read what deforms the mesh of a rig besides its skin weights, as JSON values.
+    """Read the modifiers, shape keys, B-Bones and drivers that deform the mesh of a rig, as JSON values.
 
     Raises:
         RigError: as `recorded_modifiers`.
@@ -40,10 +40,10 @@ def read_deformation(scene_rig: SceneRig) -> dict:
 
 def read_b_bones(armature: bpy.types.Armature) -> dict:
     """Read the settings of the deforming bones that have B-Bone segments, by the names of the bones."""
-    properties = [prop.identifier for prop in bpy.types.Bone.bl_rna.properties]
-    names = [name for name in properties if name.startswith("bbone_") and name not in _DISPLAY_PROPERTIES]
+    property_names = [prop.identifier for prop in bpy.types.Bone.bl_rna.properties]
+    setting_names = [name for name in property_names if name.startswith("bbone_") and name not in _DISPLAY_PROPERTIES]
     return {
-        bone.name: {name.removeprefix("bbone_"): _json_property(None, bone, name) for name in names}
+        bone.name: {name.removeprefix("bbone_"): _json_property(None, bone, name) for name in setting_names}
         for bone in armature.bones
         if bone.use_deform and bone.bbone_segments > 1
     }
@@ -56,16 +56,19 @@ def _read_modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
     else:
         properties = [p for p in modifier.bl_rna.properties if p.identifier not in _COMMON_PROPERTIES]
         bind_property = BIND_PROPERTIES.get(modifier.type)
-        names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bind_property]
-        settings = {name: _json_property(scene_rig, modifier, name) for name in names if _is_setting(modifier, name)}
-    animated = animated_paths(modifier.id_data)
+        setting_names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bind_property]
+        settings = {
+            name: _json_property(scene_rig, modifier, name) for name in setting_names if _is_setting(modifier, name)
+        }
+    animated_names = animated_paths(modifier.id_data)
     for name in settings:
-        if f"{modifier.path_from_id()}.{name}" in animated:
+        if f"{modifier.path_from_id()}.{name}" in animated_names:
             settings[name] = None
     return {"name": modifier.name, "type": modifier.type, "settings": settings}
 
 
 def _is_setting(struct: bpy.types.bpy_struct, name: str) -> bool:
+    """Return whether a property holds a value or a datablock, not a nested struct or a collection."""
     prop = struct.bl_rna.properties[name]
     if prop.type == "POINTER":
         return issubclass(getattr(bpy.types, prop.fixed_type.identifier, object), bpy.types.ID)
@@ -75,26 +78,26 @@ def _is_setting(struct: bpy.types.bpy_struct, name: str) -> bool:
 def _node_inputs(modifier: bpy.types.NodesModifier) -> dict:
     group = modifier.node_group
     items = [] if group is None else group.interface.items_tree
-    sockets = [i.identifier for i in items if i.item_type == "SOCKET" and i.in_out == "INPUT"]
-    values = {socket: node_input(modifier, socket) for socket in sockets}
-    return {socket: _json_value(None, value) for socket, value in values.items() if value is not None}
+    identifiers = [item.identifier for item in items if item.item_type == "SOCKET" and item.in_out == "INPUT"]
+    values = {identifier: node_input(modifier, identifier) for identifier in identifiers}
+    return {identifier: _json_value(None, value) for identifier, value in values.items() if value is not None}
 
 
 def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
     """Read the settings of the shape keys that move vertices, by name; animated settings are None."""
-    keys = mesh_object.data.shape_keys
-    if keys is None:
+    key_datablock = mesh_object.data.shape_keys
+    if key_datablock is None:
         return {}
-    animated, relatives, shape_keys = animated_paths(keys), {}, {}
-    for block in keys.key_blocks:
-        if block == keys.reference_key:
+    animated, relative_positions, shape_keys = animated_paths(key_datablock), {}, {}
+    for block in key_datablock.key_blocks:
+        if block == key_datablock.reference_key:
             continue
         positions = read(block.data, COORDINATE_ELEMENT)
-        relative = block.relative_key
-        if relative.name not in relatives:
-            relatives[relative.name] = read(relative.data, COORDINATE_ELEMENT)
-        if (positions == relatives[relative.name]).all():
-            # It moves no vertex.
+        relative_key = block.relative_key
+        if relative_key.name not in relative_positions:
+            relative_positions[relative_key.name] = read(relative_key.data, COORDINATE_ELEMENT)
+        if (positions == relative_positions[relative_key.name]).all():
+            # The key moves no vertex.
             continue
         settings = {name: _json_property(None, block, name) for name in _SHAPE_KEY_PROPERTIES}
         for name in settings:
@@ -129,9 +132,13 @@ def _read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
         *(curve.data_path, curve.array_index, curve.mute, driver.type),
         driver.expression if driver.type == "SCRIPTED" else "",
         [[_rounded(coordinate) for coordinate in point.co] for point in curve.keyframe_points],
-        [list(map(_rounded, m.coefficients)) for m in curve.modifiers if m.type == "GENERATOR"],
+        [list(map(_rounded, modifier.coefficients)) for modifier in curve.modifiers if modifier.type == "GENERATOR"],
         [
-            [variable.name, variable.type, *(list(_read_target(scene_rig, variable, t)) for t in variable.targets)]
+            [
+                variable.name,
+                variable.type,
+                *(list(_read_target(scene_rig, variable, target)) for target in variable.targets),
+            ]
             for variable in driver.variables
         ],
     ]
@@ -140,7 +147,7 @@ def _read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
 def _read_target(
     scene_rig: SceneRig, variable: bpy.types.DriverVariable, target: bpy.types.DriverTarget
 ) -> Iterator[str]:
-    # Without the names of other objects, which differ in a duplicate of the character.
+    # Leave out the names of other objects, because they differ in a duplicate of the character.
     owner = "" if target.id is None else owner_name(scene_rig, target.id)
     yield owner.partition(":")[0]
     if variable.type == "SINGLE_PROP":
@@ -154,7 +161,7 @@ def _json_property(scene_rig: SceneRig | None, struct: bpy.types.bpy_struct, nam
 
 
 def _json_value(scene_rig: SceneRig | None, value: object) -> object:
-    """Convert the value of a property to JSON; of a datablock only its type, because its name may change."""
+    """Convert the value of a property to JSON; a datablock becomes its type alone, because its name may change."""
     if value is None:
         return ""
     if isinstance(value, bool | int | str):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds what a mesh depends on besides its skin weights: bones and numbers that its drivers and modifiers read."""
+"""Finds the bones and numbers that drivers and modifiers of a mesh read, so that the mesh depends on them."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from .sources import Sources
 
 @dataclass(frozen=True)
 class Dependencies:
-    """What a mesh depends on besides its skin weights.
+    """Bones and controls on which a mesh depends besides its skin weights.
 
     Attributes:
         bones: names of bones of its armature that its drivers read, or that move objects that its modifiers read.
@@ -29,7 +29,7 @@ class Dependencies:
 
 
 def read_dependencies(scene_rig: SceneRig, actions: Iterable[bpy.types.Action] = ()) -> Dependencies:
-    """Find what a mesh depends on, except numbers without a range, which a user can list with one.
+    """Find the bones and controls on which a mesh depends, except numbers without a range, which a user can list.
 
     Args:
         scene_rig: the rig.
@@ -50,8 +50,12 @@ def read_dependencies(scene_rig: SceneRig, actions: Iterable[bpy.types.Action] =
 
 def deforming_mesh_objects(scene_rig: SceneRig) -> list[bpy.types.Object]:
     """Find the other mesh objects that deform a mesh."""
-    objects = Sources(scene_rig, scene_rig.mesh_object).objects
-    return [source for source, uses_geometry in list(objects.items())[1:] if uses_geometry and source.type == "MESH"]
+    sources = Sources(scene_rig, scene_rig.mesh_object).objects
+    return [
+        source_object
+        for source_object, uses_geometry in list(sources.items())[1:]
+        if uses_geometry and source_object.type == "MESH"
+    ]
 
 
 def _driver_inputs(sources: Sources) -> Iterator[str]:
@@ -63,8 +67,12 @@ def _driver_inputs(sources: Sources) -> Iterator[str]:
 
 def _keyed_shape_keys(sources: Sources, actions: tuple[bpy.types.Action, ...]) -> Iterator[str]:
     """Yield the names of the controls that are values of keyed shape keys."""
-    for keys in (datablock for datablock in sources.datablocks if isinstance(datablock, bpy.types.Key)):
-        keyed = {curve.data_path for curve in curves_with_actions(keys, actions) if changes_value(curve)}
-        for block in keys.key_blocks:
-            if (path := block.path_from_id("value")) in keyed and not block.mute and block != keys.reference_key:
-                yield sources.control_name(keys, path)
+    for shape_keys in (datablock for datablock in sources.datablocks if isinstance(datablock, bpy.types.Key)):
+        keyed_paths = {curve.data_path for curve in curves_with_actions(shape_keys, actions) if changes_value(curve)}
+        for block in shape_keys.key_blocks:
+            if (
+                (path := block.path_from_id("value")) in keyed_paths
+                and not block.mute
+                and block != shape_keys.reference_key
+            ):
+                yield sources.control_name(shape_keys, path)

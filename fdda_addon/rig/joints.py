@@ -16,7 +16,7 @@ COINCIDENCE_TOLERANCE = 1e-5
 
 
 def choose_joints(
-    scene_rig: SceneRig, skinning: Iterable[str], extra_joints: Iterable[str] | None = None
+    scene_rig: SceneRig, weighted_bones: Iterable[str], extra_joints: Iterable[str] | None = None
 ) -> tuple[Joint, ...]:
     """Choose the joints of a rig; every parent comes before its children.
 
@@ -25,14 +25,14 @@ def choose_joints(
 
     Args:
         scene_rig: the rig.
-        skinning: names of the bones that have weights, `STATIC_JOINT` among them; if empty, all deforming bones.
+        weighted_bones: names of the bones that have weights, `STATIC_JOINT` among them; if empty, all deforming bones.
         extra_joints: names of further joints; names that the armature lacks are ignored. If they include all joints,
-            they define the order. None for the bones that have a range of motion, those that the mesh depends on in
-            other ways, and all parents of joints.
+            they define the order. By default: the bones that have a range of motion, the bones on which the mesh
+            depends in other ways, and all ancestors of joints.
     """
     armature_object = scene_rig.armature_object
     bones = armature_object.data.bones
-    names = set(skinning)
+    names = set(weighted_bones)
     extra_joints = None if extra_joints is None else list(extra_joints)
     if not names - {STATIC_JOINT}:
         names |= {bone.name for bone in bones if bone.use_deform}
@@ -45,42 +45,42 @@ def choose_joints(
     joint_bones = [bone for bone in bones if bone.name in names]
     parents = _parents(joint_bones)
     depths = {bone.name: _depth(bone.name, parents) for bone in joint_bones}
-    ordered = sorted((bone.name for bone in joint_bones), key=depths.__getitem__)
-    given_order = [name for name in extra_joints or () if name != STATIC_JOINT]
-    if set(given_order) == set(ordered):
+    ordered_names = sorted((bone.name for bone in joint_bones), key=depths.__getitem__)
+    extra_order = [name for name in extra_joints or () if name != STATIC_JOINT]
+    if set(extra_order) == set(ordered_names):
         # The order of an armature's bones changes when other bones are added.
-        indices = {name: index for index, name in enumerate(given_order)}
-        if all(indices.get(parents[name], -1) < indices[name] for name in given_order):
-            ordered = given_order
-    indices = {name: index for index, name in enumerate(ordered)}
-    joints = [Joint(name, indices[parents[name]] if parents[name] else -1) for name in ordered]
+        indices = {name: index for index, name in enumerate(extra_order)}
+        if all(indices.get(parents[name], -1) < indices[name] for name in extra_order):
+            ordered_names = extra_order
+    indices = {name: index for index, name in enumerate(ordered_names)}
+    joints = [Joint(name, indices[parents[name]] if parents[name] else -1) for name in ordered_names]
     return (*joints, *([Joint(STATIC_JOINT, -1)] if STATIC_JOINT in names else []))
 
 
 def _parents(joint_bones: list[bpy.types.Bone]) -> dict[str, str]:
     """Find the parent joint of each joint, by name; empty for a root."""
     names = {bone.name for bone in joint_bones}
-    ends = np.array([[*bone.head_local, *bone.tail_local] for bone in joint_bones]).reshape(-1, 6)
-    parents = {bone.name: _parent(bone, names, joint_bones, ends) for bone in joint_bones}
-    # Coincident bones may each find the other one as parent: then only real ancestors count.
+    bone_ends = np.array([[*bone.head_local, *bone.tail_local] for bone in joint_bones]).reshape(-1, 6)
+    parents = {bone.name: _parent(bone, names, joint_bones, bone_ends) for bone in joint_bones}
+    # Two coincident bones may each find the other as its parent. Then only ancestors in the armature count.
     if any(_depth(name, parents) > len(joint_bones) for name in parents):
-        parents = {bone.name: _parent(bone, names, [], ends[:0]) for bone in joint_bones}
+        parents = {bone.name: _parent(bone, names, [], bone_ends[:0]) for bone in joint_bones}
     return parents
 
 
-def _parent(bone: bpy.types.Bone, names: set[str], joint_bones: list[bpy.types.Bone], ends: np.ndarray) -> str:
+def _parent(bone: bpy.types.Bone, names: set[str], joint_bones: list[bpy.types.Bone], bone_ends: np.ndarray) -> str:
     """Find the parent joint of a joint.
 
     Args:
         bone: the bone of the joint.
         names: names of all joints.
         joint_bones: bones of the joints that an ancestor may coincide with.
-        ends: (n, 6) float64, head and tail of these bones, armature space.
+        bone_ends: (n, 6) float64, head and tail of these bones, armature space.
     """
     for ancestor in bone.parent_recursive:
         if ancestor.name in names:
             return ancestor.name
-        distances = np.abs(ends - [*ancestor.head_local, *ancestor.tail_local]).max(axis=1, initial=0)
+        distances = np.abs(bone_ends - [*ancestor.head_local, *ancestor.tail_local]).max(axis=1, initial=0)
         for index in np.flatnonzero(distances <= COINCIDENCE_TOLERANCE * ancestor.length):
             if joint_bones[index] != bone:
                 return joint_bones[index].name
@@ -88,7 +88,7 @@ def _parent(bone: bpy.types.Bone, names: set[str], joint_bones: list[bpy.types.B
 
 
 def _depth(name: str, parents: dict[str, str]) -> int:
-    """Count the ancestors of a joint; more than all joints for a cycle."""
+    """Count the ancestors of a joint; if the parents form a cycle, the count is larger than the number of joints."""
     depth = 0
     while (name := parents[name]) and depth <= len(parents):
         depth += 1

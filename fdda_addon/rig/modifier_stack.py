@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sorts the modifiers of a rig: those that a model replaces, those that stay on, and those that are refused.
+"""Sorts the modifiers of a rig into those that a model replaces, those that stay on, and those that prevent a model.
 
 A model replaces all modifiers up to the last one that moves vertices. The modifiers after it that are on, such as a
-subdivision, are downstream: they work on the output of the rig, and in the same way on that of the model. numpy is not
-needed.
+subdivision, are downstream: they apply to the output of the rig, and in the same way to the output of the model. This
+module does not import numpy, because Blender starts without it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -39,24 +39,24 @@ BIND_PROPERTIES = {
     "CORRECTIVE_SMOOTH": "is_bind", "LAPLACIANDEFORM": "is_bind", "MESH_DEFORM": "is_bound",
     "SURFACE_DEFORM": "is_bound",
 }  # fmt: skip
-"""Modifiers that must be bound to a rest pose, and the property that tells whether they are."""
+"""Types of modifiers that must be bound to a rest pose, and their property that is true if they are bound."""
 INDIRECT_TYPES = {
     "DATA_TRANSFER", "TRIANGULATE", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY",
 }  # fmt: skip
 """Modifiers that move no vertices, but change the effect of later modifiers: they edit weights or edges."""
 ORIGINAL_MESH_TYPES = {"MULTIRES", "SOFT_BODY"}
-"""Modifiers before which Blender allows no modifier that creates a mesh, such as the FDDA modifier, on or off."""
+"""Modifiers that need the original mesh: Blender allows no Geometry Nodes modifier, such as FDDA's, before them."""
 
 
-class _Kind(Enum):
+class _ModifierEffect(Enum):
     NEUTRAL = auto()
     """Keeps the vertices and their positions: it changes UV maps, weights or normals, or emits particles."""
     DEFORMS = auto()
     """Moves vertices."""
     GENERATES = auto()
     """Changes the topology."""
-    UNSURE = auto()
-    """Only an evaluation tells whether it deforms or generates."""
+    UNKNOWN = auto()
+    """Only an evaluation shows whether it deforms or generates."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class ModifierStack:
 
     Attributes:
         replaced: modifiers that move vertices, on or off, up to the last one that is on, and those that need the
-            original mesh. For a bound object, all of these before the FDDA modifier.
+            original mesh. For a bound object, all such modifiers before the FDDA modifier.
         misplaced: modifiers that are on and change the topology before the last of `replaced`.
-        downstream: modifiers that are on after it. They change the topology or, after the FDDA modifier, deform.
+        downstream: modifiers that are on after the last of `replaced`, and change the topology or move vertices.
         insert_index: index after the last of `replaced`, not counting the FDDA modifier.
     """
 
@@ -87,33 +87,47 @@ def is_fdda_modifier(modifier: bpy.types.Modifier) -> bool:
 def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     """Sort the modifiers of a mesh object while no model plays.
 
-    Geometry Nodes that may deform or generate are evaluated, to see whether they keep the topology of the mesh.
+    Geometry Nodes with an unknown effect are evaluated, to find out whether they keep the topology of the mesh.
 
     Raises:
         RigError: Geometry Nodes have to be evaluated, and the object is hidden.
     """
     modifiers = [m for m in mesh_object.modifiers if not is_fdda_modifier(m)]
-    kinds = [_kind(m) for m in modifiers]
-    unsure = [i for i, m in enumerate(modifiers) if kinds[i] is _Kind.UNSURE and m.show_viewport]
-    generating = [m for m, kind in zip(modifiers, kinds, strict=True) if kind in {_Kind.GENERATES, _Kind.UNSURE}]
-    for i in unsure:
-        with _switched_off(mesh_object, [m for m in generating if m != modifiers[i]]):
-            kinds[i] = _Kind.DEFORMS if _keeps_topology(mesh_object) else _Kind.GENERATES
-    deforming = [i for i, kind in enumerate(kinds) if kind in {_Kind.DEFORMS, _Kind.UNSURE}]
-    need_original = [i for i, m in enumerate(modifiers) if m.type in ORIGINAL_MESH_TYPES]
-    # If all are off, all count, because the user may switch them on later.
-    visible = [i for i in deforming if modifiers[i].show_viewport] or deforming
-    last = max(visible + need_original, default=-1)
+    effects = [_effect_of(m) for m in modifiers]
+    unknown_indices = [i for i, m in enumerate(modifiers) if effects[i] is _ModifierEffect.UNKNOWN and m.show_viewport]
+    generating_modifiers = [
+        m
+        for m, effect in zip(modifiers, effects, strict=True)
+        if effect in {_ModifierEffect.GENERATES, _ModifierEffect.UNKNOWN}
+    ]
+    for i in unknown_indices:
+        with _modifiers_disabled(mesh_object, [m for m in generating_modifiers if m != modifiers[i]]):
+            effects[i] = _ModifierEffect.DEFORMS if _keeps_topology(mesh_object) else _ModifierEffect.GENERATES
+    deforming_indices = [
+        i for i, effect in enumerate(effects) if effect in {_ModifierEffect.DEFORMS, _ModifierEffect.UNKNOWN}
+    ]
+    original_mesh_indices = [i for i, m in enumerate(modifiers) if m.type in ORIGINAL_MESH_TYPES]
+    # If all deforming modifiers are off, all of them count, because the user may switch them on later.
+    effective_indices = [i for i in deforming_indices if modifiers[i].show_viewport] or deforming_indices
+    last_replaced_index = max(effective_indices + original_mesh_indices, default=-1)
     fdda_index = _fdda_modifier_index(mesh_object)
-    if fdda_index is not None and any(i < fdda_index for i in deforming):
-        last = fdda_index - 1
-    generating = [i for i, kind in enumerate(kinds) if kind is _Kind.GENERATES and modifiers[i].show_viewport]
-    candidates = sorted({*generating, *visible})
+    if fdda_index is not None and any(i < fdda_index for i in deforming_indices):
+        last_replaced_index = fdda_index - 1
+    generating_indices = [
+        i for i, effect in enumerate(effects) if effect is _ModifierEffect.GENERATES and modifiers[i].show_viewport
+    ]
+    downstream_candidates = sorted({*generating_indices, *effective_indices})
     return ModifierStack(
-        replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in deforming + need_original),
-        misplaced=tuple(modifiers[i].name for i in generating if i <= last),
-        downstream=tuple(modifiers[i].name for i in candidates if i > last and modifiers[i].show_viewport),
-        insert_index=last + 1,
+        replaced=tuple(
+            m.name
+            for i, m in enumerate(modifiers[: last_replaced_index + 1])
+            if i in deforming_indices + original_mesh_indices
+        ),
+        misplaced=tuple(modifiers[i].name for i in generating_indices if i <= last_replaced_index),
+        downstream=tuple(
+            modifiers[i].name for i in downstream_candidates if i > last_replaced_index and modifiers[i].show_viewport
+        ),
+        insert_index=last_replaced_index + 1,
     )
 
 
@@ -127,12 +141,12 @@ def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifie
     """
     fdda_index = _fdda_modifier_index(mesh_object)
     if fdda_index is not None:
-        return [m for m in mesh_object.modifiers[:fdda_index] if _kind(m) is not _Kind.NEUTRAL]
+        return [m for m in mesh_object.modifiers[:fdda_index] if _effect_of(m) is not _ModifierEffect.NEUTRAL]
     return [mesh_object.modifiers[name] for name in read_stack(mesh_object).replaced]
 
 
 def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """Return the modifiers whose effect a model includes, in their order: those that are on while the rig is shown.
+    """Return the modifiers whose effect a model includes, in their order: all that are on while the rig is shown.
 
     Raises:
         RigError: as `read_stack`.
@@ -140,19 +154,25 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
     index = _fdda_modifier_index(mesh_object)
     if index is None:
         index = read_stack(mesh_object).insert_index
-    candidates = [m for m in mesh_object.modifiers[:index] if _kind(m) is not _Kind.NEUTRAL or m.type in INDIRECT_TYPES]
+    candidates = [
+        m
+        for m in mesh_object.modifiers[:index]
+        if _effect_of(m) is not _ModifierEffect.NEUTRAL or m.type in INDIRECT_TYPES
+    ]
     binding = getattr(mesh_object, "fdda", None)
     if binding is None or not binding.is_playing:
         return [m for m in candidates if m.show_viewport]
-    stored = {saved.uid: saved for saved in binding.modifiers}
-    recorded = []
+    stored_visibilities = {saved.uid: saved for saved in binding.modifiers}
+    modifiers = []
     for modifier in candidates:
-        visibility = stored.get(modifier.persistent_uid, modifier)
-        # One that is on in renders only changes the topology there, before the FDDA modifier.
-        generates = _kind(modifier) is _Kind.GENERATES and binding.use_in_render and visibility.show_render
+        visibility = stored_visibilities.get(modifier.persistent_uid, modifier)
+        # A modifier that is on in renders alone changes the topology there, before the FDDA modifier.
+        generates = (
+            _effect_of(modifier) is _ModifierEffect.GENERATES and binding.use_in_render and visibility.show_render
+        )
         if visibility.show_viewport or generates:
-            recorded.append(modifier)
-    return recorded
+            modifiers.append(modifier)
+    return modifiers
 
 
 def _fdda_modifier_index(mesh_object: bpy.types.Object) -> int | None:
@@ -211,10 +231,10 @@ def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
         raise RigError(f"The Armature modifier of '{mesh_object.name}' is switched off in the viewport; switch it on.")
     if scene_rig.armature_object.data.pose_position == "REST":
         raise RigError(f"The armature '{scene_rig.armature_object.name}' shows its rest position; set it to pose.")
-    _evaluated(mesh_object)
+    _evaluated_object(mesh_object)
     stack = check_stack(mesh_object)
     if not stack.downstream:
-        _check_count(mesh_object, stack)
+        _check_vertex_count(mesh_object, stack)
     return stack
 
 
@@ -226,8 +246,8 @@ def downstream_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
         RigError: the evaluated mesh still has another number of vertices.
     """
     stack = read_stack(mesh_object)
-    with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
-        _check_count(mesh_object, stack)
+    with _modifiers_disabled(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
+        _check_vertex_count(mesh_object, stack)
         yield
 
 
@@ -235,13 +255,13 @@ def downstream_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
 def downstream_disabled_unchecked(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Switch the downstream modifiers off, without checking the number of vertices."""
     stack = read_stack(mesh_object)
-    with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
+    with _modifiers_disabled(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
         yield
 
 
 @contextmanager
-def _switched_off(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[None]:
-    # By identifier, because the user may add modifiers while a job runs.
+def _modifiers_disabled(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[None]:
+    # Find the modifiers by their identifiers, because the user may add modifiers while a job runs.
     uids = {m.persistent_uid for m in modifiers if m.show_viewport}
     for modifier in mesh_object.modifiers:
         if modifier.persistent_uid in uids:
@@ -256,24 +276,28 @@ def _switched_off(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.M
             bpy.context.view_layer.update()
 
 
-def _kind(modifier: bpy.types.Modifier) -> _Kind:
+def _effect_of(modifier: bpy.types.Modifier) -> _ModifierEffect:
     if modifier.type == "NODES":
         kinds = {
-            GeometryEffect.ATTRIBUTES: _Kind.NEUTRAL,
-            GeometryEffect.POSITIONS: _Kind.DEFORMS,
-            GeometryEffect.ANY: _Kind.UNSURE,
+            GeometryEffect.ATTRIBUTES: _ModifierEffect.NEUTRAL,
+            GeometryEffect.POSITIONS: _ModifierEffect.DEFORMS,
+            GeometryEffect.ANY: _ModifierEffect.UNKNOWN,
         }
         return kinds[geometry_effect(modifier.node_group)]
     if modifier.type == "OCEAN":
-        return _Kind.DEFORMS if modifier.geometry_mode == "DISPLACE" else _Kind.GENERATES
+        return _ModifierEffect.DEFORMS if modifier.geometry_mode == "DISPLACE" else _ModifierEffect.GENERATES
     if modifier.type == "FLUID":
-        return _Kind.GENERATES if modifier.fluid_type == "DOMAIN" else _Kind.NEUTRAL
+        return _ModifierEffect.GENERATES if modifier.fluid_type == "DOMAIN" else _ModifierEffect.NEUTRAL
     if modifier.type == "DYNAMIC_PAINT":
         surfaces = modifier.canvas_settings.canvas_surfaces if modifier.canvas_settings else ()
-        return _Kind.DEFORMS if any(s.surface_type in {"DISPLACE", "WAVE"} for s in surfaces) else _Kind.NEUTRAL
+        return (
+            _ModifierEffect.DEFORMS
+            if any(s.surface_type in {"DISPLACE", "WAVE"} for s in surfaces)
+            else _ModifierEffect.NEUTRAL
+        )
     if modifier.type in DEFORMING_TYPES:
-        return _Kind.DEFORMS
-    return _Kind.GENERATES if modifier.type in TOPOLOGY_CHANGING_TYPES else _Kind.NEUTRAL
+        return _ModifierEffect.DEFORMS
+    return _ModifierEffect.GENERATES if modifier.type in TOPOLOGY_CHANGING_TYPES else _ModifierEffect.NEUTRAL
 
 
 def time_dependence(modifier: bpy.types.Modifier) -> str:
@@ -281,7 +305,7 @@ def time_dependence(modifier: bpy.types.Modifier) -> str:
     if modifier.type == "NODES":
         node = find_time_node(modifier.node_group)
         return f"changes with time (node '{node.name}' of '{node.id_data.name}')" if node else ""
-    if _kind(modifier) is _Kind.NEUTRAL:
+    if _effect_of(modifier) is _ModifierEffect.NEUTRAL:
         return ""
     return TIME_DEPENDENT_TYPES.get(modifier.type, "")
 
@@ -294,7 +318,7 @@ def _is_unbound(modifier: bpy.types.Modifier) -> bool:
     return not getattr(modifier, BIND_PROPERTIES[modifier.type])
 
 
-def _evaluated(mesh_object: bpy.types.Object) -> bpy.types.Object:
+def _evaluated_object(mesh_object: bpy.types.Object) -> bpy.types.Object:
     evaluated = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
     if not evaluated.is_evaluated:
         raise RigError(f"'{mesh_object.name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
@@ -305,18 +329,24 @@ def _keeps_topology(mesh_object: bpy.types.Object) -> bool:
     # Blender starts without numpy.
     from ..scene.mesh import topology
 
-    original, evaluated = mesh_object.data, _evaluated(mesh_object).data
-    if any(len(getattr(original, name)) != len(getattr(evaluated, name)) for name in ("vertices", "edges", "loops")):
+    original_mesh, evaluated_mesh = mesh_object.data, _evaluated_object(mesh_object).data
+    if any(
+        len(getattr(original_mesh, name)) != len(getattr(evaluated_mesh, name))
+        for name in ("vertices", "edges", "loops")
+    ):
         return False
-    return all((a == b).all() for a, b in zip(topology(original), topology(evaluated), strict=True))
+    return all(
+        (original_array == evaluated_array).all()
+        for original_array, evaluated_array in zip(topology(original_mesh), topology(evaluated_mesh), strict=True)
+    )
 
 
-def _check_count(mesh_object: bpy.types.Object, stack: ModifierStack) -> None:
-    count = len(_evaluated(mesh_object).data.vertices)
-    if count != len(mesh_object.data.vertices):
-        others = [m.name for m in mesh_object.modifiers if m.name not in stack.replaced and m.show_viewport]
-        names = stack.downstream or others or stack.replaced
+def _check_vertex_count(mesh_object: bpy.types.Object, stack: ModifierStack) -> None:
+    evaluated_count = len(_evaluated_object(mesh_object).data.vertices)
+    if evaluated_count != len(mesh_object.data.vertices):
+        other_names = [m.name for m in mesh_object.modifiers if m.name not in stack.replaced and m.show_viewport]
+        suspect_names = stack.downstream or other_names or stack.replaced
         raise RigError(
-            f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into {count}; "
-            f"switch off the one that changes the topology ({', '.join(names)})."
+            f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into "
+            f"{evaluated_count}; switch off the one that changes the topology ({', '.join(suspect_names)})."
         )

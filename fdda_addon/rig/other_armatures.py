@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks the bones of other armatures that deform a mesh: their free channels have to be controls of the model."""
+"""Checks the bones of other armatures that deform a mesh. Their free channels must be controls of the model."""
 
 from collections.abc import Iterable, Iterator
 
@@ -26,14 +26,14 @@ def controls_of_other_armatures(scene_rig: SceneRig, sources: Sources) -> Iterat
 
     Rotations are Euler angles: the four components of a quaternion have no ranges, and q and -q are the same rotation.
     """
-    for armature_object, bone in _bones(scene_rig, sources):
+    for armature_object, bone in _deforming_bones(scene_rig, sources):
         for _, channel, ranges in _free_channels(bone):
             for axis, bounds in ranges.items():
                 if bounds is not None and bounds[0] < bounds[1]:
                     owner = f"{OTHER_OBJECT}{armature_object.name}"
                     yield make_control(scene_rig, owner, f"{bone.path_from_id()}.{channel}[{axis}]", bounds)
-    for armature_object, bone, path in _channels_read(scene_rig, sources):
-        bounds = _bounds_of(bone, path)
+    for armature_object, bone, path in _channels_read_by_drivers(scene_rig, sources):
+        bounds = _channel_range(bone, path)
         if bounds is not None and bounds[0] < bounds[1]:
             yield make_control(scene_rig, f"{OTHER_OBJECT}{armature_object.name}", path, bounds)
 
@@ -45,20 +45,22 @@ def check_other_armatures(
 
     Args:
         scene_rig: the rig.
-        sources: what its mesh depends on.
-        controls: the controls of the model as `scene.controls.fcurve_target` returns them.
+        sources: everything on which its mesh depends.
+        controls: the controls of the model, in the form that `scene.controls.fcurve_target` returns.
 
     Raises:
-        RigError: names a bone and its armature.
+        RigError: a bone has a free channel that is no control; the message names the bone and its armature.
     """
-    inputs = {*controls, *sources.drivers}
-    for armature_object, bone in _bones(scene_rig, sources):
+    input_keys = {*controls, *sources.drivers}
+    for armature_object, bone in _deforming_bones(scene_rig, sources):
         path = bone.path_from_id()
         free_kinds = [
             kind
             for kind, channel, ranges in _free_channels(bone)
             if any(
-                (armature_object, f"{path}.{channel}", axis) not in inputs for axis in ranges if _varies(ranges[axis])
+                (armature_object, f"{path}.{channel}", axis) not in input_keys
+                for axis in ranges
+                if _can_vary(ranges[axis])
             )
         ]
         if free_kinds:
@@ -67,8 +69,8 @@ def check_other_armatures(
                 f"'{armature_object.name}', which can {' and '.join(_VERBS[kind] for kind in free_kinds)}, but is no "
                 f"input of the model; {' and '.join(_remedies(bone, free_kinds))}, or join the armatures."
             )
-    for armature_object, _, path in _channels_read(scene_rig, sources):
-        if fcurve_target(armature_object, path) not in inputs:
+    for armature_object, _, path in _channels_read_by_drivers(scene_rig, sources):
+        if fcurve_target(armature_object, path) not in input_keys:
             raise RigError(
                 f"A driver of '{scene_rig.mesh_object.name}' reads '{path}' of a second armature, "
                 f"'{armature_object.name}', which is no input of the model; name it as a control with a range "
@@ -78,31 +80,33 @@ def check_other_armatures(
 
 def _remedies(bone: bpy.types.PoseBone, free_kinds: list[str]) -> Iterator[str]:
     if ROTATION in free_kinds:
-        has_four = bone.rotation_mode in _FOUR_COMPONENT_MODES
-        yield "set its rotation mode to XYZ Euler" if has_four else "name its rotation as controls"
-    if others := [kind for kind in free_kinds if kind != ROTATION]:
-        limits = " and ".join(f"Limit {kind.title()}" for kind in others)
-        yield f"lock its {' and '.join(others)} (or add {limits} in local space)"
+        has_four_components = bone.rotation_mode in _FOUR_COMPONENT_MODES
+        yield "set its rotation mode to XYZ Euler" if has_four_components else "name its rotation as controls"
+    if other_kinds := [kind for kind in free_kinds if kind != ROTATION]:
+        limits = " and ".join(f"Limit {kind.title()}" for kind in other_kinds)
+        yield f"lock its {' and '.join(other_kinds)} (or add {limits} in local space)"
 
 
-def _bones(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone]]:
+def _deforming_bones(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone]]:
     for armature_object, names in sources.bones.items():
         if armature_object != scene_rig.armature_object:
             yield from ((armature_object, bone) for bone in armature_object.pose.bones if bone.name in names)
 
 
-def _channels_read(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone, str]]:
+def _channels_read_by_drivers(
+    scene_rig: SceneRig, sources: Sources
+) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone, str]]:
     """Yield the unlocked channels of bones of other armatures that drivers read by path."""
     for datablock, path in sources.numbers:
-        name, rest = split_bone_path(path)
-        if name and datablock != scene_rig.armature_object and is_transform_channel(rest):
+        name, subpath = split_bone_path(path)
+        if name and datablock != scene_rig.armature_object and is_transform_channel(subpath):
             bone = datablock.pose.bones.get(name)
-            if bone is not None and _varies(_bounds_of(bone, path)):
+            if bone is not None and _can_vary(_channel_range(bone, path)):
                 yield datablock, bone, path
 
 
-def _bounds_of(bone: bpy.types.PoseBone, path: str) -> tuple[float, float] | None:
-    """Return the range of one component of a channel, None if it has none; an empty range if it is locked."""
+def _channel_range(bone: bpy.types.PoseBone, path: str) -> tuple[float, float] | None:
+    """Return the range of one component of a channel; None without a range, and an empty range if it is locked."""
     channel, axis = path.rpartition(".")[2][:-3], int(path[-2])
     if channel == LOCATION:
         return (0.0, 0.0) if bone.lock_location[axis] else location_ranges(bone).get(axis)
@@ -114,16 +118,16 @@ def _bounds_of(bone: bpy.types.PoseBone, path: str) -> tuple[float, float] | Non
     return (0.0, 0.0) if all(bone.lock_rotation) else None
 
 
-def _varies(bounds: tuple[float, float] | None) -> bool:
+def _can_vary(bounds: tuple[float, float] | None) -> bool:
     return bounds is None or bounds[0] < bounds[1]
 
 
 def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, AxisRanges]]:
     """Yield kind, property and ranges of the channels that are free to move a bone."""
     if bone.rotation_mode in _FOUR_COMPONENT_MODES:
-        if not all(bone.lock_rotation) and not _is_replaced(bone, ROTATION):
+        if not all(bone.lock_rotation) and not _is_overridden(bone, ROTATION):
             yield ROTATION, _FOUR_COMPONENT_MODES[bone.rotation_mode], dict.fromkeys(range(4))
-    elif not _is_replaced(bone, ROTATION):
+    elif not _is_overridden(bone, ROTATION):
         yield (
             ROTATION,
             "rotation_euler",
@@ -133,19 +137,19 @@ def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, AxisRan
     if not (bone.parent and bone.bone.use_connect):
         other_channels.insert(0, (LOCATION, bone.lock_location, location_ranges(bone)))
     for kind, locks, ranges in other_channels:
-        if not _is_replaced(bone, kind):
+        if not _is_overridden(bone, kind):
             yield kind, kind, {axis: ranges.get(axis) for axis in range(3) if not locks[axis]}
 
 
-def _is_replaced(bone: bpy.types.PoseBone, kind: str) -> bool:
+def _is_overridden(bone: bpy.types.PoseBone, kind: str) -> bool:
     """Return whether a constraint overrides the channels of a kind."""
     return any(
         constraint.type == "COPY_TRANSFORMS"
-        or (_COPY_CONSTRAINTS.get(constraint.type) == kind and _copies_all(constraint))
+        or (_COPY_CONSTRAINTS.get(constraint.type) == kind and _copies_all_axes(constraint))
         for constraint in bone.constraints
         if not constraint.mute and constraint.influence == 1 and getattr(constraint, "mix_mode", "REPLACE") == "REPLACE"
     )
 
 
-def _copies_all(constraint: bpy.types.Constraint) -> bool:
+def _copies_all_axes(constraint: bpy.types.Constraint) -> bool:
     return all(getattr(constraint, f"use_{axis}") for axis in "xyz") and not getattr(constraint, "use_offset", False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sets the poses of a rig and of a target that depends on time: with a pre-roll, or held until a simulation rests."""
+"""Sets poses of a rig and of a target that depends on time, with a pre-roll, or held until the target is at rest."""
 
 import time
 from collections.abc import Callable, Collection, Container, Iterator, Sequence
@@ -22,12 +22,13 @@ from .target import Target, check_clips, find_target, temporary_frame_range
 APPROACH_FRAMES = 10
 """Frames in which the rig moves from the rest pose to a pose that is held."""
 MAX_REVERSED_FRAMES = 100
-"""Only this number of frames of a clip is shown in reverse, because all frames before them are played twice."""
-REST_FRAMES = 3
-"""Consecutive frames without motion at rest: a vertex that swings stands still for one frame at each turn."""
+"""Largest number of frames of a clip that are shown in reverse, because the frames before them are played twice."""
+MIN_REST_FRAMES = 3
+"""Number of consecutive frames without motion that count as rest. A swinging vertex stands still for only one frame at
+each turning point."""
 
 PoseFunction = Callable[[float], None]
-"""Sets a pose that is a fraction, 0 to 1, of the way from the rest pose to another one."""
+"""Sets a pose between the rest pose and another pose, given a fraction from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class TargetSettings:
     Attributes:
         name: name of its object; empty for the rig itself.
         pre_roll: frames before the first frame of an action, in which the rig moves from the rest pose to that frame.
-        max_settle_frames: most frames for which a random pose is held until the target is at rest; 0 to hold no pose.
+        max_settle_frames: largest number of frames for which a random pose is held until the target is at rest; 0 to
+            hold no pose.
         rest_threshold_mm: the target is at rest when no vertex moves by more in a frame, mm.
         repeatability_poses: number of held poses, or frames of actions, that are set a second time, from another
             direction.
@@ -59,99 +61,101 @@ class RestState:
     """How a target came to rest in a pose.
 
     Attributes:
-        frames: frames for which the pose was held.
+        held_frame_count: number of frames for which the pose was held.
         speed_mm: speed of the fastest vertex in the last frame, mm per frame.
         is_at_rest: the target came to rest.
-        seconds: the time that it took.
+        seconds: time that the evaluation of these frames took.
     """
 
-    frames: int
+    held_frame_count: int
     speed_mm: float
     is_at_rest: bool
     seconds: float
 
     def __str__(self) -> str:
-        duration = f"{self.frames} frames, {self.seconds:.1f} s"
-        return duration if self.is_at_rest else f"not at rest after {duration}: {self.speed_mm:.2g} mm a frame"
+        duration = f"{self.held_frame_count} frames, {self.seconds:.1f} s"
+        return duration if self.is_at_rest else f"not at rest after {duration}: {self.speed_mm:.2g} mm per frame"
 
 
 class Settler:
     """Holds poses until a simulated target is at rest, so that its surface depends on the pose alone.
 
     Attributes:
-        frames: most frames for which a pose is held.
+        max_frames: largest number of frames for which a pose is held.
         rest_threshold_mm: the target is at rest when no vertex moves by more in a frame, mm.
-        last: the rest state of the last pose; None before the first.
+        last_rest_state: the rest state of the last pose; None before the first pose.
     """
 
-    def __init__(self, target: Target, frames: int, rest_threshold_mm: float = REST_THRESHOLD_MM):
+    def __init__(self, target: Target, max_frames: int, rest_threshold_mm: float = REST_THRESHOLD_MM):
         """Prepare to settle a target.
 
         Args:
             target: a target with simulations.
-            frames, rest_threshold_mm: as above.
+            max_frames, rest_threshold_mm: as above.
         """
-        self._target, self.frames, self.rest_threshold_mm = target, frames, rest_threshold_mm
+        self._target, self.max_frames, self.rest_threshold_mm = target, max_frames, rest_threshold_mm
         self._mm_per_unit = 1000 * metres_per_unit(target.scene_rig.mesh_object)
         self._first_frame = target.first_frame
-        self.last: RestState | None = None
+        self.last_rest_state: RestState | None = None
 
     @contextmanager
     def prepared(self) -> Iterator[None]:
         """Extend the simulations of the target to the frames that `settle` needs; restore them afterwards."""
-        last_frame = self._first_frame + 2 * APPROACH_FRAMES + self.frames
+        last_frame = self._first_frame + 2 * APPROACH_FRAMES + self.max_frames
         with temporary_frame_range(self._target, self._first_frame, last_frame):
             yield
 
     def settle(self, pose: PoseFunction, via_pose: PoseFunction | None = None) -> RestState:
-        """Move from the rest pose to a pose, and hold it until the target is at rest or the frames are used up.
+        """Move from the rest pose to a pose, and hold it until the target is at rest, for at most `max_frames` frames.
 
         Args:
             pose: the pose.
-            via_pose: another pose that is passed on the way.
+            via_pose: another pose through which the rig moves on the way.
         """
-        start, scene, frame = time.perf_counter(), bpy.context.scene, self._first_frame
+        start_time, scene, frame = time.perf_counter(), bpy.context.scene, self._first_frame
         self._target.restart_simulations()
         all_steps, later_steps = range(APPROACH_FRAMES + 1), range(1, APPROACH_FRAMES + 1)
-        moves = [(via_pose, all_steps), (pose, later_steps)] if via_pose else [(pose, all_steps)]
-        for set_fraction, steps in moves:
+        movements = [(via_pose, all_steps), (pose, later_steps)] if via_pose else [(pose, all_steps)]
+        for set_fraction, steps in movements:
             for step in steps:
                 set_fraction(step / APPROACH_FRAMES)
                 scene.frame_set(frame)
                 frame += 1
-        previous, rest_frames, held_frames, speed = self._positions(), 0, 0, 0.0
-        while held_frames < self.frames and rest_frames < REST_FRAMES:
-            scene.frame_set(frame + held_frames)
-            current = self._positions()
-            offsets = current - previous
-            speed = float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max())) * self._mm_per_unit
-            previous, held_frames = current, held_frames + 1
-            rest_frames = rest_frames + 1 if speed <= self.rest_threshold_mm else 0
-        self.last = RestState(held_frames, speed, rest_frames >= REST_FRAMES, time.perf_counter() - start)
-        return self.last
+        previous_positions, rest_frame_count, held_frame_count, speed_mm = self._positions(), 0, 0, 0.0
+        while held_frame_count < self.max_frames and rest_frame_count < MIN_REST_FRAMES:
+            scene.frame_set(frame + held_frame_count)
+            current_positions = self._positions()
+            offsets = current_positions - previous_positions
+            speed_mm = float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max())) * self._mm_per_unit
+            previous_positions, held_frame_count = current_positions, held_frame_count + 1
+            rest_frame_count = rest_frame_count + 1 if speed_mm <= self.rest_threshold_mm else 0
+        self.last_rest_state = RestState(
+            held_frame_count, speed_mm, rest_frame_count >= MIN_REST_FRAMES, time.perf_counter() - start_time
+        )
+        return self.last_rest_state
 
     def _positions(self) -> np.ndarray:
         return self._target.positions(bpy.context.evaluated_depsgraph_get())
 
 
 def show_frames(
-    player: ClipPlayer, clip: Clip, wanted: Container[int], target: Target | None = None, pre_roll: int = 0
+    player: ClipPlayer, clip: Clip, frame_indices: Container[int], target: Target | None = None, pre_roll: int = 0
 ) -> Iterator[int]:
     """Show frames of a clip in their order, one for each iteration.
 
-    If the target is a simulation, all frames from its first frame to the last wanted one are visited.
+    If the target is a simulation, all frames from its first frame to the last of `frame_indices` are visited.
 
     Args:
         player: the player of the clip.
         clip: the clip.
-        wanted: indices of the frames to yield.
+        frame_indices: indices of the frames to yield.
         target: the target; None for the rig itself.
         pre_roll: frames before the first one, in which the rig moves from the rest pose to the first pose.
 
     Yields:
         The index of the frame in the clip.
     """
-    indices = [index for index in range(len(clip.frames)) if index in wanted]
+    indices = [index for index in range(len(clip.frames)) if index in frame_indices]
     if target is None or not target.simulations or not indices:
         for index in indices:
             player.show(clip, clip.frames[index])
@@ -160,7 +164,7 @@ def show_frames(
     with _started_simulations(player, clip, target, pre_roll):
         for index, frame in enumerate(clip.frames[: indices[-1] + 1]):
             player.show(clip, frame)
-            if index in wanted:
+            if index in frame_indices:
                 yield index
 
 
@@ -170,29 +174,29 @@ def reversible_frames(clip: Clip) -> range:
 
 
 def show_frames_reversed(
-    player: ClipPlayer, clip: Clip, wanted: Collection[int], target: Target, pre_roll: int = 0
+    player: ClipPlayer, clip: Clip, frame_indices: Collection[int], target: Target, pre_roll: int = 0
 ) -> Iterator[int]:
-    """Show frames of a clip from the other direction: play past the last one, then back to the first, as time goes on.
+    """Show frames of a clip in reverse: play past the last one, then the poses backwards in later and later frames.
 
     Args:
         player: the player of the clip.
         clip: the clip.
-        wanted: indices of the frames to yield, at least one, from `reversible_frames`.
+        frame_indices: indices of the frames to yield, at least one, from `reversible_frames`.
         target: a target with simulations.
         pre_roll: as in `show_frames`.
 
     Yields:
         The index of the frame in the clip, the last one first.
     """
-    turning_index = max(wanted) + APPROACH_FRAMES
+    turning_index = max(frame_indices) + APPROACH_FRAMES
     with _started_simulations(player, clip, target, pre_roll, extra_frames=turning_index):
         shown_frames = []
         for frame in clip.frames[: turning_index + 1]:
             player.show(clip, frame)
             shown_frames.append(player.current_clip_frame)
-        for step, index in enumerate(range(turning_index - 1, min(wanted) - 1, -1), 1):
+        for step, index in enumerate(range(turning_index - 1, min(frame_indices) - 1, -1), 1):
             player.set_clip_frame(shown_frames[index], clip.frames[turning_index] + step)
-            if index in wanted:
+            if index in frame_indices:
                 yield index
 
 
@@ -204,7 +208,7 @@ def _started_simulations(
 
     Args:
         player, clip, target, pre_roll: as in `show_frames`.
-        extra_frames: frames after the last one of the clip.
+        extra_frames: number of frames after the end of the clip.
     """
     first_frame = clip.frames[0] - pre_roll if pre_roll else None
     last_frame = clip.frames[-1] + extra_frames
@@ -220,7 +224,7 @@ def _started_simulations(
 
 
 def _play_pre_roll(target: Target, player: ClipPlayer, clip: Clip, first_frame: int) -> None:
-    """Move from the rest pose at a frame to the first pose of a clip, up to the frame before it."""
+    """Move from the rest pose at a frame towards the first pose of a clip, up to the frame before the clip."""
     armature_object = target.scene_rig.armature_object
     bones = armature_object.pose.bones
     player.show(clip, clip.frames[0])
@@ -238,7 +242,7 @@ def _play_pre_roll(target: Target, player: ClipPlayer, clip: Clip, first_frame: 
 
 def _interpolate_channel(name: str, start: np.ndarray, end: np.ndarray, fraction: np.float32) -> np.ndarray:
     if name == "rotation_quaternion":
-        # q and -q are the same rotation: take the shorter way. Blender normalizes quaternions.
+        # q and -q are the same rotation; take the nearer one. Blender normalizes quaternions.
         end = np.where((start * end).sum(axis=1, keepdims=True) < 0, -end, end)
     return start + fraction * (end - start)
 
@@ -263,25 +267,25 @@ class PoseSetter:
 
     Attributes:
         target: the target; None for the rig itself.
-        settler: holds the random poses; None to evaluate them at once.
+        settler: holds the random poses until the target is at rest; None to evaluate them without waiting.
     """
 
     def __init__(self, target: Target | None = None, pre_roll: int = 0, settler: Settler | None = None):
         """Prepare to set poses.
 
         Args:
-            target, settler: as above.
+            target, settler: as in the class.
             pre_roll: as in `show_frames`.
         """
         self.target, self.settler = target, settler
         self._pre_roll = pre_roll
 
     @property
-    def recorded(self) -> RecordedTarget | None:
+    def recorded_target(self) -> RecordedTarget | None:
         """Return the description of the target in a recording; None without a target."""
         if self.target is None:
             return None
-        settling = (self.settler.frames, self.settler.rest_threshold_mm) if self.settler else ()
+        settling = (self.settler.max_frames, self.settler.rest_threshold_mm) if self.settler else ()
         return RecordedTarget(self.target.name, self.target.follows, self._pre_roll, *settling)
 
     @contextmanager
@@ -297,13 +301,13 @@ class PoseSetter:
         else:
             pose(1)
 
-    def show_frames(self, player: ClipPlayer, clip: Clip, wanted: Container[int]) -> Iterator[int]:
+    def show_frames(self, player: ClipPlayer, clip: Clip, frame_indices: Container[int]) -> Iterator[int]:
         """Show frames of a clip, as the function `show_frames` does."""
-        yield from show_frames(player, clip, wanted, self.target, self._pre_roll)
+        yield from show_frames(player, clip, frame_indices, self.target, self._pre_roll)
 
-    def show_frames_reversed(self, player: ClipPlayer, clip: Clip, wanted: Collection[int]) -> Iterator[int]:
+    def show_frames_reversed(self, player: ClipPlayer, clip: Clip, frame_indices: Collection[int]) -> Iterator[int]:
         """Show frames of a clip from the other direction, as the function `show_frames_reversed` does."""
-        yield from show_frames_reversed(player, clip, wanted, self.target, self._pre_roll)
+        yield from show_frames_reversed(player, clip, frame_indices, self.target, self._pre_roll)
 
     @property
     def depends_on_history(self) -> bool:
@@ -313,21 +317,23 @@ class PoseSetter:
     @property
     def is_at_rest(self) -> bool:
         """Return whether the last random pose came to rest, or was not held."""
-        return self.settler is None or self.settler.last is None or self.settler.last.is_at_rest
+        return self.settler is None or self.settler.last_rest_state is None or self.settler.last_rest_state.is_at_rest
 
 
 DIRECT_POSE_SETTER = PoseSetter()
 """Sets poses of a rig, whose surface follows from the pose at once."""
 
 
-def make_pose_setter(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence[Clip], random: int) -> PoseSetter:
+def make_pose_setter(
+    scene_rig: SceneRig, settings: TargetSettings, clips: Sequence[Clip], random_pose_count: int
+) -> PoseSetter:
     """Make the pose setter for a target, and check that the target can be used.
 
     Args:
         scene_rig: the rig.
         settings: settings of the target.
         clips: the clips whose frames are evaluated.
-        random: number of random poses.
+        random_pose_count: number of random poses.
 
     Raises:
         RigError: as `find_target` and `check_clips`, or the target cannot be set to these poses.
@@ -337,12 +343,12 @@ def make_pose_setter(scene_rig: SceneRig, settings: TargetSettings, clips: Seque
             raise RigError("A pre-roll and settling need a target; name one, or leave both out.")
         return DIRECT_POSE_SETTER
     target = find_target(scene_rig, settings.name)
-    if random and target.follows == FRAMES:
+    if random_pose_count and target.follows == FRAMES:
         raise RigError(
             f"The target '{target.name}' follows frames ({target.caches[0].description}), so it cannot show random "
             "poses; record 0 random poses, and the action that it was made with."
         )
-    if random and target.follows == SIMULATION and not settings.max_settle_frames:
+    if random_pose_count and target.follows == SIMULATION and not settings.max_settle_frames:
         raise RigError(
             f"The target '{target.name}' is a simulation ({target.simulations[0].description}): what it shows in a "
             "random pose depends on the pose before; let it settle, or record 0 of them, and actions."

@@ -33,7 +33,7 @@ from .modifier_stack import check_evaluable, deforming_modifiers
 from .target import Target
 
 IDENTITY_TOLERANCE = 1e-6
-"""Largest difference of a matrix element from the identity at which the matrix counts as the identity."""
+"""A matrix counts as the identity if no element differs from the identity by more than this."""
 
 
 def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, include_static_joint: bool = False) -> Rig:
@@ -50,7 +50,7 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
             position or a transform is not finite.
     """
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    # The armature first, because the mesh may be its child.
+    # Check the armature first, because the mesh may be its child.
     for scene_object in (armature_object, mesh_object):
         if not np.isfinite(scene_object.matrix_world).all():
             raise RigError(
@@ -88,21 +88,21 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
 
 def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndarray) -> None:
     """Raise a RigError if rest positions, (V, 3), are not finite or have no extent."""
-    name, count = mesh_object.name, len(rest_positions)
-    if not count:
-        raise RigError(f"The mesh of '{name}' has no vertices; choose another object.")
+    object_name, vertex_count = mesh_object.name, len(rest_positions)
+    if not vertex_count:
+        raise RigError(f"The mesh of '{object_name}' has no vertices; choose another object.")
     is_finite = np.isfinite(rest_positions).all(axis=1)
     if not is_finite.all():
         raise RigError(
-            f"{count - is_finite.sum():,} of {count:,} vertices of '{name}' have coordinates that are not finite, the "
-            f"first is vertex {is_finite.argmin()}; delete them, or give them others in edit mode."
+            f"{vertex_count - is_finite.sum():,} of {vertex_count:,} vertices of '{object_name}' have coordinates that "
+            f"are not finite, the first is vertex {is_finite.argmin()}; delete them, or give them others in edit mode."
         )
-    if count == 1:
-        raise RigError(f"The mesh of '{name}' has one vertex, and no surface to learn; choose another object.")
+    if vertex_count == 1:
+        raise RigError(f"The mesh of '{object_name}' has one vertex, and no surface to learn; choose another object.")
     if np.ptp(rest_positions, axis=0).max() <= FLOAT32_ROUNDING_RATIO * np.abs(rest_positions).max():
         raise RigError(
-            f"All {count:,} vertices of '{name}' lie at one point in the rest pose, so the mesh has no size; give the "
-            "mesh, or its Basis shape key, its shape."
+            f"All {vertex_count:,} vertices of '{object_name}' lie at one point in the rest pose, so the mesh has no "
+            "size; give the mesh, or its Basis shape key, its shape."
         )
 
 
@@ -117,7 +117,7 @@ def _check_rest_matrices(names: tuple[str, ...], rest_matrices: np.ndarray) -> N
 
 
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
-    """Read a rig with the joints, controls and unit of a model; `core.model.check_rig` finds the differences.
+    """Read a rig with the joints, controls and unit of a model, so that `core.model.check_rig` can compare them.
 
     Raises:
         RigError: as `read_rig`.
@@ -140,10 +140,10 @@ def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarr
 
 def armature_to_mesh_matrix(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
     """Return the matrix from armature space to mesh-object space, (4, 4) float64, of original or evaluated objects."""
-    return np.array(_relation(mesh_object, armature_object), np.float64)
+    return np.array(_armature_to_mesh_transform(mesh_object, armature_object), np.float64)
 
 
-def _relation(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:
+def _armature_to_mesh_transform(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:
     return mesh_object.matrix_world.inverted_safe() @ armature_object.matrix_world
 
 
@@ -151,8 +151,8 @@ class PoseReader:
     """Reads the pose matrices of a rig for recordings and models.
 
     A pose matrix is P_j = S_j B_j, with B_j the rest matrix and S_j the skin matrix of Blender's Armature modifier.
-    It is the bone's pose matrix in mesh-object space if mesh and armature have the same relative transform as in the
-    rest pose, and it stays correct if one of the objects moves on its own.
+    If mesh and armature have the same relative transform as in the rest pose, it is the bone's pose matrix in
+    mesh-object space. It stays correct if one of the objects moves alone.
     """
 
     def __init__(self, scene_rig: SceneRig, names: tuple[str, ...], rest_matrices: np.ndarray):
@@ -169,9 +169,9 @@ class PoseReader:
         self._matrix_reader = armature_io.PoseMatrixReader(scene_rig.armature_object, names)
         self._rest_matrices = rest_matrices.astype(np.float64)
         self._inverse_bone_rest = np.linalg.inv(armature_io.rest_matrices(scene_rig.armature_object.data, names))
-        self._relation: Matrix | None = None
-        self._left: np.ndarray | None = None
-        self._right: np.ndarray | None = None
+        self._armature_to_mesh: Matrix | None = None
+        self._left_factor: np.ndarray | None = None
+        self._right_factor: np.ndarray | None = None
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
         """Return whether the armature still has the same number of bones."""
@@ -186,31 +186,32 @@ class PoseReader:
         Raises:
             RigError: an object has a scale of zero.
         """
-        relation = _relation(mesh_object, armature_object)
-        if relation != self._relation:
+        armature_to_mesh = _armature_to_mesh_transform(mesh_object, armature_object)
+        if armature_to_mesh != self._armature_to_mesh:
             for scene_object in (mesh_object, armature_object):
                 if is_flat(scene_object):
                     raise RigError(
                         f"'{scene_object.name}' has a scale of zero in some pose; look for the key, constraint or "
                         "driver that sets it."
                     )
-            self._set_relation(relation)
+            self._set_armature_to_mesh(armature_to_mesh)
         matrices = self._matrix_reader.read(armature_object)
-        if self._left is not None:
-            matrices = self._left @ matrices
-        if self._right is not None:
-            matrices = matrices @ self._right
+        if self._left_factor is not None:
+            matrices = self._left_factor @ matrices
+        if self._right_factor is not None:
+            matrices = matrices @ self._right_factor
         return np.array(matrices, np.float32, order="C")
 
-    def _set_relation(self, relation: Matrix) -> None:
-        """Prepare the factors of P = T pose inv(T bone_rest) rest, with T the relation; None for an identity."""
-        self._relation = relation
-        left = np.array(relation, np.float64)
-        # One inverse in a frame instead of one for each joint: if an animated parent moves both objects, rounding
-        # changes T in each frame.
-        right = self._inverse_bone_rest @ (np.linalg.inv(left) @ self._rest_matrices)
-        self._left, self._right = (
-            None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor for factor in (left, right)
+    def _set_armature_to_mesh(self, armature_to_mesh: Matrix) -> None:
+        """Compute the factors of P = T pose inv(T bone_rest) rest, with T from armature to mesh; None for identity."""
+        self._armature_to_mesh = armature_to_mesh
+        left_factor = np.array(armature_to_mesh, np.float64)
+        # Compute one inverse per frame instead of one per joint, because rounding changes T in each frame if an
+        # animated parent moves both objects.
+        right_factor = self._inverse_bone_rest @ (np.linalg.inv(left_factor) @ self._rest_matrices)
+        self._left_factor, self._right_factor = (
+            None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor
+            for factor in (left_factor, right_factor)
         )
 
 

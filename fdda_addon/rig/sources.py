@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds what the surface of an object depends on: objects, bones, drivers, other datablocks. Evaluates nothing."""
+"""Finds the objects, bones, drivers and datablocks on which the surface of an object depends, without an evaluation."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -25,34 +25,34 @@ _GEOMETRY_CONSTRAINTS = {"SHRINKWRAP", "FOLLOW_PATH", "CLAMP_TO"}
 _TRANSFORM_MODIFIERS = {"HOOK", "CAST", "WARP", "SIMPLE_DEFORM", "MIRROR", "DISPLACE", "WAVE", "UV_WARP", "UV_PROJECT"}
 """Modifiers that read the transform of an object, but not its geometry."""
 
-Curve = tuple[bpy.types.ID, bpy.types.FCurve]
-"""A datablock, and an F-curve or a driver of it."""
+OwnedCurve = tuple[bpy.types.ID, bpy.types.FCurve]
+"""A datablock, and one of its F-curves or drivers."""
 
 
 class Sources:
-    """What the surface of an object depends on. Holds RNA references, so do not store it.
+    """Everything on which the surface of an object depends. Holds RNA references, so do not store it.
 
-    It does not include the armature object of the rig, whose pose is the input of a model, nor the carriers of the rig:
-    the parents and constraint targets that move its mesh and armature objects as a whole.
+    It does not include the armature object of the rig, whose pose is the input of a model. It also does not include the
+    carriers of the rig: the parents and constraint targets that move its mesh and armature objects as a whole.
 
     Attributes:
-        objects: the object itself first, and those it depends on; True if the geometry is read, False if only the
-            transform is.
+        objects: the object itself, then the objects on which it depends. The value is True if the geometry is read,
+            False if only the transform is read.
         datablocks: other datablocks that can be animated; the values are the prefixes of their controls' names.
-        bones: names of bones by armature object, including that of the rig; for other armatures with all parents.
-        drivers: the drivers that set any of these.
-        numbers: datablock and RNA path of each number that the drivers read, without bones of the rig's armature.
+        bones: names of bones by armature object, including the rig's; for other armatures with all their ancestors.
+        drivers: the drivers that set properties of any of these.
+        numbers: datablock and RNA path of each number that the drivers read, except bones of the rig's armature.
         scene_reads: drivers that read a scene, each with the scene and the path.
     """
 
     def __init__(self, scene_rig: SceneRig, root: bpy.types.Object, modifiers: Iterable[str] | None = None):
-        """Find what the surface of an object depends on.
+        """Find everything on which the surface of an object depends.
 
         Args:
             scene_rig: the rig.
             root: its mesh object, or a target.
-            modifiers: names of the modifiers of `root` to consider. With them, only what has an effect now is
-                followed: modifiers that are on, drivers that move something. None to follow everything.
+            modifiers: names of the modifiers of `root` to follow. If they are given, only modifiers that are on and
+                drivers that can move the surface are followed. None to follow everything.
         """
         self._rig, self._root = scene_rig, root
         self._only_active, self._modifiers = modifiers is not None, frozenset(modifiers or ())
@@ -60,13 +60,13 @@ class Sources:
         self.objects: dict[bpy.types.Object, bool] = {}
         self.datablocks: dict[bpy.types.ID, str] = {}
         self.bones: dict[bpy.types.Object, set[str]] = {}
-        self.drivers: dict[tuple, Curve] = {}
+        self.drivers: dict[tuple, OwnedCurve] = {}
         self.numbers: dict[tuple[bpy.types.ID, str], None] = {}
-        self.scene_reads: list[tuple[Curve, bpy.types.ID, str]] = []
+        self.scene_reads: list[tuple[OwnedCurve, bpy.types.ID, str]] = []
         self._queue: list[bpy.types.Object] = []
         self._add_object(root, uses_geometry=True)
         while self._queue:
-            self._follow(self._queue.pop(0))
+            self._follow_object(self._queue.pop(0))
 
     @property
     def rig_bones(self) -> set[str]:
@@ -74,7 +74,7 @@ class Sources:
         return self.bones.get(self._rig.armature_object, set())
 
     def affects_surface(self, datablock: bpy.types.ID, path: str) -> bool:
-        """Return whether a property of a datablock in here can move the surface; a custom property alone cannot."""
+        """Return whether a property of a found datablock can move the surface; a custom property alone cannot."""
         if path.startswith('["'):
             return False
         if isinstance(datablock, bpy.types.Key):
@@ -83,12 +83,12 @@ class Sources:
             return True
         if match := _MODIFIER_PATH.fullmatch(path):
             name = bpy.utils.unescape_identifier(match["name"])
-            is_used = self._uses(datablock, datablock.modifiers.get(name)) or match["rest"] == ".show_viewport"
+            is_used = self._is_followed(datablock, datablock.modifiers.get(name)) or match["rest"] == ".show_viewport"
             is_ignored = self._only_active and datablock == self._root and name not in self._modifiers
             return is_used and not is_ignored and match["rest"] not in {".show_render", ".show_in_editmode"}
-        bone, rest = split_bone_path(path)
-        if bone:
-            return bone in self.bones.get(datablock, ()) and not rest.startswith('["')
+        bone_name, subpath = split_bone_path(path)
+        if bone_name:
+            return bone_name in self.bones.get(datablock, ()) and not subpath.startswith('["')
         return datablock != self._root and path.startswith(_TRANSFORM_PREFIXES)
 
     def control_name(self, datablock: bpy.types.ID, path: str) -> str:
@@ -98,7 +98,7 @@ class Sources:
         owner = owner_name(self._rig, datablock)
         return f"{owner}/{path}" if owner else ""
 
-    def _uses(self, scene_object: bpy.types.Object, modifier: bpy.types.Modifier | None) -> bool:
+    def _is_followed(self, scene_object: bpy.types.Object, modifier: bpy.types.Modifier | None) -> bool:
         """Return whether a modifier of an object is followed."""
         if modifier is None or not self._only_active:
             return modifier is not None
@@ -107,20 +107,20 @@ class Sources:
         return modifier.show_viewport and self.objects.get(scene_object, False)
 
     def _add_object(self, scene_object: bpy.types.Object | None, uses_geometry: bool) -> None:
-        is_own_mesh = scene_object != self._root and scene_object == self._rig.mesh_object
-        if scene_object is None or scene_object in self._carriers or is_own_mesh:
+        is_rig_mesh = scene_object != self._root and scene_object == self._rig.mesh_object
+        if scene_object is None or scene_object in self._carriers or is_rig_mesh:
             return
         if scene_object not in self.objects or (uses_geometry and not self.objects[scene_object]):
             self.objects[scene_object] = uses_geometry
             self._queue.append(scene_object)
 
-    def _add_bones(self, armature_object: bpy.types.Object, names: Iterable[str], deforming: bool = False) -> None:
-        is_own = armature_object == self._rig.armature_object
-        if armature_object in self._carriers and not is_own and not deforming:
+    def _add_bones(self, armature_object: bpy.types.Object, names: Iterable[str], is_deforming: bool = False) -> None:
+        is_rig_armature = armature_object == self._rig.armature_object
+        if armature_object in self._carriers and not is_rig_armature and not is_deforming:
             return
         followed = self.bones.setdefault(armature_object, set())
         new_names = {name for name in names if name in armature_object.pose.bones} - followed
-        if is_own:
+        if is_rig_armature:
             followed |= new_names
             return
         bones = armature_object.data.bones
@@ -136,14 +136,14 @@ class Sources:
             self.datablocks[datablock] = name_prefix
             self._follow_drivers(datablock)
 
-    def _follow(self, scene_object: bpy.types.Object) -> None:
+    def _follow_object(self, scene_object: bpy.types.Object) -> None:
         """Add what an object depends on."""
         parent = scene_object.parent
         if parent is not None:
             if parent.type == "ARMATURE" and scene_object.parent_type == "BONE":
                 self._add_bones(parent, [scene_object.parent_bone])
             elif parent.type == "ARMATURE" and scene_object.parent_type == "ARMATURE":
-                self._add_bones(parent, _deforming_bones(scene_object, parent), deforming=True)
+                self._add_bones(parent, _deforming_bones(scene_object, parent), is_deforming=True)
             else:
                 self._add_object(parent, uses_geometry=scene_object.parent_type not in {"OBJECT", "BONE"})
         self._follow_constraints(scene_object.constraints)
@@ -152,7 +152,7 @@ class Sources:
             return
         owner = owner_name(self._rig, scene_object)
         for modifier in scene_object.modifiers:
-            if self._uses(scene_object, modifier):
+            if self._is_followed(scene_object, modifier):
                 path = f'{owner}/modifiers["{bpy.utils.escape_identifier(modifier.name)}"].'
                 self._follow_modifier(scene_object, modifier, path)
         data = scene_object.data
@@ -172,9 +172,9 @@ class Sources:
             if isinstance(value, bpy.types.Object):
                 subtarget = getattr(modifier, "subtarget", "")
                 if modifier.type == "ARMATURE":
-                    # The bones of the rig with skin weights are joints anyway.
+                    # The weighted bones of the rig are joints in any case.
                     names = () if is_rig_skinning else _deforming_bones(scene_object, value)
-                    self._add_bones(value, names, deforming=True)
+                    self._add_bones(value, names, is_deforming=True)
                 elif value.type == "ARMATURE" and subtarget:
                     self._add_bones(value, [subtarget])
                 else:
@@ -212,7 +212,7 @@ class Sources:
         for constraint in constraints:
             if constraint.mute:
                 continue
-            for target, subtarget in _targets(constraint):
+            for target, subtarget in _constraint_targets(constraint):
                 if target.type == "ARMATURE" and subtarget:
                     self._add_bones(target, [subtarget])
                 else:
@@ -222,9 +222,9 @@ class Sources:
     def _follow_drivers(self, datablock: bpy.types.ID) -> None:
         animation = datablock.animation_data
         for curve in animation.drivers if animation else ():
-            # Of another armature only what its bones need.
-            takes_all = not self._only_active and getattr(datablock, "type", "") != "ARMATURE"
-            if takes_all or (not curve.mute and self.affects_surface(datablock, curve.data_path)):
+            # Of another armature, follow only the drivers that its bones need.
+            follows_all = not self._only_active and getattr(datablock, "type", "") != "ARMATURE"
+            if follows_all or (not curve.mute and self.affects_surface(datablock, curve.data_path)):
                 self._add_driver(datablock, curve)
 
     def _add_driver(self, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> None:
@@ -243,17 +243,17 @@ class Sources:
                 else:
                     self._follow_transform(variable, target)
 
-    def _follow_number(self, reader: Curve, datablock: bpy.types.ID, path: str) -> None:
+    def _follow_number(self, reader: OwnedCurve, datablock: bpy.types.ID, path: str) -> None:
         if isinstance(datablock, bpy.types.Scene):
             self.scene_reads.append((reader, datablock, path))
-        bone, rest = split_bone_path(path)
-        if bone and datablock == self._rig.armature_object and is_transform_channel(rest):
-            self._add_bones(datablock, [bone])
+        bone_name, subpath = split_bone_path(path)
+        if bone_name and datablock == self._rig.armature_object and is_transform_channel(subpath):
+            self._add_bones(datablock, [bone_name])
             return
         self.numbers[datablock, path] = None
-        owner, array, index = fcurve_target(datablock, path)
+        owner, array_path, index = fcurve_target(datablock, path)
         for curve in owner.animation_data.drivers if owner.animation_data else ():
-            if (curve.data_path, curve.array_index) == (array, index) and not curve.mute:
+            if (curve.data_path, curve.array_index) == (array_path, index) and not curve.mute:
                 self._add_driver(owner, curve)
 
     def _follow_transform(self, variable: bpy.types.DriverVariable, target: bpy.types.DriverTarget) -> None:
@@ -268,26 +268,26 @@ class Sources:
 
 
 def split_bone_path(path: str) -> tuple[str, str]:
-    """Split a path of an armature object into the name of the bone, empty for none, and the rest of the path."""
+    """Split a path of an armature object into the bone's name, empty for other paths, and the path in the bone."""
     match = _BONE_PATH.match(path)
     return (bpy.utils.unescape_identifier(match["bone"]), path[match.end() :]) if match else ("", path)
 
 
-def is_transform_channel(rest: str) -> bool:
-    """Return whether the rest of a bone's path is a location, a rotation or a scale."""
-    return _TRANSFORM_CHANNEL.fullmatch(rest) is not None
+def is_transform_channel(subpath: str) -> bool:
+    """Return whether a path relative to a bone is a location, a rotation or a scale."""
+    return _TRANSFORM_CHANNEL.fullmatch(subpath) is not None
 
 
 def _carriers(scene_rig: SceneRig) -> set[bpy.types.Object]:
     """Return the armature object of a rig, and the objects that move its mesh or armature object as a whole."""
     carriers = [scene_rig.mesh_object, scene_rig.armature_object]
     for scene_object in carriers:
-        targets = [target for c in scene_object.constraints if not c.mute for target, _ in _targets(c)]
+        targets = [target for c in scene_object.constraints if not c.mute for target, _ in _constraint_targets(c)]
         carriers += [o for o in (scene_object.parent, *targets) if o is not None and o not in carriers]
     return set(carriers) - {scene_rig.mesh_object}
 
 
-def _targets(constraint: bpy.types.Constraint) -> Iterator[tuple[bpy.types.Object, str]]:
+def _constraint_targets(constraint: bpy.types.Constraint) -> Iterator[tuple[bpy.types.Object, str]]:
     """Yield the objects that a constraint reads, each with the name of a bone or a vertex group."""
     owners = [(constraint, "target", "subtarget"), (constraint, "pole_target", "pole_subtarget")]
     owners += [(target, "target", "subtarget") for target in getattr(constraint, "targets", ())]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Targets: a target is another object with the same vertices, whose surface a model learns instead of the rig's."""
+"""Target: an object with the same vertices as the mesh of a rig, whose surface a model learns instead of the rig's."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -34,7 +34,7 @@ class Target:
 
     @property
     def follows(self) -> str:
-        """Return what its surface follows from: `POSE`, `FRAMES` or `SIMULATION` of `core.recording.target`."""
+        """Return what determines the target's surface: `POSE`, `FRAMES` or `SIMULATION` (`core.recording.target`)."""
         if any(cache.is_simulation for cache in self.caches):
             return SIMULATION
         return FRAMES if self.caches else POSE
@@ -46,18 +46,18 @@ class Target:
 
     @property
     def first_frame(self) -> int:
-        """Return the first frame of its simulations, or of the scene if they have none."""
-        first_frames = [cache.first for cache in self.simulations if cache.first is not None]
+        """Return the first frame of the target's simulations, or of the scene if they have no first frame."""
+        first_frames = [cache.first_frame for cache in self.simulations if cache.first_frame is not None]
         return int(min(first_frames, default=bpy.context.scene.frame_start))
 
     def positions(self, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-        """Read its evaluated positions.
+        """Read the evaluated positions of the target.
 
         Returns:
             (V, 3) float32, space of the rig's mesh object, mesh units.
 
         Raises:
-            RigError: it has another number of vertices in this pose.
+            RigError: the target has another number of vertices in this pose.
         """
         evaluated = self.target_object.evaluated_get(depsgraph)
         mesh_object = self.scene_rig.mesh_object.evaluated_get(depsgraph)
@@ -70,7 +70,7 @@ class Target:
         return (positions @ target_to_mesh[:3, :3].T + target_to_mesh[:3, 3]).astype(np.float32)
 
     def check_mesh(self) -> None:
-        """Check that its evaluated mesh has the same vertices and faces as the mesh of the rig.
+        """Check that the evaluated mesh of the target has the same vertices and faces as the mesh of the rig.
 
         Raises:
             RigError: the numbers of vertices or the faces differ.
@@ -79,7 +79,7 @@ class Target:
         mesh = self.scene_rig.mesh_object.data
         if len(target_mesh.vertices) != len(mesh.vertices):
             raise RigError(self._count_message(len(target_mesh.vertices)))
-        # The mesh of a cache may have no faces.
+        # A mesh from a cache file may have no faces.
         if len(target_mesh.polygons) and len(mesh.polygons) and not _have_same_faces(target_mesh, mesh):
             raise RigError(
                 f"The target '{self.name}' has as many vertices as '{self.scene_rig.mesh_object.name}' and other "
@@ -96,11 +96,11 @@ class Target:
 
     @property
     def name(self) -> str:
-        """Return the name of its object."""
+        """Return the name of the target object."""
         return self.target_object.name
 
     def restart_simulations(self) -> None:
-        """Restart its simulations at their first frame, because their cached frames may be of another pose."""
+        """Restart the simulations at their first frame, because their cached frames may show other poses."""
         for cache in self.simulations:
             if cache.owner is not None:
                 # Posing alone does not invalidate the cache of a soft body.
@@ -109,7 +109,7 @@ class Target:
 
     @contextmanager
     def prepared(self) -> Iterator[None]:
-        """Switch its downstream modifiers off, such as a subdivision, and restore them afterwards."""
+        """Switch the downstream modifiers of the target off, such as a subdivision, and restore them afterwards."""
         with downstream_disabled_unchecked(self.target_object):
             yield
 
@@ -159,20 +159,22 @@ def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
             f"The target '{target.name}' is no simulation, so there is nothing that a pre-roll would change; leave it "
             "out."
         )
-    if target.follows != POSE and (mirrored := [clip for clip in clips if clip.is_mirrored]):
+    if target.follows != POSE and (mirrored_clips := [clip for clip in clips if clip.is_mirrored]):
         raise RigError(
-            f"The target '{target.name}' shows the frames of '{mirrored[0].name}' as they are, and not mirrored; leave "
-            "the mirrored frames out."
+            f"The target '{target.name}' shows the frames of '{mirrored_clips[0].name}' as they are, and not mirrored; "
+            "leave the mirrored frames out."
         )
     for clip in clips:
         for cache in target.caches:
-            first = None if pre_roll and cache in target.simulations else cache.first
-            frames, what = clip.frames, f"{clip.kind} '{clip.name}'"
-            if (first is not None and frames[0] < first) or (cache.last is not None and frames[-1] > cache.last):
-                to = "on" if cache.last is None else f"to {cache.last:g}"
+            first_frame = None if pre_roll and cache in target.simulations else cache.first_frame
+            frames, clip_description = clip.frames, f"{clip.kind} '{clip.name}'"
+            if (first_frame is not None and frames[0] < first_frame) or (
+                cache.last_frame is not None and frames[-1] > cache.last_frame
+            ):
+                range_end = "on" if cache.last_frame is None else f"to {cache.last_frame:g}"
                 raise RigError(
-                    f"The {what} has the frames {frames[0]} to {frames[-1]}, and {cache.description} has those from "
-                    f"{cache.first:g} {to}; record an action within, or give it more frames."
+                    f"The {clip_description} has the frames {frames[0]} to {frames[-1]}, and {cache.description} has "
+                    f"those from {cache.first_frame:g} {range_end}; record an action within, or give it more frames."
                 )
         if pre_roll and clip.frames[0] - pre_roll < 0 and any(c.owner == bpy.context.scene for c in target.simulations):
             raise RigError(
@@ -182,37 +184,37 @@ def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
 
 
 @contextmanager
-def temporary_frame_range(target: Target, first: int | None, last: int) -> Iterator[None]:
+def temporary_frame_range(target: Target, first_frame: int | None, last_frame: int) -> Iterator[None]:
     """Extend the frame ranges of a target's simulations, and restore them afterwards.
 
     Args:
         target: the target.
-        first: first frame; None to keep that of each simulation.
-        last: the ranges end at this frame or later.
+        first_frame: first frame of all simulations; None to keep their first frames.
+        last_frame: the ranges end at this frame or later.
     """
     with ExitStack() as stack:
         for cache in target.simulations:
             if cache.owner is not None:
-                # The end first, because Blender keeps the end after the start.
-                stack.enter_context(temporary_attributes(cache.owner, frame_end=max(cache.owner.frame_end, last)))
-                if first is not None:
-                    stack.enter_context(temporary_attributes(cache.owner, frame_start=first))
+                # Set the end first, because Blender keeps the end after the start.
+                stack.enter_context(temporary_attributes(cache.owner, frame_end=max(cache.owner.frame_end, last_frame)))
+                if first_frame is not None:
+                    stack.enter_context(temporary_attributes(cache.owner, frame_start=first_frame))
         yield
 
 
-def _have_same_faces(first: bpy.types.Mesh, second: bpy.types.Mesh) -> bool:
+def _have_same_faces(first_mesh: bpy.types.Mesh, second_mesh: bpy.types.Mesh) -> bool:
     """Return whether two meshes have the same faces, ignoring their order, first corner and direction."""
-    faces = [_faces_by_size(*mesh_io.topology(mesh)) for mesh in (first, second)]
+    faces = [_faces_by_corner_count(*mesh_io.topology(mesh)) for mesh in (first_mesh, second_mesh)]
     return faces[0].keys() == faces[1].keys() and all(
-        np.array_equal(rows, faces[1][size]) for size, rows in faces[0].items()
+        np.array_equal(face_vertices, faces[1][corner_count]) for corner_count, face_vertices in faces[0].items()
     )
 
 
-def _faces_by_size(starts: np.ndarray, vertices: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the sorted vertices (n, corners) of the faces, by their number of corners."""
-    sizes = np.diff(np.append(starts, len(vertices)))
+def _faces_by_corner_count(starts: np.ndarray, vertices: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the vertices (n, corners) of the faces, in a sorted order, by their number of corners."""
+    corner_counts = np.diff(np.append(starts, len(vertices)))
     faces = {}
-    for size in np.unique(sizes).tolist():
-        rows = np.sort(vertices[starts[sizes == size][:, None] + np.arange(size)], axis=1)
-        faces[size] = rows[np.lexsort(rows.T[::-1])]
+    for corner_count in np.unique(corner_counts).tolist():
+        rows = np.sort(vertices[starts[corner_counts == corner_count][:, None] + np.arange(corner_count)], axis=1)
+        faces[corner_count] = rows[np.lexsort(rows.T[::-1])]
     return faces

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the simulations and caches that a target depends on, and their frames. Evaluates nothing."""
+"""Finds the simulations and caches on which a target depends, and their frame ranges, without an evaluation."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,18 +22,18 @@ ALEMBIC_SUFFIXES, USD_SUFFIXES = {".abc"}, {".usd", ".usda", ".usdc", ".usdz"}
 
 @dataclass(frozen=True)
 class Cache:
-    """A simulation or a cache that a target depends on.
+    """A simulation or a cache on which a target depends.
 
     Attributes:
         description: such as "the modifier 'Cloth' of 'flesh'".
-        first, last: first and last frame; None if there is none or it is unknown.
-        is_simulation: each frame depends on the one before; False for a baked simulation.
-        owner: the RNA struct that has its frame range, if that can be set.
+        first_frame, last_frame: the frame range; None if an end is open or unknown.
+        is_simulation: each frame depends on the frame before; False for a baked simulation.
+        owner: the RNA struct that has the frame range; None if the range cannot be set.
     """
 
     description: str
-    first: float | None = None
-    last: float | None = None
+    first_frame: float | None = None
+    last_frame: float | None = None
     is_simulation: bool = False
     owner: "bpy.types.PointCache | bpy.types.Scene | None" = None
 
@@ -50,13 +50,13 @@ def read_caches(scene_rig: SceneRig, target_object: bpy.types.Object) -> tuple[C
 
 
 def _object_caches(scene_object: bpy.types.Object) -> Iterator[Cache]:
-    name = scene_object.name
+    object_name = scene_object.name
     for modifier in scene_object.modifiers:
         if modifier.show_viewport:
-            yield from _modifier_caches(modifier, f"the modifier '{modifier.name}' of '{name}'")
+            yield from _modifier_caches(modifier, f"the modifier '{modifier.name}' of '{object_name}'")
     for constraint in scene_object.constraints:
         if constraint.type == "TRANSFORM_CACHE" and constraint.cache_file and not constraint.mute:
-            yield _file_cache(constraint.cache_file, f"the constraint '{constraint.name}' of '{name}'")
+            yield _file_cache(constraint.cache_file, f"the constraint '{constraint.name}' of '{object_name}'")
 
 
 def _modifier_caches(modifier: bpy.types.Modifier, description: str) -> Iterator[Cache]:
@@ -87,10 +87,10 @@ def _mesh_cache(modifier: bpy.types.MeshCacheModifier, description: str) -> Cach
     if modifier.time_mode != "FRAME" or modifier.play_mode != "SCENE":
         return Cache(description)
     try:
-        frames = read_frame_count(path)
+        frame_count = read_frame_count(path)
     except PointCacheError as error:
         raise RigError(f"{_capitalize(description)} plays a file that cannot be read. {error}") from error
-    return Cache(description, modifier.frame_start, modifier.frame_start + (frames - 1) / modifier.frame_scale)
+    return Cache(description, modifier.frame_start, modifier.frame_start + (frame_count - 1) / modifier.frame_scale)
 
 
 def _file_cache(cache_file: bpy.types.CacheFile, description: str) -> Cache:
@@ -98,7 +98,7 @@ def _file_cache(cache_file: bpy.types.CacheFile, description: str) -> Cache:
     frame_range = None
     if not cache_file.is_sequence and not cache_file.override_frame:
         try:
-            frame_range = _file_frames(path, bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
+            frame_range = _file_frame_range(path, bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
         except OSError as error:
             raise RigError(f"'{path}' of {description} cannot be read: {os_error_text(error)}.") from error
     if frame_range is None:
@@ -107,17 +107,17 @@ def _file_cache(cache_file: bpy.types.CacheFile, description: str) -> Cache:
     return Cache(description, *(round(frame + cache_file.frame_offset, 3) for frame in frame_range))
 
 
-def _file_frames(path: Path, fps: float) -> tuple[float, float] | None:
+def _file_frame_range(path: Path, fps: float) -> tuple[float, float] | None:
     """Read the first and last frame of a cache file; return None if they are unknown."""
     if path.suffix.lower() in ALEMBIC_SUFFIXES:
-        seconds = read_time_range(path)
-        return None if seconds is None else (seconds[0] * fps, seconds[1] * fps)
+        time_range = read_time_range(path)
+        return None if time_range is None else (time_range[0] * fps, time_range[1] * fps)
     if path.suffix.lower() in USD_SUFFIXES:
-        return _usd_frames(path)
+        return _usd_frame_range(path)
     return None
 
 
-def _usd_frames(path: Path) -> tuple[float, float] | None:
+def _usd_frame_range(path: Path) -> tuple[float, float] | None:
     """Read the first and last frame from the metadata of a USD layer; return None if they are unknown."""
     bpy.utils.expose_bundled_modules()
     try:

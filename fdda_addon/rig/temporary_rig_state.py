@@ -16,7 +16,7 @@ from ..scene.temporary_state import temporary_pose
 from .modifier_stack import downstream_disabled
 
 PosedRig = tuple[SceneRig, Rig, tuple[Channel, ...]]
-"""A rig, and the channels of the random poses that will be set."""
+"""A rig as scene objects and as arrays, and the channels of the random poses that will be set."""
 
 
 @contextmanager
@@ -30,14 +30,14 @@ def temporary_rig_state(
 
 @contextmanager
 def temporary_rig_states(
-    rigs: Sequence[PosedRig], clips: tuple[Clip, ...] = (), beside: Sequence[PosedRig] = ()
+    rigs: Sequence[PosedRig], clips: tuple[Clip, ...] = (), other_rigs: Sequence[PosedRig] = ()
 ) -> Iterator[ClipPlayer]:
     """Set rigs to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
 
     Args:
         rigs: rigs of one armature object.
         clips: the clips that the yielded player will show.
-        beside: other rigs that the poses move, whose modifiers stay as they are.
+        other_rigs: further rigs that the poses move, whose modifiers do not change.
 
     Yields:
         The player of the clips.
@@ -46,20 +46,20 @@ def temporary_rig_states(
         RigError: a clip is mirrored, and a rig is not symmetric.
     """
     armature_object = rigs[0][0].armature_object
-    controlled = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *beside)]
+    controlled_rigs = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *other_rigs)]
     with ExitStack() as stack:
-        player = stack.enter_context(clip_player(controlled, clips))
+        player = stack.enter_context(clip_player(controlled_rigs, clips))
         stack.enter_context(hidden_comparison_objects())
         for scene_rig, _, _ in rigs:
             stack.enter_context(downstream_disabled(scene_rig.mesh_object))
         stack.enter_context(temporary_pose(armature_object, clip_actions(armature_object, clips)))
-        for scene_rig, names in controlled:
+        for scene_rig, names in controlled_rigs:
             stack.enter_context(temporary_controls(scene_rig, names))
         clear_pose(armature_object)
         yield player
 
 
 def control_names(rig: Rig, channels: tuple[Channel, ...]) -> list[str]:
-    """Return the names of the controls that a rig has, and of those that are sampled."""
-    sampled = [channel.name for channel in channels if channel.kind == CONTROL]
-    return list(dict.fromkeys([*(control.name for control in rig.controls), *sampled]))
+    """Return the names of the controls of a rig, and of further controls that random poses set."""
+    sampled_controls = [channel.name for channel in channels if channel.kind == CONTROL]
+    return list(dict.fromkeys([*(control.name for control in rig.controls), *sampled_controls]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds what changes a surface with time, besides the pose and the controls: keyframes, drivers, modifiers."""
+"""Finds the keyframes, drivers and modifiers that change a surface with time, besides the pose and the controls."""
 
 import ast
 from collections.abc import Iterable, Iterator
@@ -14,7 +14,7 @@ from ..scene.controls import fcurve_target, owner_of
 from ..scene.scene_rig import SceneRig
 from .modifier_stack import ModifierStack, is_fdda_modifier, time_dependence
 from .other_armatures import check_other_armatures
-from .sources import Curve, Sources
+from .sources import OwnedCurve, Sources
 
 _FRAME_PROPERTIES = {"frame", "frame_current", "frame_current_final", "frame_float", "frame_subframe"}
 _TIME_CONSTRAINTS = {"FOLLOW_TRACK", "CAMERA_SOLVER", "OBJECT_SOLVER", "TRANSFORM_CACHE"}
@@ -22,7 +22,7 @@ _MOVING_IMAGE_SOURCES = {"MOVIE", "SEQUENCE"}
 _DRIVER_REMEDY = "mute it, or let it read a number that is a control"
 
 PropertyKey = tuple[bpy.types.ID, str, int]
-"""A number as `scene.controls.fcurve_target` returns it."""
+"""Datablock, path and array index of a number, as `scene.controls.fcurve_target` returns them."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class TimeInput:
 
     Attributes:
         description: such as "the driver of 'location' of 'handle'".
-        remedy: what a user can do about it.
+        remedy: an instruction to the user, such as "remove them".
     """
 
     description: str
@@ -53,15 +53,15 @@ def check_time_inputs(
         actions: the actions whose frames are recorded.
 
     Raises:
-        RigError: names something that depends on time, or a bone of another armature.
+        RigError: the surface depends on time, or on a bone of another armature; the message names the cause.
     """
     mesh_object = scene_rig.mesh_object
-    names = [modifier.name for modifier in mesh_object.modifiers if not is_fdda_modifier(modifier)][
+    followed_modifiers = [modifier.name for modifier in mesh_object.modifiers if not is_fdda_modifier(modifier)][
         : stack.insert_index
     ]
-    sources = Sources(scene_rig, mesh_object, names)
-    owners = [(owner_of(scene_rig, control.owner), control.path) for control in controls]
-    control_keys = {fcurve_target(owner, path) for owner, path in owners if owner is not None}
+    sources = Sources(scene_rig, mesh_object, followed_modifiers)
+    owners_and_paths = [(owner_of(scene_rig, control.owner), control.path) for control in controls]
+    control_keys = {fcurve_target(owner, path) for owner, path in owners_and_paths if owner is not None}
     for time_input in (*_time_modifiers(sources), *time_inputs(sources, control_keys, actions)):
         raise RigError(
             f"The surface of '{mesh_object.name}' changes with time through {time_input.description}, so it does not "
@@ -73,38 +73,46 @@ def check_time_inputs(
 def time_inputs(
     sources: Sources, controls: Iterable[PropertyKey] = (), actions: Iterable[bpy.types.Action] = ()
 ) -> Iterator[TimeInput]:
-    """Find what changes a surface with time, except modifiers.
+    """Find everything except modifiers that changes a surface with time.
 
     Args:
-        sources: what the surface depends on.
-        controls: numbers that may change.
+        sources: everything on which the surface depends.
+        controls: numbers that are controls, so that they may change.
         actions: further actions that may be played.
     """
     controls, actions = set(controls), tuple(actions)
     for datablock in (*sources.objects, *sources.datablocks):
         for curve in curves_with_actions(datablock, actions):
-            key = (datablock, curve.data_path, curve.array_index)
-            if key not in controls and sources.affects_surface(datablock, curve.data_path) and changes_value(curve):
+            property_key = (datablock, curve.data_path, curve.array_index)
+            if (
+                property_key not in controls
+                and sources.affects_surface(datablock, curve.data_path)
+                and changes_value(curve)
+            ):
                 yield _keyed_input(sources, datablock, curve)
     numbers = [*sources.numbers, *((scene, path) for _, scene, path in sources.scene_reads)]
-    for key in dict.fromkeys(fcurve_target(*number) for number in numbers):
-        for curve in curves_with_actions(key[0], actions):
-            if (curve.data_path, curve.array_index) == key[1:] and key not in controls and changes_value(curve):
-                yield _keyed_input(sources, key[0], curve)
-    for driver, _, path in sources.scene_reads:
+    for property_key in dict.fromkeys(fcurve_target(*number) for number in numbers):
+        for curve in curves_with_actions(property_key[0], actions):
+            if (
+                (curve.data_path, curve.array_index) == property_key[1:]
+                and property_key not in controls
+                and changes_value(curve)
+            ):
+                yield _keyed_input(sources, property_key[0], curve)
+    for owned_curve, _, path in sources.scene_reads:
         if path in _FRAME_PROPERTIES:
-            yield _driver_input(driver)
-    for driver in sources.drivers.values():
-        if _reads_frame(driver[1].driver):
-            yield _driver_input(driver)
+            yield _driver_input(owned_curve)
+    for owned_curve in sources.drivers.values():
+        if _reads_frame(owned_curve[1].driver):
+            yield _driver_input(owned_curve)
     for scene_object in sources.objects:
-        name = scene_object.name
+        object_name = scene_object.name
         world = bpy.context.scene.rigidbody_world
         if scene_object.rigid_body and world and world.enabled and scene_object.rigid_body.type == "ACTIVE":
-            yield TimeInput(f"the rigid body of '{name}'", "bake it to a pose, or remove it")
+            yield TimeInput(f"the rigid body of '{object_name}'", "bake it to a pose, or remove it")
         for constraint in scene_object.constraints:
             if constraint.type in _TIME_CONSTRAINTS and not constraint.mute:
-                yield TimeInput(f"the constraint '{constraint.name}' of '{name}'", "mute it, or remove it")
+                yield TimeInput(f"the constraint '{constraint.name}' of '{object_name}'", "mute it, or remove it")
     for texture in sources.datablocks:
         image = getattr(texture, "image", None)
         if image is not None and image.source in _MOVING_IMAGE_SOURCES:
@@ -135,8 +143,8 @@ def _keyed_input(sources: Sources, datablock: bpy.types.ID, curve: bpy.types.FCu
     return TimeInput(description, remedy)
 
 
-def _driver_input(driver: Curve) -> TimeInput:
-    datablock, curve = driver
+def _driver_input(owned_curve: OwnedCurve) -> TimeInput:
+    datablock, curve = owned_curve
     description = f"the driver of '{curve.data_path}' of '{datablock.name}', which reads the frame"
     return TimeInput(description, _DRIVER_REMEDY)
 
