@@ -50,6 +50,19 @@ class DepsgraphChanges:
         return changes
 
 
+def has_edited_armature(depsgraph: bpy.types.Depsgraph) -> bool:
+    """Return whether armature data have changed by more than their drivers and keys.
+
+    Rigs of Rigify drive the B-Bones, so that Blender reports their armature data in every frame, neither as transformed
+    nor with changed geometry. Edits are reported with both.
+    """
+    return any(
+        update.is_updated_geometry or update.is_updated_transform or update.id.original.animation_data is None
+        for update in depsgraph.updates
+        if isinstance(update.id, Armature)
+    )
+
+
 def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:
     """Read only `DepsgraphChanges.meshes`: in most frames there are none, and nothing else has to be read."""
     meshes: dict[int, bool] = {}

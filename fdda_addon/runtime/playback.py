@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import bpy
 
 from . import modifier_switch, playback_modifier, registry, rig_signature
-from .depsgraph_changes import DepsgraphChanges, changed_meshes
+from .depsgraph_changes import DepsgraphChanges, changed_meshes, has_edited_armature
 from .evaluation_threads import keep_thread_state
 from .mode_override import overriding_mode
 from .model_files import network_of
@@ -36,7 +36,11 @@ def on_frame_change(depsgraph: bpy.types.Depsgraph) -> None:
     If only poses and shape keys have changed, nothing is checked.
     """
     updated = depsgraph.id_type_updated
-    if updated("ARMATURE") or updated("SCENE") or (updated("MESH") and changed_meshes(depsgraph)):
+    if (
+        updated("SCENE")
+        or (updated("ARMATURE") and has_edited_armature(depsgraph))
+        or (updated("MESH") and changed_meshes(depsgraph))
+    ):
         _check_changes(depsgraph)
     _update_players(depsgraph)
     registry.update_batches(frame_changed=True)

@@ -47,20 +47,36 @@ def trigger_check(update: str) -> None:
         bpy.context.view_layer.update()
 
 
+def drive_b_bone() -> None:
+    """Drive a setting of the armature data by a bone, as Rigify does: Blender reports the data in every frame."""
+    driver = bpy.data.objects[ELBOW_RIG].data.driver_add('bones["lower"].bbone_easein').driver
+    variable = driver.variables.new()
+    variable.type, variable.targets[0].id = "TRANSFORMS", bpy.data.objects[ELBOW_RIG]
+    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
+    driver.type = "SUM"
+    bpy.context.view_layer.update()
+
+
+@pytest.mark.parametrize("is_driven", [False, True])
 @pytest.mark.parametrize("update", ["view layer", "frame"])
 @pytest.mark.parametrize("change_name", EDIT_MODE_CHANGES)
-def test_a_change_in_edit_mode_shows_the_rig(bound, change_name, update, capsys):
+def test_a_change_in_edit_mode_shows_the_rig(bound, change_name, update, is_driven, capsys):
     name, change, clause = EDIT_MODE_CHANGES[change_name]
+    if is_driven:
+        drive_b_bone()
     pose(angle=1.0)
     change_in_edit_mode(bpy.data.objects[name], change)
     trigger_check(update)
     assert_rig_shown(bound, clause, capsys)
 
 
+@pytest.mark.parametrize("is_driven", [False, True])
 @pytest.mark.parametrize("update", ["view layer", "frame"])
 @pytest.mark.parametrize("change_name", SCRIPT_CHANGES)
-def test_a_change_by_a_script_shows_the_rig(bound, change_name, update, capsys):
+def test_a_change_by_a_script_shows_the_rig(bound, change_name, update, is_driven, capsys):
     change, clause = SCRIPT_CHANGES[change_name]
+    if is_driven:
+        drive_b_bone()
     pose(angle=1.0)
     change()
     trigger_check(update)
@@ -276,6 +292,16 @@ def test_playback_and_posing_do_not_check_the_rig(bound, elbow, monkeypatch):
         bpy.context.scene.frame_set(frame)
         pose(angle=0.1 * frame)
     assert_plays(bound, elbow.model)
+
+
+def test_a_frame_reads_no_bones_of_driven_armature_data(bound, elbow, monkeypatch):
+    drive_b_bone()
+    monkeypatch.setattr(rig_signature, "bone_signature", None)
+    shown = []
+    for frame in (5, 12, 25):
+        bpy.context.scene.frame_set(frame)
+        shown.append(assert_plays(bound, elbow.model))
+    assert np.abs(shown[0] - shown[-1]).max() > 1e-3
 
 
 def test_added_bones_do_not_change_the_order_of_joints(bound):
