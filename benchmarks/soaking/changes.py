@@ -12,7 +12,7 @@ import numpy as np
 
 from fdda_addon.runtime.binding import bind, model_disabled
 from fdda_addon.scene.scene_rig import find_rig
-from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated
+from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated_positions
 from tests.blender.test_broken_characters import add_control_to_model
 
 from .cases import CaseFailedError
@@ -123,12 +123,12 @@ def _change_and_compare(bound: bpy.types.Object, random: Random, actions: list[C
     if random.random() < 0.6:
         bpy.context.scene.frame_set(int(random.integers(1, 31)))
     bpy.context.view_layer.update()
-    shown_positions, is_playing, status = evaluated(bound), bound.fdda.is_playing, bound.fdda.status
+    shown_positions, is_playing, status = evaluated_positions(bound), bound.fdda.is_playing, bound.fdda.status
     with model_disabled(bound):
         if random.random() < 0.2:
             bound.modifiers["FDDA"].show_viewport = True
         bpy.context.view_layer.update()
-        rig_positions = evaluated(bound)
+        rig_positions = evaluated_positions(bound)
     bpy.context.view_layer.update()
     if len(shown_positions) != len(rig_positions):
         raise CaseFailedError(f"{len(shown_positions)} vertices instead of the rig's {len(rig_positions)}: {status}")

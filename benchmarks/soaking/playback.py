@@ -13,7 +13,7 @@ import numpy as np
 import fdda_addon
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.scene.scene_rig import find_rig
-from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated, pose, predicted
+from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated_positions, pose, predicted_positions
 from tests.blender.test_evaluations import (
     FRAMES,
     add_shape_key,
@@ -116,7 +116,7 @@ def _model_error_m(mesh_object: bpy.types.Object, folder: Path) -> float:
     """Return the distance between the shown mesh and the model's output, meters; any distance fails the case."""
     if mesh_object.fdda.status:
         raise CaseFailedError(mesh_object.fdda.status)
-    return _distance_m(evaluated(mesh_object), predicted(mesh_object, folder / "elbow.onnx"), 0.0)
+    return _distance_m(evaluated_positions(mesh_object), predicted_positions(mesh_object, folder / "elbow.onnx"), 0.0)
 
 
 def _distance_m(shown: np.ndarray, expected: np.ndarray, max_distance_m: float) -> float:
@@ -152,7 +152,7 @@ def _check_view_layers_and_scenes(folder: Path) -> float:
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
         layer.update()
-        expected = predicted(bound, folder / "elbow.onnx")
+        expected = predicted_positions(bound, folder / "elbow.onnx")
         scene.frame_set(frame)
         for graph in (layer.depsgraph, scene.view_layers[0].depsgraph):
             error_m = max(error_m, _distance_m(shown_in(graph, bound), expected, 0.0))
@@ -170,7 +170,7 @@ def _check_instances(folder: Path) -> float:
         bpy.context.scene.frame_set(frame)
         graph = bpy.context.evaluated_depsgraph_get()
         meshes = [i.object.data for i in graph.object_instances if i.is_instance and i.object.original == bound]
-        expected = predicted(bound, folder / "elbow.onnx")
+        expected = predicted_positions(bound, folder / "elbow.onnx")
         for mesh in meshes:
             error_m = max(error_m, _distance_m(np.array([v.co[:] for v in mesh.vertices], np.float32), expected, 0.0))
         if not meshes:
@@ -202,10 +202,10 @@ def _check_still(engine: str, use_in_render: bool) -> Callable[[Path], float]:
         if engine == "CYCLES":
             scene.cycles.samples, scene.cycles.use_denoising = 2, False
         bound.fdda.use_in_render = use_in_render
-        expected = predicted(bound, folder / "elbow.onnx")
+        expected = predicted_positions(bound, folder / "elbow.onnx")
         if not use_in_render:
             bound.fdda.mode = "RIG"
-            expected = evaluated(bound)
+            expected = evaluated_positions(bound)
             bound.fdda.mode = "FDDA"
         plain = render_positions(bound, expected, folder / "plain.png")
         if not np.array_equal(still(folder / "still.png"), plain):
@@ -225,7 +225,7 @@ def _check_export(
         for frame in FRAMES:
             bpy.context.scene.frame_set(frame)
             bound.fdda.mode = "FDDA" if mode == "VIEWPORT" or use_in_render else "RIG"
-            expected[frame] = evaluated(bound)
+            expected[frame] = evaluated_positions(bound)
             bound.fdda.mode = "FDDA"
         path = folder / f"exported{suffix}"
         export(path, mode)

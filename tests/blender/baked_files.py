@@ -10,7 +10,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .conftest import ELBOW, ElbowFiles, predicted
+from .conftest import ELBOW, ElbowFiles, predicted_positions
 
 WAVE_FRAMES = range(1, 31)
 """Frames of the action `elbow_wave`."""
@@ -72,11 +72,11 @@ def predicted_in_frames(frames, model: Path) -> np.ndarray:
     positions = []
     for frame in frames:
         bpy.context.scene.frame_set(frame)
-        positions.append(predicted(bpy.data.objects[ELBOW], model).copy())
+        positions.append(predicted_positions(bpy.data.objects[ELBOW], model).copy())
     return np.array(positions)
 
 
-def predicted_wave(elbow: ElbowFiles) -> np.ndarray:
+def predicted_wave(elbow_files: ElbowFiles) -> np.ndarray:
     """Return the model's positions (30, V, 3) in all frames of the action `elbow_wave`."""
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
-    return predicted_in_frames(WAVE_FRAMES, elbow.model)
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
+    return predicted_in_frames(WAVE_FRAMES, elbow_files.model)

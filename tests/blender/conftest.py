@@ -65,7 +65,7 @@ def pytest_sessionfinish() -> None:
 
 
 @pytest.fixture(scope="session")
-def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
+def elbow_files(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
     """Make the elbow's files in the first test process that needs them; the processes share the folder.
 
     No test may change these files. A test that writes another file beside them puts its process ID into the name.
@@ -163,15 +163,15 @@ def preferences() -> Iterator[bpy.types.AddonPreferences]:
 
 
 @pytest.fixture
-def loose_model(elbow: ElbowFiles) -> Path:
+def loose_model(elbow_files: ElbowFiles) -> Path:
     """Return a copy of the elbow's model that plays with any modifiers."""
-    return without_deformation(elbow.model)
+    return without_deformation(elbow_files.model)
 
 
 @pytest.fixture
-def rig(elbow: ElbowFiles) -> SceneRig:
+def rig(elbow_files: ElbowFiles) -> SceneRig:
     """Open the elbow's file, and return its rig."""
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
     return find_rig()
 
 
@@ -184,18 +184,18 @@ def saved(rig: SceneRig, tmp_path: Path) -> SceneRig:
 
 
 @pytest.fixture
-def bound(elbow: ElbowFiles) -> bpy.types.Object:
+def bound_elbow(elbow_files: ElbowFiles) -> bpy.types.Object:
     """Open the file of the bound elbow, and return its mesh object."""
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
     return bpy.data.objects[ELBOW]
 
 
 @pytest.fixture
-def library(elbow: ElbowFiles, tmp_path: Path):
+def library(elbow_files: ElbowFiles, tmp_path: Path):
     """Make a library with the bound elbow (`linked.Library`), and leave an empty shot open."""
     from .linked import make_library
 
-    return make_library(elbow, tmp_path)
+    return make_library(elbow_files, tmp_path)
 
 
 @pytest.fixture
@@ -210,7 +210,7 @@ def pair(library) -> list[bpy.types.Object]:
 def rig_positions(mesh_object: bpy.types.Object) -> np.ndarray:
     """Return the positions (V, 3) that a playing character has in mode RIG; the mode is FDDA afterwards."""
     mesh_object.fdda.mode = "RIG"
-    positions = evaluated(mesh_object)
+    positions = evaluated_positions(mesh_object)
     mesh_object.fdda.mode = "FDDA"
     return positions
 
@@ -221,7 +221,7 @@ def pose(armature_name: str = ELBOW_RIG, angle: float = 1.0, bone: str = "lower"
     bpy.context.view_layer.update()
 
 
-def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
+def evaluated_positions(mesh_object: bpy.types.Object) -> np.ndarray:
     """Return the positions (V, 3) of the evaluated mesh, read as a user's script reads them."""
     mesh_object = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = mesh_object.to_mesh()
@@ -230,7 +230,7 @@ def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
     return positions
 
 
-def predicted(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
+def predicted_positions(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
     """Return the model's positions (V, 3) for the evaluated pose, computed without the code for playback."""
     network = Network(model)
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -245,7 +245,7 @@ def predicted(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
 
 def assert_plays(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
     """Assert that the evaluated mesh equals the model's output within 1e-5 m, and return its positions (V, 3)."""
-    positions = evaluated(mesh_object)
+    positions = evaluated_positions(mesh_object)
     assert not mesh_object.fdda.status
-    assert np.abs(positions - predicted(mesh_object, model)).max() < 1e-5
+    assert np.abs(positions - predicted_positions(mesh_object, model)).max() < 1e-5
     return positions

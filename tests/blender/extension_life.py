@@ -108,11 +108,11 @@ def installed_onnxruntime() -> ModuleType:
     return onnxruntime
 
 
-def play_bound_file(package: str, bound: str) -> dict:
+def play_bound_file(package: str, bound_elbow: str) -> dict:
     """Install a zip, open a bound file and bend the elbow; return the evaluated positions."""
     install_zip(package, True)
     onnxruntime = installed_onnxruntime()
-    bpy.ops.wm.open_mainfile(filepath=bound)
+    bpy.ops.wm.open_mainfile(filepath=bound_elbow)
     bpy.data.objects["elbow_rig"].pose.bones["lower"].rotation_euler[0] = 1.0
     bpy.context.view_layer.update()
     elbow = bpy.data.objects["elbow"].evaluated_get(bpy.context.evaluated_depsgraph_get())

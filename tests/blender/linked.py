@@ -49,13 +49,13 @@ def save_character(source: Path, path: Path) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
 
 
-def make_library(elbow: ElbowFiles, folder: Path) -> Library:
+def make_library(elbow_files: ElbowFiles, folder: Path) -> Library:
     """Save the bound elbow as a library in one folder; then open an empty shot in another folder."""
     model_files._chosen_paths.clear()
     files = Library(folder / "characters" / "elbow.blend", folder / "characters" / "elbow.onnx")
     files.path.parent.mkdir()
-    shutil.copy(elbow.model, files.model)
-    save_character(elbow.bound, files.path)
+    shutil.copy(elbow_files.model, files.model)
+    save_character(elbow_files.bound, files.path)
     save_new_shot(folder)
     return files
 

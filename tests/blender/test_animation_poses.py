@@ -43,7 +43,7 @@ def positions_of(recording: Recording) -> np.ndarray:
     return skinning.complex_positions(matrices, np.array(recording.residuals))
 
 
-def evaluated(rig: SceneRig) -> np.ndarray:
+def evaluated_positions(rig: SceneRig) -> np.ndarray:
     """Return the positions (V, 3) of the evaluated mesh."""
     mesh_object = rig.mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
     return np.array([vertex.co[:] for vertex in mesh_object.data.vertices], np.float32)
@@ -54,7 +54,7 @@ def positions_in_frames(rig: SceneRig, frames) -> np.ndarray:
     positions_by_frame = []
     for frame in frames:
         bpy.context.scene.frame_set(frame)
-        positions_by_frame.append(evaluated(rig))
+        positions_by_frame.append(evaluated_positions(rig))
     return np.array(positions_by_frame)
 
 

@@ -48,7 +48,7 @@ def arm(animated) -> tuple[bpy.types.Object, bpy.types.Object]:
     return animated
 
 
-def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
+def evaluated_positions(mesh_object: bpy.types.Object) -> np.ndarray:
     """Return the positions (V, 3) of the mesh after all modifiers, float64, in meters."""
     bpy.context.view_layer.update()
     mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
@@ -178,7 +178,7 @@ def test_each_vertex_follows_one_bone(arm):
 
 def test_the_rest_pose_shows_the_undeformed_mesh(arm):
     mesh_object, _ = arm
-    assert np.abs(evaluated(mesh_object) - rest_positions(mesh_object)).max() < 1e-6
+    assert np.abs(evaluated_positions(mesh_object) - rest_positions(mesh_object)).max() < 1e-6
 
 
 def test_the_elbow_drives_the_biceps_shape_key(arm):
@@ -200,9 +200,9 @@ def test_biceps_bulges_on_the_front_of_the_upper_arm(arm):
     mesh_object, rig = arm
     key = mesh_object.data.shape_keys.key_blocks["biceps"]
     bend(rig, "elbow", x=140)
-    contracted = evaluated(mesh_object)
+    contracted = evaluated_positions(mesh_object)
     key.mute = True
-    offsets = np.linalg.norm(contracted - evaluated(mesh_object), axis=1)
+    offsets = np.linalg.norm(contracted - evaluated_positions(mesh_object), axis=1)
     assert 0.014 < offsets.max() < 0.020
     x, y, _ = rest_positions(mesh_object)[offsets.argmax()]
     assert 0.12 < x < 0.22 and y < -0.02
@@ -218,9 +218,9 @@ def test_corrective_smooth_moves_a_bent_joint(arm, name, angle, millimeters):
     smooth = mesh_object.modifiers["CorrectiveSmooth"]
     assert (smooth.rest_source, smooth.iterations) == ("ORCO", 10)
     bend(rig, name, x=angle)
-    smoothed = evaluated(mesh_object)
+    smoothed = evaluated_positions(mesh_object)
     smooth.show_viewport = False
-    offsets = np.linalg.norm(smoothed - evaluated(mesh_object), axis=1)
+    offsets = np.linalg.norm(smoothed - evaluated_positions(mesh_object), axis=1)
     assert offsets.max() > millimeters * 1e-3
     assert np.linalg.norm(rest_positions(mesh_object)[offsets.argmax()] - joint(name).head) < 0.06
 
@@ -285,11 +285,11 @@ def test_the_saved_fixture_equals_a_newly_built_one(name, build):
     )
     faces = [tuple(polygon.vertices) for polygon in saved.data.polygons]
     bpy.context.scene.frame_set(10)
-    posed_points = evaluated(saved)
+    posed_points = evaluated_positions(saved)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     fresh, _ = build()
     assert points == pytest.approx(rest_positions(fresh), abs=1e-6)
     assert faces == [tuple(polygon.vertices) for polygon in fresh.data.polygons]
     assert weights == [[(g.group, g.weight) for g in vertex.groups] for vertex in fresh.data.vertices]
     bpy.context.scene.frame_set(10)
-    assert posed_points == pytest.approx(evaluated(fresh), abs=1e-5)
+    assert posed_points == pytest.approx(evaluated_positions(fresh), abs=1e-5)

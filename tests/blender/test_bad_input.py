@@ -19,13 +19,13 @@ pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.fixture(params=["record", "bind", "evaluate", "benchmark"])
-def verb(request, elbow, tmp_path):
+def verb(request, elbow_files, tmp_path):
     """Return, for each verb that opens a rig, a function from the rig's path to the verb's arguments."""
     more_arguments = {
         "record": [tmp_path / "recording"],
-        "bind": [elbow.model, tmp_path / "bound.blend"],
-        "evaluate": [elbow.model, "--json", tmp_path / "e.json", "--poses", "2"],
-        "benchmark": [elbow.model, "--json", tmp_path / "b.json", "--frames", "5"],
+        "bind": [elbow_files.model, tmp_path / "bound.blend"],
+        "evaluate": [elbow_files.model, "--json", tmp_path / "e.json", "--poses", "2"],
+        "benchmark": [elbow_files.model, "--json", tmp_path / "b.json", "--frames", "5"],
     }[request.param]
     return lambda rig_path, *options: [request.param, rig_path, *more_arguments, *options]
 
@@ -81,7 +81,7 @@ def lock_all_rotations(rig) -> None:
         bone.lock_rotation = (True, True, True)
 
 
-def test_a_rig_whose_bones_are_all_locked_is_refused(refusal, elbow, tmp_path):
+def test_a_rig_whose_bones_are_all_locked_is_refused(refusal, elbow_files, tmp_path):
     path = save_elbow(tmp_path / "rig.blend", lock_all_rotations)
     expected = "No bone of 'elbow_rig' may be sampled: all 2 are locked or moved by constraints; unlock an axis"
     assert refusal("record", path, tmp_path / "r").startswith(expected)
@@ -130,38 +130,38 @@ def index_changer(**values):
         pytest.param(write_nan, "holds values that are not numbers (residuals, pose 3); record again", id="NaN"),
     ],
 )
-def test_training_on_a_damaged_recording_is_refused(refusal, elbow, tmp_path, damage, words):
-    path = shutil.copytree(elbow.recording, tmp_path / "recording")
+def test_training_on_a_damaged_recording_is_refused(refusal, elbow_files, tmp_path, damage, words):
+    path = shutil.copytree(elbow_files.recording, tmp_path / "recording")
     damage(path)
     assert words in refusal("train", path, tmp_path / "m.onnx")
 
 
-def test_recording_into_a_folder_with_a_recording_is_refused(refusal, elbow, tmp_path):
-    path = shutil.copytree(elbow.recording, tmp_path / "recording")
-    assert "holds a recording already; continue it with --resume" in refusal("record", elbow.rig, path)
+def test_recording_into_a_folder_with_a_recording_is_refused(refusal, elbow_files, tmp_path):
+    path = shutil.copytree(elbow_files.recording, tmp_path / "recording")
+    assert "holds a recording already; continue it with --resume" in refusal("record", elbow_files.rig, path)
 
 
-def test_resuming_with_other_options_is_refused(refusal, elbow, tmp_path):
-    path = shutil.copytree(elbow.recording, tmp_path / "recording")
+def test_resuming_with_other_options_is_refused(refusal, elbow_files, tmp_path):
+    path = shutil.copytree(elbow_files.recording, tmp_path / "recording")
     index_changer(complete=40)(path)
-    text = refusal("record", elbow.rig, path, "--poses", 150, "--seed", 1, "--resume")
+    text = refusal("record", elbow_files.rig, path, "--poses", 150, "--seed", 1, "--resume")
     assert "it was recorded differently (sampling.seed);" in text
-    text = refusal("record", elbow.rig, path, "--poses", 160, "--resume")
+    text = refusal("record", elbow_files.rig, path, "--poses", 160, "--resume")
     assert "it was recorded differently (poses, sampling.sources);" in text
 
 
 @pytest.fixture(params=["build-arm", "record", "bind", "evaluate", "heatmap", "benchmark"])
-def writing_verb(request, elbow, tmp_path_factory):
+def writing_verb(request, elbow_files, tmp_path_factory):
     """Return, for each verb that writes a file, a function from the output path to the verb's arguments."""
     return {
         "build-arm": lambda out: ["build-arm", out],
-        "record": lambda out: ["record", elbow.rig, out, "--poses", 60],
-        "bind": lambda out: ["bind", elbow.rig, elbow.model, out],
-        "evaluate": lambda out: ["evaluate", elbow.rig, elbow.model, "--json", out, "--poses", 2],
+        "record": lambda out: ["record", elbow_files.rig, out, "--poses", 60],
+        "bind": lambda out: ["bind", elbow_files.rig, elbow_files.model, out],
+        "evaluate": lambda out: ["evaluate", elbow_files.rig, elbow_files.model, "--json", out, "--poses", 2],
         "heatmap": lambda out: [
             "evaluate",
-            elbow.rig,
-            elbow.model,
+            elbow_files.rig,
+            elbow_files.model,
             "--poses",
             2,
             "--json",
@@ -169,7 +169,7 @@ def writing_verb(request, elbow, tmp_path_factory):
             "--heatmap",
             out,
         ],
-        "benchmark": lambda out: ["benchmark", elbow.rig, elbow.model, "--json", out, "--frames", 5],
+        "benchmark": lambda out: ["benchmark", elbow_files.rig, elbow_files.model, "--json", out, "--frames", 5],
     }[request.param]
 
 
@@ -201,10 +201,10 @@ def test_an_output_path_that_is_too_long_for_blender_is_refused(refusal, writing
     assert text.startswith("Cannot write") and "bytes, and Blender takes 1,023; choose a shorter folder." in text
 
 
-def test_a_rig_path_that_is_too_long_for_blender_is_refused(refusal, verb, elbow, tmp_path):
+def test_a_rig_path_that_is_too_long_for_blender_is_refused(refusal, verb, elbow_files, tmp_path):
     path = deep_path(tmp_path) / "rig.blend"
     path.parent.mkdir(parents=True)
-    shutil.copy(elbow.rig, path)
+    shutil.copy(elbow_files.rig, path)
     text = refusal(*verb(path))
     assert text.startswith("Blender cannot open or write") and "bytes, and Blender takes 1,023; choose a sh" in text
 
@@ -230,7 +230,7 @@ def test_a_full_disk_leaves_the_old_file(refusal_on_a_full_disk, writing_verb, t
     assert file_contents(tmp_path) == {"out": b"old"}
 
 
-def test_a_model_that_cannot_be_copied_beside_the_bound_file_is_refused(refusal, elbow, tmp_path):
-    (tmp_path / elbow.model.name).write_bytes(b"another model")
-    text = refusal("bind", elbow.rig, elbow.model, tmp_path / "b.blend")
-    assert f"there is another '{elbow.model.name}'; remove it or choose another folder" in text
+def test_a_model_that_cannot_be_copied_beside_the_bound_file_is_refused(refusal, elbow_files, tmp_path):
+    (tmp_path / elbow_files.model.name).write_bytes(b"another model")
+    text = refusal("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend")
+    assert f"there is another '{elbow_files.model.name}'; remove it or choose another folder" in text

@@ -85,33 +85,33 @@ def flip_face(rig) -> None:
     ],
     ids=["vertex count", "joints", "rest pose", "parents", "rest positions", "weights", "topology"],
 )
-def test_a_model_of_another_rig_is_refused(refusal, verb, elbow, tmp_path, change, words):
-    assert len(json.loads((elbow.recording / "recording.json").read_text())["joints"]) == 2
-    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", change), elbow.model))
-    assert text.startswith(f"The model '{elbow.model}' was trained for another rig: {words}")
+def test_a_model_of_another_rig_is_refused(refusal, verb, elbow_files, tmp_path, change, words):
+    assert len(json.loads((elbow_files.recording / "recording.json").read_text())["joints"]) == 2
+    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", change), elbow_files.model))
+    assert text.startswith(f"The model '{elbow_files.model}' was trained for another rig: {words}")
     assert text.endswith(". Record and train this rig.")
 
 
-def test_a_missing_model_is_refused(refusal, verb, elbow, tmp_path):
+def test_a_missing_model_is_refused(refusal, verb, elbow_files, tmp_path):
     path = tmp_path / "none.onnx"
-    text = refusal(*verb(elbow.rig, path))
+    text = refusal(*verb(elbow_files.rig, path))
     assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
 
 
 @pytest.mark.parametrize("content", [b"", b"text, not a model\n" * 50, bytes(5000)])
-def test_a_file_that_is_not_an_onnx_file_is_refused(refusal, verb, elbow, tmp_path, content):
+def test_a_file_that_is_not_an_onnx_file_is_refused(refusal, verb, elbow_files, tmp_path, content):
     path = tmp_path / "m.onnx"
     path.write_bytes(content)
-    assert refusal(*verb(elbow.rig, path)) == (
+    assert refusal(*verb(elbow_files.rig, path)) == (
         f"'{path}' is not a model: not an ONNX file; give an .onnx file that train made."
     )
 
 
 @pytest.mark.parametrize("kept_ratio", [0.1, 0.5, 0.999])
-def test_a_truncated_model_is_refused(refusal, verb, elbow, tmp_path, kept_ratio):
-    path, data = tmp_path / "m.onnx", elbow.model.read_bytes()
+def test_a_truncated_model_is_refused(refusal, verb, elbow_files, tmp_path, kept_ratio):
+    path, data = tmp_path / "m.onnx", elbow_files.model.read_bytes()
     path.write_bytes(data[: int(len(data) * kept_ratio)])
-    assert f"'{path}' is not a model" in refusal(*verb(elbow.rig, path))
+    assert f"'{path}' is not a model" in refusal(*verb(elbow_files.rig, path))
 
 
 def add_input(model) -> None:
@@ -157,9 +157,9 @@ def set_version_2(model) -> None:
         (set_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
     ],
 )
-def test_onnx_files_that_are_not_models_of_the_add_on_are_refused(refusal, verb, elbow, tmp_path, change, words):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", change)
-    text = refusal(*verb(elbow.rig, path))
+def test_onnx_files_that_are_not_models_of_the_add_on_are_refused(refusal, verb, elbow_files, tmp_path, change, words):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
+    text = refusal(*verb(elbow_files.rig, path))
     assert str(path) in text and words in text
 
 
@@ -176,25 +176,25 @@ def use_double_input(model) -> None:
 
 
 @pytest.mark.parametrize("change", [use_unknown_operator, create_loop])
-def test_invalid_graphs_are_refused_before_onnx_runtime_loads_them(refusal, verb, elbow, tmp_path, change):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", change)
-    text = refusal(*verb(elbow.rig, path))
+def test_invalid_graphs_are_refused_before_onnx_runtime_loads_them(refusal, verb, elbow_files, tmp_path, change):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
+    text = refusal(*verb(elbow_files.rig, path))
     assert text.startswith(f"The model '{path}' is refused: ") and text.endswith("; give one that train made.")
 
 
-def test_a_graph_with_double_inputs_is_refused(refusal, verb, elbow, tmp_path):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", use_double_input)
-    text = refusal(*verb(elbow.rig, path))
+def test_a_graph_with_double_inputs_is_refused(refusal, verb, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", use_double_input)
+    text = refusal(*verb(elbow_files.rig, path))
     assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
 
 
-def test_weights_that_do_not_match_the_checksum_are_refused(refusal, verb, elbow, tmp_path):
-    data = bytearray(elbow.model.read_bytes())
+def test_weights_that_do_not_match_the_checksum_are_refused(refusal, verb, elbow_files, tmp_path):
+    data = bytearray(elbow_files.model.read_bytes())
     weights = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
     data[bytes(data).index(bytes(weights)) + len(weights) // 2] ^= 0x40
     path = tmp_path / "m.onnx"
     path.write_bytes(data)
-    assert "is damaged: its checksum is not that of its weights" in refusal(*verb(elbow.rig, path))
+    assert "is damaged: its checksum is not that of its weights" in refusal(*verb(elbow_files.rig, path))
 
 
 def output_nan(model) -> None:
@@ -205,9 +205,9 @@ def output_nan(model) -> None:
     model.graph.node.append(helper.make_node("Mul", ["good", "nan"], ["positions"]))
 
 
-def test_evaluation_of_a_model_that_returns_nan_is_refused(refusal, elbow, tmp_path):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", output_nan)
-    text = refusal("evaluate", elbow.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
+def test_evaluation_of_a_model_that_returns_nan_is_refused(refusal, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", output_nan)
+    text = refusal("evaluate", elbow_files.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
     assert f"The model '{path}' gives positions that are not numbers (held-out poses, pose 0)" in text
 
 
@@ -232,20 +232,20 @@ def output_nan_when_straight(model) -> None:
 
 
 @pytest.mark.parametrize("change", [output_nan, output_nan_when_straight])
-def test_playing_a_model_that_returns_nan_shows_an_error(bound, elbow, tmp_path, change, capsys):
+def test_playing_a_model_that_returns_nan_shows_an_error(bound_elbow, elbow_files, tmp_path, change, capsys):
     armature = bpy.data.objects["elbow_rig"]
     armature.animation_data_clear()
-    bind(find_rig(), write_edited(elbow.model, tmp_path / "m.onnx", change))
+    bind(find_rig(), write_edited(elbow_files.model, tmp_path / "m.onnx", change))
     is_error_shown = []
     for angle in (0.8, -0.8, 0.8):
         armature.pose.bones["lower"].rotation_euler[0] = angle
         bpy.context.view_layer.update()
-        is_error_shown.append("gives positions that are not numbers; train it again." in bound.fdda.status)
+        is_error_shown.append("gives positions that are not numbers; train it again." in bound_elbow.fdda.status)
     if change is output_nan:
         assert is_error_shown == [True, True, True]
     else:
         assert sorted(set(is_error_shown)) == [False, True]
-    assert bound.fdda.mode == "FDDA"
+    assert bound_elbow.fdda.mode == "FDDA"
 
 
 def output_fewer_vertices(model) -> None:
@@ -256,21 +256,21 @@ def output_fewer_vertices(model) -> None:
     model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
 
 
-def test_a_model_whose_output_has_another_shape_is_refused(refusal, verb, elbow, tmp_path):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", output_fewer_vertices)
+def test_a_model_whose_output_has_another_shape_is_refused(refusal, verb, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", output_fewer_vertices)
     assert "is refused: its output 'positions' comes out as (1, 7, 3), not as (1, 300, 3)" in refusal(
-        *verb(elbow.rig, path)
+        *verb(elbow_files.rig, path)
     )
 
 
-def test_a_refused_model_does_not_change_a_bound_object(bound, elbow, tmp_path):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", add_custom_operator)
+def test_a_refused_model_does_not_change_a_bound_object(bound_elbow, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", add_custom_operator)
     with pytest.raises(FDDAError, match="custom operators"):
         bind(find_rig(), path)
-    assert bound.fdda.is_bound and bound.fdda.mode == "FDDA"
-    assert [m.show_viewport for m in bound.modifiers] == [False, False, True]
+    assert bound_elbow.fdda.is_bound and bound_elbow.fdda.mode == "FDDA"
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [False, False, True]
 
 
-def test_the_unchanged_model_is_accepted(verb, elbow):
+def test_the_unchanged_model_is_accepted(verb, elbow_files):
     """This shows that the changes above are the reason for the errors."""
-    assert run(*verb(elbow.rig, elbow.model)) == 0
+    assert run(*verb(elbow_files.rig, elbow_files.model)) == 0

@@ -24,11 +24,11 @@ pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.fixture
-def train_refusal(refusal, elbow, tmp_path):
+def train_refusal(refusal, elbow_files, tmp_path):
     """Return a function that runs `train` on the elbow's recording, and returns its error message."""
 
     def run_train(*options: object, status: int = 1) -> str:
-        return refusal("train", elbow.recording, tmp_path / "m.onnx", *options, status=status)
+        return refusal("train", elbow_files.recording, tmp_path / "m.onnx", *options, status=status)
 
     return run_train
 
@@ -105,10 +105,10 @@ def test_a_trainer_that_writes_an_error_and_exits_is_reported(train_refusal, tmp
 
 
 @pytest.mark.parametrize("verb", ["train", "record"])
-def test_a_missing_temporary_folder_is_reported(refusal, elbow, tmp_path, monkeypatch, verb):
+def test_a_missing_temporary_folder_is_reported(refusal, elbow_files, tmp_path, monkeypatch, verb):
     arguments = {
-        "train": ["train", elbow.recording, tmp_path / "m.onnx"],
-        "record": ["record", elbow.rig, tmp_path / "r", "--poses", 20, "--fit-linear", "hard"],
+        "train": ["train", elbow_files.recording, tmp_path / "m.onnx"],
+        "record": ["record", elbow_files.rig, tmp_path / "r", "--poses", 20, "--fit-linear", "hard"],
     }[verb]
     with monkeypatch.context() as patch:
         patch.setattr(tempfile, "tempdir", None)
@@ -143,7 +143,7 @@ def test_a_trainer_that_crashes_is_reported(train_refusal, tmp_path, monkeypatch
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="/dev/full is Linux's")
 @pytest.mark.parametrize("is_silent", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_trainer_whose_disk_is_full_is_reported(elbow, train_refusal, tmp_path, monkeypatch, is_silent):
+def test_a_trainer_whose_disk_is_full_is_reported(elbow_files, train_refusal, tmp_path, monkeypatch, is_silent):
     """The trainer cannot write to stdout, and in one case not to stderr."""
     lines = ["os.dup2(os.open('/dev/full', os.O_WRONLY), 1)", *(["os.dup2(1, 2)"] if is_silent else [])]
     packages = tmp_path / "packages"
@@ -169,9 +169,9 @@ def test_lines_that_are_not_messages_are_ignored(train_refusal, tmp_path, monkey
 
 
 @pytest.mark.parametrize("lines", [(STARTED, print_message_code(MessageType.CANCELLED)), ()])
-def test_a_trainer_that_another_program_cancels_ends_with_status_130(elbow, tmp_path, monkeypatch, lines):
+def test_a_trainer_that_another_program_cancels_ends_with_status_130(elbow_files, tmp_path, monkeypatch, lines):
     stand_in_trainer(tmp_path, monkeypatch, *lines, status=130)
-    assert run("train", elbow.recording, tmp_path / "m.onnx") == 130
+    assert run("train", elbow_files.recording, tmp_path / "m.onnx") == 130
     assert not (tmp_path / "m.onnx").exists()
 
 

@@ -18,24 +18,24 @@ from .baked_files import (
     read_pc2,
     shown_without_add_on,
 )
-from .conftest import ELBOW, ELBOW_RIG, evaluated, run, train
+from .conftest import ELBOW, ELBOW_RIG, evaluated_positions, run, train
 from .refusals import file_contents, save_elbow
 from .scene_state import fresh_elbow
 
 
 @pytest.fixture(scope="module")
-def wave_positions(elbow) -> np.ndarray:
+def wave_positions(elbow_files) -> np.ndarray:
     """Return the model's positions (F, V, 3) in all frames of the elbow's action."""
-    return predicted_wave(elbow)
+    return predicted_wave(elbow_files)
 
 
 @pytest.fixture(scope="module")
-def baked_folder(elbow, tmp_path_factory) -> Path:
+def baked_folder(elbow_files, tmp_path_factory) -> Path:
     """Bake the elbow as a point cache, as a file with a cache, and as a file with shape keys; return the folder."""
     folder = tmp_path_factory.mktemp("baked")
     for options in (["walk.pc2"], ["cache.blend"], ["keys.blend", "--shape-keys"]):
         arguments = ["--action", "elbow_wave", *options[1:]]
-        assert run("bake", elbow.rig, elbow.model, folder / options[0], *arguments) == 0
+        assert run("bake", elbow_files.rig, elbow_files.model, folder / options[0], *arguments) == 0
     return folder
 
 
@@ -85,17 +85,17 @@ class TestWithoutTheAddOn:
         path = moved / "cache.blend"
         assert (shown_without_add_on(tmp_path, (path, [4.0]))[path, 4.0] == 1).all()
 
-    def test_baking_into_another_folder_than_the_rig_s(self, elbow, wave_positions, tmp_path, monkeypatch):
+    def test_baking_into_another_folder_than_the_rig_s(self, elbow_files, wave_positions, tmp_path, monkeypatch):
         (tmp_path / "in").mkdir()
         (tmp_path / "out").mkdir()
-        rig = shutil.copy(elbow.rig, tmp_path / "in" / "rig.blend")
+        rig = shutil.copy(elbow_files.rig, tmp_path / "in" / "rig.blend")
         monkeypatch.chdir(tmp_path)
-        assert run("bake", rig, elbow.model, "out/a.blend") == 0
+        assert run("bake", rig, elbow_files.model, "out/a.blend") == 0
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "a.blend"))
         assert bpy.data.objects[ELBOW].modifiers[0].filepath == "//a.pc2"
-        assert np.abs(evaluated(bpy.data.objects[ELBOW]) - wave_positions[0]).max() < POSITION_TOLERANCE
+        assert np.abs(evaluated_positions(bpy.data.objects[ELBOW]) - wave_positions[0]).max() < POSITION_TOLERANCE
 
-    def test_a_subdivision_after_the_baked_modifiers_is_kept(self, elbow, wave_positions, tmp_path):
+    def test_a_subdivision_after_the_baked_modifiers_is_kept(self, elbow_files, wave_positions, tmp_path):
         def subdivide(rig):
             modifier = rig.mesh_object.modifiers.new("Finer", "SUBSURF")
             modifier.levels, modifier.use_pin_to_last = 1, True
@@ -103,7 +103,7 @@ class TestWithoutTheAddOn:
         rig = save_elbow(tmp_path / "rig.blend", subdivide)
         outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
         for out, options in zip(outs, ([], ["--shape-keys"]), strict=True):
-            assert run("bake", rig, elbow.model, out, "--action", "elbow_wave", *options) == 0
+            assert run("bake", rig, elbow_files.model, out, "--action", "elbow_wave", *options) == 0
         bpy.ops.wm.open_mainfile(filepath=str(outs[0]))
         assert [m.type for m in bpy.data.objects[ELBOW].modifiers] == ["MESH_CACHE", "SUBSURF"]
         shown = shown_without_add_on(tmp_path, *((out, [10.0]) for out in outs))
@@ -111,12 +111,12 @@ class TestWithoutTheAddOn:
         mesh_object.modifiers.clear()
         mesh_object.data.attributes["position"].data.foreach_set("vector", wave_positions[9].reshape(-1))
         mesh_object.modifiers.new("Finer", "SUBSURF").levels = 1
-        expected = evaluated(mesh_object)
+        expected = evaluated_positions(mesh_object)
         assert len(expected) > 3 * len(wave_positions[9])
         for out in outs:
             assert np.abs(shown[out, 10.0] - expected).max() < POSITION_TOLERANCE
 
-    def test_shape_keys_and_an_armature_parent_do_not_change_a_bake(self, elbow, wave_positions, tmp_path):
+    def test_shape_keys_and_an_armature_parent_do_not_change_a_bake(self, elbow_files, wave_positions, tmp_path):
         """The mesh keeps its shape keys for another object that uses it."""
 
         def add_keys_and_parent(rig):
@@ -133,7 +133,7 @@ class TestWithoutTheAddOn:
         rig = save_elbow(tmp_path / "rig.blend", add_keys_and_parent)
         outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
         for out, options in zip(outs, ([], ["--shape-keys"]), strict=True):
-            assert run("bake", rig, elbow.model, out, "--action", "elbow_wave", *options) == 0
+            assert run("bake", rig, elbow_files.model, out, "--action", "elbow_wave", *options) == 0
         shown = shown_without_add_on(tmp_path, *((out, [1.0, 10.0]) for out in outs))
         for out in outs:
             assert np.abs(shown[out, 10.0] - wave_positions[9]).max() < POSITION_TOLERANCE
@@ -146,7 +146,7 @@ class TestWithoutTheAddOn:
 
 class TestLinkedCharacters:
     @pytest.fixture
-    def shot(self, elbow, tmp_path) -> Path:
+    def shot(self, elbow_files, tmp_path) -> Path:
         """Return a function that saves a file with a linked elbow, or with a library override of it."""
 
         def make_shot(is_overridden: bool) -> Path:
@@ -154,7 +154,7 @@ class TestLinkedCharacters:
             path = tmp_path / "shot.blend"
             save_copy(path)
             bpy.ops.wm.open_mainfile(filepath=str(path))
-            with bpy.data.libraries.load(str(elbow.rig), link=True) as (_, into):
+            with bpy.data.libraries.load(str(elbow_files.rig), link=True) as (_, into):
                 into.objects = [ELBOW, ELBOW_RIG]
             for linked in list(into.objects):
                 bpy.context.scene.collection.objects.link(linked)
@@ -166,18 +166,20 @@ class TestLinkedCharacters:
 
         return make_shot
 
-    def test_a_linked_character_is_baked_into_a_point_cache_only(self, shot, elbow, wave_positions, tmp_path, capfd):
+    def test_a_linked_character_is_baked_into_a_point_cache_only(
+        self, shot, elbow_files, wave_positions, tmp_path, capfd
+    ):
         path = shot(is_overridden=False)
-        assert run("bake", path, elbow.model, tmp_path / "a.pc2", "--frames", 1, 30) == 0
+        assert run("bake", path, elbow_files.model, tmp_path / "a.pc2", "--frames", 1, 30) == 0
         assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - wave_positions).max() < 1e-6
-        assert run("bake", path, elbow.model, tmp_path / "a.blend") == 1
+        assert run("bake", path, elbow_files.model, tmp_path / "a.blend") == 1
         assert "so its modifiers cannot be replaced here; bake it in that file" in capfd.readouterr().err
 
     @pytest.mark.parametrize("options", [[], ["--shape-keys"]], ids=["cache", "keys"])
-    def test_a_library_override_is_baked(self, shot, elbow, wave_positions, tmp_path, options):
+    def test_a_library_override_is_baked(self, shot, elbow_files, wave_positions, tmp_path, options):
         path = shot(is_overridden=True)
         out = tmp_path / "a.blend"
-        assert run("bake", path, elbow.model, out, "--frames", 1, 30, *options) == 0
+        assert run("bake", path, elbow_files.model, out, "--frames", 1, 30, *options) == 0
         shown = shown_without_add_on(tmp_path, (out, [9.0]))
         assert np.abs(shown[out, 9.0] - wave_positions[8]).max() < POSITION_TOLERANCE
 

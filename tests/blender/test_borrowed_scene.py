@@ -141,26 +141,26 @@ def test_a_disabled_armature_modifier_is_refused(unusual_rig, tmp_path):
 
 
 @pytest.mark.parametrize("step", [None, 3, 12])
-def test_an_evaluation_restores_the_scene(rig, elbow, step):
+def test_an_evaluation_restores_the_scene(rig, elbow_files, step):
     set_unusual_state(rig)
     before = scene_state(rig)
-    drain(evaluate(rig, elbow.model, EVALUATION_SETTINGS), stop_after=step)
+    drain(evaluate(rig, elbow_files.model, EVALUATION_SETTINGS), stop_after=step)
     assert_same_state(before, scene_state(rig))
 
 
 @pytest.mark.parametrize("step", [None, 2])
-def test_a_benchmark_restores_the_scene(rig, elbow, step):
+def test_a_benchmark_restores_the_scene(rig, elbow_files, step):
     set_unusual_state(rig)
     before = scene_state(rig)
-    drain(benchmark(rig, elbow.model, 5), stop_after=step)
+    drain(benchmark(rig, elbow_files.model, 5), stop_after=step)
     assert_same_state(before, scene_state(rig))
 
 
-def test_a_benchmark_of_a_bound_rig_without_an_action_restores_the_scene(bound, elbow):
+def test_a_benchmark_of_a_bound_rig_without_an_action_restores_the_scene(bound_elbow, elbow_files):
     rig = find_rig()
     rig.armature_object.animation_data_clear()
     before = scene_state(rig)
     assert before["binding"] == (True, "FDDA", "")
     with model_disabled(rig.mesh_object):
-        drain(benchmark(rig, elbow.model, 5))
+        drain(benchmark(rig, elbow_files.model, 5))
     assert_same_state(before, scene_state(rig))

@@ -18,7 +18,7 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.player import Player
 from fdda_addon.scene.scene_rig import find_rig
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, write_edited
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, write_edited
 from .test_player_batch import crowd_of
 
 
@@ -36,17 +36,17 @@ def delete_vertices(mesh_object: bpy.types.Object) -> None:
 
 
 @pytest.mark.parametrize("count", [3, 5], ids=["single", "batched"])
-def test_a_character_without_vertices_shows_an_error(bound, elbow, count):
-    crowd = crowd_of(bound, count)
+def test_a_character_without_vertices_shows_an_error(bound_elbow, elbow_files, count):
+    crowd = crowd_of(bound_elbow, count)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
     delete_vertices(crowd[1])
     for frame in (4, 9):
         bpy.context.scene.frame_set(frame)
         for mesh_object in [o for o in crowd if o != crowd[1]]:
-            assert_plays(mesh_object, elbow.model)
+            assert_plays(mesh_object, elbow_files.model)
     pose(angle=0.4)
-    assert_plays(crowd[0], elbow.model)
+    assert_plays(crowd[0], elbow_files.model)
     assert crowd[1].fdda.mode == "RIG" and "has 0 vertices and its model was trained for" in crowd[1].fdda.status
 
 
@@ -59,8 +59,8 @@ FAILING_METHODS = {
 
 
 @pytest.mark.parametrize("event", FAILING_METHODS)
-def test_an_unexpected_error_stops_one_character_only(bound, elbow, monkeypatch, event):
-    crowd = crowd_of(bound, 3)
+def test_an_unexpected_error_stops_one_character_only(bound_elbow, elbow_files, monkeypatch, event):
+    crowd = crowd_of(bound_elbow, 3)
     bpy.context.view_layer.update()
     owner, name = FAILING_METHODS[event]
     method, failing_uid = getattr(owner, name), crowd[1].session_uid
@@ -79,7 +79,7 @@ def test_an_unexpected_error_stops_one_character_only(bound, elbow, monkeypatch,
     bpy.context.view_layer.update()
     bpy.context.scene.frame_set(8)
     for mesh_object in (crowd[0], crowd[2]):
-        assert_plays(mesh_object, elbow.model)
+        assert_plays(mesh_object, elbow_files.model)
     assert crowd[1].fdda.mode == "RIG" and "cannot be played (KeyError('position'))" in crowd[1].fdda.status
 
 
@@ -141,7 +141,7 @@ CONTROL_REMOVALS = {
 
 @pytest.mark.parametrize("update", ["pose", "frame"])
 @pytest.mark.parametrize("removal", CONTROL_REMOVALS)
-def test_a_character_that_lacks_a_control_shows_its_rig(rig, elbow, removal, update):
+def test_a_character_that_lacks_a_control_shows_its_rig(rig, elbow_files, removal, update):
     mesh_object = rig.mesh_object
     armature_object()["dial"] = 0.5
     mesh_object.shape_key_add(name="Basis")
@@ -155,7 +155,7 @@ def test_a_character_that_lacks_a_control_shows_its_rig(rig, elbow, removal, upd
     bpy.ops.object.mode_set(mode="OBJECT")
     armature_object().pose.bones["dial"]["fist"] = 0.5
     (owner, path), change = CONTROL_REMOVALS[removal]
-    bind(find_rig(), add_control_to_model(elbow.model, owner, path))
+    bind(find_rig(), add_control_to_model(elbow_files.model, owner, path))
     pose(angle=1.0)
     assert mesh_object.fdda.mode == "FDDA" and not mesh_object.fdda.status
     change()
@@ -165,6 +165,6 @@ def test_a_character_that_lacks_a_control_shows_its_rig(rig, elbow, removal, upd
         bpy.context.scene.frame_set(11)
     assert mesh_object.fdda.mode == "RIG"
     assert f"'elbow' lacks the control '{owner}/{path}'" in mesh_object.fdda.status
-    shown = evaluated(mesh_object)
+    shown = evaluated_positions(mesh_object)
     mesh_object.modifiers.remove(mesh_object.modifiers["FDDA"])
-    assert np.array_equal(evaluated(mesh_object), shown)
+    assert np.array_equal(evaluated_positions(mesh_object), shown)

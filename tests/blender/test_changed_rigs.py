@@ -10,7 +10,7 @@ from fdda_addon.runtime import rig_signature
 from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.scene_rig import find_rig
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
 from .rig_changes import (
     EDIT_MODE_CHANGES,
     REST_POSE_OF,
@@ -34,10 +34,10 @@ def assert_rig_shown(mesh_object: bpy.types.Object, clause: str, capsys: pytest.
     assert mesh_object.fdda.status.endswith("undo the change, or record and train again.")
     assert all(m.show_viewport for m in mesh_object.modifiers if m.name != "FDDA")
     assert capsys.readouterr().out.count("switched off") == 1
-    shown = evaluated(mesh_object)
+    shown = evaluated_positions(mesh_object)
     mesh_object.update_tag()
     bpy.context.view_layer.update()
-    assert np.array_equal(evaluated(mesh_object), shown)
+    assert np.array_equal(evaluated_positions(mesh_object), shown)
 
 
 def trigger_check(update: str) -> None:
@@ -60,60 +60,60 @@ def drive_b_bone() -> None:
 @pytest.mark.parametrize("is_driven", [False, True])
 @pytest.mark.parametrize("update", ["view layer", "frame"])
 @pytest.mark.parametrize("change_name", EDIT_MODE_CHANGES)
-def test_a_change_in_edit_mode_shows_the_rig(bound, change_name, update, is_driven, capsys):
+def test_a_change_in_edit_mode_shows_the_rig(bound_elbow, change_name, update, is_driven, capsys):
     name, change, clause = EDIT_MODE_CHANGES[change_name]
     if is_driven:
         drive_b_bone()
     pose(angle=1.0)
     change_in_edit_mode(bpy.data.objects[name], change)
     trigger_check(update)
-    assert_rig_shown(bound, clause, capsys)
+    assert_rig_shown(bound_elbow, clause, capsys)
 
 
 @pytest.mark.parametrize("is_driven", [False, True])
 @pytest.mark.parametrize("update", ["view layer", "frame"])
 @pytest.mark.parametrize("change_name", SCRIPT_CHANGES)
-def test_a_change_by_a_script_shows_the_rig(bound, change_name, update, is_driven, capsys):
+def test_a_change_by_a_script_shows_the_rig(bound_elbow, change_name, update, is_driven, capsys):
     change, clause = SCRIPT_CHANGES[change_name]
     if is_driven:
         drive_b_bone()
     pose(angle=1.0)
     change()
     trigger_check(update)
-    assert_rig_shown(bound, clause, capsys)
+    assert_rig_shown(bound_elbow, clause, capsys)
 
 
-def test_a_change_of_the_reference_key_shows_the_rig(bound, capsys):
-    add_shape_key(bound)
+def test_a_change_of_the_reference_key_shows_the_rig(bound_elbow, capsys):
+    add_shape_key(bound_elbow)
     pose(angle=1.0)
-    assert not bound.fdda.status
+    assert not bound_elbow.fdda.status
     move_reference_key()
     trigger_check("view layer")
-    assert_rig_shown(bound, f"{REST_POSE_OF} mesh differs", capsys)
+    assert_rig_shown(bound_elbow, f"{REST_POSE_OF} mesh differs", capsys)
 
 
-def test_a_change_through_another_object_shows_the_rig(bound, capsys):
+def test_a_change_through_another_object_shows_the_rig(bound_elbow, capsys):
     """Armature and mesh are edited through another object that shares their data."""
     for scene_object, change, clause in (
         (bpy.data.objects[ELBOW_RIG], change_bone_roll, f"{REST_POSE_OF} armature differs"),
-        (bound, flip_faces, "the topology of the mesh differs"),
+        (bound_elbow, flip_faces, "the topology of the mesh differs"),
     ):
         other = bpy.data.objects.new("other", scene_object.data)
         bpy.context.scene.collection.objects.link(other)
         pose(angle=1.0)
         change_in_edit_mode(other, change)
         trigger_check("view layer")
-        assert_rig_shown(bound, clause, capsys)
+        assert_rig_shown(bound_elbow, clause, capsys)
         if scene_object.type == "ARMATURE":
             change_in_edit_mode(other, lambda: setattr(edit_bones()["lower"], "roll", edit_bones()["lower"].roll - 0.4))
-            bound.fdda.mode = "FDDA"
+            bound_elbow.fdda.mode = "FDDA"
             trigger_check("view layer")
-            assert not bound.fdda.status
-            assert bound.fdda.mode == "FDDA"
+            assert not bound_elbow.fdda.status
+            assert bound_elbow.fdda.mode == "FDDA"
 
 
 @pytest.mark.parametrize("update", ["view layer", "frame"])
-def test_changes_of_bones_that_are_not_joints_keep_the_model_playing(bound, elbow, update):
+def test_changes_of_bones_that_are_not_joints_keep_the_model_playing(bound_elbow, elbow_files, update):
     """The order of the bones changes, but the order of the joints does not."""
     rig = bpy.data.objects[ELBOW_RIG]
 
@@ -123,72 +123,72 @@ def test_changes_of_bones_that_are_not_joints_keep_the_model_playing(bound, elbo
     change_in_edit_mode(rig, lambda: (add_bone("a"), add_bone("b"), add_bone("c", "upper")))
     trigger_check(update)
     pose(angle=0.7)
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
     lower_indices = {names().index("lower")}
     for bone, parent in (("upper", "a"), ("a", "b"), ("upper", ""), ("b", "upper"), ("c", "a"), ("c", "")):
         change_in_edit_mode(rig, lambda b=bone, p=parent: setattr(edit_bones()[b], "parent", edit_bones().get(p)))
         lower_indices.add(names().index("lower"))
         trigger_check(update)
         pose(angle=0.9)
-        assert_plays(bound, elbow.model)
+        assert_plays(bound_elbow, elbow_files.model)
     assert len(lower_indices) > 1
     change_in_edit_mode(rig, lambda: edit_bones().remove(edit_bones()["a"]))
     trigger_check(update)
-    assert_plays(bound, elbow.model)
-    assert bound.fdda.mode == "FDDA"
+    assert_plays(bound_elbow, elbow_files.model)
+    assert bound_elbow.fdda.mode == "FDDA"
 
 
-def test_changes_unrelated_to_the_rig_keep_the_model_playing(bound, elbow):
-    change_in_edit_mode(bound, lambda: bpy.ops.mesh.select_all(action="SELECT"))
-    bound.vertex_groups.new(name="no bone").add([0, 5], 0.5, "REPLACE")
-    bound.data.attributes.new("color", "FLOAT_COLOR", "POINT")
+def test_changes_unrelated_to_the_rig_keep_the_model_playing(bound_elbow, elbow_files):
+    change_in_edit_mode(bound_elbow, lambda: bpy.ops.mesh.select_all(action="SELECT"))
+    bound_elbow.vertex_groups.new(name="no bone").add([0, 5], 0.5, "REPLACE")
+    bound_elbow.data.attributes.new("color", "FLOAT_COLOR", "POINT")
     trigger_check("view layer")
     pose(angle=1.1)
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_a_moved_armature_object_keeps_the_model_playing(bound, elbow):
+def test_a_moved_armature_object_keeps_the_model_playing(bound_elbow, elbow_files):
     """The transform between mesh and armature may be animated, so it is not part of the rig."""
     bpy.data.objects[ELBOW_RIG].location = (0.3, 0.1, 0)
     bpy.data.objects[ELBOW_RIG].rotation_euler = (0.2, 0.1, 0.4)
     bpy.context.view_layer.update()
-    bound.data.update()
+    bound_elbow.data.update()
     rig_signature.invalidate_all()
     pose(angle=1.1)
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_a_change_in_mode_rig_is_found_when_the_mode_changes(bound, capsys):
-    bound.fdda.mode = "RIG"
+def test_a_change_in_mode_rig_is_found_when_the_mode_changes(bound_elbow, capsys):
+    bound_elbow.fdda.mode = "RIG"
     change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
-    bound.fdda.mode = "FDDA"
+    bound_elbow.fdda.mode = "FDDA"
     trigger_check("view layer")
-    assert_rig_shown(bound, f"{REST_POSE_OF} armature differs", capsys)
+    assert_rig_shown(bound_elbow, f"{REST_POSE_OF} armature differs", capsys)
 
 
-def test_the_model_plays_again_after_undo(bound, elbow):
+def test_the_model_plays_again_after_undo(bound_elbow, elbow_files):
     bpy.ops.ed.undo_push(message="start")
     change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
     bpy.context.view_layer.update()
-    assert bound.fdda.mode == "RIG"
+    assert bound_elbow.fdda.mode == "RIG"
     bpy.ops.ed.undo_push(message="roll")
     bpy.ops.ed.undo()
     bpy.context.view_layer.update()
     pose(angle=1.0)
-    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
     bpy.ops.ed.redo()
     bpy.context.view_layer.update()
     assert "rest pose" in bpy.data.objects[ELBOW].fdda.status
 
 
-def test_weights_restored_by_undo_show_the_rig(bound):
+def test_weights_restored_by_undo_show_the_rig(bound_elbow):
     """The weights change without an evaluation. The check after undo finds them."""
-    bound.fdda.mode = "RIG"
+    bound_elbow.fdda.mode = "RIG"
     vertex_groups()["lower"].add([0], 0.3, "ADD")
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="other weights")
     vertex_groups()["lower"].add([0], 0.3, "SUBTRACT")
-    bound.fdda.mode = "FDDA"
+    bound_elbow.fdda.mode = "FDDA"
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="weights as before")
     bpy.ops.ed.undo()
@@ -197,7 +197,7 @@ def test_weights_restored_by_undo_show_the_rig(bound):
     assert WEIGHTS_DIFFER in bpy.data.objects[ELBOW].fdda.status
 
 
-def test_a_rig_changed_without_the_add_on_shows_after_loading(bound, tmp_path, capsys):
+def test_a_rig_changed_without_the_add_on_shows_after_loading(bound_elbow, tmp_path, capsys):
     import fdda_addon
 
     path = bpy.data.filepath.replace("bound.blend", "changed.blend")
@@ -249,8 +249,8 @@ def change_in_another_process(path) -> None:
     subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, capture_output=True, timeout=120)
 
 
-def test_a_change_of_one_character_leaves_the_others_playing(bound, elbow):
-    crowd = crowd_of(bound, 5)
+def test_a_change_of_one_character_leaves_the_others_playing(bound_elbow, elbow_files):
+    crowd = crowd_of(bound_elbow, 5)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
     crowd[2].data = crowd[2].data.copy()
@@ -259,26 +259,26 @@ def test_a_change_of_one_character_leaves_the_others_playing(bound, elbow):
     assert [o.fdda.mode for o in crowd] == ["FDDA", "FDDA", "RIG", "FDDA", "FDDA"]
     bpy.context.scene.frame_set(5)
     for mesh_object in crowd[:2] + crowd[3:]:
-        assert_plays(mesh_object, elbow.model)
+        assert_plays(mesh_object, elbow_files.model)
 
 
-def test_weight_paint_mode_delays_the_check(bound, capsys):
+def test_weight_paint_mode_delays_the_check(bound_elbow, capsys):
     """The rig is checked after the mesh has left the mode."""
     pose(angle=1.0)
-    bpy.context.view_layer.objects.active = bound
+    bpy.context.view_layer.objects.active = bound_elbow
     bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
     vertex_groups()["lower"].add([0, 1], 0.3, "ADD")
     bpy.context.view_layer.update()
-    assert bound.fdda.mode == "FDDA" and not bound.fdda.status
+    assert bound_elbow.fdda.mode == "FDDA" and not bound_elbow.fdda.status
     bpy.ops.object.mode_set(mode="OBJECT")
     bpy.context.view_layer.update()
-    assert_rig_shown(bound, WEIGHTS_DIFFER, capsys)
+    assert_rig_shown(bound_elbow, WEIGHTS_DIFFER, capsys)
 
 
-def test_playback_and_posing_do_not_check_the_rig(bound, elbow, monkeypatch):
+def test_playback_and_posing_do_not_check_the_rig(bound_elbow, elbow_files, monkeypatch):
     """Frame changes, posing and driven shape keys do not read the rig again."""
-    add_shape_key(bound)
-    key = bound.data.shape_keys.key_blocks["bulge"]
+    add_shape_key(bound_elbow)
+    key = bound_elbow.data.shape_keys.key_blocks["bulge"]
     driver = key.driver_add("value").driver
     variable = driver.variables.new()
     variable.type, variable.targets[0].id = "TRANSFORMS", bpy.data.objects[ELBOW_RIG]
@@ -291,21 +291,21 @@ def test_playback_and_posing_do_not_check_the_rig(bound, elbow, monkeypatch):
     for frame in range(5):
         bpy.context.scene.frame_set(frame)
         pose(angle=0.1 * frame)
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_a_frame_reads_no_bones_of_driven_armature_data(bound, elbow, monkeypatch):
+def test_a_frame_reads_no_bones_of_driven_armature_data(bound_elbow, elbow_files, monkeypatch):
     drive_b_bone()
     monkeypatch.setattr(rig_signature, "bone_signature", None)
     shown = []
     for frame in (5, 12, 25):
         bpy.context.scene.frame_set(frame)
-        shown.append(assert_plays(bound, elbow.model))
+        shown.append(assert_plays(bound_elbow, elbow_files.model))
     assert np.abs(shown[0] - shown[-1]).max() > 1e-3
 
 
-def test_added_bones_do_not_change_the_order_of_joints(bound):
+def test_added_bones_do_not_change_the_order_of_joints(bound_elbow):
     rig = bpy.data.objects[ELBOW_RIG]
     change_in_edit_mode(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
-    info = network_of(bound).info
+    info = network_of(bound_elbow).info
     assert read_model_rig(find_rig(), info).joints == info.joints

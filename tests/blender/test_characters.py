@@ -28,7 +28,7 @@ MIN_MOVEMENT_MM = 10.0
 """Smallest mean distance by which the poses must move the vertices."""
 QUICK_ROWS = {
     "smooth_weights", "preserve_volume", "b_bones", "corrective_smooth", "geometry_nodes", "ik_fk", "custom_property",
-    "body_and_sleeve", "parented_to_bone", "far_away", "in_millimeters", "target_alembic",
+    "body_and_sleeve", "parented_to_bone", "far_away", "in_millimetres", "target_alembic",
 }  # fmt: skip
 """Rows that `make test` trains, at least one of each topic; `make test-slow` trains the others."""
 

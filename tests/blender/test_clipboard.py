@@ -10,7 +10,7 @@ import pytest
 import fdda_addon
 from fdda_addon.runtime import playback
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
 
 
 @pytest.fixture(autouse=True)
@@ -34,17 +34,17 @@ def write_library(mesh_object: bpy.types.Object, folder: Path) -> Path:
 
 @pytest.mark.parametrize("write", [copy_to_clipboard, write_library])
 @pytest.mark.parametrize("use_in_render", [False, True])
-def test_a_copied_character_shows_its_rig_without_the_add_on(bound, elbow, tmp_path, write, use_in_render):
-    bound.fdda.use_in_render = use_in_render
+def test_a_copied_character_shows_its_rig_without_the_add_on(bound_elbow, elbow_files, tmp_path, write, use_in_render):
+    bound_elbow.fdda.use_in_render = use_in_render
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     pose(angle=1.2)
-    bound.fdda.mode = "RIG"
-    rig_shape = evaluated(bound)
-    bound.fdda.mode = "FDDA"
+    bound_elbow.fdda.mode = "RIG"
+    rig_shape = evaluated_positions(bound_elbow)
+    bound_elbow.fdda.mode = "FDDA"
     bpy.context.view_layer.update()
-    path = write(bound, tmp_path)
+    path = write(bound_elbow, tmp_path)
     pose(angle=0.7)
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
     fdda_addon.unregister()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with bpy.data.libraries.load(str(path)) as (available, appended):
@@ -55,34 +55,34 @@ def test_a_copied_character_shows_its_rig_without_the_add_on(bound, elbow, tmp_p
     bpy.context.view_layer.update()
     shown = {m.name: (m.show_viewport, m.show_render) for m in bpy.data.objects[ELBOW].modifiers}
     assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
-    assert np.array_equal(evaluated(bpy.data.objects[ELBOW]), rig_shape)
+    assert np.array_equal(evaluated_positions(bpy.data.objects[ELBOW]), rig_shape)
 
 
-def test_a_pasted_character_plays(bound, elbow, tmp_path):
-    copy_to_clipboard(bound, tmp_path)
+def test_a_pasted_character_plays(bound_elbow, elbow_files, tmp_path):
+    copy_to_clipboard(bound_elbow, tmp_path)
     assert bpy.ops.view3d.pastebuffer() == {"FINISHED"}
     bpy.context.view_layer.update()
     pasted = bpy.data.objects[f"{ELBOW}.001"]
     assert pasted.fdda.is_playing
     pose(f"{ELBOW_RIG}.001", angle=1.0)
-    assert_plays(pasted, elbow.model)
-    assert_plays(bound, elbow.model)
+    assert_plays(pasted, elbow_files.model)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_a_character_copied_by_blender_s_operator_plays(bound, elbow):
+def test_a_character_copied_by_blender_s_operator_plays(bound_elbow, elbow_files):
     """Menus and scripts call Blender's operator. It saves the modifiers disabled; mode RIG enables them."""
     bpy.ops.object.select_all(action="SELECT")
     bpy.ops.view3d.copybuffer()
     bpy.ops.view3d.pastebuffer()
     bpy.context.view_layer.update()
     pasted = bpy.data.objects[f"{ELBOW}.001"]
-    assert_plays(pasted, elbow.model)
+    assert_plays(pasted, elbow_files.model)
     pasted.fdda.mode = "RIG"
     assert [m.show_viewport for m in pasted.modifiers] == [True, True, False]
 
 
-def test_copying_in_edit_mode_shows_an_error(bound):
-    bpy.context.view_layer.objects.active = bound
+def test_copying_in_edit_mode_shows_an_error(bound_elbow):
+    bpy.context.view_layer.objects.active = bound_elbow
     bpy.ops.object.mode_set(mode="EDIT")
     with pytest.raises(RuntimeError, match="Objects can only be copied in Object Mode"):
         bpy.ops.fdda.copy_objects()

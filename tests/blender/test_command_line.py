@@ -20,7 +20,7 @@ from fdda_addon.runtime import model_files, registry
 from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
 
-from .conftest import assert_plays, evaluated, pose, run
+from .conftest import assert_plays, evaluated_positions, pose, run
 from .refusals import file_contents, save_elbow
 
 
@@ -85,10 +85,10 @@ def test_a_full_disk_ends_with_the_status_for_another_try(tmp_path, monkeypatch,
     assert capfd.readouterr().err.startswith("Error: No space left on device")
 
 
-def test_train_passes_its_options_to_the_trainer(elbow, tmp_path, capfd):
+def test_train_passes_its_options_to_the_trainer(elbow_files, tmp_path, capfd):
     model = tmp_path / "m.onnx"
     options = ["--epochs", 3, "--hidden", 8, 16, "--activation", "tanh", "--seed", 9, "--learning-rate", "0.002"]
-    assert run("train", elbow.recording, model, *options) == 0
+    assert run("train", elbow_files.recording, model, *options) == 0
     from fdda_addon.core.model import read_model_info
 
     training = read_model_info(model).training
@@ -100,14 +100,14 @@ def test_train_passes_its_options_to_the_trainer(elbow, tmp_path, capfd):
     assert sorted(file_contents(tmp_path)) == ["m.checkpoint.npz", "m.onnx", "report.html", "report.json"]
 
 
-def test_a_negative_learning_rate_fails(elbow, tmp_path, capfd):
-    assert run("train", elbow.recording, tmp_path / "m.onnx", "--learning-rate", -1) == 1
+def test_a_negative_learning_rate_fails(elbow_files, tmp_path, capfd):
+    assert run("train", elbow_files.recording, tmp_path / "m.onnx", "--learning-rate", -1) == 1
     assert "learning_rate cannot be -1.0" in capfd.readouterr().err
     assert file_contents(tmp_path) == {}
 
 
-def test_record_prints_plain_lines_without_a_terminal(elbow, tmp_path, capfd):
-    assert run("record", elbow.rig, tmp_path / "r", "--poses", 20, "--seed", 4, "--action", "elbow_wave") == 0
+def test_record_prints_plain_lines_without_a_terminal(elbow_files, tmp_path, capfd):
+    assert run("record", elbow_files.rig, tmp_path / "r", "--poses", 20, "--seed", 4, "--action", "elbow_wave") == 0
     captured = capfd.readouterr()
     estimate, summary = captured.out.splitlines()
     assert estimate.startswith("50 poses of 300 vertices: less than 1 MB on the disk, about ")
@@ -151,7 +151,7 @@ def test_a_stage_prints_about_ten_plain_lines():
     )
 
 
-def test_the_option_object_selects_a_mesh(elbow, tmp_path, capfd):
+def test_the_option_object_selects_a_mesh(elbow_files, tmp_path, capfd):
     def add_second(rig):
         second = rig.mesh_object.copy()
         second.data = second.data.copy()
@@ -174,26 +174,26 @@ def open_in_new_session(path) -> bpy.types.Object:
     return bpy.data.objects["elbow"]
 
 
-def test_a_bound_file_plays_when_it_is_opened(elbow, tmp_path, capfd):
+def test_a_bound_file_plays_when_it_is_opened(elbow_files, tmp_path, capfd):
     """Rig, model and bound file are in different folders, so the model is copied into the bound file's folder."""
     model, out = tmp_path / "models" / "m.onnx", tmp_path / "out" / "bound.blend"
     for path in (model, out):
         path.parent.mkdir()
-    shutil.copy(elbow.model, model)
-    assert run("bind", elbow.rig, model, out) == 0
+    shutil.copy(elbow_files.model, model)
+    assert run("bind", elbow_files.rig, model, out) == 0
     assert capfd.readouterr().out.splitlines() == [
         f"{out.parent / 'm.onnx'}: a copy of {model}, beside the file that plays it",
         f"{out}: 'elbow' plays m.onnx",
     ]
-    assert (out.parent / "m.onnx").read_bytes() == elbow.model.read_bytes()
+    assert (out.parent / "m.onnx").read_bytes() == elbow_files.model.read_bytes()
     shutil.rmtree(model.parent)
     moved = out.parent.rename(tmp_path / "elsewhere")
     mesh_object = open_in_new_session(moved / "bound.blend")
     assert mesh_object.fdda.model == "//m.onnx" and not mesh_object.fdda.use_in_render
     pose(angle=0.3)
-    first = assert_plays(mesh_object, elbow.model)
+    first = assert_plays(mesh_object, elbow_files.model)
     pose(angle=1.7)
-    assert abs(assert_plays(mesh_object, elbow.model) - first).max() > 0.01
+    assert abs(assert_plays(mesh_object, elbow_files.model) - first).max() > 0.01
 
 
 def test_folders_that_differ_only_in_letter_case_are_refused(tmp_path):
@@ -203,80 +203,86 @@ def test_folders_that_differ_only_in_letter_case_are_refused(tmp_path):
         mesh_folders(rigs, tmp_path)
 
 
-def test_a_bound_file_that_cannot_be_saved_leaves_no_copy_of_the_model(elbow, tmp_path, monkeypatch):
+def test_a_bound_file_that_cannot_be_saved_leaves_no_copy_of_the_model(elbow_files, tmp_path, monkeypatch):
     def fail(_path: object) -> None:
         raise OutputError("There is no room.")
 
     monkeypatch.setattr(blend_file, "save_copy", fail)
-    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 1
+    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 1
     assert file_contents(tmp_path) == {}
 
 
-def test_a_model_below_the_folder_is_not_copied(elbow, tmp_path, monkeypatch):
+def test_a_model_below_the_folder_is_not_copied(elbow_files, tmp_path, monkeypatch):
     (tmp_path / "models").mkdir()
-    shutil.copy(elbow.model, tmp_path / "models" / "m.onnx")
+    shutil.copy(elbow_files.model, tmp_path / "models" / "m.onnx")
     monkeypatch.chdir(tmp_path)
-    assert run("bind", elbow.rig, "models/m.onnx", "bound.blend") == 0
+    assert run("bind", elbow_files.rig, "models/m.onnx", "bound.blend") == 0
     assert sorted(file_contents(tmp_path)) == ["bound.blend", "models", "models/m.onnx"]
     mesh_object = open_in_new_session(tmp_path / "bound.blend")
     assert mesh_object.fdda.model == "//models/m.onnx"
     pose(angle=1.0)
-    assert_plays(mesh_object, elbow.model)
+    assert_plays(mesh_object, elbow_files.model)
 
 
-def test_an_identical_model_in_the_folder_is_not_written_again(elbow, tmp_path):
-    shutil.copy2(elbow.model, tmp_path / elbow.model.name)
-    before = (tmp_path / elbow.model.name).stat()
-    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
-    after = (tmp_path / elbow.model.name).stat()
+def test_an_identical_model_in_the_folder_is_not_written_again(elbow_files, tmp_path):
+    shutil.copy2(elbow_files.model, tmp_path / elbow_files.model.name)
+    before = (tmp_path / elbow_files.model.name).stat()
+    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 0
+    after = (tmp_path / elbow_files.model.name).stat()
     assert (before.st_mtime_ns, before.st_ino) == (after.st_mtime_ns, after.st_ino)
 
 
-def test_binding_does_not_change_rig_and_model(elbow, tmp_path):
-    before = elbow.rig.read_bytes(), elbow.model.read_bytes()
-    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
-    assert (elbow.rig.read_bytes(), elbow.model.read_bytes()) == before
+def test_binding_does_not_change_rig_and_model(elbow_files, tmp_path):
+    before = elbow_files.rig.read_bytes(), elbow_files.model.read_bytes()
+    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 0
+    assert (elbow_files.rig.read_bytes(), elbow_files.model.read_bytes()) == before
 
 
-def test_binding_can_overwrite_the_rig_s_file(elbow, tmp_path):
-    rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
-    assert run("bind", rig, elbow.model, rig, "--overwrite") == 0
-    assert_plays(open_in_new_session(rig), elbow.model)
+def test_binding_can_overwrite_the_rig_s_file(elbow_files, tmp_path):
+    rig = shutil.copy(elbow_files.rig, tmp_path / "rig.blend")
+    assert run("bind", rig, elbow_files.model, rig, "--overwrite") == 0
+    assert_plays(open_in_new_session(rig), elbow_files.model)
 
 
-def test_binding_a_bound_file_again_keeps_one_modifier(elbow, tmp_path):
-    assert run("bind", elbow.bound, elbow.model, tmp_path / "b.blend") == 0
+def test_binding_a_bound_file_again_keeps_one_modifier(elbow_files, tmp_path):
+    assert run("bind", elbow_files.bound, elbow_files.model, tmp_path / "b.blend") == 0
     mesh_object = open_in_new_session(tmp_path / "b.blend")
     assert sum(m.type == "NODES" for m in mesh_object.modifiers) == 1
     pose(angle=1.3)
-    assert_plays(mesh_object, elbow.model)
+    assert_plays(mesh_object, elbow_files.model)
 
 
-def test_bind_sets_use_in_render(elbow, tmp_path):
-    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend", "--use-in-render") == 0
+def test_bind_sets_use_in_render(elbow_files, tmp_path):
+    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend", "--use-in-render") == 0
     mesh_object = open_in_new_session(tmp_path / "b.blend")
     assert mesh_object.fdda.use_in_render
     assert [m.show_render for m in mesh_object.modifiers] == [False, False, True]
 
 
-def test_a_bound_file_shows_the_rig_without_the_add_on(elbow, tmp_path):
-    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
-    model_shape, rig_shape = (evaluated(open_in_new_session(path)) for path in (tmp_path / "b.blend", elbow.rig))
+def test_a_bound_file_shows_the_rig_without_the_add_on(elbow_files, tmp_path):
+    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 0
+    model_shape, rig_shape = (
+        evaluated_positions(open_in_new_session(path)) for path in (tmp_path / "b.blend", elbow_files.rig)
+    )
     fdda_addon.unregister()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
-    assert abs(evaluated(bpy.data.objects["elbow"]) - rig_shape).max() < 1e-6 < abs(model_shape - rig_shape).max()
+    assert (
+        abs(evaluated_positions(bpy.data.objects["elbow"]) - rig_shape).max()
+        < 1e-6
+        < abs(model_shape - rig_shape).max()
+    )
 
 
-def test_recording_a_bound_file_records_the_rig(elbow, tmp_path):
-    assert run("record", elbow.bound, tmp_path / "bound", "--poses", 5) == 0
-    assert run("record", elbow.rig, tmp_path / "rig", "--poses", 5) == 0
+def test_recording_a_bound_file_records_the_rig(elbow_files, tmp_path):
+    assert run("record", elbow_files.bound, tmp_path / "bound", "--poses", 5) == 0
+    assert run("record", elbow_files.rig, tmp_path / "rig", "--poses", 5) == 0
     first, second = (file_contents(tmp_path / name) for name in ("bound", "rig"))
     assert first["residuals.npy"] == second["residuals.npy"]
 
 
-def test_verbs_restore_whether_the_add_on_is_registered(elbow, tmp_path):
-    assert run("record", elbow.rig, tmp_path / "a", "--poses", 1) == 0
+def test_verbs_restore_whether_the_add_on_is_registered(elbow_files, tmp_path):
+    assert run("record", elbow_files.rig, tmp_path / "a", "--poses", 1) == 0
     assert fdda_addon.is_registered()
     fdda_addon.unregister()
-    assert run("record", elbow.rig, tmp_path / "b", "--poses", 1) == 0
+    assert run("record", elbow_files.rig, tmp_path / "b", "--poses", 1) == 0
     assert not fdda_addon.is_registered() and not hasattr(bpy.types.Object, "fdda")

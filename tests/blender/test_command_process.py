@@ -65,8 +65,8 @@ def run_to_end(*arguments: object, **environment: str) -> tuple[int, str, str]:
     return process.returncode, out, err
 
 
-def test_a_successful_verb(elbow, tmp_path):
-    status, out, err = run_to_end("record", elbow.rig, tmp_path / "r", "--poses", 4)
+def test_a_successful_verb(elbow_files, tmp_path):
+    status, out, err = run_to_end("record", elbow_files.rig, tmp_path / "r", "--poses", 4)
     assert status == 0, err
     estimate, recorded = out.splitlines()
     assert estimate.startswith("4 poses of 300 vertices: "), "Blender's output is hidden"
@@ -110,41 +110,41 @@ def recorded_pose_count(path: Path) -> int:
         return -1
 
 
-def test_an_interrupted_recording_resumes(elbow, tmp_path):
+def test_an_interrupted_recording_resumes(elbow_files, tmp_path):
     """A recording that Ctrl-C stops and `--resume` continues has the same bytes as an uninterrupted one."""
     options = ["--poses", POSE_COUNT, "--seed", 5]
     path = tmp_path / "interrupted"
-    process = start_verb("record", elbow.rig, path, *options)
+    process = start_verb("record", elbow_files.rig, path, *options)
     wait_for(lambda: recorded_pose_count(path) > 0, process)
     process.send_signal(getattr(signal, INTERRUPT_SIGNAL))
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert out.count("\n") == 1 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
     assert 0 < recorded_pose_count(path) < POSE_COUNT
-    assert run("record", elbow.rig, path, *options, "--resume") == 0
-    assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
+    assert run("record", elbow_files.rig, path, *options, "--resume") == 0
+    assert run("record", elbow_files.rig, tmp_path / "whole", *options) == 0
     assert file_contents(path) == file_contents(tmp_path / "whole")
 
 
-def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
+def test_a_recording_that_is_killed_resumes(elbow_files, tmp_path):
     path = tmp_path / "killed"
-    process = start_verb("record", elbow.rig, path, "--poses", POSE_COUNT)
+    process = start_verb("record", elbow_files.rig, path, "--poses", POSE_COUNT)
     wait_for(lambda: recorded_pose_count(path) > 0, process)
     process.kill()
     process.communicate(timeout=60)
     assert process.returncode == (1 if os.name == "nt" else -signal.SIGKILL)
     assert 0 < recorded_pose_count(path) < POSE_COUNT
-    assert run("record", elbow.rig, path, "--poses", POSE_COUNT, "--resume") == 0
-    assert run("record", elbow.rig, tmp_path / "whole", "--poses", POSE_COUNT) == 0
+    assert run("record", elbow_files.rig, path, "--poses", POSE_COUNT, "--resume") == 0
+    assert run("record", elbow_files.rig, tmp_path / "whole", "--poses", POSE_COUNT) == 0
     assert file_contents(path) == file_contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(
     "signal_name", [STOP_SIGNALS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in STOP_SIGNALS[1:])]
 )
-def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow, tmp_path, signal_name):
+def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow_files, tmp_path, signal_name):
     """Only the process of the verb gets the signal, as from a batch system."""
-    process = start_verb("train", elbow.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
+    process = start_verb("train", elbow_files.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
     for line in process.stderr:
         if line.startswith("training: "):
             break
@@ -164,10 +164,12 @@ def test_ctrl_c_during_imports(tmp_path, module, error):
     assert run_to_end(*verb, PYTHONPATH=str(tmp_path)) == (130, "", error)
 
 
-def test_ctrl_c_during_registration(elbow, tmp_path):
+def test_ctrl_c_during_registration(elbow_files, tmp_path):
     """Blender prints exceptions that are raised while it reads the annotations of a class, and continues."""
     (tmp_path / "sitecustomize.py").write_text(REGISTRATION_HOOK)
-    status, out, err = run_to_end("record", elbow.rig, tmp_path / "r", "--poses", 10_000, PYTHONPATH=str(tmp_path))
+    status, out, err = run_to_end(
+        "record", elbow_files.rig, tmp_path / "r", "--poses", 10_000, PYTHONPATH=str(tmp_path)
+    )
     assert (status, out, err) == (130, "", "Interrupted.\n")
     assert file_contents(tmp_path / "r") == {}
 

@@ -77,9 +77,9 @@ def test_an_action_outside_the_training_data_has_small_errors(character: Charact
 
 
 def test_the_bound_character_plays_the_action(character: Character, tmp_path: Path):
-    bound = tmp_path / "bound.blend"
-    assert run("bind", character.rig, character.model, bound) == 0
-    bpy.ops.wm.open_mainfile(filepath=str(bound))
+    bound_path = tmp_path / "bound.blend"
+    assert run("bind", character.rig, character.model, bound_path) == 0
+    bpy.ops.wm.open_mainfile(filepath=str(bound_path))
     mesh_object, armature_object = bpy.data.objects["body"], bpy.data.objects["rig"]
     armature_object.animation_data.action = bpy.data.actions[rigify.PERFORMANCE]
     shapes = []

@@ -34,18 +34,18 @@ def _temporary_user_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(detached_process, "user_folder", lambda: tmp_path / "user")
 
 
-def detach_in_another_process(elbow, model: Path, epochs: int) -> None:
+def detach_in_another_process(elbow_files, model: Path, epochs: int) -> None:
     """Start a training and detach from it in another process, which then ends."""
     user = model.parent / "user"
     code = DETACHING_CODE.format(
-        root=str(ROOT), user=str(user), recording=str(elbow.recording), model=str(model), epochs=epochs
+        root=str(ROOT), user=str(user), recording=str(elbow_files.recording), model=str(model), epochs=epochs
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-def test_a_detached_training_continues_and_is_read_from_its_start(elbow, tmp_path):
+def test_a_detached_training_continues_and_is_read_from_its_start(elbow_files, tmp_path):
     model = tmp_path / "m.onnx"
-    detach_in_another_process(elbow, model, 30)
+    detach_in_another_process(elbow_files, model, 30)
     assert detached_process.is_detached(model) and not model.exists()
     with detached_process.AttachedTraining(model) as training:
         message_types = [message.type for message in training.messages()]
@@ -55,9 +55,9 @@ def test_a_detached_training_continues_and_is_read_from_its_start(elbow, tmp_pat
     assert not detached_process.is_detached(model)
 
 
-def test_attaching_to_a_training_that_has_ended(elbow, tmp_path):
+def test_attaching_to_a_training_that_has_ended(elbow_files, tmp_path):
     model = tmp_path / "m.onnx"
-    detach_in_another_process(elbow, model, 3)
+    detach_in_another_process(elbow_files, model, 3)
     deadline = time.monotonic() + 60
     while detached_process._ProcessFiles(model).is_running() and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -65,9 +65,9 @@ def test_attaching_to_a_training_that_has_ended(elbow, tmp_path):
         assert [message.type for message in training.messages()][-1] is MessageType.FINISHED
 
 
-def test_attaching_to_a_killed_training_raises_an_error(elbow, tmp_path):
+def test_attaching_to_a_killed_training_raises_an_error(elbow_files, tmp_path):
     model = tmp_path / "m.onnx"
-    detach_in_another_process(elbow, model, 100_000)
+    detach_in_another_process(elbow_files, model, 100_000)
     with detached_process.AttachedTraining(model) as training:
         training._process.kill()
         with pytest.raises(TrainingError, match="before it was done; no model was written, train again"):
@@ -75,9 +75,9 @@ def test_attaching_to_a_killed_training_raises_an_error(elbow, tmp_path):
     assert not detached_process.is_detached(model)
 
 
-def test_an_attached_training_can_be_canceled(elbow, tmp_path):
+def test_an_attached_training_can_be_canceled(elbow_files, tmp_path):
     model = tmp_path / "m.onnx"
-    detach_in_another_process(elbow, model, 100_000)
+    detach_in_another_process(elbow_files, model, 100_000)
     with detached_process.AttachedTraining(model) as training:
         messages = training.messages()
         next(messages)
@@ -102,9 +102,11 @@ def test_attaching_to_a_failed_training_shows_its_error(tmp_path):
     assert not detached_process.is_detached(tmp_path / "m.onnx")
 
 
-def test_a_training_that_is_not_detached_ends_with_its_block(elbow, tmp_path):
+def test_a_training_that_is_not_detached_ends_with_its_block(elbow_files, tmp_path):
     model = tmp_path / "m.onnx"
-    with detached_process.DetachedTraining([str(elbow.recording), str(model), "--epochs", "100000"], model) as training:
+    with detached_process.DetachedTraining(
+        [str(elbow_files.recording), str(model), "--epochs", "100000"], model
+    ) as training:
         next(training.messages())
         process = training._process
     assert process.poll() is not None and not detached_process.is_detached(model)

@@ -52,14 +52,14 @@ def run_code(text: str, folder: Path, python: str = sys.executable, arguments: t
 
 
 @pytest.fixture(scope="module")
-def folder(elbow, tmp_path_factory) -> Path:
+def folder(elbow_files, tmp_path_factory) -> Path:
     """Make a folder with the elbow's files under the names that the page uses."""
     folder = tmp_path_factory.mktemp("documents")
-    shutil.copytree(elbow.recording, folder / "recording")
-    (folder / "model.onnx").write_bytes(elbow.model.read_bytes())
+    shutil.copytree(elbow_files.recording, folder / "recording")
+    (folder / "model.onnx").write_bytes(elbow_files.model.read_bytes())
     for verb, name in (("evaluate", "evaluation.json"), ("benchmark", "benchmark.json")):
         count = ("--poses", 5) if verb == "evaluate" else ("--frames", 5)
-        assert run(verb, elbow.rig, elbow.model, "--json", folder / name, *count) == 0
+        assert run(verb, elbow_files.rig, elbow_files.model, "--json", folder / name, *count) == 0
     return folder
 
 
@@ -96,9 +96,9 @@ def test_code_of_the_messages_chapter_runs(folder, tmp_path):
     assert len(lines) == 3 and lines[1].startswith("2/2: ") and lines[2] == "finished 0"
 
 
-def test_code_of_the_development_page_runs(elbow, tmp_path):
+def test_code_of_the_development_page_runs(elbow_files, tmp_path):
     """Playback equals the model's output, and the model is nearer to the rig than linear skinning."""
-    text = run_code(DEVELOPMENT_PAGE, tmp_path, arguments=(elbow.bound, "elbow", 12))
+    text = run_code(DEVELOPMENT_PAGE, tmp_path, arguments=(elbow_files.bound, "elbow", 12))
     playback, model, linear = (
         float(distance) for distance in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE)
     )

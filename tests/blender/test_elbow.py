@@ -9,7 +9,7 @@ import pytest
 
 from blend_fixtures.elbow import LOWER_RANGE, UPPER_RANGE, build_elbow, elbow_surface
 
-from .test_arm import assert_closed, evaluated, rest_positions
+from .test_arm import assert_closed, evaluated_positions, rest_positions
 
 
 def test_the_elbow_is_a_small_closed_tube():
@@ -41,7 +41,7 @@ def test_the_action_moves_the_tip_of_the_elbow():
     assert rig.animation_data.action.name == "elbow_wave"
     scene = bpy.context.scene
     assert (scene.frame_start, scene.frame_end) == (1, 30)
-    first_positions = evaluated(mesh_object)
+    first_positions = evaluated_positions(mesh_object)
     scene.frame_set(10)
     tip = rest_positions(mesh_object)[:, 0].argmax()
-    assert np.linalg.norm(evaluated(mesh_object)[tip] - first_positions[tip]) > 0.2
+    assert np.linalg.norm(evaluated_positions(mesh_object)[tip] - first_positions[tip]) > 0.2

@@ -34,11 +34,11 @@ STATISTIC_NAMES = ["mean", "rms", "p99", "p999", "max"]
 
 
 @pytest.fixture(scope="module")
-def report(elbow, tmp_path_factory) -> dict:
+def report(elbow_files, tmp_path_factory) -> dict:
     """Return the report of `evaluate --json` with an action and scaled ranges of motion."""
     path = tmp_path_factory.mktemp("evaluation") / "e.json"
     options = ["--poses", 12, "--seed", 3, "--action", "elbow_wave", "--range-scale", 1.5, "--range-scale", 2]
-    assert run("evaluate", elbow.rig, elbow.model, "--json", path, *options) == 0
+    assert run("evaluate", elbow_files.rig, elbow_files.model, "--json", path, *options) == 0
     return json.loads(path.read_text())
 
 
@@ -69,10 +69,10 @@ def test_the_model_is_nearer_than_linear_skinning(report):
         assert values["p99"] <= values["p999"]
 
 
-def compute_errors(rig, elbow, channels, seed: int, indices) -> tuple[np.ndarray, np.ndarray]:
+def compute_errors(rig, elbow_files, channels, seed: int, indices) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors (N, V) of model and linear skinning in meters, without the code for evaluation."""
     arrays = read_rig(rig)
-    skinning, network = LinearSkinning(arrays), Network(elbow.model)
+    skinning, network = LinearSkinning(arrays), Network(elbow_files.model)
     bones, errors = rig.armature_object.pose.bones, ([], [])
     poser = Poser(rig, channels)
     for index in indices:
@@ -85,11 +85,11 @@ def compute_errors(rig, elbow, channels, seed: int, indices) -> tuple[np.ndarray
     return np.array(errors[0]), np.array(errors[1])
 
 
-def test_errors_equal_a_direct_computation(report, rig, elbow):
+def test_errors_equal_a_direct_computation(report, rig, elbow_files):
     rig.armature_object.animation_data_clear()
     clear_pose(rig.armature_object)
     channels = sampled_channels(rig, read_rig(rig))
-    fdda, linear = compute_errors(rig, elbow, channels, 3, range(FIRST_HELD_OUT_INDEX, FIRST_HELD_OUT_INDEX + 12))
+    fdda, linear = compute_errors(rig, elbow_files, channels, 3, range(FIRST_HELD_OUT_INDEX, FIRST_HELD_OUT_INDEX + 12))
     for errors, name in ((fdda, "fdda"), (linear, "linear")):
         assert report[name] == pytest.approx(error_statistics(errors).to_json(), abs=2e-4)
         mm = errors * 1000
@@ -101,28 +101,28 @@ def test_errors_equal_a_direct_computation(report, rig, elbow):
     assert widen_ranges(channels, 2)[0].high > channels[0].high
 
 
-def evaluate_with_settings(rig, elbow, **settings) -> Evaluation:
-    return drain(evaluate(rig, elbow.model, EvaluationSettings(**settings)))
+def evaluate_with_settings(rig, elbow_files, **settings) -> Evaluation:
+    return drain(evaluate(rig, elbow_files.model, EvaluationSettings(**settings)))
 
 
-def test_held_out_poses_are_not_in_the_recording(rig, elbow):
+def test_held_out_poses_are_not_in_the_recording(rig, elbow_files):
     """The evaluation uses the seed of the recording."""
-    recording = read_recording(elbow.recording)
-    evaluation = evaluate_with_settings(rig, elbow, poses=20, seed=recording.info.sampling.seed)
+    recording = read_recording(elbow_files.recording)
+    evaluation = evaluate_with_settings(rig, elbow_files, poses=20, seed=recording.info.sampling.seed)
     for pose in evaluation.held_out.pose_matrices:
         assert np.abs(recording.pose_matrices - pose).max(axis=(1, 2, 3)).min() > 1e-3
-    assert read_model_info(elbow.model).fingerprint == recording.rig.fingerprint
+    assert read_model_info(elbow_files.model).fingerprint == recording.rig.fingerprint
 
 
-def test_the_seed_determines_the_held_out_poses(rig, elbow):
-    first, second, other_seed = (evaluate_with_settings(rig, elbow, poses=4, seed=seed) for seed in (1, 1, 2))
+def test_the_seed_determines_the_held_out_poses(rig, elbow_files):
+    first, second, other_seed = (evaluate_with_settings(rig, elbow_files, poses=4, seed=seed) for seed in (1, 1, 2))
     assert first.to_json() == second.to_json()
     assert np.abs(first.held_out.pose_matrices - other_seed.held_out.pose_matrices).max() > 1e-2
 
 
-def test_a_named_pose_is_evaluated(rig, elbow):
+def test_a_named_pose_is_evaluated(rig, elbow_files):
     pose = NamedPose("fold", {"lower": (1.5, 0, 0), "upper": (0, 0.2, 0)})
-    (errors,) = evaluate_with_settings(rig, elbow, poses=1, named=(pose,)).named
+    (errors,) = evaluate_with_settings(rig, elbow_files, poses=1, named=(pose,)).named
     assert errors.name == "fold" and errors.fdda.shape == (1, 300)
     rig.armature_object.animation_data_clear()
     clear_pose(rig.armature_object)
@@ -132,24 +132,24 @@ def test_a_named_pose_is_evaluated(rig, elbow):
     np.testing.assert_allclose(errors.positions[0], true_positions, atol=1e-6)
 
 
-def test_frames_of_an_action_are_evaluated(rig, elbow):
-    (errors,) = evaluate_with_settings(rig, elbow, poses=1, actions=("elbow_wave",)).actions
+def test_frames_of_an_action_are_evaluated(rig, elbow_files):
+    (errors,) = evaluate_with_settings(rig, elbow_files, poses=1, actions=("elbow_wave",)).actions
     for frame in (1, 10, 22):
         bpy.context.scene.frame_set(frame)
         true_positions = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
         np.testing.assert_allclose(errors.positions[frame - 1], true_positions, atol=1e-6)
 
 
-def test_a_bound_file_is_compared_with_its_rig(elbow, tmp_path):
-    for name, file in (("rig", elbow.rig), ("bound", elbow.bound)):
-        assert run("evaluate", file, elbow.model, "--json", tmp_path / name, "--poses", 3) == 0
+def test_a_bound_file_is_compared_with_its_rig(elbow_files, tmp_path):
+    for name, file in (("rig", elbow_files.rig), ("bound", elbow_files.bound)):
+        assert run("evaluate", file, elbow_files.model, "--json", tmp_path / name, "--poses", 3) == 0
     first, second = (json.loads((tmp_path / name).read_text()) for name in ("rig", "bound"))
     assert first == second and first["linear"]["mean"] > 0.1
 
 
-def test_evaluate_prints_a_table_of_the_report(elbow, tmp_path, capfd):
+def test_evaluate_prints_a_table_of_the_report(elbow_files, tmp_path, capfd):
     arguments = ["--json", tmp_path / "e.json", "--poses", 3, "--action", "elbow_wave"]
-    assert run("evaluate", elbow.rig, elbow.model, *arguments) == 0
+    assert run("evaluate", elbow_files.rig, elbow_files.model, *arguments) == 0
     captured = capfd.readouterr()
     report = json.loads((tmp_path / "e.json").read_text())
     for values in (report, report["actions"][0]):
@@ -167,10 +167,10 @@ def pixels(path) -> np.ndarray:
     return values.reshape(image.size[1], image.size[0], 4)
 
 
-def test_the_heat_map_shows_colored_errors(elbow, tmp_path):
+def test_the_heat_map_shows_colored_errors(elbow_files, tmp_path):
     path = tmp_path / "heat.png"
     arguments = ["--json", tmp_path / "e.json", "--poses", 5, "--heatmap", path]
-    assert run("evaluate", elbow.rig, elbow.model, *arguments) == 0
+    assert run("evaluate", elbow_files.rig, elbow_files.model, *arguments) == 0
     # Text in a picture could reveal paths and names of the user's computer.
     assert not any(kind in path.read_bytes() for kind in (b"tEXt", b"zTXt", b"iTXt"))
     assert path.read_bytes().startswith(b"\x89PNG")
@@ -183,9 +183,9 @@ def test_the_heat_map_shows_colored_errors(elbow, tmp_path):
     assert len(np.unique((picture * 16).astype(int).reshape(-1, 3), axis=0)) > 30
 
 
-def test_the_benchmark_reports_times_and_their_ratio(elbow, tmp_path, capfd):
+def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path, capfd):
     path = tmp_path / "b.json"
-    assert run("benchmark", elbow.rig, elbow.model, "--json", path, "--frames", 12) == 0
+    assert run("benchmark", elbow_files.rig, elbow_files.model, "--json", path, "--frames", 12) == 0
     report = json.loads(path.read_text())
     methods = ["rig", "linear", "fdda", "floor", "inference"]
     assert list(report) == [
@@ -209,16 +209,16 @@ def test_the_benchmark_reports_times_and_their_ratio(elbow, tmp_path, capfd):
     out = capfd.readouterr().out
     assert report["is_faster"] == (report["ratio"] > 1) == ("x faster than the rig." in out)
     assert report["is_faster"] != ("Not worth it here" in out)
-    assert report["constant_bytes"] == Network(elbow.model).info.constant_bytes > 10_000
+    assert report["constant_bytes"] == Network(elbow_files.model).info.constant_bytes > 10_000
     assert f"{report['constant_bytes'] / 1e6:.2f}" in out
 
 
-def test_an_action_has_the_same_errors_with_and_without_held_out_poses(rig, elbow):
+def test_an_action_has_the_same_errors_with_and_without_held_out_poses(rig, elbow_files):
     settings = EvaluationSettings(1, actions=("elbow_wave",))
-    with_held_out = drain(evaluate(rig, elbow.model, settings)).actions[0]
-    action_only = drain(evaluate_action(rig, Network(elbow.model), "elbow_wave"))
+    with_held_out = drain(evaluate(rig, elbow_files.model, settings)).actions[0]
+    action_only = drain(evaluate_action(rig, Network(elbow_files.model), "elbow_wave"))
     assert action_only.held_out.name == "elbow_wave"
     np.testing.assert_allclose(action_only.held_out.fdda, with_held_out.fdda, atol=1e-6)
     assert sum(len(partition.vertices) for partition in action_only.partitions) == with_held_out.fdda.shape[1]
     with pytest.raises(RigError, match="no action 'jump'"):
-        drain(evaluate_action(rig, elbow.model, "jump"))
+        drain(evaluate_action(rig, elbow_files.model, "jump"))

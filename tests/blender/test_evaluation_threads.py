@@ -17,7 +17,7 @@ from .conftest import ELBOW_RIG, assert_plays, pose
 MAX_POSES = 2000
 
 
-def test_thread_local_data_is_kept_between_evaluations(bound, elbow, monkeypatch):
+def test_thread_local_data_is_kept_between_evaluations(bound_elbow, elbow_files, monkeypatch):
     """Python deletes thread-local data when it deletes the state of a thread."""
     calls, local_counts, local_data = Counter(), {}, threading.local()
     on_evaluate = playback.on_evaluate
@@ -37,23 +37,23 @@ def test_thread_local_data_is_kept_between_evaluations(bound, elbow, monkeypatch
     else:
         pytest.skip("Blender evaluates on one thread here")
     assert local_counts == calls
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_a_player_is_locked_while_it_reads_the_pose(bound, monkeypatch):
+def test_a_player_is_locked_while_it_reads_the_pose(bound_elbow, monkeypatch):
     """A render and the viewport may evaluate the same character on two threads."""
     read_pose, lock_states = Player.read_pose, []
 
-    def record_lock(player: Player, *evaluated: object) -> bool:
+    def record_lock(player: Player, *evaluated_positions: object) -> bool:
         lock_states.append(player.lock.locked())
-        return read_pose(player, *evaluated)
+        return read_pose(player, *evaluated_positions)
 
     monkeypatch.setattr(Player, "read_pose", record_lock)
     pose(angle=0.5)
     assert lock_states and all(lock_states)
 
 
-def test_a_changed_control_runs_the_model_in_an_unchanged_pose(bound, monkeypatch):
+def test_a_changed_control_runs_the_model_in_an_unchanged_pose(bound_elbow, monkeypatch):
     """An unchanged pose runs the model again only if a control has changed."""
     values, played_controls, run_model = [], [], Player.run_model
 

@@ -15,7 +15,15 @@ from fdda_addon.runtime.model_files import model_path
 from fdda_addon.runtime.player import VIEWPORT_KEY
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted, without_deformation
+from .conftest import (
+    ELBOW,
+    ELBOW_RIG,
+    assert_plays,
+    evaluated_positions,
+    pose,
+    predicted_positions,
+    without_deformation,
+)
 from .test_renders import rig_pixels, set_camera, still
 
 FRAMES = (4, 11, 20)
@@ -38,25 +46,25 @@ def shown_in(graph: bpy.types.Depsgraph, mesh_object: bpy.types.Object) -> np.nd
 
 
 @pytest.mark.parametrize("subframe", [0.25, 0.5, 0.999])
-def test_subframes_show_the_model(bound, elbow, subframe):
+def test_subframes_show_the_model(bound_elbow, elbow_files, subframe):
     bpy.context.scene.frame_set(10)
-    frame_positions = assert_plays(bound, elbow.model)
+    frame_positions = assert_plays(bound_elbow, elbow_files.model)
     bpy.context.scene.frame_set(10, subframe=subframe)
-    assert np.abs(assert_plays(bound, elbow.model) - frame_positions).max() > 1e-4
+    assert np.abs(assert_plays(bound_elbow, elbow_files.model) - frame_positions).max() > 1e-4
 
 
-def add_shape_key(bound: bpy.types.Object) -> bpy.types.Object:
+def add_shape_key(bound_elbow: bpy.types.Object) -> bpy.types.Object:
     """Add a shape key that the model was not trained with to the bound elbow, and return the elbow."""
-    bind(SceneRig(bound, armature_of(bound)), without_deformation(model_path(bound)))
-    bound.fdda.mode = "RIG"
-    bound.shape_key_add(name="Basis")
-    key = bound.shape_key_add(name="bulge")
+    bind(SceneRig(bound_elbow, armature_of(bound_elbow)), without_deformation(model_path(bound_elbow)))
+    bound_elbow.fdda.mode = "RIG"
+    bound_elbow.shape_key_add(name="Basis")
+    key = bound_elbow.shape_key_add(name="bulge")
     for point in key.data:
         point.co.z *= 1.2
     key.value = 1.0
-    bound.fdda.mode = "FDDA"
+    bound_elbow.fdda.mode = "FDDA"
     bpy.context.view_layer.update()
-    return bound
+    return bound_elbow
 
 
 def export_alembic(path: Path, mode: str) -> None:
@@ -84,24 +92,24 @@ def positions_in_file(path: Path) -> dict[int, np.ndarray]:
     positions = {}
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
-        positions[frame] = evaluated(mesh_object)
+        positions[frame] = evaluated_positions(mesh_object)
     return positions
 
 
 @pytest.mark.parametrize("suffix", [".abc", ".usdc"])
 @pytest.mark.parametrize("mode", ["VIEWPORT", "RENDER"])
 @pytest.mark.parametrize("use_in_render", [False, True])
-def test_exports_contain_the_model_or_the_rig(bound, elbow, tmp_path, suffix, mode, use_in_render):
+def test_exports_contain_the_model_or_the_rig(bound_elbow, elbow_files, tmp_path, suffix, mode, use_in_render):
     """Exports for renders contain the rig with its shape keys, unless Use in Render is set."""
-    add_shape_key(bound).fdda.use_in_render = use_in_render
+    add_shape_key(bound_elbow).fdda.use_in_render = use_in_render
     shows_model = use_in_render or mode == "VIEWPORT"
     expected, other = {}, {}
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
-        model_positions = assert_plays(bound, elbow.model)
-        bound.fdda.mode = "RIG"
-        rig_shape = evaluated(bound)
-        bound.fdda.mode = "FDDA"
+        model_positions = assert_plays(bound_elbow, elbow_files.model)
+        bound_elbow.fdda.mode = "RIG"
+        rig_shape = evaluated_positions(bound_elbow)
+        bound_elbow.fdda.mode = "FDDA"
         both = (model_positions, rig_shape) if shows_model else (rig_shape, model_positions)
         expected[frame], other[frame] = both
     path = tmp_path / f"elbow{suffix}"
@@ -111,10 +119,10 @@ def test_exports_contain_the_model_or_the_rig(bound, elbow, tmp_path, suffix, mo
         assert np.abs(positions - other[frame]).max() > 1e-3
 
 
-def test_motion_blur_equals_that_of_an_alembic_cache(bound, elbow, tmp_path):
+def test_motion_blur_equals_that_of_an_alembic_cache(bound_elbow, elbow_files, tmp_path):
     """Cycles evaluates subframes. The expected image shows the same mesh from an Alembic file."""
     scene = bpy.context.scene
-    bound.fdda.use_in_render = True
+    bound_elbow.fdda.use_in_render = True
     set_camera()
     scene.render.engine, scene.cycles.samples, scene.cycles.seed = "CYCLES", 8, 0
     scene.cycles.use_denoising = False
@@ -125,11 +133,11 @@ def test_motion_blur_equals_that_of_an_alembic_cache(bound, elbow, tmp_path):
     scene.collection.objects.link(light)
     scene.frame_set(11)
     model_image = still(tmp_path / "model.png")
-    assert not np.array_equal(model_image, rig_pixels(bound, tmp_path))
+    assert not np.array_equal(model_image, rig_pixels(bound_elbow, tmp_path))
     bpy.ops.wm.alembic_export(
         filepath=str(tmp_path / "e.abc"), start=10, end=13, gsamples=2, xsamples=2, as_background_job=False
     )
-    bound.hide_render = True
+    bound_elbow.hide_render = True
     bpy.ops.wm.alembic_import(filepath=str(tmp_path / "e.abc"), set_frame_range=False, as_background_job=False)
     scene.frame_set(11)
     cache_image = still(tmp_path / "cache.png")
@@ -139,57 +147,59 @@ def test_motion_blur_equals_that_of_an_alembic_cache(bound, elbow, tmp_path):
     assert np.abs(sharp_image - model_image).mean() > 4 * np.abs(model_image - cache_image).mean()
 
 
-def test_two_view_layers_show_the_model(bound, elbow):
+def test_two_view_layers_show_the_model(bound_elbow, elbow_files):
     scene = bpy.context.scene
     second_layer = scene.view_layers.new("second")
     for angle in (0.4, 1.5):
         bpy.data.objects[ELBOW_RIG].animation_data_clear()
         pose(angle=angle)
         second_layer.update()
-        expected = assert_plays(bound, elbow.model)
-        assert np.abs(shown_in(second_layer.depsgraph, bound) - expected).max() < 1e-5
+        expected = assert_plays(bound_elbow, elbow_files.model)
+        assert np.abs(shown_in(second_layer.depsgraph, bound_elbow) - expected).max() < 1e-5
 
 
-def test_two_scenes_show_the_model_at_different_frames(bound, elbow):
+def test_two_scenes_show_the_model_at_different_frames(bound_elbow, elbow_files):
     """The character is linked to a second scene with another current frame."""
     first, second = bpy.context.scene, bpy.data.scenes.new("second")
     for name in (ELBOW, ELBOW_RIG):
         second.collection.objects.link(bpy.data.objects[name])
     first.frame_set(5)
-    expected = {first: assert_plays(bound, elbow.model)}
+    expected = {first: assert_plays(bound_elbow, elbow_files.model)}
     second.frame_set(20)
-    assert np.abs(assert_plays(bound, elbow.model) - expected[first]).max() < 1e-5
+    assert np.abs(assert_plays(bound_elbow, elbow_files.model) - expected[first]).max() < 1e-5
     graph = second.view_layers[0].depsgraph
-    assert np.abs(shown_in(graph, bound) - expected[first]).max() > 1e-2
+    assert np.abs(shown_in(graph, bound_elbow) - expected[first]).max() > 1e-2
     first.frame_set(20)
-    assert np.abs(shown_in(graph, bound) - assert_plays(bound, elbow.model)).max() < 1e-5
+    assert np.abs(shown_in(graph, bound_elbow) - assert_plays(bound_elbow, elbow_files.model)).max() < 1e-5
 
 
-def test_a_handler_of_another_add_on_evaluates_the_model(bound, elbow):
+def test_a_handler_of_another_add_on_evaluates_the_model(bound_elbow, elbow_files):
     handler_positions = []
 
     def evaluate(*_):
-        handler_positions.append(evaluated(bound))
+        handler_positions.append(evaluated_positions(bound_elbow))
 
     with handler("frame_change_post", evaluate):
         for frame in FRAMES:
             bpy.context.scene.frame_set(frame)
-            assert np.abs(handler_positions[-1] - assert_plays(bound, elbow.model)).max() < 1e-5
+            assert np.abs(handler_positions[-1] - assert_plays(bound_elbow, elbow_files.model)).max() < 1e-5
     assert len(handler_positions) == len(FRAMES)
 
 
-def test_another_add_on_may_set_the_pose_after_a_frame_change(bound, elbow):
+def test_another_add_on_may_set_the_pose_after_a_frame_change(bound_elbow, elbow_files):
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
 
     def set_pose(scene, _graph):
         bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] = scene.frame_current / 20
 
     with handler("frame_change_post", set_pose):
-        shown = [assert_plays(bound, elbow.model) for frame in FRAMES if not bpy.context.scene.frame_set(frame)]
+        shown = [
+            assert_plays(bound_elbow, elbow_files.model) for frame in FRAMES if not bpy.context.scene.frame_set(frame)
+        ]
     assert np.abs(shown[0] - shown[2]).max() > 1e-2
 
 
-def test_python_drivers_of_other_objects_do_not_block_playback(bound, elbow, monkeypatch):
+def test_python_drivers_of_other_objects_do_not_block_playback(bound_elbow, elbow_files, monkeypatch):
     """The expressions of these drivers take the global interpreter lock on threads that evaluate."""
     monkeypatch.setattr(bpy.context.preferences.filepaths, "use_scripts_auto_execute", True)
     for index in range(20):
@@ -199,11 +209,11 @@ def test_python_drivers_of_other_objects_do_not_block_playback(bound, elbow, mon
         curve.driver.expression = f"len([i for i in range({index} + int(frame))])"
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
-        assert_plays(bound, elbow.model)
+        assert_plays(bound_elbow, elbow_files.model)
         assert bpy.data.objects["empty 3"].matrix_world.translation.x == 3 + frame
 
 
-def test_a_bone_driven_by_another_object_is_played(bound, elbow):
+def test_a_bone_driven_by_another_object_is_played(bound_elbow, elbow_files):
     """The location of an animated empty drives the rotation of the bone."""
     armature_object = bpy.data.objects[ELBOW_RIG]
     armature_object.animation_data_clear()
@@ -217,11 +227,11 @@ def test_a_bone_driven_by_another_object_is_played(bound, elbow):
     variable = curve.driver.variables.new()
     variable.type = "TRANSFORMS"
     variable.targets[0].id = empty
-    shown = [assert_plays(bound, elbow.model) for frame in FRAMES if not bpy.context.scene.frame_set(frame)]
+    shown = [assert_plays(bound_elbow, elbow_files.model) for frame in FRAMES if not bpy.context.scene.frame_set(frame)]
     assert np.abs(shown[0] - shown[2]).max() > 1e-2
 
 
-def test_an_unchanged_character_is_not_evaluated(bound, monkeypatch):
+def test_an_unchanged_character_is_not_evaluated(bound_elbow, monkeypatch):
     from fdda_addon.runtime.player import Player
 
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
@@ -234,7 +244,7 @@ def test_an_unchanged_character_is_not_evaluated(bound, monkeypatch):
     assert len(calls) == 1
 
 
-def test_a_render_of_the_rig_does_not_run_the_model(bound, tmp_path, monkeypatch):
+def test_a_render_of_the_rig_does_not_run_the_model(bound_elbow, tmp_path, monkeypatch):
     from fdda_addon.runtime.network import Execution
 
     set_camera()
@@ -246,27 +256,27 @@ def test_a_render_of_the_rig_does_not_run_the_model(bound, tmp_path, monkeypatch
     assert calls == []
 
 
-def test_a_character_follows_another_armature(bound, elbow):
+def test_a_character_follows_another_armature(bound_elbow, elbow_files):
     other_armature = bpy.data.objects[ELBOW_RIG].copy()
     other_armature.animation_data_clear()
     bpy.context.scene.collection.objects.link(other_armature)
     other_armature.pose.bones["lower"].rotation_euler[0] = 1.4
-    bound.modifiers["Armature"].object = bound.parent = other_armature
+    bound_elbow.modifiers["Armature"].object = bound_elbow.parent = other_armature
     bpy.context.view_layer.update()
-    first = assert_plays(bound, elbow.model)
+    first = assert_plays(bound_elbow, elbow_files.model)
     pose(other_armature.name, angle=0.2)
-    assert np.abs(assert_plays(bound, elbow.model) - first).max() > 1e-2
-    assert np.abs(evaluated(bound) - predicted(bound, elbow.model)).max() < 1e-5
+    assert np.abs(assert_plays(bound_elbow, elbow_files.model) - first).max() > 1e-2
+    assert np.abs(evaluated_positions(bound_elbow) - predicted_positions(bound_elbow, elbow_files.model)).max() < 1e-5
 
 
-def test_depsgraphs_are_identified_by_mode_scene_and_view_layer(bound, tmp_path):
+def test_depsgraphs_are_identified_by_mode_scene_and_view_layer(bound_elbow, tmp_path):
     """A new dependency graph may get the address of a deleted one."""
-    add_shape_key(bound)
+    add_shape_key(bound_elbow)
     set_camera()
     seen_graphs = []
 
     def record_graph(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-        seen_graphs.append((depsgraph.mode, VIEWPORT_KEY in bound.evaluated_get(depsgraph)))
+        seen_graphs.append((depsgraph.mode, VIEWPORT_KEY in bound_elbow.evaluated_get(depsgraph)))
 
     with handler("frame_change_post", record_graph):
         for frame in range(3):

@@ -130,10 +130,10 @@ def test_the_enabled_extension_starts_fast(package: Path, tmp_path: Path):
     assert min(start["seconds"] for start in starts) < max(MAX_START_SECONDS, MAX_START_RATIO * min(import_seconds))
 
 
-def test_an_installed_extension_plays_a_bound_file(package: Path, elbow, bound, tmp_path: Path):
+def test_an_installed_extension_plays_a_bound_file(package: Path, elbow_files, bound_elbow, tmp_path: Path):
     pose(angle=1.0)
-    shown = assert_plays(bound, elbow.model)
-    result = blender("play", package, elbow.bound, user=tmp_path)
+    shown = assert_plays(bound_elbow, elbow_files.model)
+    result = blender("play", package, elbow_files.bound, user=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
     played = json.loads(result.stdout.splitlines()[-1])
     assert played["status"] == "" and "extensions/.local/lib" in played["onnxruntime"]
@@ -193,11 +193,11 @@ def test_the_zip_is_small_and_declares_its_permissions(package: Path):
     assert not [name for name in names if "__pycache__" in name]
 
 
-def test_a_bound_file_shows_its_rig_without_onnx_runtime(elbow, monkeypatch: pytest.MonkeyPatch):
+def test_a_bound_file_shows_its_rig_without_onnx_runtime(elbow_files, monkeypatch: pytest.MonkeyPatch):
     """No wheel of the extension may fit the Python of a Blender."""
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.setattr(model_files, "_networks", {})
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
     mesh_object = bpy.data.objects["elbow"]
     pose(angle=1.0)
     assert mesh_object.fdda.mode == "RIG"

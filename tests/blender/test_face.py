@@ -86,9 +86,9 @@ def test_an_action_outside_the_training_data_has_small_errors(face_folder, tmp_p
 
 
 def test_the_bound_face_plays_the_action_and_a_shape_key(face_folder, tmp_path):
-    bound = tmp_path / "bound.blend"
-    assert run("bind", face_folder / "face.blend", face_folder / "face.onnx", bound) == 0
-    bpy.ops.wm.open_mainfile(filepath=str(bound))
+    bound_path = tmp_path / "bound.blend"
+    assert run("bind", face_folder / "face.blend", face_folder / "face.onnx", bound_path) == 0
+    bpy.ops.wm.open_mainfile(filepath=str(bound_path))
     mesh_object, armature_object = bpy.data.objects[face.MESH], bpy.data.objects[face.ARMATURE]
     armature_object.animation_data.action = bpy.data.actions[face.SPEECH]
     keys, shapes = mesh_object.data.shape_keys, []

@@ -28,7 +28,7 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
-from .conftest import ELBOW, assert_plays, evaluated, pose, run, train
+from .conftest import ELBOW, assert_plays, evaluated_positions, pose, run, train
 from .refusals import save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
@@ -136,13 +136,13 @@ def test_playback_uses_the_fitted_weights(kind, build, make_fitted_character, ca
     files = make_fitted_character(kind, build, capfd)
     rig = files.open()
     pose(angle=1.2)
-    rig_shape = evaluated(rig.mesh_object)
+    rig_shape = evaluated_positions(rig.mesh_object)
     bind(rig, files.model)
     model_positions = assert_plays(rig.mesh_object, files.model)
     heat_map.paint_partitions(rig)
     assert len(np.unique(heat_map.colors_of(rig.mesh_object), axis=0)) == 2
     rig.mesh_object.fdda.mode = "LINEAR"
-    linear_positions = evaluated(rig.mesh_object)
+    linear_positions = evaluated_positions(rig.mesh_object)
     recording = read_recording(files.recording)
     matrices = pose_matrices(rig, recording.rig)
     np.testing.assert_allclose(linear_positions, LinearSkinning(recording.rig).positions(matrices[None])[0], atol=1e-5)

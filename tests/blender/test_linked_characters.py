@@ -8,7 +8,7 @@ import pytest
 from fdda_addon.runtime import playback_modifier
 
 from . import test_player_batch as crowd_tests
-from .conftest import assert_plays, predicted
+from .conftest import assert_plays, predicted_positions
 from .linked import (
     ANGLES,
     COLLECTION,
@@ -94,7 +94,7 @@ def test_renders_of_overrides_show_the_rig_or_the_model(pair, library, tmp_path,
     first.fdda.use_in_render = use_in_render
     bpy.context.view_layer.update()
     rendered = still(tmp_path / "still.png")
-    model_image = render_positions(first, predicted(first, library.model), tmp_path / "plain.png")
+    model_image = render_positions(first, predicted_positions(first, library.model), tmp_path / "plain.png")
     rig_image = rig_pixels(first, tmp_path)
     assert not np.array_equal(model_image, rig_image)
     assert np.array_equal(rendered, model_image if use_in_render else rig_image)
@@ -148,7 +148,7 @@ def test_instances_of_a_collection_show_one_pose(library, is_linked):
     mesh_object = next(o for o in collection.all_objects if o.type == "MESH")
     for frame in (4, 21):
         bpy.context.scene.frame_set(frame)
-        expected = predicted(mesh_object, library.model)
+        expected = predicted_positions(mesh_object, library.model)
         x_locations = []
         for instance in bpy.context.evaluated_depsgraph_get().object_instances:
             if instance.object.type == "MESH":

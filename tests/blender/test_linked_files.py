@@ -10,7 +10,7 @@ import fdda_addon
 from fdda_addon.models import model_list
 from fdda_addon.runtime import model_files
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions
 from .linked import (
     ANGLES,
     COLLECTION,
@@ -34,13 +34,13 @@ def test_overrides_keep_mode_strength_and_use_in_render(pair, library, tmp_path)
     first, second = pair
     first.fdda.mode, second.fdda.strength, second.fdda.use_in_render = "RIG", 0.25, True
     bpy.context.view_layer.update()
-    saved_positions = evaluated(first), evaluated(second)
+    saved_positions = evaluated_positions(first), evaluated_positions(second)
     save_and_reopen_shot(tmp_path)
     first, second = overridden_meshes()
     assert (first.fdda.mode, first.fdda.is_playing) == ("RIG", False)
     assert (second.fdda.mode, second.fdda.strength, second.fdda.use_in_render) == ("FDDA", 0.25, True)
     for mesh_object, positions in zip((first, second), saved_positions, strict=True):
-        assert np.abs(evaluated(mesh_object) - positions).max() < 1e-6
+        assert np.abs(evaluated_positions(mesh_object) - positions).max() < 1e-6
 
 
 def positions_in_mode(mesh_objects: list[bpy.types.Object], mode: str) -> list[np.ndarray]:
@@ -48,7 +48,7 @@ def positions_in_mode(mesh_objects: list[bpy.types.Object], mode: str) -> list[n
     for mesh_object in mesh_objects:
         mesh_object.fdda.mode = mode
     bpy.context.view_layer.update()
-    return [evaluated(mesh_object) for mesh_object in mesh_objects]
+    return [evaluated_positions(mesh_object) for mesh_object in mesh_objects]
 
 
 def test_saved_overrides_show_their_rig_without_the_add_on(pair, library, tmp_path):
@@ -64,7 +64,7 @@ def test_saved_overrides_show_their_rig_without_the_add_on(pair, library, tmp_pa
         assert not hasattr(mesh_object, "fdda")
         shown = {m.name: (m.show_viewport, m.show_render) for m in mesh_object.modifiers}
         assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
-        assert np.abs(evaluated(mesh_object) - positions).max() < 1e-6
+        assert np.abs(evaluated_positions(mesh_object) - positions).max() < 1e-6
 
 
 def overridden_paths(mesh_object: bpy.types.Object) -> set[str]:
@@ -184,7 +184,7 @@ def test_overrides_play_after_the_library_is_reloaded(pair, library, tmp_path):
     assert_overrides_play(library, (0.6, 1.4))
 
 
-def test_overrides_play_the_new_model_of_a_reloaded_library(pair, library, tmp_path, elbow):
+def test_overrides_play_the_new_model_of_a_reloaded_library(pair, library, tmp_path, elbow_files):
     """While the shot is open, another process packs the model, sets mode RIG and saves the library."""
     bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)), copy=True)
     pair[1].fdda.mode = "LINEAR"
@@ -201,7 +201,7 @@ def test_overrides_play_the_new_model_of_a_reloaded_library(pair, library, tmp_p
     bpy.context.view_layer.update()
     for mesh_object in (first, second):
         assert mesh_object.fdda.packed is not None
-        assert_plays(mesh_object, elbow.model)
+        assert_plays(mesh_object, elbow_files.model)
 
 
 def test_an_override_of_an_override_plays(library, tmp_path):

@@ -17,7 +17,7 @@ from fdda_addon.scene import mask as masks
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from .baked_files import read_pc2
-from .conftest import ELBOW, assert_plays, evaluated, pose
+from .conftest import ELBOW, assert_plays, evaluated_positions, pose
 from .scene_state import drain
 from .test_player_batch import animate, crowd_of
 
@@ -46,20 +46,20 @@ def both(mesh_object: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     shown = []
     for mesh_object.fdda.mode in ("LINEAR", "FDDA"):
         bpy.context.view_layer.update()
-        shown.append(evaluated(mesh_object))
+        shown.append(evaluated_positions(mesh_object))
     mesh_object.fdda.mask, mesh_object.fdda.mode = name, mode
     bpy.context.view_layer.update()
     return tuple(shown)
 
 
 @pytest.fixture
-def masked(bound):
+def masked(bound_elbow):
     pose(angle=1.4)
-    paint(bound, ramp(bound))
-    bound.fdda.mask = GROUP
-    bpy.context.view_layer.objects.active = bound
+    paint(bound_elbow, ramp(bound_elbow))
+    bound_elbow.fdda.mask = GROUP
+    bpy.context.view_layer.objects.active = bound_elbow
     bpy.context.view_layer.update()
-    return bound
+    return bound_elbow
 
 
 def test_the_weight_blends_the_model_with_linear_skinning(masked):
@@ -67,9 +67,9 @@ def test_the_weight_blends_the_model_with_linear_skinning(masked):
     for angle in (1.4, 0.6, -0.2):
         pose(angle=angle)
         linear, model = both(masked)
-        assert np.abs(evaluated(masked) - (linear + weights * (model - linear))).max() < 1e-6
+        assert np.abs(evaluated_positions(masked) - (linear + weights * (model - linear))).max() < 1e-6
         # Vertices with weight 1 have the exact positions of the model.
-        assert (evaluated(masked)[weights[:, 0] == 1] == model[weights[:, 0] == 1]).all()
+        assert (evaluated_positions(masked)[weights[:, 0] == 1] == model[weights[:, 0] == 1]).all()
     pose(angle=1.4)
     linear, model = both(masked)
     assert np.abs(model - linear).max() > 1e-3, "the pose tells the two apart"
@@ -80,7 +80,7 @@ def test_an_inverted_mask_leaves_the_group_out(masked):
     masked.fdda.invert_mask = True
     bpy.context.view_layer.update()
     weights = 1 - ramp(masked)[:, None]
-    assert np.abs(evaluated(masked) - (linear + weights * (model - linear))).max() < 1e-6
+    assert np.abs(evaluated_positions(masked) - (linear + weights * (model - linear))).max() < 1e-6
 
 
 def test_strength_and_weight_are_multiplied(masked):
@@ -88,19 +88,19 @@ def test_strength_and_weight_are_multiplied(masked):
     masked.fdda.strength = 0.5
     bpy.context.view_layer.update()
     expected = linear + 0.5 * ramp(masked)[:, None] * (model - linear)
-    assert np.abs(evaluated(masked) - expected).max() < 1e-6
+    assert np.abs(evaluated_positions(masked) - expected).max() < 1e-6
 
 
 def test_weights_painted_during_playback_take_effect(masked):
     linear, model = both(masked)
     weights = 1 - ramp(masked)
     paint(masked, weights)
-    assert np.abs(evaluated(masked) - (linear + weights[:, None] * (model - linear))).max() < 1e-6
+    assert np.abs(evaluated_positions(masked) - (linear + weights[:, None] * (model - linear))).max() < 1e-6
     assert not masked.fdda.status
 
 
 @pytest.mark.parametrize("what", ["removed", "renamed", "never there", "empty"])
-def test_without_its_vertex_group_a_mask_has_no_effect(masked, elbow, what):
+def test_without_its_vertex_group_a_mask_has_no_effect(masked, elbow_files, what):
     if what == "removed":
         masked.vertex_groups.remove(masked.vertex_groups[GROUP])
     elif what == "renamed":
@@ -110,40 +110,40 @@ def test_without_its_vertex_group_a_mask_has_no_effect(masked, elbow, what):
         masked.fdda.mask = "none" if what == "never there" else ""
     bpy.context.view_layer.update()
     bpy.context.view_layer.update()
-    assert_plays(masked, elbow.model)
+    assert_plays(masked, elbow_files.model)
     name = masked.fdda.mask
     said = f"'elbow' has no vertex group '{name}', so the mask has no effect; choose another."
     assert mask_problem(masked) == (said if name else "")
 
 
-def test_the_group_of_a_mask_does_not_change_the_fingerprint_of_the_rig(masked, elbow):
-    info = Network(elbow.model).info
+def test_the_group_of_a_mask_does_not_change_the_fingerprint_of_the_rig(masked, elbow_files):
+    info = Network(elbow_files.model).info
     rig = read_model_rig(SceneRig(masked, armature_of(masked)), info)
     assert rig.fingerprint == info.fingerprint
     bpy.ops.fdda.unbind()
     assert masked.fdda.mask == GROUP
     assert bpy.ops.fdda.bind() == {"FINISHED"}
     linear, model = both(masked)
-    assert np.abs(evaluated(masked) - (linear + ramp(masked)[:, None] * (model - linear))).max() < 1e-6
+    assert np.abs(evaluated_positions(masked) - (linear + ramp(masked)[:, None] * (model - linear))).max() < 1e-6
 
 
 def test_a_mask_is_saved_with_the_file_and_restored_by_undo(masked, tmp_path):
     bpy.context.scene.frame_set(12)
-    before = evaluated(masked)
+    before = evaluated_positions(masked)
     bpy.ops.ed.undo_push(message="masked")
     masked.fdda.mask = ""
     bpy.ops.ed.undo_push(message="unmasked")
     bpy.ops.ed.undo()
     masked = bpy.data.objects[ELBOW]
-    assert masked.fdda.mask == GROUP and (evaluated(masked) == before).all()
+    assert masked.fdda.mask == GROUP and (evaluated_positions(masked) == before).all()
     bpy.ops.fdda.pack_model()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.context.scene.frame_set(12)
-    assert np.abs(evaluated(bpy.data.objects[ELBOW]) - before).max() < 1e-6
+    assert np.abs(evaluated_positions(bpy.data.objects[ELBOW]) - before).max() < 1e-6
 
 
-def test_without_a_mask_frames_neither_read_nor_blend_weights(bound, monkeypatch):
+def test_without_a_mask_frames_neither_read_nor_blend_weights(bound_elbow, monkeypatch):
     asked = []
     monkeypatch.setattr(masks, "read_mask", lambda *_: asked.append("read"))
     monkeypatch.setattr("fdda_addon.runtime.player.read_mask", lambda *_: asked.append("read"))
@@ -169,10 +169,10 @@ def test_a_baked_cache_contains_the_masked_deformation(masked, tmp_path):
     baked = read_pc2(tmp_path / "a.pc2")[2]
     for frame in (1, 12, 20):
         bpy.context.scene.frame_set(frame)
-        assert np.abs(baked[frame - bpy.context.scene.frame_start] - evaluated(masked)).max() < 1e-5
+        assert np.abs(baked[frame - bpy.context.scene.frame_start] - evaluated_positions(masked)).max() < 1e-5
     masked.fdda.mask = ""
     bpy.context.view_layer.update()
-    assert np.abs(baked[20 - bpy.context.scene.frame_start] - evaluated(masked)).max() > 1e-4
+    assert np.abs(baked[20 - bpy.context.scene.frame_start] - evaluated_positions(masked)).max() > 1e-4
 
 
 def test_an_evaluation_measures_the_masked_deformation(masked):
@@ -182,34 +182,36 @@ def test_an_evaluation_measures_the_masked_deformation(masked):
     assert (errors["fdda"][:, weights == 0] == errors["linear"][:, weights == 0]).all()
     for frame in (5, 20):
         bpy.context.scene.frame_set(frame)
-        shown = evaluated(masked)
+        shown = evaluated_positions(masked)
         masked.fdda.mode = "RIG"
         bpy.context.view_layer.update()
-        apart = np.linalg.norm(shown - evaluated(masked), axis=1)
+        apart = np.linalg.norm(shown - evaluated_positions(masked), axis=1)
         masked.fdda.mode = "FDDA"
         bpy.context.view_layer.update()
         pose_index = last_evaluation.get(masked).pose_at(frame)
         assert np.abs(errors["fdda"][pose_index] - apart).max() < 1e-5
 
 
-def test_picture_shows_the_masked_model(masked, elbow, tmp_path, monkeypatch):
+def test_picture_shows_the_masked_model(masked, elbow_files, tmp_path, monkeypatch):
     drawn_rows = []
     monkeypatch.setattr(pictures, "draw", lambda mesh, rows, *_, **options: drawn_rows.extend(rows))
     scene_rig = SceneRig(masked, armature_of(masked))
     with model_disabled(masked):
-        evaluation = drain(evaluate_action(scene_rig, elbow.model, "elbow_wave"))
+        evaluation = drain(evaluate_action(scene_rig, elbow_files.model, "elbow_wave"))
     posed = pictures.make_pictured_pose(evaluation.held_out, 11)
-    pictures.draw_comparison(scene_rig, elbow.model, [posed], tmp_path / "heat_map.png", heat=True)
+    pictures.draw_comparison(scene_rig, elbow_files.model, [posed], tmp_path / "heat_map.png", heat=True)
     ((_, _, model_cell),) = drawn_rows
     errors = np.linalg.norm(model_cell.positions - posed.positions, axis=1)
     np.testing.assert_allclose(errors, evaluation.held_out.fdda[11], atol=1e-6)
-    assert np.abs(model_cell.positions - Network(elbow.model).positions(posed.pose_matrices[None])[0]).max() > 1e-4
+    assert (
+        np.abs(model_cell.positions - Network(elbow_files.model).positions(posed.pose_matrices[None])[0]).max() > 1e-4
+    )
 
 
-def test_characters_of_a_crowd_have_separate_masks(bound):
-    crowd = crowd_of(bound, 6)
+def test_characters_of_a_crowd_have_separate_masks(bound_elbow):
+    crowd = crowd_of(bound_elbow, 6)
     animate(crowd)
-    paint(crowd[0], ramp(bound))
+    paint(crowd[0], ramp(bound_elbow))
     crowd[1].fdda.mask = crowd[2].fdda.mask = GROUP
     crowd[2].fdda.invert_mask = True
     crowd[3].fdda.mask, crowd[3].fdda.strength = GROUP, 0.5
@@ -217,8 +219,8 @@ def test_characters_of_a_crowd_have_separate_masks(bound):
     for frame in (1, 2, 3, 4):
         scene.frame_set(frame)
     assert registry.batches.by_driver, "they play together"
-    shown = [evaluated(mesh_object) for mesh_object in crowd]
-    ramps = ramp(bound)[:, None]
+    shown = [evaluated_positions(mesh_object) for mesh_object in crowd]
+    ramps = ramp(bound_elbow)[:, None]
     for mesh_object, positions, weights in zip(crowd, shown, (1, ramps, 1 - ramps, 0.5 * ramps, 1, 1), strict=True):
         mesh_object.fdda.strength = 1
         linear, model = both(mesh_object)

@@ -16,7 +16,7 @@ from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing import benchmark, rig_cost
 
-from .conftest import assert_plays, evaluated, pose
+from .conftest import assert_plays, evaluated_positions, pose
 from .modifiers import FEW_POSES, add_modifier_at, add_nodes_at, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
@@ -42,22 +42,22 @@ def test_a_deforming_stack_is_recorded_and_played(build, loose_model, tmp_path):
     assert_same_state(before, scene_state(rig))
 
     pose(angle=1.0)
-    true = evaluated(rig.mesh_object)
+    true = evaluated_positions(rig.mesh_object)
     bind(rig, loose_model)
     live = [m for m in rig.mesh_object.modifiers if m.name in read_live(rig)]
-    assert len(evaluated(rig.mesh_object)) == len(true)
+    assert len(evaluated_positions(rig.mesh_object)) == len(true)
     for modifier in live:
         modifier.show_viewport = False
     for mode in ("FDDA", "LINEAR"):
         rig.mesh_object.fdda.mode = mode
-        assert len(evaluated(rig.mesh_object)) == len(rig.mesh_object.data.vertices)
+        assert len(evaluated_positions(rig.mesh_object)) == len(rig.mesh_object.data.vertices)
     rig.mesh_object.fdda.mode = "FDDA"
     assert_plays(rig.mesh_object, loose_model)
     for modifier in live:
         modifier.show_viewport = True
     unbind(rig.mesh_object)
     assert shown(rig) == modifiers
-    np.testing.assert_allclose(evaluated(rig.mesh_object), true, atol=1e-6)
+    np.testing.assert_allclose(evaluated_positions(rig.mesh_object), true, atol=1e-6)
 
 
 def read_live(rig: SceneRig) -> tuple[str, ...]:
@@ -74,9 +74,9 @@ def test_modifiers_that_add_vertices_after_the_rig_use_the_output_of_the_model(l
         ("Armature", "Mush"), (), ("Subdivision", "Thickness", "Detail"), 2
     )
     pose(angle=1.0)
-    true = evaluated(rig.mesh_object)
+    true = evaluated_positions(rig.mesh_object)
     bind(rig, loose_model)
-    playing = evaluated(rig.mesh_object)
+    playing = evaluated_positions(rig.mesh_object)
     assert len(playing) == len(true) > 8 * len(rig.mesh_object.data.vertices)
     # The smoothing of this character differs slightly from the smoothing that the model has learned.
     assert np.linalg.norm(playing - true, axis=1).mean() < 0.002
@@ -85,16 +85,16 @@ def test_modifiers_that_add_vertices_after_the_rig_use_the_output_of_the_model(l
     ]  # fmt: skip
 
 
-def test_an_evaluation_disables_downstream_modifiers_and_restores_them(rig, elbow):
+def test_an_evaluation_disables_downstream_modifiers_and_restores_them(rig, elbow_files):
     settings = EvaluationSettings(poses=3, range_scales=())
-    errors = drain(evaluate(rig, elbow.model, settings)).fdda
+    errors = drain(evaluate(rig, elbow_files.model, settings)).fdda
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     before = scene_state(rig)
-    assert drain(evaluate(rig, elbow.model, settings)).fdda == errors
+    assert drain(evaluate(rig, elbow_files.model, settings)).fdda == errors
     assert_same_state(before, scene_state(rig))
 
 
-def test_frame_times_include_downstream_modifiers(rig, elbow, monkeypatch):
+def test_frame_times_include_downstream_modifiers(rig, elbow_files, monkeypatch):
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     before = scene_state(rig)
     seen, time_frames = [], benchmark.time_frames
@@ -105,7 +105,7 @@ def test_frame_times_include_downstream_modifiers(rig, elbow, monkeypatch):
 
     monkeypatch.setattr(benchmark, "time_frames", watch)
     monkeypatch.setattr(rig_cost, "time_frames", watch)
-    drain(benchmark.benchmark(rig, elbow.model, 5))
+    drain(benchmark.benchmark(rig, elbow_files.model, 5))
     drain(rig_cost.measure(rig))
     true, linear, model = ([*own, "Subdivision"] for own in (["Armature", "CorrectiveSmooth"], ["Armature"], ["FDDA"]))
     rounds = benchmark.ROUNDS
@@ -232,7 +232,7 @@ def test_a_simulation_after_the_rig_uses_the_output_of_the_model(loose_model):
     rig.mesh_object.modifiers["It"].show_viewport = True
     for frame in range(1, 5):
         bpy.context.scene.frame_set(frame)
-    falling = evaluated(rig.mesh_object)
+    falling = evaluated_positions(rig.mesh_object)
     rig.mesh_object.modifiers["It"].show_viewport = False
     moved = falling - assert_plays(rig.mesh_object, loose_model)
     assert len(falling) == len(rig.mesh_object.data.vertices) and -0.2 < moved[:, 2].mean() < -0.001

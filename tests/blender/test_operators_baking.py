@@ -8,31 +8,31 @@ import pytest
 from fdda_addon.scene.scene_rig import find_rig
 
 from .baked_files import POSITION_TOLERANCE, predicted_wave, read_pc2, shown_without_add_on
-from .conftest import ELBOW, assert_plays, evaluated, pose
+from .conftest import ELBOW, assert_plays, evaluated_positions, pose
 from .refusals import file_contents
 from .scene_state import assert_same_state, scene_state
 from .test_operators_playback import refused
 
 
 @pytest.fixture(scope="module")
-def wave(elbow) -> np.ndarray:
-    return predicted_wave(elbow)
+def wave(elbow_files) -> np.ndarray:
+    return predicted_wave(elbow_files)
 
 
 class TestOperator:
     @pytest.fixture
-    def active(self, bound):
-        bpy.context.view_layer.objects.active = bound
-        return bound
+    def active(self, bound_elbow):
+        bpy.context.view_layer.objects.active = bound_elbow
+        return bound_elbow
 
     @pytest.mark.parametrize("action", ["elbow_wave", ""])
-    def test_the_bound_model_is_baked_and_stays_bound(self, active, elbow, wave, tmp_path, action):
+    def test_the_bound_model_is_baked_and_stays_bound(self, active, elbow_files, wave, tmp_path, action):
         before = scene_state(find_rig())
         out = tmp_path / "a.blend"
         assert bpy.ops.fdda.bake(filepath=str(out), action=action) == {"FINISHED"}
         assert_same_state(before, scene_state(find_rig()))
         pose(angle=0.7)
-        assert_plays(bpy.data.objects[ELBOW], elbow.model)
+        assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
         assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - wave).max() < 1e-6
         shown = shown_without_add_on(tmp_path, (out, [12.0]))
         assert np.abs(shown[out, 12.0] - wave[11]).max() < POSITION_TOLERANCE
@@ -58,12 +58,12 @@ class TestOperator:
         active.fdda.strength, active.fdda.mode = strength, mode
         assert bpy.ops.fdda.bake(filepath=str(tmp_path / "a.pc2")) == {"FINISHED"}
         bpy.context.scene.frame_set(12)
-        shown = evaluated(active)
+        shown = evaluated_positions(active)
         baked = read_pc2(tmp_path / "a.pc2")[2][12 - bpy.context.scene.frame_start]
         assert np.abs(baked - shown).max() < 1e-5
         active.fdda.strength, active.fdda.mode = 1.0, "FDDA"
         bpy.context.view_layer.update()
-        assert np.abs(baked - evaluated(active)).max() > 1e-4, "the pose tells the two apart"
+        assert np.abs(baked - evaluated_positions(active)).max() > 1e-4, "the pose tells the two apart"
 
     def test_an_animated_strength_is_baked_frame_by_frame(self, active, tmp_path):
         for frame, strength in ((1, 0.0), (20, 1.0)):
@@ -73,7 +73,7 @@ class TestOperator:
         baked = read_pc2(tmp_path / "a.pc2")[2]
         for frame in (1, 9, 20):
             bpy.context.scene.frame_set(frame)
-            assert np.abs(baked[frame - bpy.context.scene.frame_start] - evaluated(active)).max() < 1e-5
+            assert np.abs(baked[frame - bpy.context.scene.frame_start] - evaluated_positions(active)).max() < 1e-5
 
 
 def test_no_operator_reuses_the_path_or_object_of_its_last_call():

@@ -21,9 +21,9 @@ from .test_operators_playback import refused
 
 
 @pytest.fixture
-def active(bound):
-    bpy.context.view_layer.objects.active = bound
-    return bound
+def active(bound_elbow):
+    bpy.context.view_layer.objects.active = bound_elbow
+    return bound_elbow
 
 
 @pytest.fixture
@@ -41,12 +41,12 @@ def evaluated_action(active):
     heat_map.clear_all()
 
 
-def test_the_active_action_is_evaluated(active, elbow):
+def test_the_active_action_is_evaluated(active, elbow_files):
     before = scene_state(find_rig())
     assert bpy.ops.fdda.evaluate() == {"FINISHED"}
     assert_same_state(before, scene_state(find_rig()))
     with model_disabled(active):
-        expected = drain(evaluate_action(find_rig(), elbow.model, "elbow_wave"))
+        expected = drain(evaluate_action(find_rig(), elbow_files.model, "elbow_wave"))
     last = last_evaluation.get(active)
     np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
     assert last.total["linear"].max == pytest.approx(error_statistics(expected.held_out.linear).max, rel=1e-3)
@@ -56,10 +56,10 @@ def test_the_active_action_is_evaluated(active, elbow):
     assert last.partitions[0].fdda.max == pytest.approx(last.total["fdda"].max)
 
 
-def test_random_poses_are_evaluated(active, elbow):
+def test_random_poses_are_evaluated(active, elbow_files):
     assert bpy.ops.fdda.evaluate(source="RANDOM", poses=7, seed=4) == {"FINISHED"}
     with model_disabled(active):
-        expected = drain(evaluate(find_rig(), elbow.model, EvaluationSettings(7, 4)))
+        expected = drain(evaluate(find_rig(), elbow_files.model, EvaluationSettings(7, 4)))
     last = last_evaluation.get(active)
     np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
     assert not last.name and last.seed == 4
@@ -198,8 +198,8 @@ def active_model(mesh_object):
     return model_path(mesh_object)
 
 
-def test_a_missing_report_is_refused_with_its_path(active, elbow, monkeypatch):
-    report = elbow.model.with_name("report.html")
+def test_a_missing_report_is_refused_with_its_path(active, elbow_files, monkeypatch):
+    report = elbow_files.model.with_name("report.html")
     assert report.is_file()
     report.rename(report.with_suffix(".away"))
     try:

@@ -18,15 +18,15 @@ from .test_operators_playback import refused
 
 
 @pytest.fixture
-def second(elbow, tmp_path):
+def second(elbow_files, tmp_path):
     """A copy of the elbow's model with another name, outside the folder of the .blend file."""
-    return Path(shutil.copy(elbow.model, tmp_path / "second.onnx"))
+    return Path(shutil.copy(elbow_files.model, tmp_path / "second.onnx"))
 
 
-def test_switching_between_models(rig, elbow, second):
-    bpy.ops.fdda.add_model(filepath=str(elbow.model))
+def test_switching_between_models(rig, elbow_files, second):
+    bpy.ops.fdda.add_model(filepath=str(elbow_files.model))
     bpy.ops.fdda.add_model(filepath=str(second))
-    bpy.ops.fdda.add_model(filepath=str(elbow.model))
+    bpy.ops.fdda.add_model(filepath=str(elbow_files.model))
     fdda = rig.mesh_object.fdda
     assert [entry.name for entry in fdda.models] == ["elbow", "second"] and fdda.model_index == 0
     for index, name in ((1, "second"), (0, "elbow"), (1, "second")):
@@ -35,33 +35,33 @@ def test_switching_between_models(rig, elbow, second):
         bpy.ops.fdda.bind()
         assert bound_entry(rig.mesh_object).name == name and fdda.use_in_render
         pose(angle=0.5 + index)
-        assert_plays(rig.mesh_object, elbow.model)
+        assert_plays(rig.mesh_object, elbow_files.model)
     assert sum(m.type == "NODES" for m in rig.mesh_object.modifiers) == 1
 
 
-def test_removing_a_model_unbinds_it(rig, elbow, second):
+def test_removing_a_model_unbinds_it(rig, elbow_files, second):
     bpy.ops.fdda.add_model(filepath=str(second))
-    bpy.ops.fdda.bind(filepath=str(elbow.model))
+    bpy.ops.fdda.bind(filepath=str(elbow_files.model))
     fdda = rig.mesh_object.fdda
     bpy.ops.fdda.remove_model(index=0)
     assert fdda.is_bound and [entry.name for entry in fdda.models] == ["elbow"]
     bpy.ops.fdda.remove_model()
-    assert not fdda.is_bound and not fdda.models and elbow.model.is_file()
+    assert not fdda.is_bound and not fdda.models and elbow_files.model.is_file()
     refused(bpy.ops.fdda.remove_model, "The model library is empty")
 
 
-def test_the_model_list_is_saved_with_the_file(bound, elbow):
-    assert [(entry.name, entry.path) for entry in bound.fdda.models] == [("elbow", "//elbow.onnx")]
+def test_the_model_list_is_saved_with_the_file(bound_elbow, elbow_files):
+    assert [(entry.name, entry.path) for entry in bound_elbow.fdda.models] == [("elbow", "//elbow.onnx")]
 
 
-def test_a_model_of_another_rig_is_not_added(rig, elbow):
+def test_a_model_of_another_rig_is_not_added(rig, elbow_files):
     rig.armature_object.data.bones["lower"].name = "forearm"
-    refused(lambda: bpy.ops.fdda.add_model(filepath=str(elbow.model)), "it does not know the joint 'forearm'")
+    refused(lambda: bpy.ops.fdda.add_model(filepath=str(elbow_files.model)), "it does not know the joint 'forearm'")
     assert not rig.mesh_object.fdda.models
 
 
-def test_an_index_outside_the_list_is_refused(bound):
-    bpy.context.view_layer.objects.active = bound
+def test_an_index_outside_the_list_is_refused(bound_elbow):
+    bpy.context.view_layer.objects.active = bound_elbow
     refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 models and none with index 3")
 
 
@@ -92,59 +92,59 @@ def rename_bone() -> None:
         (rename_bone, "lacks the joint 'lower'"),
     ],
 )
-def test_the_check_of_an_outdated_model_names_the_change(bound, change, words):
-    bpy.context.view_layer.objects.active = bound
+def test_the_check_of_an_outdated_model_names_the_change(bound_elbow, change, words):
+    bpy.context.view_layer.objects.active = bound_elbow
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
-    bound.fdda.mode = "RIG"
+    bound_elbow.fdda.mode = "RIG"
     change()
     refused(
         bpy.ops.fdda.check_model, "elbow was trained for an earlier state of this rig", words, "record and train again"
     )
 
 
-def test_a_changed_range_of_motion_is_reported_and_does_not_prevent_playback(bound, elbow):
+def test_a_changed_range_of_motion_is_reported_and_does_not_prevent_playback(bound_elbow, elbow_files):
     from fdda_addon.models.changes import find_changes
     from fdda_addon.scene.scene_rig import find_rig
 
-    bpy.context.view_layer.objects.active = bound
-    assert not find_changes(find_rig(), bound.fdda.models[0]).sentence
+    bpy.context.view_layer.objects.active = bound_elbow
+    assert not find_changes(find_rig(), bound_elbow.fdda.models[0]).sentence
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
-    found = find_changes(find_rig(), bound.fdda.models[0])
+    found = find_changes(find_rig(), bound_elbow.fdda.models[0])
     assert found.bones_with_changed_range == ("lower",) and not found.prevents_playback
     assert "The range of motion of 'lower' has changed since elbow was trained" in found.sentence
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
     pose(angle=0.1)
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_a_listed_model_outside_the_folder_of_the_file_is_refused(bound, elbow, second):
-    bpy.context.view_layer.objects.active = bound
-    entry = bound.fdda.models.add()
+def test_a_listed_model_outside_the_folder_of_the_file_is_refused(bound_elbow, elbow_files, second):
+    bpy.context.view_layer.objects.active = bound_elbow
+    entry = bound_elbow.fdda.models.add()
     entry.name, entry.path = "second", str(second)
-    bound.fdda.model_index = 1
+    bound_elbow.fdda.model_index = 1
     refused(bpy.ops.fdda.bind, "lies outside the folder of 'bound.blend'")
     refused(bpy.ops.fdda.pack_model, "lies outside the folder")
     refused(bpy.ops.fdda.check_model, "lies outside the folder")
-    assert bound_entry(bound).name == "elbow"
+    assert bound_entry(bound_elbow).name == "elbow"
     bpy.ops.fdda.bind(filepath=str(second))
-    assert bound_entry(bound).name == "second" and len(bound.fdda.models) == 2
+    assert bound_entry(bound_elbow).name == "second" and len(bound_elbow.fdda.models) == 2
 
 
-def test_a_model_file_that_is_replaced_is_reloaded(bound, elbow, second, tmp_path):
+def test_a_model_file_that_is_replaced_is_reloaded(bound_elbow, elbow_files, second, tmp_path):
     """Training again replaces the file of a bound model."""
     import onnx
 
     from fdda_addon.evaluation import last_evaluation
     from fdda_addon.models import model_list
 
-    bpy.context.view_layer.objects.active = bound
+    bpy.context.view_layer.objects.active = bound_elbow
     path = tmp_path / "second.onnx"
     bpy.ops.fdda.bind(filepath=str(path))
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
     bpy.ops.fdda.measure_model(frames=5)
-    assert frame_times.get(bound) is not None
+    assert frame_times.get(bound_elbow) is not None
     pose(angle=1.3)
-    before = assert_plays(bound, path)
+    before = assert_plays(bound_elbow, path)
 
     def double(proto: onnx.ModelProto) -> None:
         node = next(node for node in proto.graph.node if "positions" in node.output)
@@ -152,28 +152,28 @@ def test_a_model_file_that_is_replaced_is_reloaded(bound, elbow, second, tmp_pat
         proto.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
 
     write_edited(path, path, double)
-    model_list.add_model(bound, path)
+    model_list.add_model(bound_elbow, path)
     bpy.context.view_layer.update()
-    after = assert_plays(bound, path)
+    after = assert_plays(bound_elbow, path)
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
-    assert last_evaluation.get(bound) is None and frame_times.get(bound) is None
-    assert len(bound.fdda.models) == 2
+    assert last_evaluation.get(bound_elbow) is None and frame_times.get(bound_elbow) is None
+    assert len(bound_elbow.fdda.models) == 2
 
 
-def test_the_section_describes_the_problems_of_models(bound, elbow):
+def test_the_section_describes_the_problems_of_models(bound_elbow, elbow_files):
     from fdda_addon.panels import checks
     from fdda_addon.panels import models as section
     from fdda_addon.scene.scene_rig import find_rig
 
-    bpy.context.view_layer.objects.active = bound
+    bpy.context.view_layer.objects.active = bound_elbow
     checks.check_now(find_rig())
-    assert section._problem_values.compute_now(bound) == {}
+    assert section._problem_values.compute_now(bound_elbow) == {}
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
     checks.check_now(find_rig())
-    ((icon, sentence),) = section._problem_values.compute_now(bound).values()
+    ((icon, sentence),) = section._problem_values.compute_now(bound_elbow).values()
     assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
-    bound.fdda.models[0].path = "//away.onnx"
-    ((icon, sentence),) = section._problem_values.compute_now(bound).values()
+    bound_elbow.fdda.models[0].path = "//away.onnx"
+    ((icon, sentence),) = section._problem_values.compute_now(bound_elbow).values()
     assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 

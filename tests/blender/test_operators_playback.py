@@ -11,7 +11,7 @@ from fdda_addon.runtime import confidence, model_files, playback_modifier
 from fdda_addon.runtime.network import Network
 from fdda_addon.timing import frame_times
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
 
 
 def refused(call, *words: str) -> None:
@@ -26,41 +26,41 @@ def modifiers(mesh_object: bpy.types.Object) -> list[tuple]:
     return [(m.name, m.type, m.show_viewport, m.show_render) for m in mesh_object.modifiers]
 
 
-def test_bind_plays_and_unbind_restores(rig, elbow):
+def test_bind_plays_and_unbind_restores(rig, elbow_files):
     mesh_object = rig.mesh_object
     mesh_object.modifiers["CorrectiveSmooth"].show_render = False
     before, datablocks = modifiers(mesh_object), len(bpy.data.objects)
-    assert bpy.ops.fdda.bind(filepath=str(elbow.model)) == {"FINISHED"}
+    assert bpy.ops.fdda.bind(filepath=str(elbow_files.model)) == {"FINISHED"}
     pose(angle=1.0)
-    assert_plays(mesh_object, elbow.model)
+    assert_plays(mesh_object, elbow_files.model)
     assert [(entry.name, entry.path) for entry in mesh_object.fdda.models] == [("elbow", "//elbow.onnx")]
     assert bpy.ops.fdda.unbind() == {"FINISHED"}
     assert modifiers(mesh_object) == before and len(bpy.data.objects) == datablocks
     assert len(mesh_object.fdda.models) == 1
 
 
-def test_bind_uses_the_model_that_is_active_in_the_list(rig, elbow):
+def test_bind_uses_the_model_that_is_active_in_the_list(rig, elbow_files):
     refused(bpy.ops.fdda.bind, "'elbow' has no model yet; train one, or choose a file.")
-    bpy.ops.fdda.add_model(filepath=str(elbow.model))
+    bpy.ops.fdda.add_model(filepath=str(elbow_files.model))
     assert bpy.ops.fdda.bind() == {"FINISHED"}
     pose(angle=0.7)
-    assert_plays(rig.mesh_object, elbow.model)
+    assert_plays(rig.mesh_object, elbow_files.model)
 
 
-def test_bind_by_the_name_of_an_object_with_nothing_active(rig, elbow):
+def test_bind_by_the_name_of_an_object_with_nothing_active(rig, elbow_files):
     bpy.context.view_layer.objects.active = None
-    assert bpy.ops.fdda.bind(object=ELBOW, filepath=str(elbow.model)) == {"FINISHED"}
+    assert bpy.ops.fdda.bind(object=ELBOW, filepath=str(elbow_files.model)) == {"FINISHED"}
     assert rig.mesh_object.fdda.is_bound
     refused(lambda: bpy.ops.fdda.unbind(object="other"), "no mesh object 'other'")
 
 
-def test_bind_with_the_armature_active(rig, elbow):
+def test_bind_with_the_armature_active(rig, elbow_files):
     bpy.context.view_layer.objects.active = rig.armature_object
-    bpy.ops.fdda.bind(filepath=str(elbow.model))
+    bpy.ops.fdda.bind(filepath=str(elbow_files.model))
     assert rig.mesh_object.fdda.is_bound
 
 
-def test_a_file_that_is_not_a_model_is_not_listed(rig, elbow, tmp_path):
+def test_a_file_that_is_not_a_model_is_not_listed(rig, elbow_files, tmp_path):
     path = tmp_path / "text.onnx"
     path.write_text("no model")
     refused(lambda: bpy.ops.fdda.bind(filepath=str(path)), "is not a model")
@@ -68,74 +68,78 @@ def test_a_file_that_is_not_a_model_is_not_listed(rig, elbow, tmp_path):
     assert not rig.mesh_object.fdda.models and not rig.mesh_object.fdda.is_bound
 
 
-def test_a_refused_model_does_not_unbind_the_bound_model(bound, elbow):
-    bpy.context.view_layer.objects.active = bound
-    bound.data.vertices[0].co.x += 0.1
-    refused(lambda: bpy.ops.fdda.bind(filepath=str(elbow.model)), "the rest pose of the mesh differs")
+def test_a_refused_model_does_not_unbind_the_bound_model(bound_elbow, elbow_files):
+    bpy.context.view_layer.objects.active = bound_elbow
+    bound_elbow.data.vertices[0].co.x += 0.1
+    refused(lambda: bpy.ops.fdda.bind(filepath=str(elbow_files.model)), "the rest pose of the mesh differs")
     # The bound model does not match the changed mesh either. It stays bound, and the rig is shown.
-    assert bound.fdda.is_bound and bound.fdda.mode == "RIG" and "the rest pose of the mesh" in bound.fdda.status
+    assert (
+        bound_elbow.fdda.is_bound
+        and bound_elbow.fdda.mode == "RIG"
+        and "the rest pose of the mesh" in bound_elbow.fdda.status
+    )
 
 
-def test_bind_and_unbind_can_be_undone(rig, elbow):
+def test_bind_and_unbind_can_be_undone(rig, elbow_files):
     before = modifiers(rig.mesh_object)
     bpy.ops.ed.undo_push(message="start")
-    bpy.ops.fdda.bind(filepath=str(elbow.model))
+    bpy.ops.fdda.bind(filepath=str(elbow_files.model))
     bpy.ops.ed.undo_push(message="bound")
     bpy.ops.fdda.unbind()
     bpy.ops.ed.undo_push(message="unbound")
     bpy.ops.ed.undo()
     pose(angle=1.2)
-    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
     bpy.ops.ed.undo()
     assert modifiers(bpy.data.objects[ELBOW]) == before
 
 
-def test_disabled_operators_say_why(elbow):
+def test_disabled_operators_say_why(elbow_files):
     refused(bpy.ops.fdda.unbind, "Nothing with a rig is active")
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
     for name in ("unbind", "set_mode", "measure_model", "relink", "evaluate", "open_report"):
         refused(getattr(bpy.ops.fdda, name), "No model is bound; bind one first")
 
 
-def test_set_mode_changes_and_toggles_the_mode(bound, elbow):
-    bpy.context.view_layer.objects.active = bound
+def test_set_mode_changes_and_toggles_the_mode(bound_elbow, elbow_files):
+    bpy.context.view_layer.objects.active = bound_elbow
     pose(angle=1.3)
-    playing = assert_plays(bound, elbow.model)
+    playing = assert_plays(bound_elbow, elbow_files.model)
     for mode in ("RIG", "LINEAR"):
         assert bpy.ops.fdda.set_mode(mode=mode) == {"FINISHED"}
-        assert bound.fdda.mode == mode
-        assert np.abs(evaluated(bound) - playing).max() > 5e-5
+        assert bound_elbow.fdda.mode == mode
+        assert np.abs(evaluated_positions(bound_elbow) - playing).max() > 5e-5
     bpy.ops.fdda.set_mode(mode="RIG")
     bpy.ops.fdda.set_mode()
-    assert bound.fdda.mode == "FDDA"
+    assert bound_elbow.fdda.mode == "FDDA"
     bpy.ops.fdda.set_mode()
-    assert bound.fdda.mode == "RIG"
+    assert bound_elbow.fdda.mode == "RIG"
 
 
-def test_set_mode_says_why_a_model_cannot_play(bound):
-    bpy.context.view_layer.objects.active = bound
+def test_set_mode_says_why_a_model_cannot_play(bound_elbow):
+    bpy.context.view_layer.objects.active = bound_elbow
     bpy.ops.fdda.set_mode(mode="RIG")
-    bound.modifiers.remove(playback_modifier.find_modifier(bound))
+    bound_elbow.modifiers.remove(playback_modifier.find_modifier(bound_elbow))
     refused(lambda: bpy.ops.fdda.set_mode(mode="FDDA"), "was removed; bind the model again")
 
 
-def test_measuring_stores_frame_times_and_restores_the_mode(bound):
-    bpy.context.view_layer.objects.active = bound
-    bound.fdda.mode = "LINEAR"
-    assert frame_times.get(bound) is None
+def test_measuring_stores_frame_times_and_restores_the_mode(bound_elbow):
+    bpy.context.view_layer.objects.active = bound_elbow
+    bound_elbow.fdda.mode = "LINEAR"
+    assert frame_times.get(bound_elbow) is None
     assert bpy.ops.fdda.measure_model(frames=5) == {"FINISHED"}
-    times = frame_times.get(bound)
+    times = frame_times.get(bound_elbow)
     assert min(times.rig, times.linear, times.fdda, times.floor, times.inference) > 0
-    assert times.constant_bytes == model_files.network_of(bound).info.constant_bytes > 0
+    assert times.constant_bytes == model_files.network_of(bound_elbow).info.constant_bytes > 0
     is_faster = times.rig > times.fdda
     assert ("x faster than the rig" if is_faster else "Not worth it here") in times.sentence
-    assert bound.fdda.mode == "LINEAR" and bound.fdda.is_bound and bound.fdda.model == "//elbow.onnx"
+    assert bound_elbow.fdda.mode == "LINEAR" and bound_elbow.fdda.is_bound and bound_elbow.fdda.model == "//elbow.onnx"
     bpy.ops.fdda.unbind()
-    assert frame_times.get(bound) is None
+    assert frame_times.get(bound_elbow) is None
 
 
-def test_relink_finds_a_model_that_was_moved(elbow, tmp_path):
-    for path in (elbow.bound, elbow.model):
+def test_relink_finds_a_model_that_was_moved(elbow_files, tmp_path):
+    for path in (elbow_files.bound, elbow_files.model):
         shutil.copy(path, tmp_path)
     (tmp_path / "elbow.onnx").rename(tmp_path / "moved.onnx")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "bound.blend"))
@@ -151,29 +155,29 @@ def test_relink_finds_a_model_that_was_moved(elbow, tmp_path):
     assert_plays(mesh_object, tmp_path / "moved.onnx")
 
 
-def test_confidence_is_the_model_s_and_computed_once_per_pose(bound, elbow, monkeypatch):
+def test_confidence_is_the_model_s_and_computed_once_per_pose(bound_elbow, elbow_files, monkeypatch):
     pose(angle=0.3)
-    inside = confidence.partition_confidence(bound)
+    inside = confidence.partition_confidence(bound_elbow)
     assert sorted(name for name, _ in inside) == ["lower", "upper"]
     assert all(value == pytest.approx(1) for _, value in inside)
     bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]
     bone.constraints.remove(bone.constraints[0])
     pose(angle=-2.0)
-    outside = confidence.partition_confidence(bound)
+    outside = confidence.partition_confidence(bound_elbow)
     assert outside[0][1] < 0.99 and outside[0][1] <= outside[-1][1]
-    network = Network(elbow.model)
+    network = Network(elbow_files.model)
     calls = []
     monkeypatch.setattr(
         Network, "confidence", lambda self, *inputs: calls.append(1) or np.ones((1, len(network.info.partitions)))
     )
-    assert confidence.partition_confidence(bound) == outside and not calls
+    assert confidence.partition_confidence(bound_elbow) == outside and not calls
     pose(angle=2.0)
-    confidence.partition_confidence(bound)
-    assert confidence.partition_confidence(bound) and len(calls) == 1
+    confidence.partition_confidence(bound_elbow)
+    assert confidence.partition_confidence(bound_elbow) and len(calls) == 1
 
 
-def test_without_a_joint_or_armature_there_is_no_confidence(bound):
+def test_without_a_joint_or_armature_there_is_no_confidence(bound_elbow):
     bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "forearm"
-    assert confidence.partition_confidence(bound) is None
+    assert confidence.partition_confidence(bound_elbow) is None
     bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
-    assert confidence.partition_confidence(bound) is None
+    assert confidence.partition_confidence(bound_elbow) is None

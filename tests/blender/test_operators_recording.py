@@ -105,11 +105,11 @@ def test_deleting_a_recording_keeps_other_files(saved, tmp_path):
     assert [path.name for path in recorded_folder(tmp_path).iterdir()] == ["notes.txt"]
 
 
-def test_a_bound_character_is_recorded_with_its_rig(bound, elbow, tmp_path):
-    bpy.context.view_layer.objects.active = bound
-    assert bound.fdda.is_playing
-    bound.fdda.settings.poses = 5
+def test_a_bound_character_is_recorded_with_its_rig(bound_elbow, elbow_files, tmp_path):
+    bpy.context.view_layer.objects.active = bound_elbow
+    assert bound_elbow.fdda.is_playing
+    bound_elbow.fdda.settings.poses = 5
     assert bpy.ops.fdda.record(folder=str(tmp_path / "r")) == {"FINISHED"}
-    first, again = (read_recording(path).residuals[:5] for path in (elbow.recording, tmp_path / "r"))
+    first, again = (read_recording(path).residuals[:5] for path in (elbow_files.recording, tmp_path / "r"))
     np.testing.assert_allclose(again, first, atol=1e-6)
-    assert bound.fdda.is_playing
+    assert bound_elbow.fdda.is_playing

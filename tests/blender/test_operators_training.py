@@ -21,15 +21,15 @@ def recorded_folder(tmp_path: Path) -> Path:
     return tmp_path / "elbow_recording"
 
 
-def train(rig: SceneRig, elbow, **options) -> set[str]:
+def train(rig: SceneRig, elbow_files, **options) -> set[str]:
     settings = rig.mesh_object.fdda.settings
     settings.epochs, settings.tolerance_mm, settings.training_seed = 6, 0.2, 3
-    return bpy.ops.fdda.train(recording=str(elbow.recording), **options)
+    return bpy.ops.fdda.train(recording=str(elbow_files.recording), **options)
 
 
-def test_a_model_is_trained_with_the_settings_and_learning_curves_are_stored(saved, elbow, tmp_path):
+def test_a_model_is_trained_with_the_settings_and_learning_curves_are_stored(saved, elbow_files, tmp_path):
     saved.mesh_object.fdda.settings.model = "//models/a.onnx"
-    assert train(saved, elbow) == {"FINISHED"}
+    assert train(saved, elbow_files) == {"FINISHED"}
     model = tmp_path / "models" / "a.onnx"
     training = read_model_info(model).training
     assert (training["epochs"], training["tolerance_mm"], training["seed"]) == (6, 0.2, 3)
@@ -39,7 +39,7 @@ def test_a_model_is_trained_with_the_settings_and_learning_curves_are_stored(sav
     assert state.curves["validation"][-1] < state.curves["validation"][0]
 
 
-def test_a_canceled_training_writes_no_model(saved, elbow, tmp_path, monkeypatch):
+def test_a_canceled_training_writes_no_model(saved, elbow_files, tmp_path, monkeypatch):
     show = job.JobState.show
 
     def cancel(state, progress):
@@ -49,13 +49,13 @@ def test_a_canceled_training_writes_no_model(saved, elbow, tmp_path, monkeypatch
 
     monkeypatch.setattr(job.JobState, "show", cancel)
     saved.mesh_object.fdda.settings.epochs = 10_000
-    options = {"recording": str(elbow.recording), "model": str(tmp_path / "m.onnx")}
+    options = {"recording": str(elbow_files.recording), "model": str(tmp_path / "m.onnx")}
     assert bpy.ops.fdda.train(**options) == {"CANCELLED"}
     assert job.state_of("train").outcome == "Training canceled; no model was written."
     assert not (tmp_path / "m.onnx").exists()
 
 
-def test_refining_adds_poses_and_training_continues_from_the_checkpoint(saved, elbow, tmp_path):
+def test_refining_adds_poses_and_training_continues_from_the_checkpoint(saved, elbow_files, tmp_path):
     settings = saved.mesh_object.fdda.settings
     settings.poses, settings.epochs, settings.use_goal, settings.goal_mm = 20, 2, True, 0.001
     assert bpy.ops.fdda.record() == {"FINISHED"}
@@ -96,8 +96,8 @@ def test_a_missing_or_incomplete_recording_is_refused(saved, tmp_path):
         bpy.ops.fdda.train()
 
 
-def test_a_missing_python_of_the_trainer_is_refused(saved, elbow, tmp_path, monkeypatch):
+def test_a_missing_python_of_the_trainer_is_refused(saved, elbow_files, tmp_path, monkeypatch):
     monkeypatch.setenv("FDDA_TRAINER_PYTHON", "/none/python")
     with pytest.raises(RuntimeError, match="The trainer's Python '/none/python' cannot be started"):
-        train(saved, elbow)
+        train(saved, elbow_files)
     assert job.current() is None

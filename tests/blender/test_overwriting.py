@@ -21,11 +21,11 @@ IS_OTHER = "another file is there, which is not {}; give another name, or --over
 
 
 @pytest.fixture
-def place(elbow, tmp_path):
+def place(elbow_files, tmp_path):
     """A folder with the elbow's rig, recording and model, and a note of the user's."""
-    shutil.copy(elbow.rig, tmp_path / "rig.blend")
-    shutil.copy(elbow.model, tmp_path / "m.onnx")
-    shutil.copytree(elbow.recording, tmp_path / "recording")
+    shutil.copy(elbow_files.rig, tmp_path / "rig.blend")
+    shutil.copy(elbow_files.model, tmp_path / "m.onnx")
+    shutil.copytree(elbow_files.recording, tmp_path / "recording")
     (tmp_path / "notes.txt").write_text("months of work\n")
     if not systems.WINDOWS:
         (tmp_path / "link.blend").symlink_to(tmp_path / "rig.blend")

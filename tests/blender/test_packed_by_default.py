@@ -17,11 +17,11 @@ from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose, run
 
 
 @pytest.fixture
-def model(elbow, tmp_path):
+def model(elbow_files, tmp_path):
     """The elbow's model in another folder than the .blend file."""
     folder = tmp_path / "models"
     folder.mkdir()
-    return shutil.copy(elbow.model, folder / "elbow.onnx")
+    return shutil.copy(elbow_files.model, folder / "elbow.onnx")
 
 
 def save_elsewhere(tmp_path):
@@ -34,22 +34,22 @@ def save_elsewhere(tmp_path):
     return bpy.data.objects[ELBOW]
 
 
-def test_a_bound_model_is_saved_with_save_as(rig, elbow, model, tmp_path):
+def test_a_bound_model_is_saved_with_save_as(rig, elbow_files, model, tmp_path):
     bpy.ops.fdda.bind(filepath=str(model))
     assert rig.mesh_object.fdda.packed is not None
     mesh_object = save_elsewhere(tmp_path)
     pose(angle=1.1)
-    assert_plays(mesh_object, elbow.model)
+    assert_plays(mesh_object, elbow_files.model)
 
 
-def test_a_relinked_model_is_packed(bound, elbow, model, tmp_path):
+def test_a_relinked_model_is_packed(bound_elbow, elbow_files, model, tmp_path):
     bpy.ops.fdda.relink(object=ELBOW, filepath=str(model))
-    assert bound.fdda.packed is not None
+    assert bound_elbow.fdda.packed is not None
     pose(angle=0.8)
-    assert_plays(save_elsewhere(tmp_path), elbow.model)
+    assert_plays(save_elsewhere(tmp_path), elbow_files.model)
 
 
-def test_a_bound_model_is_appended_with_its_object(rig, elbow, model, tmp_path):
+def test_a_bound_model_is_appended_with_its_object(rig, elbow_files, model, tmp_path):
     bpy.ops.fdda.bind(filepath=str(model))
     path = tmp_path / "library" / "character.blend"
     path.parent.mkdir()
@@ -62,7 +62,7 @@ def test_a_bound_model_is_appended_with_its_object(rig, elbow, model, tmp_path):
     for appended in wanted.objects:
         bpy.context.scene.collection.objects.link(appended)
     pose(angle=1.2)
-    assert_plays(wanted.objects[0], elbow.model)
+    assert_plays(wanted.objects[0], elbow_files.model)
     assert set(bpy.context.scene.objects.keys()) - before == {ELBOW, ELBOW_RIG}
 
 
@@ -80,7 +80,7 @@ def test_models_are_not_packed_if_the_preferences_say_so(rig, model, monkeypatch
     assert rig.mesh_object.fdda.packed is None and not bpy.data.texts
 
 
-def test_a_packed_model_that_is_trained_again_is_packed_again(rig, elbow, model):
+def test_a_packed_model_that_is_trained_again_is_packed_again(rig, elbow_files, model):
     from fdda_addon.models.model_list import add_model
 
     bpy.ops.fdda.bind(filepath=str(model))
@@ -95,34 +95,34 @@ def test_a_packed_model_that_is_trained_again_is_packed_again(rig, elbow, model)
     assert len(rig.mesh_object.fdda.models) == 1 and len(bpy.data.texts) == 1
 
 
-def test_models_are_loaded_from_trusted_folders_only(bound, elbow, model, tmp_path, monkeypatch):
-    bound.fdda.model = bound.fdda.models[0].path = str(model)
+def test_models_are_loaded_from_trusted_folders_only(bound_elbow, elbow_files, model, tmp_path, monkeypatch):
+    bound_elbow.fdda.model = bound_elbow.fdda.models[0].path = str(model)
     model_files._chosen_paths.clear()
     with pytest.raises(ModelError, match="or add its folder in the preferences"):
-        model_files.model_path(bound)
+        model_files.model_path(bound_elbow)
     monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [(tmp_path / "other").resolve()])
     with pytest.raises(ModelError, match="is not followed"):
-        model_files.model_path(bound)
+        model_files.model_path(bound_elbow)
     monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [tmp_path.resolve()])
-    assert model_files.model_path(bound) == model_files.Path(model)
+    assert model_files.model_path(bound_elbow) == model_files.Path(model)
 
 
 @systems.symbolic_links
-def test_a_link_out_of_the_folder_of_the_file_is_not_followed(bound, elbow, model, tmp_path):
+def test_a_link_out_of_the_folder_of_the_file_is_not_followed(bound_elbow, elbow_files, model, tmp_path):
     (tmp_path / "shots").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shots" / "shot.blend"))
     (tmp_path / "shots" / "way_out.onnx").symlink_to(model)
     model_files._chosen_paths.clear()
-    bound.fdda.model = "//way_out.onnx"
+    bound_elbow.fdda.model = "//way_out.onnx"
     with pytest.raises(ModelError, match="lies outside the folder of"):
-        model_files.model_path(bound)
+        model_files.model_path(bound_elbow)
 
 
 @systems.symbolic_links
-def test_a_link_out_of_a_trusted_folder_is_not_followed(elbow, tmp_path, monkeypatch):
+def test_a_link_out_of_a_trusted_folder_is_not_followed(elbow_files, tmp_path, monkeypatch):
     trusted = tmp_path / "trusted"
     trusted.mkdir()
-    (trusted / "way_out.onnx").symlink_to(elbow.model)
+    (trusted / "way_out.onnx").symlink_to(elbow_files.model)
     monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [trusted.resolve()])
     assert not folder_trust.is_trusted(trusted / "way_out.onnx")
     assert not folder_trust.is_trusted(trusted / ".." / "m.onnx") and folder_trust.is_trusted(trusted / "m.onnx")
@@ -145,13 +145,13 @@ def named_paths(mesh_object):
     return [binding.model, binding.models[0].path, binding.settings.recording, binding.settings.model]
 
 
-def test_a_model_outside_is_found_after_save_as(followed, elbow, tmp_path):
+def test_a_model_outside_is_found_after_save_as(followed, elbow_files, tmp_path):
     assert named_paths(followed) == ["//models/elbow.onnx"] * 2 + ["//poses/elbow", "//models/trained.onnx"]
     mesh_object = save_elsewhere(tmp_path)
     there = ["//../models/elbow.onnx"] * 2 + ["//../poses/elbow", "//../models/trained.onnx"]
     assert named_paths(mesh_object) == there
     pose(angle=1.1)
-    assert_plays(mesh_object, elbow.model)
+    assert_plays(mesh_object, elbow_files.model)
 
 
 def test_paths_that_blender_on_windows_has_stored_are_followed(followed, tmp_path):
@@ -164,21 +164,21 @@ def test_paths_that_blender_on_windows_has_stored_are_followed(followed, tmp_pat
     assert named_paths(save_elsewhere(tmp_path)) == there
 
 
-def test_a_saved_copy_and_the_open_file_both_find_the_model(followed, elbow, tmp_path):
+def test_a_saved_copy_and_the_open_file_both_find_the_model(followed, elbow_files, tmp_path):
     before, copy = named_paths(followed), tmp_path / "copies" / "copy.blend"
     copy.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True)
     assert named_paths(followed) == before
     pose(angle=0.7)
-    assert_plays(followed, elbow.model)
+    assert_plays(followed, elbow_files.model)
     with pytest.raises(RuntimeError):
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "nowhere" / "shot.blend"))
     assert named_paths(followed) == before
     pose(angle=0.8)
-    assert_plays(followed, elbow.model)
+    assert_plays(followed, elbow_files.model)
     bpy.ops.wm.open_mainfile(filepath=str(copy))
     pose(angle=0.9)
-    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
 
 
 @pytest.mark.parametrize(("folder", "stored"), [(".", "//models/elbow.onnx"), ("elsewhere", None)])
@@ -194,10 +194,10 @@ def test_absolute_paths_stay_absolute_unless_they_are_below_the_file(followed, m
 
 
 @systems.symbolic_links
-def test_a_file_opened_through_a_link_stores_the_model_path_relative(elbow, tmp_path):
+def test_a_file_opened_through_a_link_stores_the_model_path_relative(elbow_files, tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
-    model = shutil.copy(elbow.model, tmp_path / "real" / "elbow.onnx")
-    assert run("bind", elbow.rig, model, tmp_path / "link" / "bound.blend") == 0
+    model = shutil.copy(elbow_files.model, tmp_path / "real" / "elbow.onnx")
+    assert run("bind", elbow_files.rig, model, tmp_path / "link" / "bound.blend") == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "link" / "bound.blend"))
     assert bpy.data.objects[ELBOW].fdda.model == "//elbow.onnx"

@@ -82,10 +82,10 @@ class TestChecks:
         check = checks.check_now(fresh)
         assert check.problems == () and check.rig is not None and check.channels == ()
 
-    def test_a_playing_model_is_no_problem(self, bound):
-        bpy.context.view_layer.objects.active = bound
+    def test_a_playing_model_is_no_problem(self, bound_elbow):
+        bpy.context.view_layer.objects.active = bound_elbow
         rig, sentence = panel_rig(bpy.context)
-        assert bound.fdda.is_playing and sentence == ""
+        assert bound_elbow.fdda.is_playing and sentence == ""
         assert checks.check_now(rig).problems == ()
 
     def test_a_missing_rig_is_a_message_and_not_an_exception(self):
@@ -165,8 +165,8 @@ class TestTraining:
     def test_curves_of_any_values_can_be_drawn(self, values):
         assert np.isfinite(curves.paint({"training": values, "validation": values})).all()
 
-    def test_a_report_is_read_and_a_damaged_one_passed_over(self, elbow, tmp_path):
-        report = _read_report(elbow.model.with_name("report.json"))
+    def test_a_report_is_read_and_a_damaged_one_passed_over(self, elbow_files, tmp_path):
+        report = _read_report(elbow_files.model.with_name("report.json"))
         assert report["model"] == "elbow.onnx" and {p["joint"] for p in report["partitions"]} == {"upper", "lower"}
         for number, text in enumerate(("{", "[]", '{"model": 1, "fdda": {}, "partitions": []}')):
             path = tmp_path / f"{number}.json"
@@ -179,13 +179,13 @@ class TestTraining:
             path.write_text(json.dumps({**report, "warnings": warnings}))
             assert (_read_report(path) is not None) is passed
 
-    def test_its_trainer_ends_with_the_file(self, rig, elbow, tmp_path):
+    def test_its_trainer_ends_with_the_file(self, rig, elbow_files, tmp_path):
         from fdda_addon.training.process import Training
 
         trainings = []
 
         def steps():
-            with Training([str(elbow.recording), str(tmp_path / "m.onnx"), "--epochs", "100000"]) as training:
+            with Training([str(elbow_files.recording), str(tmp_path / "m.onnx"), "--epochs", "100000"]) as training:
                 trainings.append(training)
                 yield from training.messages(wait=False)
 

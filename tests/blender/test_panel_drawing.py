@@ -60,21 +60,21 @@ def test_a_section_of_a_rig_draws_few_fields(rig: SceneRig, name: str):
         ("models", "Matches this rig"),
     ],
 )
-def test_a_section_of_a_bound_model_draws(bound: bpy.types.Object, name: str, text: str):
-    bpy.context.view_layer.objects.active = bound
-    checks.check_now(SceneRig(bound, bpy.data.objects[ELBOW_RIG]))
+def test_a_section_of_a_bound_model_draws(bound_elbow: bpy.types.Object, name: str, text: str):
+    bpy.context.view_layer.objects.active = bound_elbow
+    checks.check_now(SceneRig(bound_elbow, bpy.data.objects[ELBOW_RIG]))
     bpy.ops.fdda.evaluate()
     bpy.ops.fdda.measure_model(frames=5)
     bpy.ops.fdda.color_mesh(colors="ERRORS")
-    playback._confidence_value.compute_now(bound)
-    models._problem_values.compute_now(bound)
+    playback._confidence_value.compute_now(bound_elbow)
+    models._problem_values.compute_now(bound_elbow)
     assert text in texts_of(draw_section(name))
 
 
-def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(bound: bpy.types.Object, capfd):
-    bpy.context.view_layer.objects.active = bound
+def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(bound_elbow: bpy.types.Object, capfd):
+    bpy.context.view_layer.objects.active = bound_elbow
     bpy.ops.fdda.evaluate(source="RANDOM", poses=3)
-    index, error_mm = last_evaluation.get(bound).worst(1)[0]
+    index, error_mm = last_evaluation.get(bound_elbow).worst(1)[0]
     assert f"Pose {index + 1}: {error_mm:.2f} mm" in texts_of(draw_section("evaluation"))
     bpy.ops.fdda.jump_to_worst()
     assert f"Random pose {index + 1}: max error {error_mm:.2f} mm." in capfd.readouterr().out
@@ -97,9 +97,9 @@ def test_a_section_without_a_rig_draws(name: str):
         assert "Add Sample Arm" in texts
 
 
-def test_lists_draw_their_items(bound: bpy.types.Object):
-    bpy.context.view_layer.objects.active = bound
-    control = bound.fdda.settings.controls.add()
+def test_lists_draw_their_items(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    control = bound_elbow.fdda.settings.controls.add()
     control.name, control.has_range = "flex", True
     assert list_items("poses") == [
         "Select upper ±45°  ±45°  ±45°",

@@ -14,7 +14,7 @@ from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.network import Execution
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
-from .conftest import ELBOW, assert_plays, predicted, run, train
+from .conftest import ELBOW, assert_plays, predicted_positions, run, train
 
 ROOT = Path(__file__).resolve().parents[2]
 CROWD = 20
@@ -66,8 +66,8 @@ def animate(crowd: list[bpy.types.Object]) -> None:
             bone.keyframe_insert("rotation_euler", index=0, frame=frame)
 
 
-def test_one_frame_of_a_crowd_is_one_network_call(bound, elbow, calls):
-    crowd = crowd_of(bound, CROWD)
+def test_one_frame_of_a_crowd_is_one_network_call(bound_elbow, elbow_files, calls):
+    crowd = crowd_of(bound_elbow, CROWD)
     animate(crowd)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
@@ -75,34 +75,34 @@ def test_one_frame_of_a_crowd_is_one_network_call(bound, elbow, calls):
     for frame in (4, 9):
         bpy.context.scene.frame_set(frame)
         for mesh_object in crowd:
-            assert_plays(mesh_object, elbow.model)
+            assert_plays(mesh_object, elbow_files.model)
     assert calls.count(CROWD) == 2 and calls.count(1) == len(calls) - 2 == 2 * CROWD, "predicted() makes a call too"
-    assert len({predicted(mesh_object, elbow.model).tobytes() for mesh_object in crowd}) == CROWD
+    assert len({predicted_positions(mesh_object, elbow_files.model).tobytes() for mesh_object in crowd}) == CROWD
 
 
-def test_posing_one_character_of_a_crowd_is_one_network_call(bound, elbow, calls):
-    crowd = crowd_of(bound, CROWD)
+def test_posing_one_character_of_a_crowd_is_one_network_call(bound_elbow, elbow_files, calls):
+    crowd = crowd_of(bound_elbow, CROWD)
     animate(crowd)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
-    still = {mesh_object: assert_plays(mesh_object, elbow.model) for mesh_object in crowd}
+    still = {mesh_object: assert_plays(mesh_object, elbow_files.model) for mesh_object in crowd}
     for angle in (0.2, 0.4):
         calls.clear()
         armature_modifier(crowd[7]).object.pose.bones["lower"].rotation_euler[0] = angle
         bpy.context.view_layer.update()
         assert calls == [1]
-        moved = assert_plays(crowd[7], elbow.model)
+        moved = assert_plays(crowd[7], elbow_files.model)
         assert np.abs(moved - still[crowd[7]]).max() > 1e-3
         for mesh_object in crowd[:7] + crowd[8:]:
-            assert np.array_equal(assert_plays(mesh_object, elbow.model), still[mesh_object])
+            assert np.array_equal(assert_plays(mesh_object, elbow_files.model), still[mesh_object])
     for frame in (3, 4, 5):
         bpy.context.scene.frame_set(frame)
         for mesh_object in crowd:
-            assert_plays(mesh_object, elbow.model)
+            assert_plays(mesh_object, elbow_files.model)
 
 
-def test_removed_crowds_leave_no_batch_drivers(bound):
-    crowd = crowd_of(bound, 5)
+def test_removed_crowds_leave_no_batch_drivers(bound_elbow):
+    crowd = crowd_of(bound_elbow, 5)
     animate(crowd)
     bpy.context.view_layer.update()
     count = len(bpy.data.objects)
@@ -115,9 +115,9 @@ def test_removed_crowds_leave_no_batch_drivers(bound):
         assert len(bpy.data.objects) == count
 
 
-def test_the_others_play_on_when_one_character_leaves_a_crowd(bound, elbow):
+def test_the_others_play_on_when_one_character_leaves_a_crowd(bound_elbow, elbow_files):
     """One character is deleted, fails, is disabled, is duplicated or gets another strength."""
-    crowd = crowd_of(bound, 12)
+    crowd = crowd_of(bound_elbow, 12)
     animate(crowd)
     scene = bpy.context.scene
     for frame in (1, 2, 3):
@@ -137,11 +137,11 @@ def test_the_others_play_on_when_one_character_leaves_a_crowd(bound, elbow):
     for frame in (9, 10, 11, 12):
         scene.frame_set(frame)
         for mesh_object in (*crowd, copy):
-            assert_plays(mesh_object, elbow.model)
+            assert_plays(mesh_object, elbow_files.model)
 
 
-def test_only_characters_that_moved_are_evaluated(bound, calls):
-    crowd = crowd_of(bound, 5)
+def test_only_characters_that_moved_are_evaluated(bound_elbow, calls):
+    crowd = crowd_of(bound_elbow, 5)
     bpy.context.view_layer.update()
     calls.clear()
     armature_modifier(crowd[2]).object.pose.bones["lower"].rotation_euler[0] = -0.3
@@ -149,10 +149,10 @@ def test_only_characters_that_moved_are_evaluated(bound, calls):
     assert calls == [1]
 
 
-def test_different_models_side_by_side(bound, elbow, tmp_path, calls):
+def test_different_models_side_by_side(bound_elbow, elbow_files, tmp_path, calls):
     other = tmp_path / "other.onnx"
-    train(elbow.recording, other, "--epochs", 3, "--hidden", 8, "--seed", 5)
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
+    train(elbow_files.recording, other, "--epochs", 3, "--hidden", 8, "--seed", 5)
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
     crowd = crowd_of(bpy.data.objects[ELBOW], 4)
     for mesh_object in crowd[2:]:
         unbind(mesh_object)
@@ -164,12 +164,12 @@ def test_different_models_side_by_side(bound, elbow, tmp_path, calls):
     bpy.context.view_layer.update()
     assert calls == [1] * 4
     for number, mesh_object in enumerate(crowd):
-        assert_plays(mesh_object, elbow.model if number < 2 else other)
-    assert np.abs(predicted(crowd[0], elbow.model) - predicted(crowd[0], other)).max() > 1e-4
+        assert_plays(mesh_object, elbow_files.model if number < 2 else other)
+    assert np.abs(predicted_positions(crowd[0], elbow_files.model) - predicted_positions(crowd[0], other)).max() > 1e-4
 
 
-def test_the_others_play_on_when_one_character_fails(bound, elbow, capsys):
-    crowd = crowd_of(bound, 3)
+def test_the_others_play_on_when_one_character_fails(bound_elbow, elbow_files, capsys):
+    crowd = crowd_of(bound_elbow, 3)
     bpy.context.view_layer.update()
     bpy.data.objects.remove(armature_modifier(crowd[1]).object)
     for mesh_object in (crowd[0], crowd[2]):
@@ -177,7 +177,7 @@ def test_the_others_play_on_when_one_character_fails(bound, elbow, capsys):
     bpy.context.view_layer.update()
     assert (crowd[0].fdda.mode, crowd[1].fdda.mode, crowd[2].fdda.mode) == ("FDDA", "RIG", "FDDA")
     for mesh_object in (crowd[0], crowd[2]):
-        assert_plays(mesh_object, elbow.model)
+        assert_plays(mesh_object, elbow_files.model)
 
 
 @pytest.fixture(scope="module")
@@ -186,16 +186,18 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import fdda_addon
 
     folder = tmp_path_factory.mktemp("dense")
-    rig, recording, model, bound = (folder / name for name in ("arm.blend", "recording", "arm.onnx", "bound.blend"))
+    rig, recording, model, bound_path = (
+        folder / name for name in ("arm.blend", "recording", "arm.onnx", "bound.blend")
+    )
     fdda_addon.register()
     try:
         assert run("build-arm", rig, "--density", 3) == 0
         assert run("record", rig, recording, "--poses", 40) == 0
         train(recording, model, "--epochs", 2)
-        assert run("bind", rig, model, bound) == 0
+        assert run("bind", rig, model, bound_path) == 0
     finally:
         fdda_addon.unregister()
-    return bound
+    return bound_path
 
 
 @pytest.mark.slow
@@ -207,14 +209,14 @@ def test_the_first_frame_of_a_dense_mesh_takes_less_than_a_second(dense):
     assert measured["is_right"] and measured["seconds"] < COLD_START_SECONDS
 
 
-def test_a_crowd_without_one_of_its_joints_shows_the_rig(bound, calls):
+def test_a_crowd_without_one_of_its_joints_shows_the_rig(bound_elbow, calls):
     """The armature objects share one data-block, so renaming a bone affects all characters."""
-    crowd = crowd_of(bound, 4)
+    crowd = crowd_of(bound_elbow, 4)
     animate(crowd)
     for frame in range(1, 5):
         bpy.context.scene.frame_set(frame)
     assert calls[-1] == 4
-    armature_modifier(bound).object.data.bones["lower"].name = "elsewhere"
+    armature_modifier(bound_elbow).object.data.bones["lower"].name = "elsewhere"
     bpy.context.scene.frame_set(5)
     for mesh_object in crowd:
         assert mesh_object.fdda.mode == "RIG" and "lacks the joint 'lower'" in mesh_object.fdda.status

@@ -187,8 +187,8 @@ def test_an_action_that_moves_the_object_restores_its_transform(fresh, tmp_path)
     assert action.name == "walk" and rig.animation_data.action.name == "elbow_wave"
 
 
-def test_the_index_describes_the_rig_and_its_sampling(fresh, elbow):
-    index = json.loads((elbow.recording / "recording.json").read_text())
+def test_the_index_describes_the_rig_and_its_sampling(fresh, elbow_files):
+    index = json.loads((elbow_files.recording / "recording.json").read_text())
     assert index["rig"]["file"] == "elbow.blend" and index["rig"]["object"] == "elbow"
     assert index["blender"] == bpy.app.version_string
     assert index["units"] == {"length": "m", "angle": "rad"}

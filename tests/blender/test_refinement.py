@@ -28,9 +28,9 @@ pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.fixture
-def recording(elbow, tmp_path):
+def recording(elbow_files, tmp_path):
     """A copy of the elbow's recording, to be extended."""
-    return shutil.copytree(elbow.recording, tmp_path / "recording")
+    return shutil.copytree(elbow_files.recording, tmp_path / "recording")
 
 
 def errors(recording, model, poses: slice) -> np.ndarray:
@@ -41,9 +41,9 @@ def errors(recording, model, poses: slice) -> np.ndarray:
     return distances(Network(model).positions(matrices), true).max(axis=1)
 
 
-def test_poses_are_added_where_the_model_errs(elbow, recording):
+def test_poses_are_added_where_the_model_errs(elbow_files, recording):
     before = read_recording(recording)
-    assert run("record", elbow.rig, recording, "--refine", elbow.model, "--poses", 60) == 0
+    assert run("record", elbow_files.rig, recording, "--refine", elbow_files.model, "--poses", 60) == 0
     after = read_recording(recording)
     assert len(after.pose_matrices) == 210
     assert after.info.sampling.sources[-1] == type(after.info.sampling.sources[0])(REFINED, 60, "elbow.onnx")
@@ -51,13 +51,15 @@ def test_poses_are_added_where_the_model_errs(elbow, recording):
     assert np.array_equal(after.residuals[:150], before.residuals)
     # The added poses were chosen for their large errors, so their mean error exceeds that of the other poses.
     rest = np.arange(0, 150, 10)
-    assert errors(after, elbow.model, slice(150, 210)).mean() > 1.2 * errors(after, elbow.model, rest).mean()
+    assert (
+        errors(after, elbow_files.model, slice(150, 210)).mean() > 1.2 * errors(after, elbow_files.model, rest).mean()
+    )
 
 
-def test_added_poses_have_the_residuals_of_the_rig(elbow, recording):
-    assert run("record", elbow.rig, recording, "--refine", elbow.model, "--poses", 8) == 0
+def test_added_poses_have_the_residuals_of_the_rig(elbow_files, recording):
+    assert run("record", elbow_files.rig, recording, "--refine", elbow_files.model, "--poses", 8) == 0
     read = read_recording(recording)
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
     scene_rig = find_rig()
     evaluator = PoseEvaluator(scene_rig, read_rig(scene_rig))
     features = joint_features(read.pose_matrices[-1:], read.rig.rest_matrices, read.rig.parents)[0]
@@ -72,17 +74,17 @@ def test_added_poses_have_the_residuals_of_the_rig(elbow, recording):
     assert np.abs(recorded - positions).max() < 1e-5
 
 
-def test_every_refinement_chooses_other_poses(elbow, recording):
+def test_every_refinement_chooses_other_poses(elbow_files, recording):
     for _ in range(2):
-        assert run("record", elbow.rig, recording, "--refine", elbow.model, "--poses", 5) == 0
+        assert run("record", elbow_files.rig, recording, "--refine", elbow_files.model, "--poses", 5) == 0
     read = read_recording(recording)
     assert [(s.kind, s.poses) for s in read.info.sampling.sources] == [("random", 150), (REFINED, 5), (REFINED, 5)]
     assert np.abs(read.pose_matrices[150:155] - read.pose_matrices[155:160]).max() > 1e-3
 
 
-def test_an_interruption_leaves_a_complete_recording_and_the_scene(elbow, recording, rig):
+def test_an_interruption_leaves_a_complete_recording_and_the_scene(elbow_files, recording, rig):
     state = scene_state(rig)
-    steps = refine(rig, recording, elbow.model, RefinementSettings(poses=5))
+    steps = refine(rig, recording, elbow_files.model, RefinementSettings(poses=5))
     for step in steps:
         if step.done == 3:
             break
@@ -98,61 +100,61 @@ def sentence(rig, recording, model) -> str:
     return str(error.value)
 
 
-def test_another_range_of_motion_is_refused(elbow, recording, rig):
+def test_another_range_of_motion_is_refused(elbow_files, recording, rig):
     for bone in bpy.data.objects[ELBOW_RIG].pose.bones:
         bone.lock_rotation[1] = not bone.lock_rotation[1]
-    assert "The range of motion of the rig is not that of" in sentence(rig, recording, elbow.model)
+    assert "The range of motion of the rig is not that of" in sentence(rig, recording, elbow_files.model)
     assert len(read_recording(recording).pose_matrices) == 150
 
 
-def test_an_action_alone_has_no_range_of_motion(elbow, tmp_path, rig):
-    assert run("record", elbow.rig, tmp_path / "a", "--poses", 0, "--action", "elbow_wave") == 0
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
-    assert "has no random poses" in sentence(find_rig(), tmp_path / "a", elbow.model)
+def test_an_action_alone_has_no_range_of_motion(elbow_files, tmp_path, rig):
+    assert run("record", elbow_files.rig, tmp_path / "a", "--poses", 0, "--action", "elbow_wave") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
+    assert "has no random poses" in sentence(find_rig(), tmp_path / "a", elbow_files.model)
 
 
-def test_another_rig_is_refused(elbow, recording, rig):
+def test_another_rig_is_refused(elbow_files, recording, rig):
     rig.mesh_object.data.vertices[0].co.x += 0.1
     if rig.mesh_object.data.shape_keys:
         rig.mesh_object.data.shape_keys.reference_key.data[0].co.x += 0.1
-    assert "was trained for another rig" in sentence(rig, recording, elbow.model)
+    assert "was trained for another rig" in sentence(rig, recording, elbow_files.model)
 
 
-def test_a_resumed_refinement_adds_only_the_missing_poses(elbow, recording, rig, tmp_path):
+def test_a_resumed_refinement_adds_only_the_missing_poses(elbow_files, recording, rig, tmp_path):
     """An interrupted and resumed refinement writes the same bytes as an uninterrupted one."""
     whole = shutil.copytree(recording, tmp_path / "whole")
     settings = RefinementSettings(poses=7, resume=True)
-    list(refine(rig, whole, elbow.model, settings))
-    steps = refine(rig, recording, elbow.model, settings)
+    list(refine(rig, whole, elbow_files.model, settings))
+    steps = refine(rig, recording, elbow_files.model, settings)
     for step in steps:
         if step.stage == "poses" and step.done == 3:
             break
     steps.close()
     assert len(read_recording(recording).pose_matrices) == 153
     for _ in range(2):
-        assert list(refine(rig, recording, elbow.model, settings))[-1].done == 7
+        assert list(refine(rig, recording, elbow_files.model, settings))[-1].done == 7
         assert file_contents(recording) == file_contents(whole)
 
 
-def test_poses_that_were_not_chosen_for_the_model_are_not_resumed(elbow, recording, rig):
-    list(refine(rig, recording, elbow.model, RefinementSettings(poses=2)))
-    list(refine(rig, recording, elbow.model, RefinementSettings(poses=2)))
+def test_poses_that_were_not_chosen_for_the_model_are_not_resumed(elbow_files, recording, rig):
+    list(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2)))
+    list(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2)))
     with pytest.raises(FDDAError, match=r"was trained on 150 poses, and the other 4 of .* were not chosen for it"):
-        list(refine(rig, recording, elbow.model, RefinementSettings(poses=2, resume=True)))
+        list(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2, resume=True)))
 
 
 @pytest.mark.parametrize("option", [["--shard", "1/2"], ["--action", "elbow_wave"], ["--poses", 0]])
-def test_contradicting_options_of_record_are_refused(elbow, recording, capfd, option):
-    assert run("record", elbow.rig, recording, "--refine", elbow.model, *option) == 2
+def test_contradicting_options_of_record_are_refused(elbow_files, recording, capfd, option):
+    assert run("record", elbow_files.rig, recording, "--refine", elbow_files.model, *option) == 2
     assert "--refine adds random poses to a complete recording" in capfd.readouterr().err
 
 
-def test_training_refines_until_the_goal_is_met(elbow, recording, tmp_path, capfd):
+def test_training_refines_until_the_goal_is_met(elbow_files, recording, tmp_path, capfd):
     model = tmp_path / "m.onnx"
     quick = ("--epochs", 4, "--hidden", 8)
     train(recording, model, *quick)
     goal_mm = 0.9 * read_model_info(model).held_out_mm["p999"]
-    assert run("train", recording, model, *quick, "--goal-mm", goal_mm, "--refine", elbow.rig, "--poses", 40) == 0
+    assert run("train", recording, model, *quick, "--goal-mm", goal_mm, "--refine", elbow_files.rig, "--poses", 40) == 0
     out = capfd.readouterr()
     read, info = read_recording(recording), read_model_info(model)
     added = [s.poses for s in read.info.sampling.sources if s.kind == REFINED]
@@ -169,11 +171,11 @@ def test_training_refines_until_the_goal_is_met(elbow, recording, tmp_path, capf
         (["--object", "elbow"], "give --refine RIG.blend too"),
     ],
 )
-def test_options_of_the_goal_that_contradict_are_refused(elbow, recording, tmp_path, capfd, options, words):
-    options = [elbow.rig if option == "RIG" else option for option in options]
+def test_options_of_the_goal_that_contradict_are_refused(elbow_files, recording, tmp_path, capfd, options, words):
+    options = [elbow_files.rig if option == "RIG" else option for option in options]
     assert run("train", recording, tmp_path / "m.onnx", *options) == 2
     assert words in capfd.readouterr().err
-    assert run("train", "--goal-mm", 1, recording, tmp_path / "m.onnx", "--refine", elbow.rig) == 2
+    assert run("train", "--goal-mm", 1, recording, tmp_path / "m.onnx", "--refine", elbow_files.rig) == 2
     assert "give RECORDING and MODEL.onnx before the training settings" in capfd.readouterr().err
     assert run("train", recording, tmp_path / "m.onnx", "--goal-mm", 1, "--refine", tmp_path / "no.blend") == 1
     assert "There is no file" in capfd.readouterr().err

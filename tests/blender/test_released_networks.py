@@ -22,16 +22,16 @@ def opened(path) -> weakref.ref:
     return weakref.ref(network_of(bpy.data.objects[ELBOW]))
 
 
-def copy_of(elbow, folder):
+def copy_of(elbow_files, folder):
     folder.mkdir()
-    shutil.copy(elbow.model, folder / elbow.model.name)
-    return shutil.copy(elbow.bound, folder / elbow.bound.name)
+    shutil.copy(elbow_files.model, folder / elbow_files.model.name)
+    return shutil.copy(elbow_files.bound, folder / elbow_files.bound.name)
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_the_networks_of_files_that_were_open_are_released(elbow, tmp_path, packed):
-    bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
-    paths = [copy_of(elbow, tmp_path / str(number)) for number in range(4)]
+def test_the_networks_of_files_that_were_open_are_released(elbow_files, tmp_path, packed):
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
+    paths = [copy_of(elbow_files, tmp_path / str(number)) for number in range(4)]
     if packed:
         for path in paths:
             opened(path)
@@ -47,7 +47,7 @@ def test_the_networks_of_files_that_were_open_are_released(elbow, tmp_path, pack
     assert networks[-1]() is None
 
 
-def test_a_file_that_is_opened_again_plays(elbow):
+def test_a_file_that_is_opened_again_plays(elbow_files):
     for _ in range(3):
-        opened(elbow.bound)
-        assert_plays(bpy.data.objects[ELBOW], elbow.model)
+        opened(elbow_files.bound)
+        assert_plays(bpy.data.objects[ELBOW], elbow_files.model)

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from .conftest import ELBOW_RIG, assert_plays, evaluated, pose
+from .conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose
 from .test_evaluations import add_shape_key, handler
 from .test_renders import FRAME, animation, set_camera, still
 
@@ -16,17 +16,17 @@ OBJ_DIGITS = 2e-6
 
 
 @pytest.fixture(params=[False, True], ids=["rig in renders", "model in renders"])
-def character(request, bound, elbow) -> tuple[bpy.types.Object, np.ndarray, np.ndarray]:
+def character(request, bound_elbow, elbow_files) -> tuple[bpy.types.Object, np.ndarray, np.ndarray]:
     """The elbow with a shape key, posed; what renders show of it and what they do not."""
-    add_shape_key(bound).fdda.use_in_render = request.param
+    add_shape_key(bound_elbow).fdda.use_in_render = request.param
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     pose(angle=1.1)
-    model = assert_plays(bound, elbow.model)
-    bound.fdda.mode = "RIG"
-    rig = evaluated(bound)
-    bound.fdda.mode = "FDDA"
+    model = assert_plays(bound_elbow, elbow_files.model)
+    bound_elbow.fdda.mode = "RIG"
+    rig = evaluated_positions(bound_elbow)
+    bound_elbow.fdda.mode = "FDDA"
     bpy.context.view_layer.update()
-    return (bound, model, rig) if request.param else (bound, rig, model)
+    return (bound_elbow, model, rig) if request.param else (bound_elbow, rig, model)
 
 
 def test_an_obj_export_has_the_rendered_deformation(character, tmp_path):
@@ -41,27 +41,27 @@ def test_an_obj_export_has_the_rendered_deformation(character, tmp_path):
 
 def test_a_cycles_bake_has_the_rendered_deformation(character):
     """Cycles bakes the position of each vertex into a color attribute."""
-    bound, shown, other = character
+    bound_path, shown, other = character
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.samples = "CYCLES", 1
-    colors = bound.data.attributes.new("baked", "FLOAT_COLOR", "POINT")
-    bound.data.attributes.active_color = colors
-    if not bound.data.materials:
-        bound.data.materials.append(bpy.data.materials.new("plain"))
+    colors = bound_path.data.attributes.new("baked", "FLOAT_COLOR", "POINT")
+    bound_path.data.attributes.active_color = colors
+    if not bound_path.data.materials:
+        bound_path.data.materials.append(bpy.data.materials.new("plain"))
     bpy.ops.object.select_all(action="DESELECT")
-    bound.select_set(True)
-    bpy.context.view_layer.objects.active = bound
+    bound_path.select_set(True)
+    bpy.context.view_layer.objects.active = bound_path
     bpy.context.view_layer.update()
     assert bpy.ops.object.bake(type="POSITION", target="VERTEX_COLORS") == {"FINISHED"}
-    values = np.empty(4 * len(bound.data.vertices), np.float32)
-    bound.data.attributes["baked"].data.foreach_get("color", values)
+    values = np.empty(4 * len(bound_path.data.vertices), np.float32)
+    bound_path.data.attributes["baked"].data.foreach_get("color", values)
     positions = values.reshape(-1, 4)[:, :3]
     assert np.abs(positions - shown).max() < 1e-4 < 1e-3 < np.abs(positions - other).max()
 
 
-def test_rendered_frames_have_poses_that_another_addon_sets(bound, tmp_path):
+def test_rendered_frames_have_poses_that_another_addon_sets(bound_elbow, tmp_path):
     """Each frame shows its own pose, not the pose of the previous frame."""
-    bound.fdda.use_in_render = True
+    bound_elbow.fdda.use_in_render = True
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     set_camera()
     bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]

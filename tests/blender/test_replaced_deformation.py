@@ -12,7 +12,7 @@ from fdda_addon.runtime import playback_modifier
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
-from .conftest import ELBOW_RIG, assert_plays, evaluated, pose, rig_positions, with_deformation
+from .conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, with_deformation
 from .test_changed_rigs import trigger_check
 
 
@@ -94,30 +94,30 @@ CHANGES = {
 def assert_shows_rig(mesh_object: bpy.types.Object, clause: str) -> np.ndarray:
     """Assert that the rig is shown as without a bound model, and that the status gives the reason."""
     assert clause in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
-    shown = evaluated(mesh_object)
+    shown = evaluated_positions(mesh_object)
     modifier = playback_modifier.find_modifier(mesh_object)
     if modifier is not None:
         mesh_object.modifiers.remove(modifier)
-    assert np.array_equal(evaluated(mesh_object), shown)
+    assert np.array_equal(evaluated_positions(mesh_object), shown)
     return shown
 
 
 @pytest.mark.parametrize("when", ["view layer", "frame"])
 @pytest.mark.parametrize("what", CHANGES)
-def test_a_change_of_the_replaced_deformation_shows_the_rig(bound, what, when):
+def test_a_change_of_the_replaced_deformation_shows_the_rig(bound_elbow, what, when):
     change, clause = CHANGES[what]
     pose(angle=1.0)
-    change(bound)
+    change(bound_elbow)
     trigger_check(when)
-    assert_shows_rig(bound, clause)
+    assert_shows_rig(bound_elbow, clause)
 
 
-def test_a_render_only_topology_change_shows_the_rig(bound):
+def test_a_render_only_topology_change_shows_the_rig(bound_elbow):
     """A model that is also used in renders would be applied to another topology there."""
-    bound.fdda.use_in_render = True
-    add("SUBSURF", 0, show_viewport=False)(bound)
+    bound_elbow.fdda.use_in_render = True
+    add("SUBSURF", 0, show_viewport=False)(bound_elbow)
     trigger_check("view layer")
-    assert_shows_rig(bound, "it was recorded without the modifier 'Subsurf'")
+    assert_shows_rig(bound_elbow, "it was recorded without the modifier 'Subsurf'")
 
 
 ALLOWED = {
@@ -132,38 +132,38 @@ ALLOWED = {
 
 
 @pytest.mark.parametrize("what", ALLOWED)
-def test_playback_continues_after_an_unrelated_change(bound, elbow, what):
+def test_playback_continues_after_an_unrelated_change(bound_elbow, elbow_files, what):
     pose(angle=1.0)
-    playing = evaluated(bound)
-    ALLOWED[what](bound)
+    playing = evaluated_positions(bound_elbow)
+    ALLOWED[what](bound_elbow)
     pose(angle=1.0)
-    assert bound.fdda.mode == "FDDA" and not bound.fdda.status
-    for modifier in bound.modifiers:
-        if bound.modifiers.find(modifier.name) > bound.modifiers.find("FDDA"):
+    assert bound_elbow.fdda.mode == "FDDA" and not bound_elbow.fdda.status
+    for modifier in bound_elbow.modifiers:
+        if bound_elbow.modifiers.find(modifier.name) > bound_elbow.modifiers.find("FDDA"):
             modifier.show_viewport = False
-    assert np.abs(assert_plays(bound, elbow.model) - playing).max() < 1e-6
+    assert np.abs(assert_plays(bound_elbow, elbow_files.model) - playing).max() < 1e-6
     # The rig differs from the model as little as before the change.
-    assert np.abs(rig_positions(bound) - playing).max() < 5e-3
+    assert np.abs(rig_positions(bound_elbow) - playing).max() < 5e-3
 
 
-def test_playback_resumes_after_the_change_is_undone(bound, elbow):
+def test_playback_resumes_after_the_change_is_undone(bound_elbow, elbow_files):
     pose(angle=1.0)
-    add("SMOOTH", 0)(bound)
+    add("SMOOTH", 0)(bound_elbow)
     trigger_check("view layer")
-    assert bound.fdda.mode == "RIG"
-    bound.modifiers.remove(bound.modifiers["Smooth"])
-    bound.fdda.mode = "FDDA"
+    assert bound_elbow.fdda.mode == "RIG"
+    bound_elbow.modifiers.remove(bound_elbow.modifiers["Smooth"])
+    bound_elbow.fdda.mode = "FDDA"
     pose(angle=0.8)
-    assert_plays(bound, elbow.model)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_binding_again_keeps_modifiers_after_the_playback_modifier(bound, elbow):
+def test_binding_again_keeps_modifiers_after_the_playback_modifier(bound_elbow, elbow_files):
     """Deforming modifiers after the playback modifier are not replaced and keep their position."""
-    add("SMOOTH", None, iterations=5)(bound)
-    bind(find_rig(), elbow.model)
+    add("SMOOTH", None, iterations=5)(bound_elbow)
+    bind(find_rig(), elbow_files.model)
     bpy.context.view_layer.update()
-    assert [m.name for m in bound.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA", "Smooth"]
-    assert not bound.fdda.status
+    assert [m.name for m in bound_elbow.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA", "Smooth"]
+    assert not bound_elbow.fdda.status
 
 
 def drive_key(mesh_object: bpy.types.Object) -> bpy.types.Driver:
@@ -209,10 +209,10 @@ def sculpt(mesh_object: bpy.types.Object) -> None:
 
 
 @pytest.mark.parametrize("what", DRIVEN)
-def test_a_change_of_a_recorded_shape_key_shows_the_rig(rig, elbow, what):
+def test_a_change_of_a_recorded_shape_key_shows_the_rig(rig, elbow_files, what):
     driver = drive_key(rig.mesh_object)
     bpy.context.view_layer.update()
-    bind(rig, with_deformation(elbow.model, read_deformation(rig)))
+    bind(rig, with_deformation(elbow_files.model, read_deformation(rig)))
     for angle in (0.5, 1.0):
         pose(angle=angle)
     assert rig.mesh_object.fdda.mode == "FDDA" and not rig.mesh_object.fdda.status
@@ -222,11 +222,11 @@ def test_a_change_of_a_recorded_shape_key_shows_the_rig(rig, elbow, what):
     assert_shows_rig(rig.mesh_object, clause)
 
 
-def test_a_copied_character_with_copied_drivers_plays(rig, elbow):
+def test_a_copied_character_with_copied_drivers_plays(rig, elbow_files):
     """Names of objects are not compared."""
     drive_key(rig.mesh_object)
     bpy.context.view_layer.update()
-    bind(rig, with_deformation(elbow.model, read_deformation(rig)))
+    bind(rig, with_deformation(elbow_files.model, read_deformation(rig)))
     mesh_object, armature_object = rig.mesh_object.copy(), rig.armature_object.copy()
     mesh_object.data = mesh_object.data.copy()
     for copy in (mesh_object, armature_object):

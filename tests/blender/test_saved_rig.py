@@ -10,21 +10,21 @@ from fdda_addon.runtime import model_files
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
-from .conftest import ELBOW, assert_plays, evaluated, pose, without_deformation
+from .conftest import ELBOW, assert_plays, evaluated_positions, pose, without_deformation
 
 
 @pytest.fixture
-def keyed(bound):
+def keyed(bound_elbow):
     """The bound elbow with a shape key that has no effect while the model plays."""
-    bind(SceneRig(bound, armature_of(bound)), without_deformation(model_files.model_path(bound)))
-    bound.fdda.mode = "RIG"
-    bound.shape_key_add(name="Basis")
-    key = bound.shape_key_add(name="bulge")
+    bind(SceneRig(bound_elbow, armature_of(bound_elbow)), without_deformation(model_files.model_path(bound_elbow)))
+    bound_elbow.fdda.mode = "RIG"
+    bound_elbow.shape_key_add(name="Basis")
+    key = bound_elbow.shape_key_add(name="bulge")
     key.data[0].co.x += 0.05
     key.value = 1.0
-    bound.active_shape_key_index = 1
-    bound.fdda.mode = "FDDA"
-    return bound
+    bound_elbow.active_shape_key_index = 1
+    bound_elbow.fdda.mode = "FDDA"
+    return bound_elbow
 
 
 def state(mesh_object):
@@ -40,9 +40,9 @@ def test_without_the_addon_the_file_shows_and_renders_the_rig(keyed, tmp_path, u
     keyed.fdda.use_in_render = use_in_render
     pose(angle=1.3)
     keyed.fdda.mode = "RIG"
-    true = evaluated(keyed)
+    true = evaluated_positions(keyed)
     keyed.fdda.mode = "FDDA"
-    playing = evaluated(keyed)
+    playing = evaluated_positions(keyed)
     assert np.abs(playing - true).max() > 1e-5
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"), copy=True)
     fdda_addon.unregister()
@@ -53,71 +53,71 @@ def test_without_the_addon_the_file_shows_and_renders_the_rig(keyed, tmp_path, u
     assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
     assert (pinned, index) == (False, 1)
     pose(angle=1.3)
-    assert np.abs(evaluated(mesh_object) - true).max() < 1e-6
+    assert np.abs(evaluated_positions(mesh_object) - true).max() < 1e-6
 
 
-def test_saving_does_not_stop_the_playback(keyed, elbow):
+def test_saving_does_not_stop_the_playback(keyed, elbow_files):
     keyed.fdda.use_in_render = True
     before = state(keyed)
     pose(angle=0.8)
-    first = assert_plays(keyed, elbow.model)
-    bpy.ops.wm.save_as_mainfile(filepath=str(elbow.bound.with_name("again.blend")), copy=True)
+    first = assert_plays(keyed, elbow_files.model)
+    bpy.ops.wm.save_as_mainfile(filepath=str(elbow_files.bound.with_name("again.blend")), copy=True)
     assert state(keyed) == before
-    assert np.array_equal(assert_plays(keyed, elbow.model), first)
+    assert np.array_equal(assert_plays(keyed, elbow_files.model), first)
     keyed.fdda.mode = "RIG"
     assert [m.show_viewport for m in keyed.modifiers] == [True, True, False]
 
 
-def test_a_save_that_fails_does_not_stop_the_playback(bound, elbow, tmp_path):
+def test_a_save_that_fails_does_not_stop_the_playback(bound_elbow, elbow_files, tmp_path):
     folder = tmp_path / "taken.blend"
     folder.mkdir()
     with pytest.raises(RuntimeError):
         bpy.ops.wm.save_as_mainfile(filepath=str(folder), copy=True)
     pose(angle=1.1)
-    assert_plays(bound, elbow.model)
-    assert bound.fdda.is_playing
+    assert_plays(bound_elbow, elbow_files.model)
+    assert bound_elbow.fdda.is_playing
 
 
 @pytest.mark.parametrize("mode", ["FDDA", "LINEAR", "RIG"])
-def test_the_mode_is_restored_with_the_file(bound, elbow, mode):
-    bound.fdda.mode = mode
+def test_the_mode_is_restored_with_the_file(bound_elbow, elbow_files, mode):
+    bound_elbow.fdda.mode = mode
     pose(angle=1.2)
-    before, shown = evaluated(bound), state(bound)
-    path = elbow.bound.with_name("mode.blend")
+    before, shown = evaluated_positions(bound_elbow), state(bound_elbow)
+    path = elbow_files.bound.with_name("mode.blend")
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     bpy.ops.wm.open_mainfile(filepath=str(path))
     mesh_object = bpy.data.objects[ELBOW]
     assert mesh_object.fdda.mode == mode and state(mesh_object) == shown
     pose(angle=1.2)
-    assert np.abs(evaluated(mesh_object) - before).max() < 1e-6
+    assert np.abs(evaluated_positions(mesh_object) - before).max() < 1e-6
 
 
-def test_disabling_the_addon_shows_the_rig_and_enabling_it_resumes_playback(bound, elbow):
+def test_disabling_the_addon_shows_the_rig_and_enabling_it_resumes_playback(bound_elbow, elbow_files):
     pose(angle=1.0)
     fdda_addon.unregister()
-    assert state(bound)[0] == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+    assert state(bound_elbow)[0] == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
     fdda_addon.register()
     bpy.context.view_layer.update()
-    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
 
 
-def test_a_linked_character_plays(elbow):
-    model_files.allow_path(elbow.model)
-    with bpy.data.libraries.load(str(elbow.bound), link=True) as (_, wanted):
+def test_a_linked_character_plays(elbow_files):
+    model_files.allow_path(elbow_files.model)
+    with bpy.data.libraries.load(str(elbow_files.bound), link=True) as (_, wanted):
         wanted.objects = [ELBOW, "elbow_rig"]
     for linked in wanted.objects:
         bpy.context.scene.collection.objects.link(linked)
     pose(angle=1.2)
-    assert_plays(wanted.objects[0], elbow.model)
+    assert_plays(wanted.objects[0], elbow_files.model)
 
 
-def test_undo_across_a_save(bound, elbow):
+def test_undo_across_a_save(bound_elbow, elbow_files):
     bpy.ops.ed.undo_push(message="start")
     pose(angle=0.5)
     bpy.ops.ed.undo_push(message="posed")
-    bpy.ops.wm.save_as_mainfile(filepath=str(elbow.bound.with_name("undone.blend")), copy=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(elbow_files.bound.with_name("undone.blend")), copy=True)
     pose(angle=1.5)
     bpy.ops.ed.undo_push(message="posed again")
     bpy.ops.ed.undo()
-    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
     assert bpy.data.objects[ELBOW].fdda.is_playing

@@ -16,7 +16,7 @@ from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseEvaluator
 from fdda_addon.runtime.binding import bind
 
-from .conftest import evaluated
+from .conftest import evaluated_positions
 from .modifiers import FEW_POSES, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
@@ -75,9 +75,9 @@ def test_a_bone_that_is_no_input_of_the_model_is_named(build, loose_model, tmp_p
     with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*is no input of the model; "):
         bind(rig, loose_model)
     assert_same_state(before, scene_state(rig))
-    still = evaluated(rig.mesh_object)
+    still = evaluated_positions(rig.mesh_object)
     move(bpy.data.objects["muscle_rig"].pose.bones["root" if build is second_armature.free_root else "muscle"])
-    assert np.linalg.norm(evaluated(rig.mesh_object) - still, axis=1).max() > APART, "it is a case"
+    assert np.linalg.norm(evaluated_positions(rig.mesh_object) - still, axis=1).max() > APART, "it is a case"
 
 
 EXPECTED = {

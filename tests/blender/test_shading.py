@@ -69,16 +69,16 @@ def test_faces_of_a_rig_are_those_of_its_mesh(rig):
 
 
 @pytest.fixture
-def report(elbow, tmp_path) -> dict:
+def report(elbow_files, tmp_path) -> dict:
     path = tmp_path / "e.json"
     options = ["--poses", 24, "--seed", 3, "--action", "elbow_wave", "--range-scale", 2]
-    assert run("evaluate", elbow.rig, elbow.model, "--json", path, *options) == 0
+    assert run("evaluate", elbow_files.rig, elbow_files.model, "--json", path, *options) == 0
     return json.loads(path.read_text())
 
 
-def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(report, rig: SceneRig, elbow):
+def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(report, rig: SceneRig, elbow_files):
     """The positions of the true rig and of linear skinning go into meshes of Blender's."""
-    evaluation = drain(evaluate(rig, elbow.model, EvaluationSettings(poses=24, seed=3)))
+    evaluation = drain(evaluate(rig, elbow_files.model, EvaluationSettings(poses=24, seed=3)))
     arrays = read_rig(rig)
     skinning = LinearSkinning(arrays)
     partition_of = {int(vertex): p.joint for p in skinning.partitions for vertex in p.vertices}
@@ -119,8 +119,8 @@ def test_the_model_shades_better_than_linear_skinning_everywhere_it_was_compared
         assert normals["fdda"]["mean"] < normals["linear"]["mean"]
 
 
-def test_the_table_has_a_line_on_normals_and_one_on_edges(elbow, tmp_path, capfd):
-    assert run("evaluate", elbow.rig, elbow.model, "--json", tmp_path / "e.json", "--poses", 3) == 0
+def test_the_table_has_a_line_on_normals_and_one_on_edges(elbow_files, tmp_path, capfd):
+    assert run("evaluate", elbow_files.rig, elbow_files.model, "--json", tmp_path / "e.json", "--poses", 3) == 0
     out, report = capfd.readouterr().out, json.loads((tmp_path / "e.json").read_text())
     fdda, linear = report["normals"]["fdda"], report["normals"]["linear"]
     assert f"FDDA {fdda['mean']:.3f}, p99 {fdda['p99']:.2f}; linear skinning {linear['mean']:.3f}, p99 " in out

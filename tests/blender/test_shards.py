@@ -138,15 +138,15 @@ def test_a_resumed_shard_repeats_no_work(tmp_path, monkeypatch, shard):
     assert file_contents(tmp_path / "part") == file_contents(tmp_path / "whole")
 
 
-def test_record_and_merge_recordings_use_shards(elbow, tmp_path, capfd):
+def test_record_and_merge_recordings_use_shards(elbow_files, tmp_path, capfd):
     options = ("--poses", 10, "--action", "elbow_wave")
-    assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
+    assert run("record", elbow_files.rig, tmp_path / "whole", *options) == 0
     for _ in range(2):
-        assert run("record", elbow.rig, tmp_path / "found", *options, "--detect-influences", "--resume") == 0
+        assert run("record", elbow_files.rig, tmp_path / "found", *options, "--detect-influences", "--resume") == 0
     for number in (1, 2):
         own = ("--shard", f"{number}/2", "--influences", tmp_path / "found", "--resume")
-        assert run("record", elbow.rig, tmp_path / f"s{number}", *options, *own) == 0
-        assert run("record", elbow.rig, tmp_path / f"s{number}", *options, *own) == 0
+        assert run("record", elbow_files.rig, tmp_path / f"s{number}", *options, *own) == 0
+        assert run("record", elbow_files.rig, tmp_path / f"s{number}", *options, *own) == 0
     assert run("merge-recordings", tmp_path / "s1", tmp_path / "s2", tmp_path / "merged") == 0
     out = capfd.readouterr().out
     assert f"{tmp_path / 'found'}: influences in" in out and f"{tmp_path / 's2'}: 20 poses in" in out
@@ -154,19 +154,19 @@ def test_record_and_merge_recordings_use_shards(elbow, tmp_path, capfd):
     assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
 
 
-def test_invalid_options_of_shards_are_refused(elbow, tmp_path, capfd):
+def test_invalid_options_of_shards_are_refused(elbow_files, tmp_path, capfd):
     for shard in ("0/2", "3/2", "1", "a/b", "1/2/3", "-1/2", "1/100001"):
-        assert run("record", elbow.rig, tmp_path / "r", f"--shard={shard}") == 2
+        assert run("record", elbow_files.rig, tmp_path / "r", f"--shard={shard}") == 2
         assert "a shard is K/N, part K of N" in capfd.readouterr().err
-    assert run("record", elbow.rig, tmp_path / "r", "--detect-influences", "--shard", "1/2") == 2
+    assert run("record", elbow_files.rig, tmp_path / "r", "--detect-influences", "--shard", "1/2") == 2
     assert "leave --shard and --influences out" in capfd.readouterr().err
 
 
-def test_influences_of_another_rig_are_refused(elbow, tmp_path, capfd):
+def test_influences_of_another_rig_are_refused(elbow_files, tmp_path, capfd):
     refusal = Refusal(tmp_path, capfd)
     found = tmp_path / "found"
-    assert run("record", elbow.rig, found, "--poses", 10, "--detect-influences") == 0
-    of_shard = ("record", elbow.rig, tmp_path / "s", "--shard", "1/2", "--influences")
+    assert run("record", elbow_files.rig, found, "--poses", 10, "--detect-influences") == 0
+    of_shard = ("record", elbow_files.rig, tmp_path / "s", "--shard", "1/2", "--influences")
     text = refusal(*of_shard, found, "--poses", 11)
     assert "not those of this recording: they were found with other settings (sources, poses)." in text
     assert "with other settings (seed)" in refusal(*of_shard, found, "--poses", 10, "--seed", 1)
@@ -176,9 +176,9 @@ def test_influences_of_another_rig_are_refused(elbow, tmp_path, capfd):
     assert "are of other partitions than those of 'body'; find them with the same rig and options" in text
 
 
-def test_a_shard_of_another_rig_is_not_resumed(elbow, tmp_path):
+def test_a_shard_of_another_rig_is_not_resumed(elbow_files, tmp_path):
     settings = RecordingSettings(poses=6, influence_poses=1, shard=(1, 2))
-    drain(record(opened(elbow.rig), tmp_path / "s", settings))
+    drain(record(opened(elbow_files.rig), tmp_path / "s", settings))
     other = opened(saved(waving, tmp_path / "other.blend"))
     with pytest.raises(RecordingError, match=r"Cannot resume .* it was recorded differently"):
         drain(record(other, tmp_path / "s", replace(settings, resume=True)))

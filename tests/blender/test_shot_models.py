@@ -13,7 +13,7 @@ from fdda_addon.models import model_list
 from fdda_addon.runtime import model_files
 from fdda_addon.runtime.binding import bind, unbind
 
-from .conftest import assert_plays, evaluated
+from .conftest import assert_plays, evaluated_positions
 from .linked import (
     assert_overrides_play,
     link_character,
@@ -28,15 +28,15 @@ from .linked import (
 )
 
 
-def test_binding_to_an_override(elbow, tmp_path):
+def test_binding_to_an_override(elbow_files, tmp_path):
     """A model in the shot for a character whose library has none."""
     source, model = tmp_path / "plain.blend", tmp_path / "shots" / "elbow.onnx"
-    save_character(elbow.rig, source)
+    save_character(elbow_files.rig, source)
     save_new_shot(tmp_path)
-    shutil.copy(elbow.model, model)
+    shutil.copy(elbow_files.model, model)
     mesh_object = override_character(link_character(source), 1.1)
     bpy.context.view_layer.update()
-    true = evaluated(mesh_object)
+    true = evaluated_positions(mesh_object)
     model_list.bind_entry(rig_of(mesh_object), model_list.add_model(mesh_object, model))
     model_files._chosen_paths.clear()
     for _ in range(2):
@@ -53,14 +53,14 @@ def test_binding_to_an_override(elbow, tmp_path):
         ("Armature", True),
         ("CorrectiveSmooth", True),
     ]
-    assert np.abs(evaluated(mesh_object) - true).max() < 1e-6
+    assert np.abs(evaluated_positions(mesh_object) - true).max() < 1e-6
 
 
-def test_an_override_that_was_saved_without_the_addon_is_bound_again(elbow, tmp_path):
+def test_an_override_that_was_saved_without_the_addon_is_bound_again(elbow_files, tmp_path):
     source, model = tmp_path / "plain.blend", tmp_path / "shots" / "elbow.onnx"
-    save_character(elbow.rig, source)
+    save_character(elbow_files.rig, source)
     save_new_shot(tmp_path)
-    shutil.copy(elbow.model, model)
+    shutil.copy(elbow_files.model, model)
     bind(rig_of(override_character(link_character(source), 1.1)), model)
     bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)))
     fdda_addon.unregister()
@@ -75,10 +75,10 @@ def test_an_override_that_was_saved_without_the_addon_is_bound_again(elbow, tmp_
     assert sum("positions" in o.name for o in bpy.data.objects) == 1
 
 
-def test_another_model_in_the_shot(pair, library, elbow, tmp_path):
+def test_another_model_in_the_shot(pair, library, elbow_files, tmp_path):
     """One override unbound and bound to a model beside the shot, which is called as the library's own is."""
     model = tmp_path / "shots" / "elbow.onnx"
-    shutil.copy(elbow.model, model)
+    shutil.copy(elbow_files.model, model)
     unbind(pair[0])
     assert [m.show_viewport for m in pair[0].modifiers] == [True, True, False]
     save_and_reopen_shot(tmp_path)
@@ -105,10 +105,10 @@ def test_an_override_keeps_the_name_of_the_librarys_model(pair, library, tmp_pat
     assert_overrides_play(library)
 
 
-def test_a_model_of_the_librarys_list_is_not_forgotten(library, elbow, tmp_path):
+def test_a_model_of_the_librarys_list_is_not_forgotten(library, elbow_files, tmp_path):
     run_in_another_process(f"pack_model({str(library.path)!r})")
     mesh_object = override_character(link_character(library.path), 0.6)
-    own = model_list.add_model(mesh_object, elbow.model)
+    own = model_list.add_model(mesh_object, elbow_files.model)
     assert [entry.name for entry in mesh_object.fdda.models] == ["elbow", own.name]
     with pytest.raises(ModelError, match=r"'elbow' is in the list of 'elbow\.blend'; remove it there, or unbind"):
         model_list.remove_entry(mesh_object, 0)

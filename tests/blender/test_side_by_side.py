@@ -10,21 +10,21 @@ from fdda_addon.scene.active_rig import rigs_of_active_armature
 from fdda_addon.scene.comparison import comparison_objects, hidden_comparison_objects, is_comparison
 from fdda_addon.scene.scene_rig import armature_of, find_rig, find_rigs
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
 from .test_operators_playback import refused
 
 
 @pytest.fixture
-def active(bound):
-    bpy.context.view_layer.objects.active = bound
+def active(bound_elbow):
+    bpy.context.view_layer.objects.active = bound_elbow
     pose(angle=1.3)
-    return bound
+    return bound_elbow
 
 
 def world(mesh_object: bpy.types.Object) -> np.ndarray:
     """(V, 3): what is shown, in the world."""
     matrix = np.array(mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world)
-    return evaluated(mesh_object) @ matrix[:3, :3].T + matrix[:3, 3]
+    return evaluated_positions(mesh_object) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def rig_world(mesh_object: bpy.types.Object) -> np.ndarray:
@@ -60,12 +60,12 @@ def test_beside_is_the_rig_to_the_side_in_every_pose(active, scale, turned):
     np.testing.assert_allclose(apart[:, 0], 3.0, atol=2e-5)
 
 
-def test_overlay_is_the_rig_as_a_wireframe_where_it_is(active, elbow):
+def test_overlay_is_the_rig_as_a_wireframe_where_it_is(active, elbow_files):
     bpy.ops.fdda.show_rig(placement="OVERLAY")
     other = side_by_side.find(active)
     pose(angle=0.8)
     np.testing.assert_allclose(world(other), rig_world(active), atol=1e-6)
-    assert_plays(active, elbow.model)
+    assert_plays(active, elbow_files.model)
     assert other.display_type == "WIRE" and side_by_side.display_mode(active) == "OVERLAY"
     assert other.hide_select and other.hide_render and other.data == active.data and not other.fdda.is_bound
 
@@ -92,14 +92,14 @@ def test_the_displayed_rig_is_no_character(active):
     assert rigs_of_active_armature(bpy.context) == []
 
 
-def test_the_displayed_rig_is_not_saved_and_stays_visible(active, elbow, tmp_path):
+def test_the_displayed_rig_is_not_saved_and_stays_visible(active, elbow_files, tmp_path):
     bpy.ops.fdda.pack_model()
     bpy.ops.fdda.show_rig(placement="BESIDE")
     name, links = side_by_side.find(active).name, len(bpy.context.scene.collection.objects)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     assert side_by_side.find(active).name == name
     pose(angle=0.5)
-    assert_plays(active, elbow.model)
+    assert_plays(active, elbow_files.model)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     assert name not in bpy.data.objects and not comparison_objects()
     assert len(bpy.context.scene.collection.objects) == links - 1
@@ -109,7 +109,7 @@ def test_the_displayed_rig_is_not_saved_and_stays_visible(active, elbow, tmp_pat
         assert sorted(there.objects) == [ELBOW, ELBOW_RIG]
 
 
-def test_undo_and_redo_hide_and_show_the_displayed_rig(active, elbow):
+def test_undo_and_redo_hide_and_show_the_displayed_rig(active, elbow_files):
     bpy.ops.ed.undo_push(message="bound")
     bpy.ops.fdda.show_rig(placement="BESIDE")
     bpy.ops.ed.undo_push(message="beside")
@@ -119,17 +119,17 @@ def test_undo_and_redo_hide_and_show_the_displayed_rig(active, elbow):
         bpy.ops.ed.undo()
         assert len(comparison_objects()) == 1
         bpy.context.view_layer.update()
-        assert_plays(bpy.data.objects[ELBOW], elbow.model)
+        assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
         bpy.ops.ed.undo()
         assert not comparison_objects()
         bpy.context.view_layer.update()
-        assert_plays(bpy.data.objects[ELBOW], elbow.model)
+        assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
         bpy.ops.ed.redo()
         bpy.ops.ed.redo()
         mesh_object = bpy.data.objects[ELBOW]
         assert side_by_side.find(mesh_object) is not None
         pose(angle=0.6)
-        assert_plays(mesh_object, elbow.model)
+        assert_plays(mesh_object, elbow_files.model)
 
 
 def test_deleting_the_character_removes_the_displayed_rig(active):

@@ -13,7 +13,7 @@ from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.scene.scene_rig import find_rig
 
-from .conftest import ELBOW, evaluated, pose
+from .conftest import ELBOW, evaluated_positions, pose
 
 EXACT = 2e-6
 
@@ -122,7 +122,7 @@ def test_linear_skinning_equals_the_armature_modifier(smooth: bpy.types.Object, 
         pose(angle=angle)
         pose(angle=angle / 3, bone="upper")
         matrices, positions, _ = evaluator.evaluate()
-        assert np.array_equal(positions, evaluated(smooth))
+        assert np.array_equal(positions, evaluated_positions(smooth))
         moved = max(moved, np.abs(positions - rig.rest_positions).max())
         assert np.abs(skinning.positions(matrices[None])[0] - positions).max() < EXACT
     assert moved > 0.01 or change is without_groups

@@ -19,13 +19,17 @@ RIG_COMPARISON_PARTS = {"mode": 40, "topology": 40, "controls": 20}
 
 
 @pytest.fixture(scope="module")
-def soak_folder(elbow, tmp_path_factory) -> Path:
+def soak_folder(elbow_files, tmp_path_factory) -> Path:
     """Return a folder with the files that the soak test builds first, copied from the elbow fixture."""
     folder = tmp_path_factory.mktemp("soak")
-    for name, path in (("elbow.blend", elbow.rig), ("elbow.onnx", elbow.model), ("bound.blend", elbow.bound)):
+    for name, path in (
+        ("elbow.blend", elbow_files.rig),
+        ("elbow.onnx", elbow_files.model),
+        ("bound.blend", elbow_files.bound),
+    ):
         (folder / name).write_bytes(path.read_bytes())
-    shutil.copytree(elbow.recording, folder / "recording")
-    assert run("record", elbow.rig, folder / "short recording", "--poses", 40) == 0
+    shutil.copytree(elbow_files.recording, folder / "recording")
+    assert run("record", elbow_files.rig, folder / "short recording", "--poses", 40) == 0
     return folder
 
 
@@ -98,12 +102,12 @@ def test_only_root_runs_the_part_of_full_disks_unless_it_is_named(monkeypatch, c
     assert [part.name for part in soak.select_parts(["disks"])] == ["disks"]
 
 
-def test_the_seed_determines_the_mutations(elbow):
+def test_the_seed_determines_the_mutations(elbow_files):
     import numpy as np
 
     from benchmarks.soaking.models import mutate_model
 
-    data = elbow.model.read_bytes()
+    data = elbow_files.model.read_bytes()
     models, same_seed_models, other_seed_models = (
         [mutate_model(np.random.default_rng((seed, case_index)), data) for case_index in range(20)]
         for seed in (1, 1, 2)

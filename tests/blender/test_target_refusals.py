@@ -128,12 +128,12 @@ def test_an_unknown_target_is_refused(refusal, tmp_path):
     )
 
 
-def test_a_target_that_plays_a_model_is_refused(refusal, elbow, tmp_path):
+def test_a_target_that_plays_a_model_is_refused(refusal, elbow_files, tmp_path):
     def bind() -> None:
         from fdda_addon.runtime.binding import bind as bind_model
         from fdda_addon.scene.scene_rig import find_rig
 
-        bind_model(find_rig("flesh"), elbow.model)
+        bind_model(find_rig("flesh"), elbow_files.model)
 
     rig = change(targets.target_copy, bind, tmp_path / "rig.blend")
     assert refused(refusal, rig).startswith("The target 'flesh' plays a model, so there is nothing to learn from it")

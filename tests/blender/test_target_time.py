@@ -21,7 +21,7 @@ from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import find_rig
 
 from .. import systems
-from .conftest import evaluated, run, train
+from .conftest import evaluated_positions, run, train
 from .scene_state import assert_same_state, drain, scene_state
 from .test_target_refusals import refused
 from .test_targets import built, complex_positions, of_flesh, recorded
@@ -38,7 +38,7 @@ def played(rig: Path) -> np.ndarray:
     found = []
     for frame in range(1, FRAMES + 1):
         bpy.context.scene.frame_set(frame)
-        found.append(evaluated(bpy.data.objects["flesh"]))
+        found.append(evaluated_positions(bpy.data.objects["flesh"]))
     return np.stack(found)
 
 
@@ -298,9 +298,9 @@ def test_other_simulations_keep_their_state(tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(rig))
     for frame in range(1, 13):
         bpy.context.scene.frame_set(frame)
-    before = evaluated(bpy.data.objects["flag"])
+    before = evaluated_positions(bpy.data.objects["flag"])
     settings = RecordingSettings(poses=4, target=TargetSettings("flesh", max_settle_frames=40))
     drain(record(find_rig("elbow"), tmp_path / "recording", settings))
     assert bpy.context.scene.frame_current == 12
-    assert np.array_equal(evaluated(bpy.data.objects["flag"]), before)
+    assert np.array_equal(evaluated_positions(bpy.data.objects["flag"]), before)
     assert np.abs(before - np.array([v.co for v in bpy.data.objects["flag"].data.vertices])).max() > 0.01

@@ -110,7 +110,7 @@ def test_a_target_with_another_transform_is_recorded_in_the_space_of_the_mesh(ow
 def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, capfd):
     rig = built(targets.target_alembic, tmp_path / "rig.blend")
     of_flesh(rig, tmp_path / "recording")
-    model, bound = tmp_path / "elbow.onnx", tmp_path / "bound.blend"
+    model, bound_path = tmp_path / "elbow.onnx", tmp_path / "bound.blend"
     train(tmp_path / "recording", model, "--epochs", 60)
     errors = tmp_path / "errors.json"
     options = ["--object", "elbow", "--target", "flesh", "--poses", 0, "--action", ACTION, "--json", errors]
@@ -120,8 +120,8 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
     assert found["fdda"]["mean"] < 0.3 * found["linear"]["mean"]
     assert run("record", rig, tmp_path / "recording", "--object", "elbow", "--refine", model) == 1
     assert "is of the target 'flesh', and poses are added of rigs alone" in capfd.readouterr().err
-    assert run("bind", rig, model, bound, "--object", "elbow") == 0
-    bpy.ops.wm.open_mainfile(filepath=str(bound))
+    assert run("bind", rig, model, bound_path, "--object", "elbow") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(bound_path))
     from .conftest import assert_plays
 
     bpy.data.objects.remove(bpy.data.objects["flesh"])

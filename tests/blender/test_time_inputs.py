@@ -18,7 +18,7 @@ from fdda_addon.rig.pose_setter import TargetSettings
 from fdda_addon.scene.controls import ControlReader
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
-from .conftest import ELBOW, evaluated
+from .conftest import ELBOW, evaluated_positions
 from .modifiers import FEW_POSES, assert_refused, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
@@ -93,7 +93,7 @@ def shown_in_frames(rig: SceneRig) -> list[np.ndarray]:
     found = []
     for frame in (1, 30):
         bpy.context.scene.frame_set(frame)
-        found.append(evaluated(rig.mesh_object))
+        found.append(evaluated_positions(rig.mesh_object))
     return found
 
 

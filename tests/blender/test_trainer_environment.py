@@ -262,10 +262,12 @@ def test_the_result_of_a_background_check_is_stored(own: Path):
     assert session.check_result.level == "INFO" and session.notice is None
 
 
-def test_an_environment_without_its_python_is_broken(own: Path, elbow, tmp_path: Path, capfd: pytest.CaptureFixture):
+def test_an_environment_without_its_python_is_broken(
+    own: Path, elbow_files, tmp_path: Path, capfd: pytest.CaptureFixture
+):
     folder.interpreter_path(own).unlink()
     assert session.environment_state() is FolderState.BROKEN
-    assert run("train", elbow.recording, tmp_path / "m.onnx") == 1
+    assert run("train", elbow_files.recording, tmp_path / "m.onnx") == 1
     python = folder.interpreter_path(own)
     assert capfd.readouterr().err.strip() == (
         f"Error: The trainer's Python '{python}' cannot be started (No such file or directory); reinstall the "

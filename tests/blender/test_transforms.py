@@ -14,7 +14,7 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import armature_modifier, find_rig
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, predicted, run, train
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, predicted_positions, run, train
 
 POSES = ((0.3, -0.2, 0.1), (1.2, 0.5, -0.4), (1.9, 0.1, 0.6))
 """Radians: the bend of the lower bone, two turns of the upper one."""
@@ -58,11 +58,11 @@ def character(request, trained) -> tuple[bpy.types.Object, Path, float]:
 
 def show(mesh_object: bpy.types.Object, mode: str) -> np.ndarray:
     mesh_object.fdda.mode = mode
-    return evaluated(mesh_object)
+    return evaluated_positions(mesh_object)
 
 
 def assert_equal(mesh_object: bpy.types.Object, model: Path, size: float) -> None:
-    assert np.abs(show(mesh_object, "FDDA") - predicted(mesh_object, model)).max() < 1e-5 * size
+    assert np.abs(show(mesh_object, "FDDA") - predicted_positions(mesh_object, model)).max() < 1e-5 * size
     assert not mesh_object.fdda.status
 
 
@@ -109,18 +109,18 @@ def test_linear_skinning_is_blenders_skinning(character):
         linear = show(mesh_object, "LINEAR")
         mesh_object.fdda.mode = "RIG"
         mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
-        largest = np.abs(evaluated(mesh_object) - linear).max()
+        largest = np.abs(evaluated_positions(mesh_object) - linear).max()
         mesh_object.modifiers["CorrectiveSmooth"].show_viewport = True
         # Blender itself computes in single precision here.
         assert largest < 1e-5 * size + 1e-6 * np.abs(mesh_object.matrix_world.translation).max()
 
 
-def test_a_character_survives_an_animated_scale_of_zero(bound, elbow, capsys):
+def test_a_character_survives_an_animated_scale_of_zero(bound_elbow, elbow_files, capsys):
     """At scale 0 the character is invisible. Other characters play on, and it plays again afterwards."""
     armature_object = bpy.data.objects[ELBOW_RIG]
     hider = bpy.data.objects.new("hider", None)
     bpy.context.scene.collection.objects.link(hider)
-    other_rig, other = armature_object.copy(), bound.copy()
+    other_rig, other = armature_object.copy(), bound_elbow.copy()
     for copy in (other_rig, other):
         bpy.context.scene.collection.objects.link(copy)
     other.parent = armature_modifier(other).object = other_rig
@@ -130,10 +130,10 @@ def test_a_character_survives_an_animated_scale_of_zero(bound, elbow, capsys):
         hider.keyframe_insert("scale", frame=frame)
     for frame in (3, 7, 11, 20, 4):
         bpy.context.scene.frame_set(frame)
-        assert_plays(other, elbow.model)
-        assert (bound.fdda.mode, bound.fdda.status) == ("FDDA", "")
+        assert_plays(other, elbow_files.model)
+        assert (bound_elbow.fdda.mode, bound_elbow.fdda.status) == ("FDDA", "")
         if frame not in (7, 20):
-            assert_plays(bound, elbow.model)
+            assert_plays(bound_elbow, elbow_files.model)
     assert "Traceback" not in "".join(capsys.readouterr())
 
 
