@@ -122,7 +122,7 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
         poses[:, index] = poses[:, parents[index]] @ poses[:, index]
     partition = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
     inputs: NetworkInputs = make_inputs(parents, points, [partition])
-    features = inputs.features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
+    features = inputs.compute_features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
     residuals = residuals * np.float32(METERS_PER_CM)
     data = PartitionData(
         name,
@@ -140,9 +140,9 @@ def measure(
 ) -> tuple[float, float, float]:
     """Return the mean and largest error over the measured poses and the mean length of their residuals, cm."""
     true_residuals, poses = partition.data.read_residuals()[measured], partition.poses[measured]
-    coefficients = network.coefficients(prepared.inputs[measured], activation)
-    fitted = prepared.fit.offsets(poses) @ np.linalg.inv(poses[:, partition.joint, :3, :3]).transpose(0, 2, 1)
-    learned = prepared.basis.residuals(coefficients).reshape(true_residuals.shape)
+    coefficients = network.evaluate(prepared.inputs[measured], activation)
+    fitted = prepared.fit.compute_offsets(poses) @ np.linalg.inv(poses[:, partition.joint, :3, :3]).transpose(0, 2, 1)
+    learned = prepared.basis.reconstruct(coefficients).reshape(true_residuals.shape)
     errors_cm = np.linalg.norm(fitted + learned - true_residuals, axis=2) / METERS_PER_CM
     linear_errors_cm = np.linalg.norm(true_residuals, axis=2) / METERS_PER_CM
     return float(errors_cm.mean()), float(errors_cm.max()), float(linear_errors_cm.mean())

@@ -116,7 +116,7 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor_start, "wall": time.perf_counter() - wall_start}
     poses, controls = (np.array(a[split.training]) for a in (recording.pose_matrices, recording.controls))
-    training_features = inputs.features(poses, recording.rig.rest_matrices, controls)
+    training_features = inputs.compute_features(poses, recording.rig.rest_matrices, controls)
     training_range = measure_training_range(training_features, recording.rig, recording.partitions)
     trained_model = TrainedModel(
         recording.rig,
@@ -179,9 +179,9 @@ def _truncation_error_mm(trained_model: TrainedModel, index: int, recording: Rec
     """Return the mean error with the best coefficients of the basis, mm: the error of a network without error."""
     partition, prepared = trained_model.partitions[index], trained_model.prepared[index]
     skin = skin_matrices(recording.pose_matrices, recording.rig.rest_matrices).astype(np.float64)
-    fitted = prepared.fit.offsets(skin) @ np.linalg.inv(skin[:, partition.joint, :3, :3]).transpose(0, 2, 1)
+    fitted = prepared.fit.compute_offsets(skin) @ np.linalg.inv(skin[:, partition.joint, :3, :3]).transpose(0, 2, 1)
     residuals = (recording.residuals[:, partition.vertices] - fitted).reshape(len(skin), -1).astype(np.float32)
-    truncation = prepared.basis.residuals(prepared.basis.coefficients(residuals)) - residuals
+    truncation = prepared.basis.reconstruct(prepared.basis.project(residuals)) - residuals
     return error_statistics(np.linalg.norm(truncation.reshape(fitted.shape), axis=2)).mean
 
 

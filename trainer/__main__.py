@@ -23,7 +23,7 @@ if __name__ == "__main__":
 
 from .config import add_options, config_from_arguments
 from .outputs import check_training_outputs
-from .process import StopRequest, missing_package, run_with_messages
+from .process import StopRequest, missing_package_error, run_with_messages
 from .progress import JsonMessageSink, MessageSink, TextMessageSink
 
 
@@ -52,7 +52,7 @@ def _train(options: argparse.Namespace, sink: MessageSink, stop_request: StopReq
         with stop_request.exit_immediately(sink):
             from .training import train_model
     except ModuleNotFoundError as error:
-        raise missing_package("Training", error) from error
+        raise missing_package_error("Training", error) from error
     settings = (config, sink, stop_request, options.warm_start, options.strict, options.overwrite)
     if recordings:
         train_models(recordings, options.model, *settings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Principal components of a partition's local residuals. A tolerance determines their number."""
+"""Principal components of a partition's local residuals. A tolerance determines the number of components."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 MAX_POSES = 1000
-"""Maximum number of poses from which components are computed. Coefficients are computed for all poses."""
+"""Maximum number of poses from which components are computed. Coefficients are then computed for all poses."""
 MAX_COMPONENTS = 128
 NEGLIGIBLE_RMS_RATIO = 0.01
-"""Error that components may always leave, as a part of the rms residual. Errors of the networks are far larger."""
+"""Error that the components may always leave, as a part of the rms residual. Networks have far larger errors."""
 MAX_ERROR_RATIO = 2.0
 """Maximum ratio of a partition's error to its allowed error when partitions share the tolerance."""
 FINE_TOLERANCE_FACTOR = 4.0
 """Factor by which the tolerance is divided to compute the bases from which components are allocated."""
-BLOCK_COLUMNS = 1 << 14
-"""Columns, or rows, of a block that is converted to float64, so that the sums need little memory."""
+BLOCK_LENGTH = 1 << 14
+"""Number of columns, or of rows, that are converted to float64 at a time, so that the sums need little memory."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class Basis:
     truncation_rms: float
     error_by_count: np.ndarray
 
-    def coefficients(self, residuals: np.ndarray) -> np.ndarray:
+    def project(self, residuals: np.ndarray) -> np.ndarray:
         """Compute (N, K) float32 coefficients of (N, 3 Vp) residuals, both in mesh units.
 
         The distance between two rows of coefficients equals the distance between the residuals that they represent.
         """
-        # This equals (residuals - mean) @ components.T, without a copy of the residuals.
+        # This equals (residuals - mean) @ components.T, but makes no copy of the residuals.
         return (residuals @ self.components.T - self.mean @ self.components.T).astype(np.float32)
 
-    def residuals(self, coefficients: np.ndarray) -> np.ndarray:
+    def reconstruct(self, coefficients: np.ndarray) -> np.ndarray:
         """Compute (N, 3 Vp) float32 residuals from (N, K) coefficients, both in mesh units."""
         return (coefficients @ self.components + self.mean).astype(np.float32)
 
@@ -123,17 +123,19 @@ def make_basis(
         residuals, weights, pose_count = residuals[sampled_poses], weights[sampled_poses], MAX_POSES
     use_gram = pose_count <= coordinate_count
     weight_roots = np.sqrt(weights)[:, None]
-    gram = np.zeros((min(pose_count, coordinate_count),) * 2)
+    gram_matrix = np.zeros((min(pose_count, coordinate_count),) * 2)
     for block in _block_slices(coordinate_count if use_gram else pose_count):
-        values = residuals[:, block] if use_gram else residuals[block]
-        centered = (values.astype(np.float64) - (mean[block] if use_gram else mean)) * weight_roots[
+        block_values = residuals[:, block] if use_gram else residuals[block]
+        centered = (block_values.astype(np.float64) - (mean[block] if use_gram else mean)) * weight_roots[
             slice(None) if use_gram else block
         ]
-        gram += centered @ centered.T if use_gram else centered.T @ centered
-    eigenvalues, eigenvectors = np.linalg.eigh(gram)
+        gram_matrix += centered @ centered.T if use_gram else centered.T @ centered
+    eigenvalues, eigenvectors = np.linalg.eigh(gram_matrix)
     eigenvalues, eigenvectors = np.maximum(eigenvalues[::-1], 0), eigenvectors[:, ::-1]
-    errors = np.sqrt(np.append(np.cumsum(eigenvalues[::-1])[::-1], 0) / (weights.sum() * coordinate_count / 3))
-    component_count = min(int(np.argmax(errors <= max(tolerance, NEGLIGIBLE_RMS_RATIO * errors[0]))), MAX_COMPONENTS)
+    error_by_count = np.sqrt(np.append(np.cumsum(eigenvalues[::-1])[::-1], 0) / (weights.sum() * coordinate_count / 3))
+    component_count = min(
+        int(np.argmax(error_by_count <= max(tolerance, NEGLIGIBLE_RMS_RATIO * error_by_count[0]))), MAX_COMPONENTS
+    )
     eigenvectors = eigenvectors[:, :component_count]
     if use_gram:
         components = np.empty((coordinate_count, component_count))
@@ -142,7 +144,7 @@ def make_basis(
             components[block] = ((residuals[:, block].astype(np.float64) - mean[block]) * weight_roots).T @ eigenvectors
         eigenvectors = np.linalg.qr(components)[0] if component_count else components
     components = np.ascontiguousarray(eigenvectors.T, np.float32)
-    return Basis(mean, components, float(errors[component_count]), errors[: component_count + 1])
+    return Basis(mean, components, float(error_by_count[component_count]), error_by_count[: component_count + 1])
 
 
 def _weighted_mean(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -155,4 +157,4 @@ def _weighted_mean(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _block_slices(length: int) -> list[slice]:
-    return [slice(start, start + BLOCK_COLUMNS) for start in range(0, length, BLOCK_COLUMNS)]
+    return [slice(start, start + BLOCK_LENGTH) for start in range(0, length, BLOCK_LENGTH)]

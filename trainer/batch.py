@@ -17,21 +17,21 @@ from .progress import MessageSink
 
 
 class _BatchItemSink:
-    """Receives the messages of each training, sends its last one as `MODEL_FINISHED`, and stores the values of it."""
+    """Forwards the messages of each training, sends `FINISHED` as `MODEL_FINISHED`, and stores its values."""
 
     def __init__(self, sink: MessageSink):
         self._sink = sink
         self.finished_values: list[dict] = []
 
-    def send(self, kind: MessageType, **values) -> None:
-        if kind is MessageType.FINISHED:
-            kind = MessageType.MODEL_FINISHED
+    def send(self, message_type: MessageType, **values) -> None:
+        if message_type is MessageType.FINISHED:
+            message_type = MessageType.MODEL_FINISHED
             self.finished_values.append(values)
-        self._sink.send(kind, **values)
+        self._sink.send(message_type, **values)
 
 
 def check_batch(recordings: list[Path], folder: Path, overwrite: bool = False) -> None:
-    """Check recordings and outputs before the first training. This needs no torch.
+    """Check recordings and outputs before the first training, without importing torch.
 
     Args:
         recordings: folders of the recordings.
@@ -97,10 +97,10 @@ def train_models(
         try:
             train_model(recording, model, config, item_sink, should_stop, warm_start, strict, overwrite)
         finally:
-            # A folder with files stays, because rmdir fails there.
-            for created in (model.parent, folder):
+            # A folder with files is not removed, because rmdir fails there.
+            for created_folder in (model.parent, folder):
                 with suppress(OSError):
-                    created.rmdir()
+                    created_folder.rmdir()
     sink.send(
         MessageType.FINISHED,
         model=str(folder),

@@ -27,7 +27,7 @@ READ_ERRORS = (
     *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
     *(RuntimeError, IndexError, *NPY_HEADER_ERRORS),
 )
-"""Errors of numpy and zipfile on a damaged file; RuntimeError for an encrypted archive."""
+"""Errors that numpy and zipfile raise for a damaged file. RuntimeError is for an encrypted archive."""
 OTHER_PARTITIONS_SENTENCE = "The checkpoint is of other partitions; train without --warm-start."
 CONTRADICTION_CLAUSE = "its arrays contradict each other"
 NOT_FINITE_CLAUSE = "its arrays hold values that are not numbers"
@@ -142,7 +142,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         with open_input(path) as file:
             size = os.fstat(file.fileno()).st_size
             with zipfile.ZipFile(file) as archive:
-                # An array that is larger than the file is refused before memory is allocated.
+                # An array that is larger than the file is refused before memory is allocated for it.
                 if any(member.file_size > size for member in archive.infolist()):
                     raise ValueError("it is packed")
             file.seek(0)

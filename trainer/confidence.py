@@ -50,7 +50,7 @@ class TrainingRange:
     counts: np.ndarray
     controls: tuple[Control, ...] = ()
 
-    def confidence(self, features: np.ndarray) -> np.ndarray:
+    def compute_confidence(self, features: np.ndarray) -> np.ndarray:
         """Compute the (N, P) float32 confidence of each partition from (N, F) features."""
         direct_count = len(self.fade_width)
         direct_features = features[:, :direct_count]
@@ -63,7 +63,7 @@ def measure_training_range(features: np.ndarray, rig: Rig, partitions: tuple[Par
     """Measure the range of the training poses.
 
     Args:
-        features: (n, F) float32, features of the training poses from `NetworkInputs.features`.
+        features: (n, F) float32, features of the training poses from `NetworkInputs.compute_features`.
         rig, partitions: rig and partitions of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)

@@ -20,7 +20,7 @@ from .low_rank import factorize, may_factorize
 from .splitting import Split
 
 MARGIN_POSE_WEIGHT = 0.1
-"""Weight of a margin pose in the basis; other poses have weight 1. Its residual is many times as large as others, but
+"""Weight of a margin pose in the basis; other poses have weight 1. Margin poses have residuals many times as large, but
 the components are meant for the range of motion."""
 MIN_FEATURE_SPREAD = 1e-5
 """A feature is constant if its standard deviation over the training poses is smaller: meters, or no unit."""
@@ -135,7 +135,7 @@ def partition_data(
         use_half_rotations: whether residuals are also regressed on half-rotation matrices.
     """
     rig = recording.rig
-    features = inputs.features(recording.pose_matrices, rig.rest_matrices, recording.controls)
+    features = inputs.compute_features(recording.pose_matrices, rig.rest_matrices, recording.controls)
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations)
     min_length_spread = max(MIN_FEATURE_SPREAD / rig.metres_per_unit, float32_rounding(recording.pose_matrices))
     min_spread = np.where(inputs.length_mask(), min_length_spread, MIN_FEATURE_SPREAD)
@@ -184,8 +184,8 @@ def prepare_partition(
     tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
     rng, weights = np.random.default_rng([seed, 2]), split.weights(MARGIN_POSE_WEIGHT)
     basis = make_basis(residuals[split.training], tolerance, rng, weights)
-    coefficients = basis.coefficients(residuals)
-    truncated = residuals[split.validation] - basis.residuals(coefficients[split.validation])
+    coefficients = basis.project(residuals)
+    truncated = residuals[split.validation] - basis.reconstruct(coefficients[split.validation])
     return PreparedPartition(
         partition.name,
         partition.vertex_count,

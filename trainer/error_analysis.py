@@ -11,13 +11,13 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.refinement import nearest_recorded_distances
 
 from .data import PreparedPartition, residuals_of
-from .error_causes import COMPONENTS, EXTREMES, NONE, POSES, STEEP
+from .error_causes import EXTREME_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE, TOO_FEW_COMPONENTS, TOO_FEW_POSES
 from .half_rotations import regression_matrices
 from .splitting import Split
 from .trained_model import TrainedModel
 
 ANALYZED_FRACTION = 5e-3
-"""Part of a partition's held-out errors that is analyzed: the largest errors, at least one."""
+"""Part of a partition's held-out errors that is analyzed. They are the largest errors, and at least one."""
 MAX_TRAINING_POSES = 2000
 """Maximum number of training poses among which the nearest pose is searched."""
 MIN_TRUNCATION_FRACTION = 0.5
@@ -45,7 +45,7 @@ class ErrorAnalysis:
         distance: ratio between the distance of these poses to the nearest training pose and the median distance of all
             held-out poses.
         generalization: ratio between the 99.9th percentiles of the held-out errors and of the training errors.
-        cause: key of `error_causes.CAUSES`.
+        cause: key of `error_causes.REMEDY_BY_CAUSE`.
     """
 
     poses: int
@@ -64,7 +64,11 @@ class ErrorAnalysis:
 
 
 def analyze_errors(
-    recording: Recording, trained_model: TrainedModel, split: Split, held_out: np.ndarray, on_training: np.ndarray
+    recording: Recording,
+    trained_model: TrainedModel,
+    split: Split,
+    held_out_errors: np.ndarray,
+    training_errors: np.ndarray,
 ) -> list[ErrorAnalysis]:
     """Analyze the largest errors of each partition.
 
@@ -72,8 +76,8 @@ def analyze_errors(
         recording: recording of the training.
         trained_model: the result of the training.
         split: split of the poses.
-        held_out: (n, V) float32 errors of the held-out poses, meters.
-        on_training: (m, V) float32 errors of some training poses, meters.
+        held_out_errors: (n, V) float32 errors of the held-out poses, meters.
+        training_errors: (m, V) float32 errors of some training poses, meters.
     """
     rig = recording.rig
     training = split.training[:: max(1, len(split.training) // MAX_TRAINING_POSES)]
@@ -84,19 +88,23 @@ def analyze_errors(
     is_boundary = _boundary_mask(recording, trained_model)
     analyses = []
     for partition, prepared in zip(trained_model.partitions, trained_model.prepared, strict=True):
-        errors = held_out[:, partition.vertices].astype(np.float64)
+        errors = held_out_errors[:, partition.vertices].astype(np.float64)
         count = max(1, round(errors.size * ANALYZED_FRACTION))
         largest = np.argpartition(errors.ravel(), -count)[-count:]
         poses, vertices = np.unravel_index(largest, errors.shape)
-        values, training_values = (
+        held_out_values, training_values = (
             _influencing_values(recording, partition, features, rows)
             for features, rows in ((held_out_features, split.held_out), (training_features, training))
         )
-        nearest = nearest_recorded_distances(values, training_values) if values.shape[1] else np.zeros(len(values))
-        distance = _ratio(float(nearest[poses].mean()), float(np.median(nearest)))
-        joint, extreme = _most_extreme_joint(recording, partition, values, training_values, poses)
+        nearest_distances = (
+            nearest_recorded_distances(held_out_values, training_values)
+            if held_out_values.shape[1]
+            else np.zeros(len(held_out_values))
+        )
+        distance = _ratio(float(nearest_distances[poses].mean()), float(np.median(nearest_distances)))
+        joint, extreme = _most_extreme_joint(recording, partition, held_out_values, training_values, poses)
         truncation = _truncation_fraction(recording, partition, prepared, split.held_out, poses, vertices, errors)
-        percentiles = (float(np.percentile(e, 99.9)) for e in (errors, on_training[:, partition.vertices]))
+        percentiles = (float(np.percentile(e, 99.9)) for e in (errors, training_errors[:, partition.vertices]))
         generalization = _ratio(*percentiles)
         boundary = None
         if is_boundary is not None and is_boundary[partition.vertices].any():
@@ -118,11 +126,13 @@ def _influencing_values(
 
 def _cause(truncation: float, distance: float, generalization: float) -> str:
     if truncation >= MIN_TRUNCATION_FRACTION:
-        return COMPONENTS
+        return TOO_FEW_COMPONENTS
     is_extreme = distance >= MIN_DISTANCE_RATIO
     if generalization >= MIN_GENERALIZATION_RATIO:
-        return EXTREMES if is_extreme else POSES
-    return EXTREMES if is_extreme else STEEP if truncation < MIN_TRUNCATION_FRACTION / 2 else NONE
+        return EXTREME_POSES if is_extreme else TOO_FEW_POSES
+    if is_extreme:
+        return EXTREME_POSES
+    return HIGH_TRAINING_ERRORS if truncation < MIN_TRUNCATION_FRACTION / 2 else NO_CLEAR_CAUSE
 
 
 def _ratio(value: float, reference: float) -> float:
@@ -147,13 +157,17 @@ def _boundary_mask(recording: Recording, trained_model: TrainedModel) -> np.ndar
 
 
 def _most_extreme_joint(
-    recording: Recording, partition: Partition, values: np.ndarray, training_values: np.ndarray, poses: np.ndarray
+    recording: Recording,
+    partition: Partition,
+    held_out_values: np.ndarray,
+    training_values: np.ndarray,
+    poses: np.ndarray,
 ) -> tuple[str, float]:
     """Find the joint or control that is furthest from its mean in the analyzed poses.
 
     Args:
         recording, partition: recording and partition of the values.
-        values: (n, f) values of the held-out poses from `_influencing_values`.
+        held_out_values: (n, f) values of the held-out poses from `_influencing_values`.
         training_values: (m, f) values of training poses.
         poses: indices of the analyzed poses among the n.
 
@@ -161,18 +175,18 @@ def _most_extreme_joint(
         The name, and the ratio between its distance from the mean in the analyzed poses and in all n poses.
     """
     names = [recording.rig.joint_names[joint] for joint in partition.influencing]
-    widths = [FEATURES_PER_JOINT] * len(names) + [1] * len(partition.controls)
+    column_counts = [FEATURES_PER_JOINT] * len(names) + [1] * len(partition.controls)
     names += [recording.rig.controls[control].name for control in partition.controls]
     spread = training_values.std(axis=0, dtype=np.float64)
     is_used = spread > spread.max(initial=0) * MIN_SPREAD_RATIO
-    squares = np.zeros(values.shape)
-    offsets = (values - training_values.mean(axis=0, dtype=np.float64))[:, is_used]
+    squares = np.zeros(held_out_values.shape)
+    offsets = (held_out_values - training_values.mean(axis=0, dtype=np.float64))[:, is_used]
     squares[:, is_used] = (offsets / spread[is_used]) ** 2
-    most_extreme, squares_by_name = ("", 1.0), np.split(squares, np.cumsum(widths), axis=1)
+    most_extreme, squares_by_name = ("", 1.0), np.split(squares, np.cumsum(column_counts), axis=1)
     for name, columns in zip(names, squares_by_name[:-1], strict=True):
         distances = np.sqrt(columns.sum(axis=1))
-        extreme = _ratio(float(distances[poses].mean()), float(distances.mean()))
-        most_extreme = max(most_extreme, (name, extreme), key=lambda pair: pair[1])
+        distance_ratio = _ratio(float(distances[poses].mean()), float(distances.mean()))
+        most_extreme = max(most_extreme, (name, distance_ratio), key=lambda pair: pair[1])
     return most_extreme
 
 
@@ -180,7 +194,7 @@ def _truncation_fraction(
     recording: Recording,
     partition: Partition,
     prepared: PreparedPartition,
-    held_out: np.ndarray,
+    held_out_poses: np.ndarray,
     poses: np.ndarray,
     vertices: np.ndarray,
     errors: np.ndarray,
@@ -189,19 +203,21 @@ def _truncation_fraction(
 
     Args:
         recording, partition, prepared: recording, and the partition with its data.
-        held_out: indices of the n held-out poses.
+        held_out_poses: indices of the n held-out poses.
         poses, vertices: indices of the analyzed errors.
         errors: (n, Vp) distances, meters.
     """
     unique_poses, rows = np.unique(poses, return_inverse=True)
-    pose_indices = held_out[unique_poses]
-    remaining = residuals_of(recording, partition, pose_indices).astype(np.float64)
+    pose_indices = held_out_poses[unique_poses]
+    remaining_residuals = residuals_of(recording, partition, pose_indices).astype(np.float64)
     if len(prepared.fit.joints):
         use_half_rotations = prepared.fit.joints.max() >= len(recording.rig.joints)
         pose_matrices = np.array(recording.pose_matrices[pose_indices])
         matrices = regression_matrices(pose_matrices, recording.rig, use_half_rotations)
         to_local = np.linalg.inv(matrices[:, prepared.fit.joints[0], :, :3].astype(np.float64))
-        remaining -= prepared.fit.offsets(matrices) @ to_local.transpose(0, 2, 1)
-    remaining -= prepared.basis.residuals(prepared.coefficients[pose_indices]).reshape(remaining.shape)
-    distances = np.linalg.norm(remaining, axis=2)[rows, vertices] * recording.rig.metres_per_unit
+        remaining_residuals -= prepared.fit.compute_offsets(matrices) @ to_local.transpose(0, 2, 1)
+    remaining_residuals -= prepared.basis.reconstruct(prepared.coefficients[pose_indices]).reshape(
+        remaining_residuals.shape
+    )
+    distances = np.linalg.norm(remaining_residuals, axis=2)[rows, vertices] * recording.rig.metres_per_unit
     return min(1.0, _ratio(float((distances**2).sum()), float((errors[poses, vertices] ** 2).sum())))

@@ -70,8 +70,8 @@ def reference_positions(
         (N, V, 3) float32 positions, mesh-object space, mesh units, and (N, P) float32 confidence.
     """
     rig, training_range = trained_model.rig, trained_model.training_range
-    features = trained_model.inputs.features(pose_matrices, rig.rest_matrices, controls)
-    confidence = training_range.confidence(features)
+    features = trained_model.inputs.compute_features(pose_matrices, rig.rest_matrices, controls)
+    confidence = training_range.compute_confidence(features)
     mean, scale = trained_model.feature_statistics()
     clamped = np.clip(features, training_range.low, training_range.high)
     inputs = ((clamped - mean) / scale).astype(np.float32)
@@ -80,10 +80,10 @@ def reference_positions(
     for index, (partition, prepared, network) in enumerate(
         zip(trained_model.partitions, trained_model.prepared, trained_model.networks, strict=True)
     ):
-        coefficients = network.coefficients(inputs[:, trained_model.feature_columns(index)], trained_model.activation)
-        residuals = prepared.basis.residuals(coefficients) * confidence[:, index, None]
+        coefficients = network.evaluate(inputs[:, trained_model.feature_columns(index)], trained_model.activation)
+        residuals = prepared.basis.reconstruct(coefficients) * confidence[:, index, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
-        offsets[:, partition.vertices] = prepared.fit.offsets(matrices) * confidence[:, index, None, None]
+        offsets[:, partition.vertices] = prepared.fit.compute_offsets(matrices) * confidence[:, index, None, None]
     return LinearSkinning(rig, trained_model.partitions).complex_positions(pose_matrices, local) + offsets, confidence
 
 
@@ -97,7 +97,7 @@ def open_session(model: bytes) -> onnxruntime.InferenceSession:
     options.log_severity_level = 3
     try:
         return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's exceptions have no other common base.
+    except Exception as error:  # ONNX Runtime's exceptions have no narrower common base class.
         raise TrainingError(f"ONNX Runtime {onnxruntime.__version__} refuses the exported model: {error}") from error
 
 
@@ -143,7 +143,7 @@ def measure_surface(
         truth = skinning.complex_positions(matrices, np.array(recording.residuals[pose, None]))
         (positions,) = session.run([POSITIONS_OUTPUT], inputs)
         rows.append(comparison.compare(truth[0], (positions[0], skinning.positions(matrices)[0])))
-    return surface_json(*(surface_errors(way) for way in zip(*rows, strict=True)))
+    return surface_json(*(surface_errors(method_rows) for method_rows in zip(*rows, strict=True)))
 
 
 def check_parity(
@@ -186,14 +186,16 @@ def check_parity(
     return max_difference
 
 
-def model_info(recording: Recording, trained_model: TrainedModel, held_out: np.ndarray, training: dict) -> ModelInfo:
+def model_info(
+    recording: Recording, trained_model: TrainedModel, held_out_errors: np.ndarray, training_info: dict
+) -> ModelInfo:
     """Create the metadata of a model; the parity is 0 until it is measured.
 
     Args:
         recording: recording of the training.
         trained_model: the result of the training.
-        held_out: (n, V) errors of the held-out poses, meters.
-        training: settings and versions.
+        held_out_errors: (n, V) errors of the held-out poses, meters.
+        training_info: settings and versions.
     """
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
     partitions = zip(trained_model.partitions, recording.partitions, trained_model.component_counts(), strict=True)
@@ -211,9 +213,13 @@ def model_info(recording: Recording, trained_model: TrainedModel, held_out: np.n
         ),
         *(bound[: trained_model.inputs.control_start].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         trained_model.training_range.controls,
-        error_statistics(held_out).to_json(),
+        error_statistics(held_out_errors).to_json(),
         0.0,
-        {**training, OBJECT_KEY: recording.info.object_name, LIMITS_KEY: recording.info.sampling.to_json()["limits"]},
+        {
+            **training_info,
+            OBJECT_KEY: recording.info.object_name,
+            LIMITS_KEY: recording.info.sampling.to_json()["limits"],
+        },
         rig.metres_per_unit,
     )
 
@@ -236,15 +242,15 @@ class ExportedModel:
 
 
 def build_model(
-    recording: Recording, trained_model: TrainedModel, held_out: np.ndarray, training: dict
+    recording: Recording, trained_model: TrainedModel, held_out_poses: np.ndarray, training_info: dict
 ) -> ExportedModel:
     """Build the model, check it against the trained networks, and measure its errors; nothing is written.
 
     Args:
         recording: recording of the training.
         trained_model: the result of the training.
-        held_out: indices of the held-out poses.
-        training: settings and versions for the metadata.
+        held_out_poses: indices of the held-out poses.
+        training_info: settings and versions for the metadata.
 
     Raises:
         TrainingError: the model differs from the trained networks.
@@ -252,10 +258,10 @@ def build_model(
     model = build_graph(trained_model)
     onnx.checker.check_model(model)
     session = open_session(model.SerializeToString())
-    parity = check_parity(session, recording, trained_model, held_out)
-    errors = measure(session, recording, trained_model, held_out)
+    parity = check_parity(session, recording, trained_model, held_out_poses)
+    held_out_errors = measure(session, recording, trained_model, held_out_poses)
     info = replace(
-        model_info(recording, trained_model, errors.fdda, training),
+        model_info(recording, trained_model, held_out_errors.fdda, training_info),
         parity_mm=parity * 1000,
         constant_bytes=sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer),
     )
@@ -265,7 +271,7 @@ def build_model(
     if recording.info.fit:
         skin = skin_to_text(recording.rig.skin_joints, recording.rig.skin_weights)
         model.metadata_props.add(key=SKIN_KEY, value=skin)
-    return ExportedModel(model.SerializeToString(), info, errors, session)
+    return ExportedModel(model.SerializeToString(), info, held_out_errors, session)
 
 
 def write_model(path: Path, content: bytes) -> None:
@@ -279,6 +285,6 @@ def write_model(path: Path, content: bytes) -> None:
     read_model_info(path)
 
 
-def _blocks(poses: int, vertices: int) -> list[slice]:
-    step = max(1, BLOCK_ELEMENTS // (3 * vertices))
-    return [slice(start, start + step) for start in range(0, poses, step)]
+def _blocks(pose_count: int, vertex_count: int) -> list[slice]:
+    block_size = max(1, BLOCK_ELEMENTS // (3 * vertex_count))
+    return [slice(start, start + block_size) for start in range(0, pose_count, block_size)]

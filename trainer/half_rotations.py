@@ -36,7 +36,7 @@ def half_rotation_matrices(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-        rig: with J joints.
+        rig: rig with J joints.
 
     Returns:
         (N, J, 3, 3) float64, no unit; zero for roots.
@@ -44,11 +44,11 @@ def half_rotation_matrices(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
     joint_count = len(rig.parents)
     rotations = joint_features(pose_matrices, rig.rest_matrices, rig.parents).reshape(-1, joint_count, 3, 4)[..., :3]
     rotations = rotations.astype(np.float64)
-    divisor = np.maximum(3 + np.trace(rotations, axis1=2, axis2=3), MIN_DIVISOR)
-    rotations = (rotations - rotations.swapaxes(2, 3)) / divisor[..., None, None]
-    rest = rig.rest_matrices[:, :3, :3].astype(np.float64)
+    divisors = np.maximum(3 + np.trace(rotations, axis1=2, axis2=3), MIN_DIVISOR)
+    rotations = (rotations - rotations.swapaxes(2, 3)) / divisors[..., None, None]
+    rest_rotations = rig.rest_matrices[:, :3, :3].astype(np.float64)
     parent_skin = skin_matrices(pose_matrices, rig.rest_matrices)[:, np.maximum(rig.parents, 0), :3, :3]
-    matrices = parent_skin @ (rest @ rotations @ np.linalg.inv(rest))
+    matrices = parent_skin @ (rest_rotations @ rotations @ np.linalg.inv(rest_rotations))
     return np.where((rig.parents < 0)[:, None, None], 0, matrices)
 
 
@@ -57,7 +57,7 @@ def regression_matrices(pose_matrices: np.ndarray, rig: Rig, use_half_rotations:
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-        rig: with J joints.
+        rig: rig with J joints.
         use_half_rotations: whether to append half-rotation matrices.
 
     Returns:
@@ -86,7 +86,7 @@ def half_rotations_help(
     """
     rig = recording.rig
     poses = training[:: -(-len(training) // MAX_POSES)]
-    fitted, measured = np.arange(0, len(poses), 2), np.arange(1, len(poses), 2)
+    fitted_poses, measured_poses = np.arange(0, len(poses), 2), np.arange(1, len(poses), 2)
     pose_matrices = np.array(recording.pose_matrices[poses])
     candidates = [regression_matrices(pose_matrices, rig, use_half_rotations) for use_half_rotations in (False, True)]
     errors = np.zeros(2)
@@ -96,7 +96,7 @@ def half_rotations_help(
         vertices = partition.vertices[:: -(-len(partition.vertices) // MAX_VERTICES_PER_PARTITION)]
         residuals = np.array(recording.residuals[poses[:, None], vertices])
         for index, matrices in enumerate(candidates):
-            _, remaining = joint_regression(rig, partition, matrices).fit(residuals, fitted)
-            mean_square = float((remaining[measured].astype(np.float64) ** 2).mean())
+            _, remaining = joint_regression(rig, partition, matrices).fit(residuals, fitted_poses)
+            mean_square = float((remaining[measured_poses].astype(np.float64) ** 2).mean())
             errors[index] += len(partition.vertices) * mean_square
     return bool(errors[1] < MAX_ERROR_RATIO * errors[0])

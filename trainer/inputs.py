@@ -79,11 +79,11 @@ class NetworkInputs:
         columns = []
         for partition, partition_columns in zip(partitions, self.columns, strict=True):
             indices = np.flatnonzero(surface_frames.main_joints == partition.joint)
-            added = [_columns(self.surface_frame_start, index, FEATURES_PER_SURFACE_FRAME) for index in indices]
-            columns.append(np.concatenate([partition_columns, *added]))
+            added_columns = [_columns(self.surface_frame_start, index, FEATURES_PER_SURFACE_FRAME) for index in indices]
+            columns.append(np.concatenate([partition_columns, *added_columns]))
         return replace(self, columns=tuple(columns), surface_frames=surface_frames)
 
-    def features(
+    def compute_features(
         self, pose_matrices: np.ndarray, rest_matrices: np.ndarray, controls: np.ndarray | None = None
     ) -> np.ndarray:
         """Compute the features of poses.
@@ -91,7 +91,7 @@ class NetworkInputs:
         Args:
             pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
             rest_matrices: (J, 4, 4), mesh-object space, mesh units.
-            controls: (N, C) values; None where C is 0.
+            controls: (N, C) values; None if C is 0.
 
         Returns:
             (N, F) float32.
@@ -99,19 +99,23 @@ class NetworkInputs:
         Raises:
             ValueError: the controls have another shape.
         """
-        values, shape = controls, (len(pose_matrices), self.control_count)
-        if values is None:
-            values = np.zeros((len(pose_matrices), 0))
-        if values.shape != shape:
-            raise ValueError(f"values of controls are {values.shape} and should be {shape}")
+        control_values, expected_shape = controls, (len(pose_matrices), self.control_count)
+        if control_values is None:
+            control_values = np.zeros((len(pose_matrices), 0))
+        if control_values.shape != expected_shape:
+            raise ValueError(f"values of controls are {control_values.shape} and should be {expected_shape}")
         joints = joint_features(pose_matrices, rest_matrices, self.parents).reshape(len(pose_matrices), -1)
         poses = pose_matrices.astype(np.float64)
         point_poses = poses[:, self.point_joints]
         points = np.einsum("nmab,mb->nma", point_poses[:, :, :3, :3], self.points) + point_poses[:, :, :3, 3]
         offsets = points[:, self.pair_points] - poses[:, :, :3, 3][:, self.pair_references]
-        local = np.einsum("nqab,nqb->nqa", np.linalg.inv(poses[:, :, :3, :3])[:, self.pair_references], offsets)
-        parts = [joints, values.astype(np.float32), local.reshape(len(poses), -1).astype(np.float32)]
-        return np.concatenate([*parts, self.surface_frames.evaluate(pose_matrices)], axis=1)
+        local_points = np.einsum("nqab,nqb->nqa", np.linalg.inv(poses[:, :, :3, :3])[:, self.pair_references], offsets)
+        feature_groups = [
+            joints,
+            control_values.astype(np.float32),
+            local_points.reshape(len(poses), -1).astype(np.float32),
+        ]
+        return np.concatenate([*feature_groups, self.surface_frames.evaluate(pose_matrices)], axis=1)
 
 
 def inputs_of_rig(rig: Rig, points: np.ndarray, partitions: Sequence[Partition]) -> NetworkInputs:

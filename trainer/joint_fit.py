@@ -43,7 +43,7 @@ class JointFit:
     joints: np.ndarray
     factors: np.ndarray
 
-    def offsets(self, matrices: np.ndarray) -> np.ndarray:
+    def compute_offsets(self, matrices: np.ndarray) -> np.ndarray:
         """Compute the offsets of the vertices from linear skinning.
 
         Args:

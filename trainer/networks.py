@@ -29,7 +29,7 @@ class Network:
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
 
-    def coefficients(self, inputs: np.ndarray, activation: str) -> np.ndarray:
+    def evaluate(self, inputs: np.ndarray, activation: str) -> np.ndarray:
         """Evaluate the network in PyTorch.
 
         Args:

@@ -131,7 +131,7 @@ class _Refinement:
         gain_per_parameter = 0.0
         for index, vertices, basis, count in zip(self._refinable, vertices_of, bases, counts, strict=True):
             unexplained = self._unexplained[:, vertices].reshape(len(self._poses), -1)
-            coefficients[index] = basis.truncate(count).coefficients(unexplained)
+            coefficients[index] = basis.truncate(count).project(unexplained)
             joint_count = len(np.unique(rig.skin_joints[vertices][rig.skin_weights[vertices] > 0]))
             parameter_count += len(vertices) * (3 * count + 4 * joint_count) + self._parameters_per_component * count
             if count + 1 < len(basis.error_by_count):

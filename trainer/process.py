@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Process control of the trainer: requests to stop, exit statuses, and the last message."""
+"""The trainer as a process: requests to stop it, exit statuses, and the last message that it sends."""
 
 import errno
 import os
@@ -27,46 +27,49 @@ from .progress import MessageSink
 POLL_SECONDS = 0.1
 """Minimum time between checks for the stop file."""
 MEMORY_ERROR_TEXTS = ("can't allocate memory", "not enough memory", "bad allocation", "bad_alloc", "WinError 1455")
-"""Error texts of torch and ONNX Runtime on Linux and Windows; 1455 is a paging file that is too small."""
-# Spinning OpenMP threads make training ten times slower on a busy machine, and no faster on an idle one. torch reads
-# the variable when it loads.
+"""Texts in errors of torch and ONNX Runtime when memory runs out. Windows error 1455: the paging file is too small."""
+# OpenMP threads that wait actively make training ten times slower on a busy machine, and no faster on an idle machine.
+# torch reads the variable when it loads.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-# Half the processors: the networks are small, and a second thread on two busy processors makes training slower.
+# The networks are small: a second thread on two busy processors makes training slower, so half the processors are used.
 os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 2) // 2)))
 
 
 class Cancelled(Exception):  # noqa: N818 - a request, not an error
-    """Raised when the work stops on request."""
+    """Raised when a job stops because a stop was requested."""
 
 
 class StopRequest:
-    """A request to stop, by a signal (Ctrl-C, SIGTERM, …) or by the add-on's stop file; call it to check."""
+    """A request to stop, by a signal (Ctrl-C, SIGTERM, …) or by the add-on's stop file.
+
+    Calling the object returns whether a stop is requested.
+    """
 
     def __init__(self):
-        self.requested = False
-        self._file = os.environ.get(STOP_FILE_VARIABLE, "")
+        self.is_requested = False
+        self._stop_file = os.environ.get(STOP_FILE_VARIABLE, "")
         self._next_poll = 0.0
         handle_stop_signals(self._request)
 
     def _request(self, *_) -> None:
-        self.requested = True
+        self.is_requested = True
 
     def __call__(self) -> bool:
-        if not self.requested and self._file and (now := time.monotonic()) >= self._next_poll:
+        if not self.is_requested and self._stop_file and (now := time.monotonic()) >= self._next_poll:
             self._next_poll = now + POLL_SECONDS
-            self.requested = os.path.exists(self._file)
-            if self.requested:
-                # The process that created it may be gone.
+            self.is_requested = os.path.exists(self._stop_file)
+            if self.is_requested:
+                # The stop file is deleted here, because the process that created it may have ended.
                 with suppress(OSError):
-                    os.unlink(self._file)
-        return self.requested
+                    os.unlink(self._stop_file)
+        return self.is_requested
 
     @contextmanager
     def exit_immediately(self, sink: MessageSink) -> Iterator[None]:
-        """Let a request end the process immediately, while torch loads, which can take half a minute.
+        """Let a stop request end the process immediately, for example while torch loads, which can take half a minute.
 
         Raises:
-            Cancelled: the stop was requested before.
+            Cancelled: a stop was requested before the call.
         """
         if self():
             raise Cancelled
@@ -75,7 +78,7 @@ class StopRequest:
         def watch() -> None:
             while not is_done.wait(POLL_SECONDS):
                 if self():
-                    os._exit(_send_last(sink, INTERRUPTED, MessageType.CANCELLED))
+                    os._exit(_send_last_message(sink, INTERRUPTED, MessageType.CANCELLED))
 
         watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()
@@ -86,34 +89,35 @@ class StopRequest:
             watcher.join()
 
 
-def run_with_messages(work: Callable[[], None], sink: MessageSink) -> int:
-    """Run the work and send one last message, except after a broken pipe; returns the exit status.
+def run_with_messages(run_job: Callable[[], None], sink: MessageSink) -> int:
+    """Run a job and send one last message, except after a broken pipe; returns the exit status.
 
     Args:
-        work: sends its own last message when it succeeds; raises `Cancelled` when it is stopped.
+        run_job: runs the job. It sends the last message itself when it succeeds, and raises `Cancelled` when it is
+            stopped.
         sink: receives the messages.
     """
     try:
-        work()
+        run_job()
     except Cancelled:
-        return _send_last(sink, INTERRUPTED, MessageType.CANCELLED)
+        return _send_last_message(sink, INTERRUPTED, MessageType.CANCELLED)
     except BrokenPipeError:
         _close_output()
         return 1
     except Exception as error:  # The add-on waits for a last message, whatever happened.
         text, status = _describe_error(error)
         values = {"text": text, **({"try_again": True} if status == TRY_AGAIN else {})}
-        status = _send_last(sink, status, MessageType.FAILED, **values)
+        status = _send_last_message(sink, status, MessageType.FAILED, **values)
         with suppress(OSError):
             print(text, file=sys.stderr)
         return status
     return 0
 
 
-def _send_last(sink: MessageSink, status: int, kind: MessageType, **values) -> int:
-    """Send the last message, if the output takes it; returns the exit status."""
+def _send_last_message(sink: MessageSink, status: int, message_type: MessageType, **values) -> int:
+    """Send the last message, unless the output is closed; returns the exit status."""
     try:
-        sink.send(kind, **values)
+        sink.send(message_type, **values)
     except OSError as error:
         _close_output()
         return 1 if isinstance(error, BrokenPipeError) else status
@@ -121,19 +125,19 @@ def _send_last(sink: MessageSink, status: int, kind: MessageType, **values) -> i
 
 
 def _close_output() -> None:
-    """Discard buffered output: flushing it at exit would fail again, and change the exit status."""
+    """Discard buffered output, because flushing it at exit would fail again and change the exit status."""
     with suppress(OSError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _describe_error(error: Exception) -> tuple[str, int]:
-    """Return a sentence for an error that ended the work, and the exit status."""
+    """Return a sentence for an error that ended the job, and the exit status."""
     if isinstance(error, FDDAError):
         return str(error), exit_status(error)
     cause: BaseException = error
     while cause.__cause__ is not None and not isinstance(cause, OSError | MemoryError):
         cause = cause.__cause__
-    if _lacks_memory(cause):
+    if _is_memory_error(cause):
         return to_single_line(
             f"The training lacks memory ({cause}); free some, or train on a larger machine."
         ), TRY_AGAIN
@@ -146,19 +150,19 @@ def _describe_error(error: Exception) -> tuple[str, int]:
     return f"The trainer stopped on an error of its own ({error!r}); please report it.", 1
 
 
-def _lacks_memory(error: BaseException) -> bool:
-    """Return whether numpy or torch ran out of memory. torch is not imported, as it may be missing."""
+def _is_memory_error(error: BaseException) -> bool:
+    """Return whether numpy or torch ran out of memory. torch may be missing, so its error is recognized by name."""
     class_names = {cls.__name__ for cls in type(error).__mro__}
     if class_names & {"MemoryError", "OutOfMemoryError"} or getattr(error, "errno", None) == errno.ENOMEM:
         return True
     return any(text in str(error) for text in MEMORY_ERROR_TEXTS)
 
 
-def missing_package(work: str, error: ModuleNotFoundError) -> TrainingError:
-    """Make the error of a process whose Python lacks a package; `work` is the subject of the sentence."""
+def missing_package_error(activity: str, error: ModuleNotFoundError) -> TrainingError:
+    """Return the error for a package that Python lacks; `activity` is the subject of its sentence."""
     package = str(error.name).partition(".")[0]
     return TrainingError(
-        f"{work} needs the Python package '{package}', which {sys.executable} does not have; install torch, onnx, "
+        f"{activity} needs the Python package '{package}', which {sys.executable} does not have; install torch, onnx, "
         "onnxruntime, numpy, scipy and matplotlib there, install the training environment in the preferences of the "
         "add-on, or set FDDA_TRAINER_PYTHON to a Python that has them."
     )

@@ -7,7 +7,7 @@ from typing import Protocol
 from fdda_addon.core.messages import WARNING_LINE, Message, MessageType
 
 FINISHED_LINE = "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s."
-LINES = {
+LINE_FORMATS = {
     MessageType.STARTED: "Training {partitions} partitions, {vertices} vertices, {poses} poses, on {device}.",
     MessageType.PARTITION_FINISHED: "  {joint}: {basis} components, held-out error {held_out_mm:.4f} mm",
     MessageType.LOG: "{text}",
@@ -16,8 +16,8 @@ LINES = {
     MessageType.FINISHED: FINISHED_LINE,
     MessageType.CANCELLED: "Cancelled; nothing was written.",
 }
-LINE_INTERVAL = 0.1
-"""Part of the epochs between two lines of progress where stdout is not a terminal."""
+LINE_EPOCH_INTERVAL = 0.1
+"""Part of the epochs between two lines of progress, if stdout is not a terminal."""
 BAR_WIDTH = 30
 """Characters of the progress bar."""
 
@@ -25,16 +25,16 @@ BAR_WIDTH = 30
 class MessageSink(Protocol):
     """Receives the messages of one training, in order."""
 
-    def send(self, kind: MessageType, **values) -> None:
+    def send(self, message_type: MessageType, **values) -> None:
         """Send a message; `core.messages` has the keys of each type."""
 
 
 class JsonMessageSink:
     """Writes messages as JSON lines to stdout."""
 
-    def send(self, kind: MessageType, **values) -> None:
+    def send(self, message_type: MessageType, **values) -> None:
         """Send a message."""
-        print(Message(kind, values).encode(), flush=True)
+        print(Message(message_type, values).encode(), flush=True)
 
 
 class TextMessageSink:
@@ -45,15 +45,15 @@ class TextMessageSink:
         self.has_open_line = False
         self.last_shown_epoch = 0.0
 
-    def send(self, kind: MessageType, **values) -> None:
+    def send(self, message_type: MessageType, **values) -> None:
         """Send a message."""
-        if kind is MessageType.PROGRESS:
+        if message_type is MessageType.PROGRESS:
             self._show_progress(**values)
             return
         if self.has_open_line:
             print()
             self.has_open_line = False
-        if line := LINES.get(kind):
+        if line := LINE_FORMATS.get(message_type):
             print(line.format(**values), flush=True)
 
     def _show_progress(self, epoch: int, epochs: int, validation_mm: float, **_: float) -> None:
@@ -62,6 +62,6 @@ class TextMessageSink:
             bar = "#" * filled + "." * (BAR_WIDTH - filled)
             print(f"\r[{bar}] epoch {epoch}/{epochs}, validation {validation_mm:.4f} mm ", end="", flush=True)
             self.has_open_line = True
-        elif epoch == epochs or epoch >= self.last_shown_epoch + LINE_INTERVAL * epochs:
+        elif epoch == epochs or epoch >= self.last_shown_epoch + LINE_EPOCH_INTERVAL * epochs:
             self.last_shown_epoch = epoch
             print(f"epoch {epoch}/{epochs}, validation {validation_mm:.4f} mm", flush=True)

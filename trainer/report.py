@@ -37,7 +37,7 @@ def make_report(
     recording: Recording,
     trained_model: TrainedModel,
     exported: ExportedModel,
-    on_training: PositionErrors,
+    training_errors: PositionErrors,
     surface: dict,
     curves: Sequence[Curves],
     model_name: str,
@@ -47,10 +47,10 @@ def make_report(
 
     Args:
         recording, trained_model, exported, curves: input and results of the training.
-        on_training: errors on a sample of the training poses.
+        training_errors: errors on a sample of the training poses.
         surface: `normals` and `edges` of held-out poses.
         model_name: file name of the model.
-        analyses: of the largest errors of each partition.
+        analyses: analysis of the largest errors of each partition.
     """
     names, controls = recording.rig.joint_names, [control.name for control in recording.rig.controls]
     held_out = exported.held_out
@@ -69,7 +69,7 @@ def make_report(
                 "features": len(prepared.columns),
                 "basis": len(prepared.basis.components),
                 "truncation": prepared.basis.truncation_rms * prepared.mm_per_unit,
-                "training": error_statistics(on_training.fdda[:, vertices]).to_json(),
+                "training": error_statistics(training_errors.fdda[:, vertices]).to_json(),
                 "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),
                 "linear": error_statistics(held_out.linear[:, vertices]).to_json(),
                 "histogram": _histogram(held_out.fdda[:, vertices]),
@@ -96,7 +96,7 @@ def make_report(
         "parity": exported.info.parity_mm,
         "constant_bytes": exported.info.constant_bytes,
         "fdda": {
-            "training": error_statistics(on_training.fdda).to_json(),
+            "training": error_statistics(training_errors.fdda).to_json(),
             "held_out": exported.info.held_out_mm,
         },
         "linear": {"held_out": error_statistics(held_out.linear).to_json()},
@@ -136,7 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("report", type=Path, help="report.json; the page is written beside it")
     parser.add_argument("--pictures", type=Path, help="folder of PNG or JPEG files to show, in order of their names")
     parser.add_argument("--evaluation", type=Path, help="JSON that evaluate wrote")
-    parser.add_argument("--overwrite", action="store_true", help="write over a page that is no report")
+    parser.add_argument("--overwrite", action="store_true", help="overwrite a page that is no report")
     options = parser.parse_args(arguments)
     try:
         page = page_path(options.report)

@@ -35,17 +35,22 @@ def check_drawable(report: dict, path: Path) -> None:
     edges, counts = histogram["edges"], (histogram["fdda"], histogram["linear"])
     problems = {
         "it has no partitions": not report["partitions"],
-        "its histogram has not as many counts as edges": not all(len(edges) == len(bins) + 1 > 3 for bins in counts),
-        "its histogram counts nothing": not all(min(bins, default=0) >= 0 and any(bins) for bins in counts),
+        "its histogram has not as many counts as edges": not all(
+            len(edges) == len(bin_counts) + 1 > 3 for bin_counts in counts
+        ),
+        "its histogram counts nothing": not all(
+            min(bin_counts, default=0) >= 0 and any(bin_counts) for bin_counts in counts
+        ),
         "the edges of its histogram do not ascend": not all(low < high for low, high in pairwise(edges))
         or not all(MIN_AXIS_MM <= edge <= MAX_EDGE_MM for edge in edges[1:]),
         "a curve is empty": any(
-            bool(p["curve"]["training"]) != bool(p["curve"]["validation"]) for p in report["partitions"]
+            bool(partition["curve"]["training"]) != bool(partition["curve"]["validation"])
+            for partition in report["partitions"]
         ),
         "it has normals without edges": bool(report.get("normals")) and not report.get("edges"),
     }
-    if present := [problem for problem, is_present in problems.items() if is_present]:
-        raise TrainingError(f"The report '{path}' is damaged: {present[0]}; train again.")
+    if found_problems := [problem for problem, is_present in problems.items() if is_present]:
+        raise TrainingError(f"The report '{path}' is damaged: {found_problems[0]}; train again.")
 
 
 def read_evaluation(path: Path) -> dict:

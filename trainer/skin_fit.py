@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fits skin weights to poses that `record` has evaluated: `python -m trainer.skin_fit FOLDER hard|smooth`.
 
-FOLDER is written by `core.recording.fit_folder`; the fitted weights are written into it. Messages and exit status are
-those of `python -m trainer`.
+`core.recording.fit_folder` writes FOLDER, and this command writes the fitted weights into it. It has the same messages
+and exit statuses as `python -m trainer`.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from pathlib import Path
 from fdda_addon.core.skin_fit import FIT_KINDS
 from fdda_addon.core.terminal import escape_unencodable_output
 
-from .process import StopRequest, missing_package, run_with_messages
+from .process import StopRequest, missing_package_error, run_with_messages
 from .progress import JsonMessageSink, MessageSink
 
 
@@ -24,17 +24,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("kind", choices=FIT_KINDS, help="one joint per vertex, or at most four")
     parser.add_argument("--metres-per-unit", type=float, default=1.0, help="length of a mesh unit in meters")
     options = parser.parse_args(arguments)
-    sink, stop = JsonMessageSink(), StopRequest()
-    return run_with_messages(lambda: _fit(options, sink, stop), sink)
+    sink, stop_request = JsonMessageSink(), StopRequest()
+    return run_with_messages(lambda: _fit(options, sink, stop_request), sink)
 
 
-def _fit(options: argparse.Namespace, sink: MessageSink, stop: StopRequest) -> None:
+def _fit(options: argparse.Namespace, sink: MessageSink, stop_request: StopRequest) -> None:
     try:
-        with stop.exit_immediately(sink):
+        with stop_request.exit_immediately(sink):
             from .skin_fit_job import fit_folder
     except ModuleNotFoundError as error:
-        raise missing_package("Fitting skin weights", error) from error
-    fit_folder(options.folder, options.kind, sink, stop, options.metres_per_unit)
+        raise missing_package_error("Fitting skin weights", error) from error
+    fit_folder(options.folder, options.kind, sink, stop_request, options.metres_per_unit)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from .config import TrainingConfig
 
 MIN_POSES = 10
 BLOCK_FRAMES = 10
-"""Frames of an animation that stay together in a split, because adjacent frames are nearly the same pose."""
+"""Number of consecutive frames that stay in one part of a split, because adjacent frames are nearly the same pose."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ def _check_pose_count(count: int) -> None:
 
 
 def _split(items: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float) -> Split:
-    order = np.random.default_rng([seed, 1]).permutation(items)
-    validation = max(1, round(len(items) * validation_fraction))
-    held_out = max(1, round(len(items) * held_out_fraction)) if held_out_fraction else 0
-    parts = np.split(order, [held_out, held_out + validation])
+    shuffled_items = np.random.default_rng([seed, 1]).permutation(items)
+    validation_count = max(1, round(len(items) * validation_fraction))
+    held_out_count = max(1, round(len(items) * held_out_fraction)) if held_out_fraction else 0
+    parts = np.split(shuffled_items, [held_out_count, held_out_count + validation_count])
     return Split(np.sort(parts[2]), np.sort(parts[1]), np.sort(parts[0]))
 
 

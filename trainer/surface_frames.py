@@ -19,7 +19,7 @@ from .blocks import BLOCK_ELEMENTS
 
 FEATURES_PER_SURFACE_FRAME = 3
 MIN_SQUARED_LENGTH = 1e-18
-"""Added to squared lengths before a division: a joint that is scaled to zero gives finite values."""
+"""Added to squared lengths before a division, so that a joint that is scaled to zero gives finite values."""
 MAX_JOINT_ENTRIES = 1 << 12
 """Maximum of joints times surface frames. Each evaluation reads one value of each joint for each tangent."""
 
@@ -37,8 +37,8 @@ class SurfaceFrameFeatures:
         main_joints: (D,) int64, main joint of each vertex's partition; the features are in its space.
         tangents: (2, D, K, 4 J) float64, mesh units. Their product with the columns of all pose matrices, stacked to
             (4 J, 3), is the tangents in mesh-object space. Padded with 0.
-        epsilons: (3, D, K) float64, of the tangents in mesh units, of the normal in square mesh units; above 0.
-        lengths: (3, D, K) float64, mesh units, weights of tangents and normal in the sum. Padded with 0.
+        epsilons: (3, D, K) float64, above 0: of the tangents in mesh units, of the normal in square mesh units.
+        lengths: (3, D, K) float64, mesh units, weights of the tangents and of the normal in the sum. Padded with 0.
     """
 
     vertices: np.ndarray
@@ -52,16 +52,18 @@ class SurfaceFrameFeatures:
 
     def fits(self, rig: Rig) -> bool:
         """Return whether indices and sizes are possible for a rig."""
-        joints, vertices = len(rig.joints), rig.vertex_count
-        are_in_range = self.main_joints.max(initial=0) < joints and self.vertices.max(initial=0) < vertices
-        are_few = len(self) * joints <= MAX_JOINT_ENTRIES
-        return are_in_range and are_few and (not len(self) or self.tangents.shape[3] == 4 * joints)
+        joint_count, vertex_count = len(rig.joints), rig.vertex_count
+        has_valid_indices = (
+            self.main_joints.max(initial=0) < joint_count and self.vertices.max(initial=0) < vertex_count
+        )
+        has_valid_size = len(self) * joint_count <= MAX_JOINT_ENTRIES
+        return has_valid_indices and has_valid_size and (not len(self) or self.tangents.shape[3] == 4 * joint_count)
 
     def subset(self, mask: np.ndarray) -> "SurfaceFrameFeatures":
-        """Select surface frames by a (D,) bool mask, without corners that none of them uses."""
-        used = (self.lengths[:, mask] != 0).any(axis=(0, 1))
-        corners = (array[:, mask][:, :, used] for array in (self.tangents, self.epsilons, self.lengths))
-        return SurfaceFrameFeatures(self.vertices[mask], self.main_joints[mask], *corners)
+        """Return the surface frames of a (D,) bool mask, without the corners that none of them uses."""
+        is_used = (self.lengths[:, mask] != 0).any(axis=(0, 1))
+        corner_arrays = (array[:, mask][:, :, is_used] for array in (self.tangents, self.epsilons, self.lengths))
+        return SurfaceFrameFeatures(self.vertices[mask], self.main_joints[mask], *corner_arrays)
 
     def evaluate(self, pose_matrices: np.ndarray) -> np.ndarray:
         """Compute the features along the axes of the main joints; a uniform scale of the character cancels out.
@@ -72,18 +74,18 @@ class SurfaceFrameFeatures:
         Returns:
             (N, 3 D) float32, mesh units.
         """
-        count = len(self)
-        features = np.empty((len(pose_matrices), FEATURES_PER_SURFACE_FRAME * count), np.float32)
+        frame_count = len(self)
+        features = np.empty((len(pose_matrices), FEATURES_PER_SURFACE_FRAME * frame_count), np.float32)
         step = max(1, BLOCK_ELEMENTS // max(1, 3 * self.lengths.size))
-        for start in range(0, len(features) if count else 0, step):
+        for start in range(0, len(features) if frame_count else 0, step):
             poses = pose_matrices[start : start + step].astype(np.float64)
-            sums = np.einsum("nfdkc,fdk->ndc", self.corner_vectors(poses), self.lengths)
+            frame_sums = np.einsum("nfdkc,fdk->ndc", self.compute_corner_vectors(poses), self.lengths)
             axes = poses[:, self.main_joints, :3, :3]
             axes /= np.sqrt((axes**2).sum(axis=2, keepdims=True) + MIN_SQUARED_LENGTH)
-            features[start : start + step] = np.einsum("ndab,nda->ndb", axes, sums).reshape(len(poses), -1)
+            features[start : start + step] = np.einsum("ndab,nda->ndb", axes, frame_sums).reshape(len(poses), -1)
         return features
 
-    def corner_vectors(self, pose_matrices: np.ndarray) -> np.ndarray:
+    def compute_corner_vectors(self, pose_matrices: np.ndarray) -> np.ndarray:
         """Compute the tangents and normals of all corners.
 
         Args:

@@ -14,8 +14,8 @@ from .inputs import NetworkInputs
 from .networks import Network
 
 MAX_COLUMN_COSINE = 1e-5
-"""A pose matrix is sheared where two of its columns have a larger cosine; rounding to float32 makes a tenth of it.
-Nearly locked joints are sensitive to 3e-5: treating their bones as orthogonal lowers their confidence."""
+"""A pose matrix is sheared if two of its columns have a larger cosine. Rounding to float32 causes a tenth of it.
+A cosine of 3e-5 already lowers the confidence of nearly locked joints if their bones are treated as orthogonal."""
 BLOCK_POSES = 256
 
 
@@ -24,7 +24,7 @@ class TrainedModel:
     """A trained character.
 
     Attributes:
-        rig: with J joints and V vertices.
+        rig: rig with J joints and V vertices.
         partitions: P partitions.
         inputs: input features of the networks.
         prepared: data of each partition.
@@ -62,7 +62,7 @@ class TrainedModel:
         return fitted[fitted >= len(self.rig.parents)] - len(self.rig.parents)
 
     def component_counts(self) -> list[int]:
-        """Return K of each partition."""
+        """Return K, the number of components, of each partition."""
         return [len(prepared.basis.components) for prepared in self.prepared]
 
 

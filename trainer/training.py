@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One training: all steps from the recording to the written files."""
+"""Runs a training: all steps from the recording to the written files."""
 
 import time
 from collections.abc import Callable
@@ -57,9 +57,9 @@ def train_model(
     Args:
         recording_path: folder of a complete recording.
         model_path: the .onnx file. All files are written at the end.
-        config: the settings.
-        sink: receives the messages from `STARTED` to `FINISHED`, but no errors.
-        should_stop: called often; nothing has been written when it stops the training.
+        config: settings of the training.
+        sink: receives the messages from `STARTED` to `FINISHED`. Errors are raised, not sent.
+        should_stop: called often. If it returns True, the training stops and writes nothing.
         warm_start: start from the checkpoint of the model, on a recording that may have grown since.
         strict: treat warnings about the recording as errors.
         overwrite: overwrite files of another kind.
@@ -68,7 +68,7 @@ def train_model(
         Cancelled: `should_stop` returned True.
         FDDAError: the recording, the settings or the output path cannot be used.
     """
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     check_training_outputs(model_path, overwrite)
     recording = read_recording(recording_path)
     split = split_recording(recording, config)
@@ -83,8 +83,8 @@ def train_model(
         device=str(device),
     )
     sink.send(MessageType.LOG, text=training_size_sentence(recording))
-    warnings = _check(recording, sink, strict)
-    _check_stop(should_stop)
+    warnings = _check_recording(recording, sink, strict)
+    _raise_if_stopped(should_stop)
     recording = drop_gravity_input(recording, split)
     # A warm start keeps the inputs of the checkpoint.
     surface_frames = (
@@ -114,25 +114,27 @@ def train_model(
             MessageType.LOG, text=f"Partitions refined: {reassigned} vertices are reassigned to a neighbor partition."
         )
     inputs = inputs_with_surface_frames(recording.rig, partitions, surface_frames)
-    prepared = _prepare(recording, partitions, inputs, use_half_rotations, split, config, sink, should_stop)
-    columns = [offered[partition.columns] for offered, partition in zip(inputs.columns, prepared, strict=True)]
+    prepared = _prepare_partitions(recording, partitions, inputs, use_half_rotations, split, config, sink, should_stop)
+    columns = [
+        offered_columns[partition.columns] for offered_columns, partition in zip(inputs.columns, prepared, strict=True)
+    ]
     result = train(
         prepared,
         split,
         warm_start_config(config) if checkpoint else config,
         device,
-        lambda p: sink.send(
+        lambda progress: sink.send(
             MessageType.PROGRESS,
-            epoch=p.epoch,
-            epochs=p.epochs,
-            training_mm=round(p.training_mm, 6),
-            validation_mm=round(p.validation_mm, 6),
+            epoch=progress.epoch,
+            epochs=progress.epochs,
+            training_mm=round(progress.training_mm, 6),
+            validation_mm=round(progress.validation_mm, 6),
         ),
         should_stop,
         initial_networks(checkpoint, prepared, columns) if checkpoint else None,
     )
-    trained_model = _trained_model(recording, partitions, inputs, split, prepared, result, config)
-    _check_stop(should_stop)
+    trained_model = _make_trained_model(recording, partitions, inputs, split, prepared, result, config)
+    _raise_if_stopped(should_stop)
     training_info = {
         **config.to_json(),
         "torch": str(torch.__version__),
@@ -146,39 +148,39 @@ def train_model(
     }
     sink.send(MessageType.LOG, text=f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
     exported = build_model(recording, trained_model, split.held_out, training_info)
-    _check_stop(should_stop)
-    sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
-    on_training = measure(exported.session, recording, trained_model, sample)
+    _raise_if_stopped(should_stop)
+    training_sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
+    training_errors = measure(exported.session, recording, trained_model, training_sample)
     surface = measure_surface(exported.session, recording, trained_model, split.held_out)
-    analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, on_training.fdda)
+    analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
     report = make_report(
-        recording, trained_model, exported, on_training, surface, result.curves, model_path.name, analyses
+        recording, trained_model, exported, training_errors, surface, result.curves, model_path.name, analyses
     )
-    # Times are not in the model, so that equal recordings and settings give equal files.
-    report["training"] = {**report["training"], "seconds": round(time.perf_counter() - started, 2)}
+    # The time is in the report only, so that equal recordings and settings give equal models.
+    report["training"] = {**report["training"], "seconds": round(time.perf_counter() - start_time, 2)}
     if recording.info.repeatability:
         report["repeatability"] = recording.info.repeatability.to_json()
     report["warnings"] = [warning.to_json() for warning in warnings]
-    poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
-    history = [*(checkpoint.history if checkpoint else ()), {"poses": poses, "p999": p999}]
+    pose_count, p999_mm = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
+    history = [*(checkpoint.history if checkpoint else ()), {"poses": pose_count, "p999": p999_mm}]
     goal_result = None
     if config.goal_mm:
-        training_p999 = report["fdda"]["training"]["p999"]
-        goal_result = evaluate_goal(config.goal_mm, history, training_p999, recording_path, model_path)
+        training_p999_mm = report["fdda"]["training"]["p999"]
+        goal_result = evaluate_goal(config.goal_mm, history, training_p999_mm, recording_path, model_path)
         report["goal"] = goal_result.to_json()
     page = render_html(report)
-    _check_stop(should_stop)
-    # From here on the training cannot be stopped: model, checkpoint and report belong together.
+    _raise_if_stopped(should_stop)
+    # The training cannot be stopped while it writes, because model, checkpoint and report belong together.
     with atomic_write_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
         write_checkpoint(checkpoint_file, trained_model, holdout, config.hidden, history)
         report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
-    _send_end(sink, model_path, report, goal_result, time.perf_counter() - started)
+    _send_final_messages(sink, model_path, report, goal_result, time.perf_counter() - start_time)
 
 
-def _check(recording: Recording, sink: MessageSink, strict: bool) -> list[RecordingWarning]:
-    """Check the recording, and send its warnings.
+def _check_recording(recording: Recording, sink: MessageSink, strict: bool) -> list[RecordingWarning]:
+    """Check the recording, send its warnings, and return them.
 
     Raises:
         RecordingError: there are warnings, and `strict` is set.
@@ -191,7 +193,7 @@ def _check(recording: Recording, sink: MessageSink, strict: bool) -> list[Record
     return warnings
 
 
-def _send_end(
+def _send_final_messages(
     sink: MessageSink, model_path: Path, report: dict, goal_result: GoalResult | None, seconds: float
 ) -> None:
     for partition in report["partitions"]:
@@ -214,7 +216,7 @@ def _send_end(
     )
 
 
-def _prepare(
+def _prepare_partitions(
     recording: Recording,
     partitions: tuple[Partition, ...],
     inputs: NetworkInputs,
@@ -224,9 +226,9 @@ def _prepare(
     sink: MessageSink,
     should_stop: Callable[[], bool],
 ) -> list[PreparedPartition]:
-    def announce(done: int) -> None:
-        sink.send(MessageType.PREPARING, done=done, total=len(recording.partitions))
-        _check_stop(should_stop)
+    def send_progress(prepared_count: int) -> None:
+        sink.send(MessageType.PREPARING, done=prepared_count, total=len(recording.partitions))
+        _raise_if_stopped(should_stop)
 
     return prepare_partitions(
         partition_data(recording, partitions, inputs, use_half_rotations),
@@ -235,11 +237,11 @@ def _prepare(
         config.seed,
         recording.rig.metres_per_unit,
         config.hidden[-1],
-        announce,
+        send_progress,
     )
 
 
-def _trained_model(
+def _make_trained_model(
     recording: Recording,
     partitions: tuple[Partition, ...],
     inputs: NetworkInputs,
@@ -250,7 +252,7 @@ def _trained_model(
 ) -> TrainedModel:
     rig = recording.rig
     matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
-    features = inputs.features(matrices, rig.rest_matrices, controls)
+    features = inputs.compute_features(matrices, rig.rest_matrices, controls)
     return TrainedModel(
         rig,
         partitions,
@@ -263,6 +265,6 @@ def _trained_model(
     )
 
 
-def _check_stop(should_stop: Callable[[], bool]) -> None:
+def _raise_if_stopped(should_stop: Callable[[], bool]) -> None:
     if should_stop():
         raise Cancelled

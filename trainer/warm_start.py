@@ -71,7 +71,7 @@ def initial_networks(
     """Convert the networks of a checkpoint to the features and bases of the current training.
 
     Args:
-        checkpoint: of the same rig, controls, hidden layers and activation.
+        checkpoint: checkpoint of the same rig, controls, hidden layers and activation.
         prepared: the partitions of the current training.
         columns: for each partition, (F',) indices of its features among all features of `NetworkInputs`.
 
@@ -85,23 +85,23 @@ def initial_networks(
     sizes = [3 * partition.vertex_count for partition in prepared]
     if sizes != [len(partition.basis_mean) for partition in checkpoint.partitions]:
         raise TrainingError(OTHER_PARTITIONS_SENTENCE)
-    return [_converted(*each) for each in zip(checkpoint.partitions, prepared, columns, strict=True)]
+    return [_convert_network(*arguments) for arguments in zip(checkpoint.partitions, prepared, columns, strict=True)]
 
 
-def _converted(former: PartitionCheckpoint, prepared: PreparedPartition, columns: np.ndarray) -> Network | None:
+def _convert_network(former: PartitionCheckpoint, prepared: PreparedPartition, columns: np.ndarray) -> Network | None:
     """Convert the network of one partition; arguments and result as in `initial_networks`."""
     if not len(former.basis_components) or not len(prepared.basis.components):
         return None
     weights, biases = (
         [array.astype(np.float64) for array in arrays] for arrays in (former.network.weights, former.network.biases)
     )
-    # A feature that was constant before gets weight 0; one that is constant now stays at its mean.
-    first_weight = np.zeros((len(columns), weights[0].shape[1]))
-    _, now, before = np.intersect1d(columns, former.columns, return_indices=True)
-    unscaled = weights[0][before] / former.feature_scale[before, None]
-    first_weight[now] = unscaled * prepared.feature_scale[now, None]
-    biases[0] = biases[0] + (prepared.feature_mean[now] - former.feature_mean[before]) @ unscaled
-    weights[0] = first_weight
+    # A feature that was constant before gets weight 0. A feature that is constant now stays at its mean.
+    first_weights = np.zeros((len(columns), weights[0].shape[1]))
+    _, new_rows, former_rows = np.intersect1d(columns, former.columns, return_indices=True)
+    unscaled = weights[0][former_rows] / former.feature_scale[former_rows, None]
+    first_weights[new_rows] = unscaled * prepared.feature_scale[new_rows, None]
+    biases[0] = biases[0] + (prepared.feature_mean[new_rows] - former.feature_mean[former_rows]) @ unscaled
+    weights[0] = first_weights
     components = prepared.basis.components.T.astype(np.float64)
     change_of_basis = former.basis_components @ components
     weights[-1] = weights[-1] @ change_of_basis

@@ -29,8 +29,8 @@ class MessageSink:
     def __init__(self) -> None:
         self.has_trained = False
 
-    def send(self, kind, **_) -> None:
-        self.has_trained |= kind.name in ("PROGRESS", "PREPARING")
+    def send(self, message_type, **_) -> None:
+        self.has_trained |= message_type.name in ("PROGRESS", "PREPARING")
 
 
 def run(folder: Path, seed: int, first_case: int, end_case: int) -> None:

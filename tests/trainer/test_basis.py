@@ -27,10 +27,10 @@ def test_the_tolerance_determines_the_number_of_components(poses, vertices, tole
     monkeypatch.setattr(basis_module, "NEGLIGIBLE_RMS_RATIO", 0)
     values = residuals(poses, vertices, 12)
     basis = make_basis(values, tolerance, np.random.default_rng(0))
-    error = rms(values - basis.residuals(basis.coefficients(values)))
+    error = rms(values - basis.reconstruct(basis.project(values)))
     assert error <= tolerance * 1.01
     assert basis.truncation_rms == pytest.approx(error, rel=0.02, abs=1e-8)
-    coefficients = basis.coefficients(values)[:, :-1]
+    coefficients = basis.project(values)[:, :-1]
     fewer = coefficients @ basis.components[:-1] + basis.mean
     assert rms(values - fewer) > tolerance
     assert 0 < len(basis.components) <= 12
@@ -48,7 +48,7 @@ def test_components_are_orthonormal_so_coefficients_measure_distance():
     values = residuals(80, 100, 10)
     basis = make_basis(values, 1e-6, np.random.default_rng(0))
     np.testing.assert_allclose(basis.components @ basis.components.T, np.eye(len(basis.components)), atol=1e-5)
-    coefficients = basis.coefficients(values)
+    coefficients = basis.project(values)
     distance = np.linalg.norm(values[3].astype(np.float64) - values[4])
     assert np.linalg.norm(coefficients[3] - coefficients[4]) == pytest.approx(distance, rel=1e-3)
 
@@ -57,7 +57,7 @@ def test_a_constant_residual_needs_no_component():
     values = np.tile(np.float32([[0.01, 0.02, 0.03]]), (20, 5))
     basis = make_basis(values, 1e-5, np.random.default_rng(0))
     assert basis.components.shape == (0, 15)
-    np.testing.assert_allclose(basis.residuals(basis.coefficients(values)), values, atol=1e-8)
+    np.testing.assert_allclose(basis.reconstruct(basis.project(values)), values, atol=1e-8)
 
 
 def test_a_sample_of_the_poses_gives_the_same_components(monkeypatch):
@@ -65,7 +65,7 @@ def test_a_sample_of_the_poses_gives_the_same_components(monkeypatch):
     monkeypatch.setattr(basis_module, "NEGLIGIBLE_RMS_RATIO", 0)
     values = residuals(150, 60, 6)
     basis = make_basis(values, 1e-6, np.random.default_rng(0))
-    assert rms(values - basis.residuals(basis.coefficients(values))) < 3e-6
+    assert rms(values - basis.reconstruct(basis.project(values))) < 3e-6
 
 
 def spectra() -> tuple[list[np.ndarray], list[int]]:
@@ -112,7 +112,7 @@ def test_truncated_bases_have_the_stated_error():
     basis = make_basis(values, 1e-5, np.random.default_rng(0))
     for count in range(len(basis.components) + 1):
         fewer = basis.truncate(count)
-        error = rms(values - fewer.residuals(fewer.coefficients(values)))
+        error = rms(values - fewer.reconstruct(fewer.project(values)))
         assert fewer.truncation_rms == pytest.approx(error, rel=0.02, abs=1e-8)
 
 

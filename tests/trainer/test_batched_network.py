@@ -76,7 +76,7 @@ def test_returned_weights_are_those_of_the_best_epoch():
     prepared, trained = train_partitions([replace(learned, read_residuals=lambda: learned.read_residuals() + noise)])
     assert trained.curves[0].best_epoch < CONFIG.epochs
     split = split_poses(np.arange(40), CONFIG.validation_fraction, CONFIG.seed)
-    coefficients = trained.networks[0].coefficients(prepared[0].inputs[split.validation], CONFIG.activation)
+    coefficients = trained.networks[0].evaluate(prepared[0].inputs[split.validation], CONFIG.activation)
     squared = ((coefficients - prepared[0].coefficients[split.validation]) ** 2).sum(axis=1) / 10
     error = np.sqrt(squared + prepared[0].validation_truncation ** 2).mean() * 1000
     assert error == pytest.approx(min(trained.curves[0].validation_mm), rel=1e-3)
@@ -142,7 +142,7 @@ def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
     monkeypatch.setattr(_Loop, "run", run_and_rescale)
     prepared, after = train_partitions(partitions, config)
     for data, first_network, second_network in zip(prepared, before.networks, after.networks, strict=True):
-        expected, actual = (network.coefficients(data.inputs, "silu") for network in (first_network, second_network))
+        expected, actual = (network.evaluate(data.inputs, "silu") for network in (first_network, second_network))
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
@@ -154,7 +154,7 @@ def test_a_warm_start_keeps_the_outputs():
     for curve, first_curve in zip(again.curves, first.curves, strict=True):
         np.testing.assert_allclose(curve.validation_mm, min(first_curve.validation_mm), rtol=1e-3)
     for data, first_network, second_network in zip(prepared, first.networks, again.networks, strict=True):
-        expected, actual = (network.coefficients(data.inputs, "silu") for network in (first_network, second_network))
+        expected, actual = (network.evaluate(data.inputs, "silu") for network in (first_network, second_network))
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 

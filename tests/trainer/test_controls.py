@@ -159,9 +159,11 @@ def test_a_constant_control_with_a_range_counts_where_it_influences():
     partitions = make_partitions(rig, INFLUENCING, {1: (0,)})
     inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
     poses, still = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
-    own = measure_training_range(inputs.features(poses, rig.rest_matrices, still), rig, partitions)
+    own = measure_training_range(inputs.compute_features(poses, rig.rest_matrices, still), rig, partitions)
     assert own.controls == (replace(BULGE, low=0.25, high=0.25),)
-    confidence = own.confidence(inputs.features(poses[:3], rig.rest_matrices, np.array([[0.25], [1], [6]])))
+    confidence = own.compute_confidence(
+        inputs.compute_features(poses[:3], rig.rest_matrices, np.array([[0.25], [1], [6]]))
+    )
     assert (
         (confidence[:, [0, 2]] == 1).all() and confidence[0, 1] == 1 > confidence[1, 1] > 0.8 and confidence[2, 1] == 0
     )

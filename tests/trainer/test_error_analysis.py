@@ -8,7 +8,14 @@ import pytest
 
 from trainer.__main__ import main
 from trainer.error_analysis import _cause
-from trainer.error_causes import CAUSES, COMPONENTS, EXTREMES, NONE, POSES, STEEP
+from trainer.error_causes import (
+    EXTREME_POSES,
+    HIGH_TRAINING_ERRORS,
+    NO_CLEAR_CAUSE,
+    REMEDY_BY_CAUSE,
+    TOO_FEW_COMPONENTS,
+    TOO_FEW_POSES,
+)
 from trainer.report_page import render_html
 
 from .chain import write_chain
@@ -25,29 +32,29 @@ def test_too_few_components_are_the_cause(tmp_path):
     """With a tolerance of two millimeters, components do not represent most of the error."""
     partitions = train_chain(tmp_path, 200, "--epochs", "60", "--tolerance-mm", "2")
     analyses = [p["largest_errors"] for p in partitions if p["held_out"]["max"] > 1]
-    assert analyses and all(a["truncation"] > 0.8 and a["cause"] == COMPONENTS for a in analyses)
+    assert analyses and all(a["truncation"] > 0.8 and a["cause"] == TOO_FEW_COMPONENTS for a in analyses)
 
 
 def test_too_few_poses_are_the_cause(tmp_path):
     """With thirty poses and many epochs, the training poses are accurate and the other poses are not."""
     partitions = train_chain(tmp_path, 30, "--epochs", "300", "--tolerance-mm", "0.001", "--held-out-fraction", "0.4")
     analysis = max(partitions, key=lambda p: p["held_out"]["max"])["largest_errors"]
-    assert analysis["generalization"] > 1.5 and analysis["cause"] in (POSES, EXTREMES)
+    assert analysis["generalization"] > 1.5 and analysis["cause"] in (TOO_FEW_POSES, EXTREME_POSES)
 
 
 @pytest.mark.parametrize(
     ("truncation", "distance", "generalization", "cause"),
     [
-        (0.9, 3.0, 3.0, COMPONENTS),
-        (0.1, 1.0, 3.0, POSES),
-        (0.1, 3.0, 3.0, EXTREMES),
-        (0.1, 3.0, 1.0, EXTREMES),
-        (0.1, 1.0, 1.0, STEEP),
-        (0.4, 1.0, 1.0, NONE),
+        (0.9, 3.0, 3.0, TOO_FEW_COMPONENTS),
+        (0.1, 1.0, 3.0, TOO_FEW_POSES),
+        (0.1, 3.0, 3.0, EXTREME_POSES),
+        (0.1, 3.0, 1.0, EXTREME_POSES),
+        (0.1, 1.0, 1.0, HIGH_TRAINING_ERRORS),
+        (0.4, 1.0, 1.0, NO_CLEAR_CAUSE),
     ],
 )
 def test_cause_of_measured_ratios(truncation, distance, generalization, cause):
-    assert _cause(truncation, distance, generalization) == cause and cause in CAUSES
+    assert _cause(truncation, distance, generalization) == cause and cause in REMEDY_BY_CAUSE
 
 
 def test_the_page_shows_the_analysis(report):

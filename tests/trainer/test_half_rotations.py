@@ -157,7 +157,9 @@ def test_half_rotations_explain_most_residuals_of_preserved_volume(recording):
             regression = joint_regression(recording.rig, partition, matrices)
             fit, rest = regression.fit(residuals, split.training)
             left.append(float((rest[split.held_out].astype(np.float64) ** 2).mean()))
-            offsets = fit.offsets(matrices) @ np.linalg.inv(matrices[:, partition.joint, :, :3]).transpose(0, 2, 1)
+            offsets = fit.compute_offsets(matrices) @ np.linalg.inv(matrices[:, partition.joint, :, :3]).transpose(
+                0, 2, 1
+            )
             np.testing.assert_allclose(residuals - offsets, rest, atol=1e-5)
         assert (fit.joints >= len(recording.rig.joints)).any()
         assert left[1] < 0.25 * left[0]

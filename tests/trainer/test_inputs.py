@@ -47,10 +47,10 @@ def test_controls_are_between_joints_and_pairs():
     assert inputs.columns[1].tolist() == [61]
     poses = np.tile(np.eye(4), (2, 5, 1, 1))
     controls = np.float32([[1, 2, 3], [4, 5, 6]])
-    features = inputs.features(poses, np.tile(np.eye(4), (5, 1, 1)), controls)
+    features = inputs.compute_features(poses, np.tile(np.eye(4), (5, 1, 1)), controls)
     assert features.shape == (2, 69) and np.array_equal(features[:, 60:63], controls)
     with pytest.raises(ValueError, match=r"are \(2, 0\) and should be \(2, 3\)"):
-        inputs.features(poses, np.tile(np.eye(4), (5, 1, 1)))
+        inputs.compute_features(poses, np.tile(np.eye(4), (5, 1, 1)))
 
 
 def test_a_pair_is_the_center_of_a_partition_in_the_space_of_a_joint():
@@ -59,7 +59,7 @@ def test_a_pair_is_the_center_of_a_partition_in_the_space_of_a_joint():
     inputs = make_inputs(rig.parents, partition_centers(rig, partitions), [partition(1, 1, 2, 3)])
     assert list(zip(inputs.pair_references, inputs.pair_points, strict=True)) == [(1, 3)]
     poses = pose_chain(rig, chain_angles(5, 4, 0))
-    features = inputs.features(poses, rig.rest_matrices)
+    features = inputs.compute_features(poses, rig.rest_matrices)
     joints = joint_features(poses, rig.rest_matrices, rig.parents)
     np.testing.assert_array_equal(features[:, :48], joints.reshape(5, -1))
     center = np.append(rig.rest_positions[partitions[3].vertices].mean(axis=0), 1)

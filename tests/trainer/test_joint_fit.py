@@ -51,7 +51,7 @@ def test_smooth_skinning_is_recovered(smooth_rig, poses, joint):
     skin = skin_matrices(poses, rig.rest_matrices)
     fit, remainder = joint_regression(rig, partition, skin).fit(residuals, TRAINING)
     assert np.abs(residuals).max() > 5e-3 and np.abs(remainder).max() < 1e-4
-    fitted = skinning.positions(poses)[:, partition.vertices] + fit.offsets(skin)
+    fitted = skinning.positions(poses)[:, partition.vertices] + fit.compute_offsets(skin)
     np.testing.assert_allclose(fitted, truth[:, partition.vertices], atol=1e-4)
 
 
@@ -82,7 +82,7 @@ def test_offsets_and_remainder_sum_to_the_residuals(smooth_rig, poses):
     residuals = random_residuals(smooth_rig, partition, len(poses))
     fit, remainder = joint_regression(smooth_rig, partition, skin).fit(residuals, TRAINING)
     inverse = np.linalg.inv(skin[:, partition.joint, :3, :3].astype(np.float64))
-    offsets = np.einsum("nab,nvb->nva", inverse, fit.offsets(skin))
+    offsets = np.einsum("nab,nvb->nva", inverse, fit.compute_offsets(skin))
     np.testing.assert_allclose(offsets + remainder, residuals, atol=1e-5)
     assert (remainder[TRAINING] ** 2).mean() < 0.3 * (residuals[TRAINING] ** 2).mean(), "not even the mean was fitted"
 
@@ -95,8 +95,10 @@ def test_offsets_rotate_with_the_character(smooth_rig, poses):
     )
     character_transform = rotation(1, 0.8)
     character_transform[:3, 3] = 3, 20, -1
-    expected = fit.offsets(skin) @ character_transform[:3, :3].T
-    np.testing.assert_allclose(fit.offsets((character_transform @ skin).astype(np.float32)), expected, atol=1e-4)
+    expected = fit.compute_offsets(skin) @ character_transform[:3, :3].T
+    np.testing.assert_allclose(
+        fit.compute_offsets((character_transform @ skin).astype(np.float32)), expected, atol=1e-4
+    )
 
 
 def test_joints_that_only_influencing_joints_move():
@@ -131,4 +133,4 @@ def test_joints_that_never_moved_get_small_factors(smooth_rig):
     fit, _ = joint_regression(smooth_rig, partition, skin).fit(residuals, np.arange(30))
     assert np.abs(fit.factors).max() < 0.1
     bent_skin = skin_matrices(pose_chain(smooth_rig, np.full((1, JOINTS, 2), 0.5)), smooth_rig.rest_matrices)
-    assert np.abs(fit.offsets(bent_skin)).max() < 0.1
+    assert np.abs(fit.compute_offsets(bent_skin)).max() < 0.1

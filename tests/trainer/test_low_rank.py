@@ -66,7 +66,7 @@ class Prepared:
         self.fit, left = self.regression.fit(own, TRAINING)
         left = left.reshape(POSES, -1)
         self.basis = make_basis(left, self.tolerance, np.random.default_rng(0))
-        self.coefficients = self.basis.coefficients(left)
+        self.coefficients = self.basis.project(left)
 
     def factorize(self, weights: np.ndarray = ONES) -> LowRankFactors | None:
         arguments = self.fit, self.basis, self.coefficients, self.regression, TRAINING, weights, self.tolerance
@@ -75,8 +75,8 @@ class Prepared:
     def offsets(self, of: "Prepared | LowRankFactors") -> np.ndarray:
         """Return the (N, Vp, 3) offsets from linear skinning in the space of the main joint, mesh units."""
         turned = np.linalg.inv(self.skin[:, self.partition.joint, :3, :3].astype(np.float64))
-        fitted = of.fit.offsets(self.skin) @ turned.transpose(0, 2, 1)
-        return fitted + of.basis.residuals(of.coefficients).reshape(fitted.shape)
+        fitted = of.fit.compute_offsets(self.skin) @ turned.transpose(0, 2, 1)
+        return fitted + of.basis.reconstruct(of.coefficients).reshape(fitted.shape)
 
 
 def moved(rig: Rig, translation: np.ndarray, per_metre: float) -> Rig:

@@ -31,7 +31,7 @@ JOINTS, VERTICES, POSES = 24, 300, 40
 
 
 class SilentSink:
-    def send(self, kind: MessageType, **values) -> None:
+    def send(self, message_type: MessageType, **values) -> None:
         pass
 
 

@@ -110,9 +110,9 @@ def test_the_errors_are_those_of_the_model_on_the_held_out_poses(studied, result
 def test_the_networks_see_what_they_see_when_all_partitions_train(recording, held_out):
     whole = read_recording(recording)
     inputs = inputs_of_rig(whole.rig, partition_centers(whole.rig, whole.partitions), whole.partitions)
-    features = inputs.features(whole.pose_matrices, whole.rig.rest_matrices)
+    features = inputs.compute_features(whole.pose_matrices, whole.rig.rest_matrices)
     study_data = read_study_data(recording, held_out, NAMES)
-    own = study_data.inputs.features(study_data.training.pose_matrices, study_data.training.rig.rest_matrices)
+    own = study_data.inputs.compute_features(study_data.training.pose_matrices, study_data.training.rig.rest_matrices)
     for columns, all_columns in zip(study_data.inputs.columns, inputs.columns[1:], strict=True):
         assert np.array_equal(own[:, columns], features[:, all_columns])
 

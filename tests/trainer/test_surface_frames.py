@@ -58,7 +58,7 @@ def test_tangents_and_normals_are_those_of_the_smoothed_surface(recording, surfa
         vectors /= np.linalg.norm(vectors, axis=2, keepdims=True)
         for number, vertex in enumerate(surface_frames.vertices):
             expected = vectors[:, rig.face_vertices == vertex]
-            found = surface_frames.corner_vectors(matrices[pose, None])[0, :, number, : expected.shape[1]]
+            found = surface_frames.compute_corner_vectors(matrices[pose, None])[0, :, number, : expected.shape[1]]
             # Epsilons and the fitted number of iterations make no difference.
             assert np.abs(found - expected).max() < 1e-3
 
@@ -119,14 +119,14 @@ def test_a_rig_that_smooths_one_partition_has_no_surface_frames(tmp_path, record
 
 
 def test_a_vertex_without_a_measure_selects_nothing(recording, monkeypatch):
-    fit = surface_frame_fit._fit
+    fit = surface_frame_fit._fit_lengths
 
     def fit_with_nan(*arguments) -> tuple[np.ndarray, np.ndarray]:
         lengths, explained = fit(*arguments)
         explained[0] = np.nan
         return lengths, explained
 
-    monkeypatch.setattr(surface_frame_fit, "_fit", fit_with_nan)
+    monkeypatch.setattr(surface_frame_fit, "_fit_lengths", fit_with_nan)
     assert select(recording) is NO_SURFACE_FRAMES
 
 

@@ -69,11 +69,11 @@ def test_networks_start_with_nearly_their_former_outputs(recording, trained, gro
             continue
         features = now.inputs * now.feature_scale + now.feature_mean
         assert np.array_equal(before.columns, columns[compared]) or len(before.columns) == len(now.columns)
-        old_coefficients = before.network.coefficients(
+        old_coefficients = before.network.evaluate(
             ((features - before.feature_mean) / before.feature_scale).astype(np.float32), checkpoint.activation
         )
         expected = old_coefficients @ before.basis_components + before.basis_mean
-        residuals = now.basis.residuals(network.coefficients(now.inputs, checkpoint.activation))
+        residuals = now.basis.reconstruct(network.evaluate(now.inputs, checkpoint.activation))
         # Not exactly: the linear fit and the components are computed from other poses.
         assert np.linalg.norm(residuals - expected) < 0.05 * np.linalg.norm(expected)
         compared += 1
