@@ -44,7 +44,7 @@ def trained(recording: Path) -> Character:
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
     """A tube on a chain of joints bone_0 to bone_3."""
     recording = tmp_path_factory.mktemp("chain") / "recording"
-    write_chain(recording, POSES, joints=JOINTS)
+    write_chain(recording, POSES, joint_count=JOINTS)
     return trained(recording)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A small rig without Blender: a tube on a chain of joints whose residual bends with them."""
+"""A small rig without Blender: a tube on a chain of joints. Its residuals depend on the bends of the joints."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 
-LIMIT = 0.9
-"""Range of motion of every joint about x and z, radians."""
+MAX_ANGLE = 0.9
+"""Largest angle of every joint about x and about z, in both directions, radians."""
 
 
 def rotation(axis: int, angle: float) -> np.ndarray:
@@ -23,24 +23,24 @@ def rotation(axis: int, angle: float) -> np.ndarray:
     return matrix
 
 
-def chain_rig(joints: int = 3, vertices: int = 90, seed: int = 0) -> Rig:
-    """Create a tube of one meter along z, smoothly skinned to a chain of joints. Vertices are in random order."""
+def chain_rig(joint_count: int = 3, vertex_count: int = 90, seed: int = 0) -> Rig:
+    """Create a tube of one meter along z with smooth skin weights on a chain of joints and vertices in random order."""
     rng = np.random.default_rng(seed)
-    rest = np.stack([np.eye(4)] * joints)
-    rest[:, 2, 3] = np.arange(joints) / joints
-    rest = rest @ rotation(0, 0.3)
-    height, angle = rng.permutation(np.linspace(0.01, 0.99, vertices)), rng.uniform(0, 2 * np.pi, vertices)
+    rest_matrices = np.stack([np.eye(4)] * joint_count)
+    rest_matrices[:, 2, 3] = np.arange(joint_count) / joint_count
+    rest_matrices = rest_matrices @ rotation(0, 0.3)
+    height, angle = rng.permutation(np.linspace(0.01, 0.99, vertex_count)), rng.uniform(0, 2 * np.pi, vertex_count)
     positions = np.stack([0.06 * np.cos(angle), 0.06 * np.sin(angle), height], axis=1).astype(np.float32)
-    along = height * joints - 0.5
-    first = np.clip(np.floor(along).astype(int), 0, joints - 1)
-    second = np.minimum(first + 1, joints - 1)
-    weight = np.clip(along - first, 0, 1) * (second > first)
-    skin_joints = np.stack([first, np.where(weight > 0, second, 0)], axis=1).astype(np.int32)
-    skin_weights = np.stack([1 - weight, weight], axis=1).astype(np.float32)
-    chain = tuple(Joint(f"bone_{number}", number - 1) for number in range(joints))
+    joint_coordinate = height * joint_count - 0.5
+    lower_joints = np.clip(np.floor(joint_coordinate).astype(int), 0, joint_count - 1)
+    upper_joints = np.minimum(lower_joints + 1, joint_count - 1)
+    upper_weights = np.clip(joint_coordinate - lower_joints, 0, 1) * (upper_joints > lower_joints)
+    skin_joints = np.stack([lower_joints, np.where(upper_weights > 0, upper_joints, 0)], axis=1).astype(np.int32)
+    skin_weights = np.stack([1 - upper_weights, upper_weights], axis=1).astype(np.float32)
+    joints = tuple(Joint(f"bone_{index}", index - 1) for index in range(joint_count))
     fingerprint = Fingerprint("chain", Fingerprint.digest(positions), Fingerprint.digest(skin_weights))
     faces = chain_faces(height)
-    return Rig(chain, positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
+    return Rig(joints, positions, rest_matrices.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
 
 
 def chain_faces(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,54 +50,60 @@ def chain_faces(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(0, vertices.size, 3, dtype=np.int32), vertices.astype(np.int32).ravel()
 
 
-def chain_angles(poses: int, joints: int, seed: int, reach: float = 1.0) -> np.ndarray:
-    """Draw (poses, joints, 2) angles about x and z, uniform in `reach` times the range of motion; the root is still."""
-    angles = np.random.default_rng(seed).uniform(-LIMIT * reach, LIMIT * reach, (poses, joints, 2))
+def chain_angles(pose_count: int, joint_count: int, seed: int, range_scale: float = 1.0) -> np.ndarray:
+    """Draw (N, J, 2) angles about x and z, uniform in `range_scale` times the range of motion; 0 for the root."""
+    angles = np.random.default_rng(seed).uniform(
+        -MAX_ANGLE * range_scale, MAX_ANGLE * range_scale, (pose_count, joint_count, 2)
+    )
     angles[:, 0] = 0
     return angles
 
 
 def pose_chain(rig: Rig, angles: np.ndarray) -> np.ndarray:
     """Convert (N, J, 2) angles to (N, J, 4, 4) float32 pose matrices."""
-    rest = rig.rest_matrices.astype(np.float64)
+    rest_matrices = rig.rest_matrices.astype(np.float64)
     matrices = np.empty((len(angles), len(rig.joints), 4, 4))
-    for pose, by_joint in enumerate(angles):
-        for joint, (x, z) in enumerate(by_joint):
+    for pose, pose_angles in enumerate(angles):
+        for joint, (x, z) in enumerate(pose_angles):
             parent = rig.joints[joint].parent
-            base = rest[joint]
+            carried_matrix = rest_matrices[joint]
             if parent >= 0:
-                base = matrices[pose, parent] @ np.linalg.inv(rest[parent]) @ rest[joint]
-            matrices[pose, joint] = base @ rotation(0, x) @ rotation(2, z)
+                carried_matrix = matrices[pose, parent] @ np.linalg.inv(rest_matrices[parent]) @ rest_matrices[joint]
+            matrices[pose, joint] = carried_matrix @ rotation(0, x) @ rotation(2, z)
     return matrices.astype(np.float32)
 
 
 def chain_residuals(rig: Rig, angles: np.ndarray) -> np.ndarray:
     """Return (N, V, 3) float32 local residuals: bulges of some millimeters that grow with nearby bends."""
-    position = rig.rest_positions[:, 2] * len(rig.joints)
+    joint_coordinate = rig.rest_positions[:, 2] * len(rig.joints)
     residuals = np.zeros((len(angles), rig.vertex_count, 3), np.float32)
     for joint in range(1, len(rig.joints)):
-        near = np.exp(-(((position - joint) / 0.4) ** 2))
-        bend = np.sin(angles[:, joint]) ** 2 * 0.02
-        residuals[:, :, 0] += bend[:, :1] * near
-        residuals[:, :, 1] += bend[:, 1:] * near * np.cos(7 * position)
+        falloff = np.exp(-(((joint_coordinate - joint) / 0.4) ** 2))
+        bulges = np.sin(angles[:, joint]) ** 2 * 0.02
+        residuals[:, :, 0] += bulges[:, :1] * falloff
+        residuals[:, :, 1] += bulges[:, 1:] * falloff * np.cos(7 * joint_coordinate)
     return residuals
 
 
-def write_chain(path: Path, poses: int = 120, complete: int | None = None, joints: int = 3, seed: int = 0) -> Rig:
-    """Write a recording of the chain with its last joint locked; `complete` poses of it are written, None for all."""
-    rig = chain_rig(joints)
-    angles = chain_angles(poses, joints, seed)
-    angles[:, joints - 1, 1] = 0
-    influencing = {j: tuple(i for i in (j, j + 1) if 0 < i < joints) for j in range(joints)}
-    info = chain_info(poses, seed)
-    written_angles = angles[: poses if complete is None else complete]
+def write_chain(
+    path: Path, pose_count: int = 120, complete_count: int | None = None, joint_count: int = 3, seed: int = 0
+) -> Rig:
+    """Write a recording of the chain with its last joint locked about z; `complete_count` of its poses are complete."""
+    rig = chain_rig(joint_count)
+    angles = chain_angles(pose_count, joint_count, seed)
+    angles[:, joint_count - 1, 1] = 0
+    influencing = {
+        joint: tuple(other for other in (joint, joint + 1) if 0 < other < joint_count) for joint in range(joint_count)
+    }
+    info = chain_info(pose_count, seed)
+    written_angles = angles[: pose_count if complete_count is None else complete_count]
     with RecordingWriter(path, rig, make_partitions(rig, influencing), info) as writer:
         writer.append(pose_chain(rig, written_angles), chain_residuals(rig, written_angles))
     return rig
 
 
-def chain_info(poses: int, seed: int = 0) -> RecordingInfo:
+def chain_info(pose_count: int, seed: int = 0) -> RecordingInfo:
     """Create the index of a recording of random poses."""
-    limits = (Channel("bone_1", "rotation", 0, -LIMIT, LIMIT),)
-    sampling = Sampling(seed, 1.0, limits, (Source("random", poses),))
-    return RecordingInfo(poses, 0, "chain.blend", "chain", "5.2.0", sampling)
+    limits = (Channel("bone_1", "rotation", 0, -MAX_ANGLE, MAX_ANGLE),)
+    sampling = Sampling(seed, 1.0, limits, (Source("random", pose_count),))
+    return RecordingInfo(pose_count, 0, "chain.blend", "chain", "5.2.0", sampling)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A recording of the chain and a training of it, shared by the tests."""
+"""Fixtures that the tests share: a recording of the chain, and a training on this recording."""
 
 import json
 import os
@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from trainer.__main__ import main  # First, because it sets how threads wait, and torch reads that when it loads.
+from trainer.__main__ import main  # Imported first, because torch reads the variables that it sets.
 
 from .chain import write_chain
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-QUICK = ("--epochs", "40", "--hidden", "24", "24", "--batch-size", "16")
+QUICK_OPTIONS = ("--epochs", "40", "--hidden", "24", "24", "--batch-size", "16")
 
 
 def start_trainer(*arguments: str | Path, **options) -> subprocess.Popen:
@@ -31,7 +31,7 @@ def start_trainer(*arguments: str | Path, **options) -> subprocess.Popen:
     )
 
 
-def run_page(chapter: str, folder: Path) -> str:
+def run_page_code(chapter: str, folder: Path) -> str:
     """Run the code block of a chapter of docs/formats.md in a folder, and return its output."""
     page = (REPOSITORY / "docs" / "formats.md").read_text("utf-8")
     text = page.partition(f"\n## {chapter}\n")[2].partition("\n## ")[0]
@@ -51,7 +51,7 @@ def recording(tmp_path_factory) -> Path:
 def trained(recording, tmp_path_factory) -> Path:
     """Folder of a finished training of the chain: model.onnx, report.json, report.html; read only."""
     folder = tmp_path_factory.mktemp("trained")
-    assert main([str(recording), str(folder / "model.onnx"), *QUICK]) == 0
+    assert main([str(recording), str(folder / "model.onnx"), *QUICK_OPTIONS]) == 0
     return folder
 
 

@@ -8,7 +8,7 @@ from trainer import basis as basis_module
 from trainer.basis import allocate_components, make_basis
 
 
-def residuals(poses: int, vertices: int, rank: int, seed: int = 0) -> np.ndarray:
+def random_residuals(poses: int, vertices: int, rank: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     sizes = 0.01 * 0.5 ** np.arange(rank)
     components = np.linalg.qr(rng.normal(size=(3 * vertices, rank)))[0].T
@@ -25,19 +25,19 @@ def rms(values: np.ndarray) -> float:
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-5, 1e-6])
 def test_the_tolerance_determines_the_number_of_components(poses, vertices, tolerance, monkeypatch):
     monkeypatch.setattr(basis_module, "NEGLIGIBLE_RMS_RATIO", 0)
-    values = residuals(poses, vertices, 12)
+    values = random_residuals(poses, vertices, 12)
     basis = make_basis(values, tolerance, np.random.default_rng(0))
     error = rms(values - basis.reconstruct(basis.project(values)))
     assert error <= tolerance * 1.01
     assert basis.truncation_rms == pytest.approx(error, rel=0.02, abs=1e-8)
     coefficients = basis.project(values)[:, :-1]
-    fewer = coefficients @ basis.components[:-1] + basis.mean
-    assert rms(values - fewer) > tolerance
+    approximation = coefficients @ basis.components[:-1] + basis.mean
+    assert rms(values - approximation) > tolerance
     assert 0 < len(basis.components) <= 12
 
 
 def test_a_hundredth_of_the_residual_needs_no_components():
-    values = residuals(60, 50, 12)
+    values = random_residuals(60, 50, 12)
     basis = make_basis(values, 1e-9, np.random.default_rng(0))
     spread = rms(values - values.mean(axis=0))
     assert 0.002 * spread < basis.truncation_rms <= 0.01 * spread
@@ -45,7 +45,7 @@ def test_a_hundredth_of_the_residual_needs_no_components():
 
 
 def test_components_are_orthonormal_so_coefficients_measure_distance():
-    values = residuals(80, 100, 10)
+    values = random_residuals(80, 100, 10)
     basis = make_basis(values, 1e-6, np.random.default_rng(0))
     np.testing.assert_allclose(basis.components @ basis.components.T, np.eye(len(basis.components)), atol=1e-5)
     coefficients = basis.project(values)
@@ -63,12 +63,12 @@ def test_a_constant_residual_needs_no_component():
 def test_a_sample_of_the_poses_gives_the_same_components(monkeypatch):
     monkeypatch.setattr(basis_module, "MAX_POSES", 50)
     monkeypatch.setattr(basis_module, "NEGLIGIBLE_RMS_RATIO", 0)
-    values = residuals(150, 60, 6)
+    values = random_residuals(150, 60, 6)
     basis = make_basis(values, 1e-6, np.random.default_rng(0))
     assert rms(values - basis.reconstruct(basis.project(values))) < 3e-6
 
 
-def spectra() -> tuple[list[np.ndarray], list[int]]:
+def example_errors() -> tuple[list[np.ndarray], list[int]]:
     """Return errors by number of components, and vertex counts, of a simple, a complex and a small partition."""
     return [np.array(by_count) for by_count in ([1.0, 0.1, 0.02, 0.005], 0.8 ** np.arange(25), [0.5, 0.1, 0.05])], [
         400,
@@ -77,29 +77,32 @@ def spectra() -> tuple[list[np.ndarray], list[int]]:
     ]
 
 
-def joint_error(errors: list[np.ndarray], vertices: list[int], counts: list[int]) -> float:
-    squared = sum(size * by_count[count] ** 2 for by_count, size, count in zip(errors, vertices, counts, strict=True))
-    return float(np.sqrt(squared / sum(vertices)))
+def common_error(errors: list[np.ndarray], vertex_counts: list[int], counts: list[int]) -> float:
+    squared = sum(
+        vertex_count * error_by_count[count] ** 2
+        for error_by_count, vertex_count, count in zip(errors, vertex_counts, counts, strict=True)
+    )
+    return float(np.sqrt(squared / sum(vertex_counts)))
 
 
 def test_shared_allocation_meets_the_tolerance_with_fewer_parameters():
-    errors, vertices = spectra()
-    counts = allocate_components(errors, vertices, 0.06, parameters_per_component=65)
-    alone = [int(np.argmax(by_count <= 0.06)) for by_count in errors]
-    assert joint_error(errors, vertices, counts) <= 0.06
+    errors, vertex_counts = example_errors()
+    counts = allocate_components(errors, vertex_counts, 0.06, parameters_per_component=65)
+    separate_counts = [int(np.argmax(error_by_count <= 0.06)) for error_by_count in errors]
+    assert common_error(errors, vertex_counts, counts) <= 0.06
 
-    def parameters(counts: list[int]) -> int:
-        return sum(count * (3 * size + 65) for count, size in zip(counts, vertices, strict=True))
+    def count_parameters(counts: list[int]) -> int:
+        return sum(count * (3 * vertex_count + 65) for count, vertex_count in zip(counts, vertex_counts, strict=True))
 
-    assert parameters(counts) < parameters(alone)
-    assert all(by_count[count] <= 2 * 0.06 for by_count, count in zip(errors, counts, strict=True))
+    assert count_parameters(counts) < count_parameters(separate_counts)
+    assert all(error_by_count[count] <= 2 * 0.06 for error_by_count, count in zip(errors, counts, strict=True))
 
 
-def test_a_single_partition_meets_the_tolerance_alone():
-    errors, vertices = spectra()
-    for by_count, size in zip(errors, vertices, strict=True):
-        (count,) = allocate_components([by_count], [size], 0.06, parameters_per_component=65)
-        assert by_count[count] <= 0.06 < by_count[count - 1]
+def test_a_single_partition_gets_just_enough_components():
+    errors, vertex_counts = example_errors()
+    for error_by_count, vertex_count in zip(errors, vertex_counts, strict=True):
+        (count,) = allocate_components([error_by_count], [vertex_count], 0.06, parameters_per_component=65)
+        assert error_by_count[count] <= 0.06 < error_by_count[count - 1]
 
 
 def test_an_unreachable_tolerance_takes_all_components():
@@ -107,25 +110,27 @@ def test_an_unreachable_tolerance_takes_all_components():
     assert allocate_components(errors, vertices, 1e-3, parameters_per_component=0) == [1, 0]
 
 
-def test_truncated_bases_have_the_stated_error():
-    values = residuals(60, 50, 12)
+def test_a_truncated_basis_has_the_error_that_it_reports():
+    values = random_residuals(60, 50, 12)
     basis = make_basis(values, 1e-5, np.random.default_rng(0))
     for count in range(len(basis.components) + 1):
-        fewer = basis.truncate(count)
-        error = rms(values - fewer.reconstruct(fewer.project(values)))
-        assert fewer.truncation_rms == pytest.approx(error, rel=0.02, abs=1e-8)
+        truncated = basis.truncate(count)
+        error = rms(values - truncated.reconstruct(truncated.project(values)))
+        assert truncated.truncation_rms == pytest.approx(error, rel=0.02, abs=1e-8)
 
 
 @pytest.mark.parametrize("poses, vertices", [(60, 50), (200, 20)], ids=["gram", "covariance"])
 def test_a_pose_of_weight_two_equals_two_poses(poses, vertices):
-    values = residuals(poses, vertices, 12)
-    twice = np.concatenate([values, values[:10]])
+    values = random_residuals(poses, vertices, 12)
+    repeated_values = np.concatenate([values, values[:10]])
     weights = np.where(np.arange(poses) < 10, 2.0, 1.0)
-    weighted, repeated = (
+    weighted_basis, repeated_basis = (
         make_basis(values, 1e-5, np.random.default_rng(0), weights),
-        make_basis(twice, 1e-5, np.random.default_rng(0)),
+        make_basis(repeated_values, 1e-5, np.random.default_rng(0)),
     )
-    np.testing.assert_allclose(weighted.mean, repeated.mean, atol=1e-8)
-    np.testing.assert_allclose(weighted.error_by_count, repeated.error_by_count, rtol=1e-3, atol=1e-9)
-    first = slice(0, 5)
-    np.testing.assert_allclose(np.abs(weighted.components[first] @ repeated.components[first].T), np.eye(5), atol=1e-3)
+    np.testing.assert_allclose(weighted_basis.mean, repeated_basis.mean, atol=1e-8)
+    np.testing.assert_allclose(weighted_basis.error_by_count, repeated_basis.error_by_count, rtol=1e-3, atol=1e-9)
+    leading = slice(0, 5)
+    np.testing.assert_allclose(
+        np.abs(weighted_basis.components[leading] @ repeated_basis.components[leading].T), np.eye(5), atol=1e-3
+    )

@@ -19,7 +19,7 @@ from .chain import chain_angles
 CONFIG = TrainingConfig(epochs=30, hidden=(16, 16), batch_size=16, tolerance_mm=0.01, learning_rate=0.01)
 
 
-def partition(inputs: int, vertices: int, seed: int, poses: int = 150) -> PartitionData:
+def make_partition_data(inputs: int, vertices: int, seed: int, poses: int = 150) -> PartitionData:
     """Create a partition with residuals of some millimeters that depend smoothly on its features."""
     features = np.sin(chain_angles(poses, inputs + 1, seed)[:, 1:, 0]).astype(np.float32)
     rng = np.random.default_rng(seed)
@@ -60,7 +60,7 @@ def test_dropout_drops_only_with_a_generator():
 
 
 def test_training_learns_every_partition():
-    prepared, trained = train_partitions([partition(2, 12, 0), partition(5, 7, 1)])
+    prepared, trained = train_partitions([make_partition_data(2, 12, 0), make_partition_data(5, 7, 1)])
     for data, network, curve in zip(prepared, trained.networks, trained.curves, strict=True):
         assert min(curve.validation_mm) < 0.15 * data.residual_rms * 1000
         assert curve.validation_mm[curve.best_epoch - 1] == min(curve.validation_mm)
@@ -68,12 +68,14 @@ def test_training_learns_every_partition():
         assert network.weights[-1].shape[1] == len(data.basis.components)
 
 
-def test_returned_weights_are_those_of_the_best_epoch():
+def test_the_training_returns_the_weights_of_the_best_epoch():
     """The residuals are noisy, so the networks overfit the training poses, and the last epoch is not the best."""
-    learned = partition(3, 10, 2, poses=40)
+    smooth_partition = make_partition_data(3, 10, 2, poses=40)
     rng = np.random.default_rng(3)
-    noise = rng.normal(scale=0.02, size=learned.read_residuals().shape).astype(np.float32)
-    prepared, trained = train_partitions([replace(learned, read_residuals=lambda: learned.read_residuals() + noise)])
+    noise = rng.normal(scale=0.02, size=smooth_partition.read_residuals().shape).astype(np.float32)
+    prepared, trained = train_partitions(
+        [replace(smooth_partition, read_residuals=lambda: smooth_partition.read_residuals() + noise)]
+    )
     assert trained.curves[0].best_epoch < CONFIG.epochs
     split = split_poses(np.arange(40), CONFIG.validation_fraction, CONFIG.seed)
     coefficients = trained.networks[0].evaluate(prepared[0].inputs[split.validation], CONFIG.activation)
@@ -83,7 +85,7 @@ def test_returned_weights_are_those_of_the_best_epoch():
 
 
 def test_one_seed_gives_the_same_weights_and_another_does_not():
-    partitions = [partition(3, 10, 2), partition(2, 5, 3)]
+    partitions = [make_partition_data(3, 10, 2), make_partition_data(2, 5, 3)]
     config = TrainingConfig(epochs=3, hidden=(8,), batch_size=16, dropout=0.1)
     first, second = (train_partitions(partitions, config)[1].networks for _ in range(2))
     for first_network, second_network in zip(first, second, strict=True):
@@ -93,44 +95,48 @@ def test_one_seed_gives_the_same_weights_and_another_does_not():
             strict=True,
         ):
             np.testing.assert_array_equal(first_array, second_array)
-    reseeded = TrainingConfig(seed=1, epochs=3, hidden=(8,), batch_size=16, dropout=0.1)
-    assert not np.array_equal(train_partitions(partitions, reseeded)[1].networks[0].weights[0], first[0].weights[0])
+    reseeded_config = TrainingConfig(seed=1, epochs=3, hidden=(8,), batch_size=16, dropout=0.1)
+    assert not np.array_equal(
+        train_partitions(partitions, reseeded_config)[1].networks[0].weights[0], first[0].weights[0]
+    )
 
 
 def test_a_partition_without_inputs_keeps_its_mean():
-    without_features = PartitionData("still", np.zeros((150, 0), np.float32), partition(2, 6, 4).read_residuals, 6)
-    constant = PartitionData("constant", np.ones((150, 12), np.float32), partition(2, 6, 4).read_residuals, 6)
-    prepared, trained = train_partitions([without_features, partition(2, 6, 5), constant])
+    without_features = PartitionData(
+        "still", np.zeros((150, 0), np.float32), make_partition_data(2, 6, 4).read_residuals, 6
+    )
+    constant = PartitionData("constant", np.ones((150, 12), np.float32), make_partition_data(2, 6, 4).read_residuals, 6)
+    prepared, trained = train_partitions([without_features, make_partition_data(2, 6, 5), constant])
     assert [len(p.basis.components) > 0 for p in prepared] == [False, True, False]
     assert trained.curves[0].validation_mm == []
     assert trained.networks[2].biases[-1].shape == (0,)
 
 
 def test_penalties_shrink_the_weights():
-    def size(**penalty) -> float:
+    def weight_sum(**penalty) -> float:
         config = TrainingConfig(epochs=10, hidden=(8,), batch_size=16, weight_decay=0, **penalty)
-        return float(np.abs(train_partitions([partition(3, 5, 6)], config)[1].networks[0].weights[0]).sum())
+        return float(np.abs(train_partitions([make_partition_data(3, 5, 6)], config)[1].networks[0].weights[0]).sum())
 
-    assert size(l1=1e-2) < 0.9 * size()
-    assert size(l2=1e-2) < 0.9 * size()
+    assert weight_sum(l1=1e-2) < 0.9 * weight_sum()
+    assert weight_sum(l2=1e-2) < 0.9 * weight_sum()
 
 
 def test_irrelevant_inputs_are_suppressed(monkeypatch):
-    relevant = partition(4, 12, 8, poses=200)
+    relevant = make_partition_data(4, 12, 8, poses=200)
     noise_features = np.random.default_rng(9).normal(size=(200, 80)).astype(np.float32)
     with_noise = replace(relevant, features=np.concatenate([relevant.features, noise_features], axis=1))
     config = replace(CONFIG, validation_fraction=0.3, weight_decay=0.2)
 
-    def error() -> float:
+    def validation_error() -> float:
         return min(train_partitions([with_noise], config)[1].curves[0].validation_mm)
 
-    rescaled = error()
+    rescaled_error = validation_error()
     monkeypatch.setattr("trainer.loop.RELEVANCE_EPOCH_FRACTIONS", ())
-    assert rescaled < 0.7 * error()
+    assert rescaled_error < 0.7 * validation_error()
 
 
 def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
-    partitions = [partition(3, 10, 2), partition(5, 7, 1)]
+    partitions = [make_partition_data(3, 10, 2), make_partition_data(5, 7, 1)]
     config = replace(CONFIG, epochs=3, averaging=0)
     before = train_partitions(partitions, config)[1]
     loop_run = _Loop.run
@@ -147,27 +153,27 @@ def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
 
 
 def test_a_warm_start_keeps_the_outputs():
-    partitions = [partition(3, 10, 2), partition(5, 7, 1)]
+    partitions = [make_partition_data(3, 10, 2), make_partition_data(5, 7, 1)]
     prepared, first = train_partitions(partitions)
     paused_config = replace(CONFIG, epochs=10, learning_rate=1e-12, averaging=0)
-    again = train_partitions(partitions, paused_config, initial=first.networks)[1]
-    for curve, first_curve in zip(again.curves, first.curves, strict=True):
+    restarted = train_partitions(partitions, paused_config, initial=first.networks)[1]
+    for curve, first_curve in zip(restarted.curves, first.curves, strict=True):
         np.testing.assert_allclose(curve.validation_mm, min(first_curve.validation_mm), rtol=1e-3)
-    for data, first_network, second_network in zip(prepared, first.networks, again.networks, strict=True):
+    for data, first_network, second_network in zip(prepared, first.networks, restarted.networks, strict=True):
         expected, actual = (network.evaluate(data.inputs, "silu") for network in (first_network, second_network))
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_patience_stops_early():
+def test_a_training_without_improvement_stops_early():
     epochs = []
     config = TrainingConfig(epochs=60, hidden=(8,), batch_size=16, learning_rate=1e-9, averaging=0, patience=3)
-    noise = PartitionData(
+    noise_partition = PartitionData(
         "noise",
         np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32),
         lambda: np.random.default_rng(1).normal(size=(60, 4, 3)).astype(np.float32),
         4,
     )
-    train_partitions([noise], config, on_epoch=epochs.append)
+    train_partitions([noise_partition], config, on_epoch=epochs.append)
     assert len(epochs) < 60
 
 
@@ -179,5 +185,5 @@ def test_a_stop_request_cancels_the_training():
         return len(calls) > 5
 
     with pytest.raises(Cancelled):
-        train_partitions([partition(2, 5, 7)], should_stop=should_stop_after_five_calls)
+        train_partitions([make_partition_data(2, 5, 7)], should_stop=should_stop_after_five_calls)
     assert len(calls) == 6

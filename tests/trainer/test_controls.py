@@ -27,14 +27,14 @@ from trainer.inputs import inputs_of_rig, partition_centers
 from trainer.splitting import split_recording
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
-from .conftest import QUICK, run_page
+from .conftest import QUICK_OPTIONS, run_page_code
 
 POSES = 150
 BULGE = Control("shape_keys", 'key_blocks["Bulge"].value', 0, 1)
 PUFF = Control("armature_object", '["puff"]', -2, 2)
 LOCKED = Control("armature", '["locked"]', 0.5, 0.5)
 INFLUENCING = {0: (), 1: (1, 2), 2: (2,)}
-CONTROLLED = {0: (1,), 1: (0,), 2: (0,)}
+CONTROLS_BY_PARTITION = {0: (1,), 1: (0,), 2: (0,)}
 """Controls that influence each partition. No joint influences the first partition."""
 
 
@@ -49,7 +49,7 @@ def controlled_poses(poses: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def controlled_residuals(rig: Rig, angles: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return (N, V, 3) residuals: of the chain except at its first joint, plus centimeters that depend on controls."""
+    """Return (N, V, 3) residuals: the chain's, but 0 at its first joint, plus centimeters that depend on controls."""
     position = rig.rest_positions[:, 2] * 3
     residuals = chain_residuals(rig, angles)
     first = make_partitions(rig)[0].vertices
@@ -60,22 +60,24 @@ def controlled_residuals(rig: Rig, angles: np.ndarray, values: np.ndarray) -> np
     return residuals
 
 
-def write_controlled(path: Path, rig: Rig) -> Path:
+def write_controlled_recording(path: Path, rig: Rig) -> Path:
     angles, values = controlled_poses(POSES, 0)
-    with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING, CONTROLLED), chain_info(POSES)) as writer:
+    with RecordingWriter(
+        path, rig, make_partitions(rig, INFLUENCING, CONTROLS_BY_PARTITION), chain_info(POSES)
+    ) as writer:
         writer.append(pose_chain(rig, angles), controlled_residuals(rig, angles, values), values)
     return path
 
 
 @pytest.fixture(scope="module")
-def controlled(tmp_path_factory) -> Path:
-    return write_controlled(tmp_path_factory.mktemp("controls") / "recording", controlled_rig())
+def controlled_recording(tmp_path_factory) -> Path:
+    return write_controlled_recording(tmp_path_factory.mktemp("controls") / "recording", controlled_rig())
 
 
 @pytest.fixture(scope="module")
-def model(controlled) -> Path:
-    path = controlled.parent / "model.onnx"
-    assert main([str(controlled), str(path), *QUICK]) == 0
+def model(controlled_recording) -> Path:
+    path = controlled_recording.parent / "model.onnx"
+    assert main([str(controlled_recording), str(path), *QUICK_OPTIONS]) == 0
     return path
 
 
@@ -91,8 +93,8 @@ def test_the_model_needs_the_values_of_controls(network, model):
     error, linear = distances(network.positions(poses, values), truth), distances(skinning.positions(poses), truth)
     for partition in make_partitions(rig):
         assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
-    middle = np.tile(values.mean(axis=0), (50, 1))
-    assert distances(network.positions(poses, middle), truth).mean() > 5 * error.mean()
+    mean_values = np.tile(values.mean(axis=0), (50, 1))
+    assert distances(network.positions(poses, mean_values), truth).mean() > 5 * error.mean()
     report = json.loads(model.with_name("report.json").read_text())
     assert 0.5 < report["fdda"]["held_out"]["mean"] / (error.mean() * 1000) < 2
 
@@ -109,8 +111,8 @@ def test_the_graph_has_the_controls_input_only_with_controls(model, trained):
     assert read_model_info(trained / "model.onnx").controls == ()
 
 
-def test_metadata_has_the_ranges_of_the_training_poses(model, controlled):
-    info, recording = read_model_info(model), read_recording(controlled)
+def test_metadata_has_the_ranges_of_the_training_poses(model, controlled_recording):
+    info, recording = read_model_info(model), read_recording(controlled_recording)
     values = recording.controls[split_recording(recording, TrainingConfig()).training]
     assert [c.name for c in info.controls] == [c.name for c in (BULGE, PUFF, LOCKED)]
     assert [c.low for c in info.controls] == values.min(axis=0).tolist()
@@ -128,7 +130,7 @@ def test_the_report_names_controls(model):
     assert "<th>controls</th>" in page and '<td title="armature_object/[&quot;puff&quot;]">1</td>' in page
 
 
-def confidence_of(network: Network, control: int, values: np.ndarray) -> np.ndarray:
+def confidence_of_control(network: Network, control: int, values: np.ndarray) -> np.ndarray:
     """Return the (N, 3) confidence in the rest pose for values of one control; the other controls are centered."""
     controls = np.tile(np.float32([0.5, 0, 0.5]), (len(values), 1))
     controls[:, control] = values
@@ -136,7 +138,7 @@ def confidence_of(network: Network, control: int, values: np.ndarray) -> np.ndar
 
 
 def test_confidence_fades_beyond_the_range_of_a_control(network):
-    confidence = confidence_of(network, 0, np.linspace(0, 8, 80))
+    confidence = confidence_of_control(network, 0, np.linspace(0, 8, 80))
     assert (confidence[:10, 1:] == 1).all() and (confidence[-1, 1:] == 0).all()
     assert (np.diff(confidence[:, 1:], axis=0) <= 0).all() and np.abs(np.diff(confidence, axis=0)).max() < 0.05
     assert (confidence[:, 0] == 1).all(), "the first partition does not follow this control"
@@ -149,7 +151,7 @@ def test_confidence_fades_beyond_the_range_of_a_control(network):
 
 
 def test_a_control_that_never_moved_lowers_confidence_only_when_it_moves(network):
-    confidence = confidence_of(network, 2, np.float32([0.5, 0.7, 1.5, 5]))
+    confidence = confidence_of_control(network, 2, np.float32([0.5, 0.7, 1.5, 5]))
     assert (confidence[0] == 1).all()
     assert (np.diff(confidence, axis=0) < 0).all() and (confidence[-1] == 0).all(), "its effect is unknown"
 
@@ -158,10 +160,12 @@ def test_a_constant_control_with_a_range_counts_where_it_influences():
     rig = controlled_rig(BULGE)
     partitions = make_partitions(rig, INFLUENCING, {1: (0,)})
     inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
-    poses, still = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
-    own = measure_training_range(inputs.compute_features(poses, rig.rest_matrices, still), rig, partitions)
-    assert own.controls == (replace(BULGE, low=0.25, high=0.25),)
-    confidence = own.compute_confidence(
+    poses, constant_values = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
+    training_range = measure_training_range(
+        inputs.compute_features(poses, rig.rest_matrices, constant_values), rig, partitions
+    )
+    assert training_range.controls == (replace(BULGE, low=0.25, high=0.25),)
+    confidence = training_range.compute_confidence(
         inputs.compute_features(poses[:3], rig.rest_matrices, np.array([[0.25], [1], [6]]))
     )
     assert (
@@ -171,55 +175,55 @@ def test_a_constant_control_with_a_range_counts_where_it_influences():
 
 def test_values_of_controls_must_be_given(network):
     rest = np.repeat(network.info.rest_matrices[None], 2, axis=0)
-    for call in (network.positions, network.confidence):
+    for evaluate in (network.positions, network.confidence):
         with pytest.raises(
             ModelError, match=r"has 3 controls and takes their values as an array \(2, 3\);.* given none"
         ):
-            call(rest)
+            evaluate(rest)
         with pytest.raises(ModelError, match=r"it was given \(3,\)\."):
-            call(rest, np.zeros(3, np.float32))
+            evaluate(rest, np.zeros(3, np.float32))
 
 
 def test_each_pose_of_a_batch_has_its_own_control_values(network):
     angles, values = controlled_poses(6, 4)
     poses = pose_chain(controlled_rig(), angles)
-    together = network.positions(poses, values).copy()
-    for number in (0, 5):
-        alone = network.positions(poses[number : number + 1], values[number : number + 1])
-        np.testing.assert_allclose(alone[0], together[number], atol=2e-6)
-    assert np.abs(network.positions(poses, values[::-1]) - together).max() > 1e-3
+    batch_positions = network.positions(poses, values).copy()
+    for index in (0, 5):
+        single_positions = network.positions(poses[index : index + 1], values[index : index + 1])
+        np.testing.assert_allclose(single_positions[0], batch_positions[index], atol=2e-6)
+    assert np.abs(network.positions(poses, values[::-1]) - batch_positions).max() > 1e-3
 
 
 def test_the_code_in_the_model_format_page_runs(model):
-    assert run_page("Model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
+    assert run_page_code("Model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
 
 
 def test_a_model_without_controls_ignores_controls(trained):
     network = Network(trained / "model.onnx")
     rest = network.info.rest_matrices[None]
-    alone = network.positions(rest).copy()
-    np.testing.assert_array_equal(network.positions(rest, np.zeros((1, 0), np.float32)), alone)
+    expected_positions = network.positions(rest).copy()
+    np.testing.assert_array_equal(network.positions(rest, np.zeros((1, 0), np.float32)), expected_positions)
 
 
-def test_a_warm_start_takes_the_same_controls(controlled, model, tmp_path, capsys):
+def test_a_warm_start_requires_the_same_controls(controlled_recording, model, tmp_path, capsys):
     for path in (model, model.with_suffix(".checkpoint.npz")):
         shutil.copy(path, tmp_path)
-    again = tmp_path / "model.onnx"
-    before = json.loads(model.with_name("report.json").read_text())["fdda"]["held_out"]["mean"]
-    assert main([str(controlled), str(again), *QUICK, "--epochs", "10", "--warm-start"]) == 0
-    after = json.loads((tmp_path / "report.json").read_text())["fdda"]["held_out"]["mean"]
-    assert after < 1.5 * before
-    other = controlled_rig(PUFF, BULGE, LOCKED)
-    write_controlled(tmp_path / "other", other)
-    assert main([str(tmp_path / "other"), str(again), *QUICK, "--warm-start"]) == 1
+    model_copy = tmp_path / "model.onnx"
+    error_before = json.loads(model.with_name("report.json").read_text())["fdda"]["held_out"]["mean"]
+    assert main([str(controlled_recording), str(model_copy), *QUICK_OPTIONS, "--epochs", "10", "--warm-start"]) == 0
+    error_after = json.loads((tmp_path / "report.json").read_text())["fdda"]["held_out"]["mean"]
+    assert error_after < 1.5 * error_before
+    reordered_rig = controlled_rig(PUFF, BULGE, LOCKED)
+    write_controlled_recording(tmp_path / "other", reordered_rig)
+    assert main([str(tmp_path / "other"), str(model_copy), *QUICK_OPTIONS, "--warm-start"]) == 1
     assert "is of other controls; train without --warm-start." in capsys.readouterr().err
 
 
-def test_poses_that_differ_in_controls_alone_are_other_poses(controlled, model, tmp_path, capsys):
+def test_the_holdout_fingerprint_depends_on_controls(controlled_recording, model, tmp_path, capsys):
     for path in (model, model.with_suffix(".checkpoint.npz")):
         shutil.copy(path, tmp_path)
-    shutil.copytree(controlled, tmp_path / "recording")
+    shutil.copytree(controlled_recording, tmp_path / "recording")
     values = np.load(tmp_path / "recording" / "controls.npy")
     np.save(tmp_path / "recording" / "controls.npy", values[::-1].copy())
-    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK, "--warm-start"]) == 1
+    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK_OPTIONS, "--warm-start"]) == 1
     assert "may have been trained on poses that are held out now" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from .conftest import start_trainer
 
 
 @pytest.mark.parametrize(
-    "options", [(), pytest.param(("--dropout", "0.1"), marks=pytest.mark.slow)], ids=["as it is", "dropout"]
+    "options", [(), pytest.param(("--dropout", "0.1"), marks=pytest.mark.slow)], ids=["defaults", "dropout"]
 )
 def test_two_processes_write_the_same_model(recording, tmp_path: Path, options):
     model_bytes = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names that are not ASCII on an ASCII terminal, and file names that are not UTF-8."""
+"""The trainer works with names that are not ASCII on an ASCII terminal, and with file names that are not UTF-8."""
 
 import os
 import subprocess
@@ -16,7 +16,13 @@ from .. import systems
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import REPOSITORY
 
-ASCII = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+ASCII_ENVIRONMENT = {
+    **os.environ,
+    "PYTHONIOENCODING": "ascii",
+    "LC_ALL": "C",
+    "PYTHONUTF8": "0",
+    "PYTHONCOERCECLOCALE": "0",
+}
 
 
 @pytest.fixture
@@ -32,24 +38,24 @@ def recording(tmp_path):
     return path
 
 
-def trainer(*arguments) -> subprocess.CompletedProcess:
+def run_module(*arguments) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", *arguments]
-    return subprocess.run(command, cwd=REPOSITORY, env=ASCII, capture_output=True, check=False)
+    return subprocess.run(command, cwd=REPOSITORY, env=ASCII_ENVIRONMENT, capture_output=True, check=False)
 
 
-def test_a_training_on_an_ascii_terminal(recording, tmp_path):
+def test_an_ascii_terminal_shows_escaped_names(recording, tmp_path):
     model = tmp_path / "modèle.onnx"
-    done = trainer("trainer", recording, model, "--epochs", "2", "--hidden", "8")
-    assert done.returncode == 0, done.stderr
-    assert rb"\u524d\u8155.L" in done.stdout and b"Wurzel \\xdf" in done.stdout
+    process = run_module("trainer", recording, model, "--epochs", "2", "--hidden", "8")
+    assert process.returncode == 0, process.stderr
+    assert rb"\u524d\u8155.L" in process.stdout and b"Wurzel \\xdf" in process.stdout
     assert model.exists()
-    done = trainer("trainer.report", tmp_path / "réport.json")
-    assert done.returncode == 1 and done.stderr.startswith(b"The report '") and b"Traceback" not in done.stderr
+    process = run_module("trainer.report", tmp_path / "réport.json")
+    assert process.returncode == 1 and process.stderr.startswith(b"The report '") and b"Traceback" not in process.stderr
 
 
 @pytest.mark.skipif(systems.WINDOWS, reason="On Windows every file name is text.")
-def test_a_file_name_that_is_not_utf_8(recording, tmp_path):
+def test_a_model_name_that_is_not_utf_8_is_written(recording, tmp_path):
     model = os.fsencode(tmp_path) + b"/m\xff.onnx"
-    done = trainer("trainer", recording, model, "--epochs", "2", "--hidden", "8")
-    assert done.returncode == 0, done.stderr
+    process = run_module("trainer", recording, model, "--epochs", "2", "--hidden", "8")
+    assert process.returncode == 0, process.stderr
     assert os.path.exists(model) and (tmp_path / "report.html").exists()

@@ -53,7 +53,7 @@ def test_too_few_poses_are_the_cause(tmp_path):
         (0.4, 1.0, 1.0, NO_CLEAR_CAUSE),
     ],
 )
-def test_cause_of_measured_ratios(truncation, distance, generalization, cause):
+def test_measured_ratios_determine_the_cause(truncation, distance, generalization, cause):
     assert _cause(truncation, distance, generalization) == cause and cause in REMEDY_BY_CAUSE
 
 

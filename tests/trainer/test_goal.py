@@ -9,8 +9,8 @@ from fdda_addon.core.report import Verdict
 from trainer.goal import evaluate_goal
 
 
-def goal_result(*errors: float, goal: float = 0.5, training: float = 0.1):
-    history = [{"poses": 500 + 250 * number, "p999": error} for number, error in enumerate(errors)]
+def evaluate_errors(*errors: float, goal: float = 0.5, training: float = 0.1):
+    history = [{"poses": 500 + 250 * index, "p999": error} for index, error in enumerate(errors)]
     return evaluate_goal(goal, history, training, Path("recording"), Path("arm.onnx"))
 
 
@@ -26,19 +26,20 @@ def goal_result(*errors: float, goal: float = 0.5, training: float = 0.1):
         ((0.9, 0.95, 0.4), Verdict.MET),
     ],
 )
-def test_verdict(errors, verdict):
-    assert goal_result(*errors).verdict is verdict
+def test_the_errors_determine_the_verdict(errors, verdict):
+    assert evaluate_errors(*errors).verdict is verdict
 
 
-def test_a_miss_gives_advice():
-    text = goal_result(0.8).text
+def test_a_missed_goal_gives_advice():
+    text = evaluate_errors(0.8).text
     assert "within 0.8 mm and the goal is 0.5 mm" in text
     assert "record RIG.blend recording --refine arm.onnx" in text and "--warm-start" in text
 
 
-def test_exhaustion_names_the_limit():
-    assert "500 more poses brought it there from 0.9 mm" in goal_result(0.9, 0.89, 0.88).text
-    assert "Narrow the range of motion" in goal_result(0.9, 0.89, 0.88).text
+def test_an_exhausted_goal_names_the_reason():
+    assert "500 more poses brought it there from 0.9 mm" in evaluate_errors(0.9, 0.89, 0.88).text
+    assert "Narrow the range of motion" in evaluate_errors(0.9, 0.89, 0.88).text
     assert (
-        "training poses are at 0.85 mm, so the networks are too small" in goal_result(0.9, 0.9, 0.9, training=0.85).text
+        "training poses are at 0.85 mm, so the networks are too small"
+        in evaluate_errors(0.9, 0.9, 0.9, training=0.85).text
     )

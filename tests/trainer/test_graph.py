@@ -20,7 +20,7 @@ from trainer.graph import build_graph
 from trainer.trained_model import TrainedModel, is_sheared
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain, rotation
-from .conftest import QUICK
+from .conftest import QUICK_OPTIONS
 
 SHEAR = np.eye(4)
 SHEAR[0, 1] = 0.3
@@ -41,7 +41,7 @@ def collect_trained_models(monkeypatch) -> list[TrainedModel]:
 def trained_model(recording, tmp_path_factory) -> TrainedModel:
     with pytest.MonkeyPatch.context() as monkeypatch:
         trained_models = collect_trained_models(monkeypatch)
-        assert main([str(recording), str(tmp_path_factory.mktemp("graph") / "model.onnx"), *QUICK]) == 0
+        assert main([str(recording), str(tmp_path_factory.mktemp("graph") / "model.onnx"), *QUICK_OPTIONS]) == 0
     return trained_models[0]
 
 
@@ -78,13 +78,15 @@ def test_a_character_that_is_scaled_as_a_whole_keeps_its_residuals(trained_model
     angles = chain_angles(10, 3, 5)
     angles[:, 2, 1] = 0
     poses = pose_chain(trained_model.rig, angles)
-    scaled = np.diag([2, 2, 2, 1]).astype(np.float32) @ poses
+    scaled_poses = np.diag([2, 2, 2, 1]).astype(np.float32) @ poses
     # The last partition does not depend on the root, which was locked.
-    last = trained_model.partitions[2].vertices
-    positions, confidence = run_graph(trained_model, scaled)
+    last_vertices = trained_model.partitions[2].vertices
+    positions, confidence = run_graph(trained_model, scaled_poses)
     assert (confidence[:, 2] == 1).all()
-    np.testing.assert_allclose(positions[:, last], 2 * run_graph(trained_model, poses)[0][:, last], atol=4e-6)
-    assert np.abs(positions - LinearSkinning(trained_model.rig).positions(scaled))[:, last].max() > 1e-3
+    np.testing.assert_allclose(
+        positions[:, last_vertices], 2 * run_graph(trained_model, poses)[0][:, last_vertices], atol=4e-6
+    )
+    assert np.abs(positions - LinearSkinning(trained_model.rig).positions(scaled_poses))[:, last_vertices].max() > 1e-3
 
 
 def test_the_graph_agrees_with_pytorch_far_from_the_origin(trained_model):
@@ -109,7 +111,7 @@ def test_scale_is_not_shear(recording):
     assert not is_sheared(poses @ np.diag([3, 0.2, 1, 1]).astype(np.float32))
     poses[299, 1] = poses[299, 1] @ SHEAR.astype(np.float32)
     assert is_sheared(poses)
-    # As little shear as a stretching bone of a control rig has.
+    # A stretching bone of a control rig has as little shear as this.
     small_shear = np.eye(4)
     small_shear[0, 1] = 3e-5
     assert is_sheared((pose_chain(chain_rig(), chain_angles(20, 3, 0)) @ small_shear).astype(np.float32))
@@ -118,14 +120,14 @@ def test_scale_is_not_shear(recording):
 def test_a_model_of_sheared_bones_agrees_with_pytorch(tmp_path, monkeypatch):
     rig, angles = chain_rig(), chain_angles(120, 3, 0)
     # A mesh object that is scaled along a slanted axis shears every matrix.
-    squash = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
-    rig = replace(rig, rest_matrices=(squash @ rig.rest_matrices).astype(np.float32))
-    poses = (squash @ pose_chain(chain_rig(), angles)).astype(np.float32)
+    slanted_scale = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
+    rig = replace(rig, rest_matrices=(slanted_scale @ rig.rest_matrices).astype(np.float32))
+    poses = (slanted_scale @ pose_chain(chain_rig(), angles)).astype(np.float32)
     influencing = {0: (1,), 1: (1, 2), 2: (2,)}
     with RecordingWriter(tmp_path / "recording", rig, make_partitions(rig, influencing), chain_info(120)) as writer:
         writer.append(poses, chain_residuals(chain_rig(), angles))
     trained_models = collect_trained_models(monkeypatch)
-    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK]) == 0
+    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
     assert trained_models[0].sheared and read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["fdda"]["held_out"]["mean"] < 0.1 * report["linear"]["held_out"]["mean"]
@@ -143,12 +145,12 @@ def product_count(trained_model: TrainedModel) -> int:
 
 def test_small_partitions_share_a_product(trained_model, monkeypatch):
     poses = pose_chain(chain_rig(), chain_angles(5, 3, 3))
-    together, _ = run_graph(trained_model, poses)
+    positions_of_shared_product, _ = run_graph(trained_model, poses)
     assert product_count(trained_model) == 1
     monkeypatch.setattr(skinning_nodes, "MAX_PADDING_ELEMENTS", 0)
-    apart, _ = run_graph(trained_model, poses)
+    positions_of_separate_products, _ = run_graph(trained_model, poses)
     assert product_count(trained_model) == len(trained_model.partitions) == 3
-    np.testing.assert_allclose(together, apart, atol=2e-6)
+    np.testing.assert_allclose(positions_of_shared_product, positions_of_separate_products, atol=2e-6)
 
 
 def test_only_small_partitions_share_a_product():
@@ -187,11 +189,11 @@ def test_partial_slices_of_translations_agree_with_pytorch(trained_model, joints
     """Fewer fitted joints change the slices of translations."""
     poses = pose_chain(trained_model.rig, chain_angles(5, 3, 3))
     prepared = list(trained_model.prepared)
-    for n in joints:
-        fit = prepared[n].fit
-        kept = fit.joints == trained_model.partitions[n].joint
-        factors = fit.factors.reshape(len(kept), -1)[kept].reshape(-1, fit.factors.shape[-1])
-        prepared[n] = replace(prepared[n], fit=replace(fit, joints=fit.joints[kept], factors=factors))
+    for index in joints:
+        fit = prepared[index].fit
+        is_main_joint = fit.joints == trained_model.partitions[index].joint
+        factors = fit.factors.reshape(len(is_main_joint), -1)[is_main_joint].reshape(-1, fit.factors.shape[-1])
+        prepared[index] = replace(prepared[index], fit=replace(fit, joints=fit.joints[is_main_joint], factors=factors))
     check_agreement(replace(trained_model, prepared=tuple(prepared)), poses)
 
 
@@ -206,7 +208,7 @@ def test_networks_in_chunks_have_the_same_outputs(trained_model, monkeypatch, ch
     assert ("layer_sums" in {node.name for node in build_graph(trained_model).graph.node}) == (split_cost == 0)
 
 
-def test_the_chunk_size_costs_least():
+def test_the_chunk_size_has_the_lowest_cost():
     # One network has a hundred times as many inputs as nine others: not all are padded to it.
     assert 30 <= network_nodes._chunk_size([3000, *[30] * 9], 192, 10) <= 60
     assert network_nodes._chunk_size([30, 29, 28, 30], 192, 4) == 30
@@ -221,13 +223,13 @@ def test_constants_are_the_matrices_and_little_else(trained, trained_model, repo
     info = read_model_info(trained / "model.onnx")
     assert info.constant_bytes == report["constant_bytes"] == constant_bytes(onnx.load(trained / "model.onnx"))
     assert f"{info.constant_bytes:,}" in (trained / "report.html").read_text()
-    networks = sum(a.size for network in trained_model.networks for a in (*network.weights, *network.biases))
-    matrices = sum(
+    network_parameters = sum(a.size for network in trained_model.networks for a in (*network.weights, *network.biases))
+    matrix_elements = sum(
         (4 * 2 + 4 * len(p.fit.joints) + 3 * len(p.basis.components)) * p.vertex_count for p in trained_model.prepared
     )
-    together = constant_bytes(build_graph(trained_model))
+    shared_bytes = constant_bytes(build_graph(trained_model))
     monkeypatch.setattr(skinning_nodes, "MAX_PADDING_ELEMENTS", 0)
-    apart = constant_bytes(build_graph(trained_model))
-    assert apart < 1.5 * 4 * (networks + matrices) + 16_000
-    # Zeros of the block-diagonal matrix.
-    assert apart < together < apart + 2 * 4 * 6_000
+    separate_bytes = constant_bytes(build_graph(trained_model))
+    assert separate_bytes < 1.5 * 4 * (network_parameters + matrix_elements) + 16_000
+    # The block-diagonal matrix has more zeros.
+    assert separate_bytes < shared_bytes < separate_bytes + 2 * 4 * 6_000

@@ -13,22 +13,22 @@ from fdda_addon.core.recording.target import FRAMES, POSE, SIMULATION, RecordedT
 from trainer.gravity import drop_gravity_input
 from trainer.splitting import Split
 
-from .chain import LIMIT, chain_residuals, chain_rig, pose_chain
+from .chain import MAX_ANGLE, chain_residuals, chain_rig, pose_chain
 
 POSES = 200
-DOWN = np.array([0.0, 0.0, -1.0])
+GRAVITY_DIRECTION = np.array([0.0, 0.0, -1.0])
 
 
 def record_sagging_chain(follows: str, sag: float) -> Recording:
     """Create a recording of a chain that bends and rotates, and whose surface sags by `sag` meters."""
-    rig = chain_rig(joints=4)
-    angles = np.random.default_rng(0).uniform(-LIMIT, LIMIT, (POSES, 4, 2))
+    rig = chain_rig(joint_count=4)
+    angles = np.random.default_rng(0).uniform(-MAX_ANGLE, MAX_ANGLE, (POSES, 4, 2))
     matrices = pose_chain(rig, angles)
     residuals = chain_residuals(rig, angles)
     bare_partitions = make_partitions(rig, {joint: () for joint in range(4)})
     for partition in bare_partitions:
         rotations = matrices[:, partition.joint, :3, :3] @ rig.rest_matrices[partition.joint, :3, :3].T
-        residuals[:, partition.vertices] += (sag * DOWN @ rotations).astype(np.float32)[:, None]
+        residuals[:, partition.vertices] += (sag * GRAVITY_DIRECTION @ rotations).astype(np.float32)[:, None]
     info = RecordingInfo(
         POSES, POSES, "chain.blend", "chain", "5.2.0", Sampling(0, 1.0, (), (Source("random", POSES),)),
         target=RecordedTarget("flesh", follows, 0),
@@ -43,8 +43,8 @@ def make_split() -> Split:
 
 @pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
 def test_without_sag_the_gravity_input_is_dropped(follows):
-    found = drop_gravity_input(record_sagging_chain(follows, sag=0.0), make_split())
-    assert [partition.influencing for partition in found.partitions] == [(1,), (1, 2), (1, 2, 3), (1, 2, 3)]
+    result = drop_gravity_input(record_sagging_chain(follows, sag=0.0), make_split())
+    assert [partition.influencing for partition in result.partitions] == [(1,), (1, 2), (1, 2, 3), (1, 2, 3)]
 
 
 @pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
@@ -71,10 +71,12 @@ def test_held_out_poses_are_not_used():
 
 
 def test_joints_of_several_roots_keep_their_influences():
-    rig = chain_rig(joints=2)
-    apart = type(rig)(
+    rig = chain_rig(joint_count=2)
+    rig_with_two_roots = type(rig)(
         tuple(type(joint)(joint.name, -1) for joint in rig.joints), rig.rest_positions, rig.rest_matrices,
         rig.skin_joints, rig.skin_weights, rig.fingerprint, rig.face_starts, rig.face_vertices,
     )  # fmt: skip
-    found = assume_nearby_influences(apart, make_partitions(apart, {0: (), 1: ()}), may_sag=False)
-    assert [partition.influencing for partition in found] == [(0, 1), (0, 1)]
+    result = assume_nearby_influences(
+        rig_with_two_roots, make_partitions(rig_with_two_roots, {0: (), 1: ()}), may_sag=False
+    )
+    assert [partition.influencing for partition in result] == [(0, 1), (0, 1)]

@@ -29,11 +29,11 @@ from trainer.splitting import split_recording
 from trainer.trained_model import TrainedModel
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, rotation, write_chain
-from .conftest import QUICK
+from .conftest import QUICK_OPTIONS
 from .test_graph import check_agreement, collect_trained_models, constant_bytes
 from .tube import write_tube
 
-POSES, REACH = 160, 1.8
+POSES, RANGE_SCALE = 160, 1.8
 INFLUENCING = {0: (1,), 1: (1, 2), 2: (1, 2)}
 
 
@@ -46,13 +46,13 @@ def blend_rotations(rig: Rig, pose_matrices: np.ndarray) -> np.ndarray:
     first = real[:, rig.skin_joints[:, :1]]
     real, dual = real[:, rig.skin_joints], dual[:, rig.skin_joints]
     weights = rig.skin_weights[None, :, :, None] * np.where((first * real).sum(axis=3, keepdims=True) < 0, -1, 1)
-    real, dual = ((weights * each).sum(axis=2) for each in (real, dual))
-    length = np.linalg.norm(real, axis=2, keepdims=True)
-    real, dual = real / length, dual / length
-    moved = 2 * multiply_quaternions(dual, real * [1, -1, -1, -1])[..., 1:]
+    real, dual = ((weights * quaternions).sum(axis=2) for quaternions in (real, dual))
+    lengths = np.linalg.norm(real, axis=2, keepdims=True)
+    real, dual = real / lengths, dual / lengths
+    translations = 2 * multiply_quaternions(dual, real * [1, -1, -1, -1])[..., 1:]
     rotations = Rotation.from_quat(real.reshape(-1, 4), scalar_first=True)
-    rest = np.broadcast_to(rig.rest_positions, moved.shape).reshape(-1, 3)
-    return rotations.apply(rest).reshape(moved.shape) + moved
+    rest = np.broadcast_to(rig.rest_positions, translations.shape).reshape(-1, 3)
+    return rotations.apply(rest).reshape(translations.shape) + translations
 
 
 def multiply_quaternions(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -62,21 +62,23 @@ def multiply_quaternions(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.append(scalar[..., None], vector + np.cross(first[..., 1:], second[..., 1:]), axis=-1)
 
 
-def write_volume(path: Path, per_metre: float = 1.0, away: float = 0.0, squash: np.ndarray | None = None) -> Recording:
+def write_volume_recording(
+    path: Path, units_per_metre: float = 1.0, origin_distance: float = 0.0, slanted_scale: np.ndarray | None = None
+) -> Recording:
     """Write a recording of the chain with an armature that preserves volume."""
-    plain, squash = chain_rig(), np.eye(4) if squash is None else squash
-    poses = pose_chain(plain, chain_angles(POSES, 3, seed=2, reach=REACH))
-    positions = blend_rotations(plain, poses)
-    rest, poses = squash @ plain.rest_matrices, squash @ poses
-    rest_positions, positions = (each @ squash[:3, :3].T for each in (plain.rest_positions, positions))
+    plain_rig, slanted_scale = chain_rig(), np.eye(4) if slanted_scale is None else slanted_scale
+    poses = pose_chain(plain_rig, chain_angles(POSES, 3, seed=2, range_scale=RANGE_SCALE))
+    positions = blend_rotations(plain_rig, poses)
+    rest, poses = slanted_scale @ plain_rig.rest_matrices, slanted_scale @ poses
+    rest_positions, positions = (points @ slanted_scale[:3, :3].T for points in (plain_rig.rest_positions, positions))
     for matrices in (rest, poses):
-        matrices[..., :3, 3] = per_metre * (matrices[..., :3, 3] + away)
-    rest_positions, positions = (per_metre * (each + away) for each in (rest_positions, positions))
+        matrices[..., :3, 3] = units_per_metre * (matrices[..., :3, 3] + origin_distance)
+    rest_positions, positions = (units_per_metre * (points + origin_distance) for points in (rest_positions, positions))
     rig = replace(
-        plain,
+        plain_rig,
         rest_matrices=rest.astype(np.float32),
         rest_positions=rest_positions.astype(np.float32),
-        metres_per_unit=1 / per_metre,
+        metres_per_unit=1 / units_per_metre,
     )
     residuals = LinearSkinning(rig).local_residuals(poses.astype(np.float32), positions)
     with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
@@ -86,16 +88,16 @@ def write_volume(path: Path, per_metre: float = 1.0, away: float = 0.0, squash: 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
-    return write_volume(tmp_path_factory.mktemp("volumes") / "volume")
+    return write_volume_recording(tmp_path_factory.mktemp("volumes") / "volume")
 
 
 @pytest.fixture(scope="module")
-def trained(recording, tmp_path_factory) -> tuple:
+def model_and_path(recording, tmp_path_factory) -> tuple:
     """The trained model and the path of its file."""
     path = tmp_path_factory.mktemp("models") / "volume.onnx"
     with pytest.MonkeyPatch.context() as monkeypatch:
         trained_models = collect_trained_models(monkeypatch)
-        assert main([str(recording.path), str(path), *QUICK]) == 0
+        assert main([str(recording.path), str(path), *QUICK_OPTIONS]) == 0
     return trained_models[0], path
 
 
@@ -103,7 +105,7 @@ def half_rotations_are_selected(recording: Recording) -> bool:
     return half_rotations_help(recording, split_recording(recording, TrainingConfig()).training)
 
 
-def pose_second(rig: Rig, matrix: np.ndarray) -> np.ndarray:
+def pose_second_joint(rig: Rig, matrix: np.ndarray) -> np.ndarray:
     """Return (1, J, 4, 4) pose matrices with a transform of the second joint relative to the first."""
     rest = rig.rest_matrices.astype(np.float64)
     poses = rest.copy()
@@ -116,16 +118,16 @@ def pose_second(rig: Rig, matrix: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("degrees", [-120, -60, 1, 30, 90, 120])
 def test_a_half_rotation_is_proportional_to_the_sine_of_half_the_angle(degrees):
     rig, angle = chain_rig(), np.radians(degrees)
-    poses = pose_second(rig, rotation(0, angle))
-    found = half_rotation_matrices(poses, rig)[0]
-    about = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    poses = pose_second_joint(rig, rotation(0, angle))
+    half_rotations = half_rotation_matrices(poses, rig)[0]
+    axis_matrix = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]])
     carried = poses[0, 0, :3, :3] @ np.linalg.inv(rig.rest_matrices[0, :3, :3])
     rest = rig.rest_matrices[1, :3, :3]
-    for size, tolerance in ((np.sin(angle) / (2 + np.cos(angle)), 1e-6), (0.687 * np.sin(angle / 2), 0.03)):
-        expected = carried @ rest @ (size * about) @ np.linalg.inv(rest)
-        np.testing.assert_allclose(found[1], expected, atol=tolerance * max(abs(size), 1e-3))
+    for factor, tolerance in ((np.sin(angle) / (2 + np.cos(angle)), 1e-6), (0.687 * np.sin(angle / 2), 0.03)):
+        expected = carried @ rest @ (factor * axis_matrix) @ np.linalg.inv(rest)
+        np.testing.assert_allclose(half_rotations[1], expected, atol=tolerance * max(abs(factor), 1e-3))
     # A root has no half rotation, and the third joint does not rotate relative to the second.
-    assert not found[0].any() and np.abs(found[2]).max() < 1e-6
+    assert not half_rotations[0].any() and np.abs(half_rotations[2]).max() < 1e-6
 
 
 def test_half_rotations_rotate_with_the_character():
@@ -133,52 +135,54 @@ def test_half_rotations_rotate_with_the_character():
     poses = pose_chain(rig, chain_angles(5, 3, seed=3)).astype(np.float64)
     character_transform = rotation(0, 0.7) @ rotation(2, -1.9)
     character_transform[:3, 3] = 30, -20, 10
-    moved = regression_matrices((character_transform @ poses).astype(np.float32), rig, use_half_rotations=True)[:, 3:]
+    rotated = regression_matrices((character_transform @ poses).astype(np.float32), rig, use_half_rotations=True)[:, 3:]
     expected = (
         character_transform[:3, :3] @ regression_matrices(poses.astype(np.float32), rig, use_half_rotations=True)[:, 3:]
     )
-    np.testing.assert_allclose(moved, expected, atol=1e-5)
-    assert not moved[..., 3].any() and np.abs(moved).max() > 0.1
+    np.testing.assert_allclose(rotated, expected, atol=1e-5)
+    assert not rotated[..., 3].any() and np.abs(rotated).max() > 0.1
 
 
 @pytest.mark.parametrize("matrix", [rotation(0, np.pi), np.diag([100, 100, 100, 1]), np.diag([-1, -1, -1, 1])])
 def test_half_rotations_are_bounded(matrix):
     """The cases are 180 degrees, a joint scaled by a hundred, and a mirrored joint, whose divisor would be 0."""
     rig = chain_rig()
-    assert np.abs(half_rotation_matrices(pose_second(rig, matrix), rig)).max() < 1e-4
+    assert np.abs(half_rotation_matrices(pose_second_joint(rig, matrix), rig)).max() < 1e-4
 
 
 def test_half_rotations_explain_most_residuals_of_preserved_volume(recording):
     split = split_recording(recording, TrainingConfig())
     for partition in recording.partitions:
-        residuals, left = recording.residuals[:, partition.vertices], []
+        residuals, mean_squares = recording.residuals[:, partition.vertices], []
         for use_half_rotations in (False, True):
             matrices = regression_matrices(recording.pose_matrices, recording.rig, use_half_rotations)
             regression = joint_regression(recording.rig, partition, matrices)
-            fit, rest = regression.fit(residuals, split.training)
-            left.append(float((rest[split.held_out].astype(np.float64) ** 2).mean()))
+            fit, remainder = regression.fit(residuals, split.training)
+            mean_squares.append(float((remainder[split.held_out].astype(np.float64) ** 2).mean()))
             offsets = fit.compute_offsets(matrices) @ np.linalg.inv(matrices[:, partition.joint, :, :3]).transpose(
                 0, 2, 1
             )
-            np.testing.assert_allclose(residuals - offsets, rest, atol=1e-5)
+            np.testing.assert_allclose(residuals - offsets, remainder, atol=1e-5)
         assert (fit.joints >= len(recording.rig.joints)).any()
-        assert left[1] < 0.25 * left[0]
+        assert mean_squares[1] < 0.25 * mean_squares[0]
 
 
-@pytest.mark.parametrize("per_metre, away", [(1000.0, 0.0), (1.0, 100.0), (1000.0, 100.0)])
-def test_selection_does_not_depend_on_unit_and_position(tmp_path, recording, per_metre, away):
-    other = write_volume(tmp_path / "volume", per_metre, away)
-    assert half_rotations_are_selected(recording) and half_rotations_are_selected(other)
-    joints = []
-    for each in (recording, other):
-        matrices = regression_matrices(each.pose_matrices, each.rig, use_half_rotations=True)
-        partition = each.partitions[1]
-        regression = joint_regression(each.rig, partition, matrices)
-        joints.append(regression.fit(each.residuals[:, partition.vertices], np.arange(POSES))[0].joints.tolist())
-    assert joints[0] == joints[1]
+@pytest.mark.parametrize("units_per_metre, origin_distance", [(1000.0, 0.0), (1.0, 100.0), (1000.0, 100.0)])
+def test_selection_does_not_depend_on_unit_and_position(tmp_path, recording, units_per_metre, origin_distance):
+    moved_recording = write_volume_recording(tmp_path / "volume", units_per_metre, origin_distance)
+    assert half_rotations_are_selected(recording) and half_rotations_are_selected(moved_recording)
+    selected_joints = []
+    for tested_recording in (recording, moved_recording):
+        matrices = regression_matrices(tested_recording.pose_matrices, tested_recording.rig, use_half_rotations=True)
+        partition = tested_recording.partitions[1]
+        regression = joint_regression(tested_recording.rig, partition, matrices)
+        selected_joints.append(
+            regression.fit(tested_recording.residuals[:, partition.vertices], np.arange(POSES))[0].joints.tolist()
+        )
+    assert selected_joints[0] == selected_joints[1]
 
 
-def test_a_rig_that_blends_matrices_has_none(tmp_path):
+def test_a_rig_that_blends_matrices_has_no_half_rotations(tmp_path):
     """The cases are bulges that grow with the bend, skinning alone, and delta mush, which has surface frames."""
     write_chain(tmp_path / "chain")
     bulges = read_recording(tmp_path / "chain")
@@ -186,7 +190,7 @@ def test_a_rig_that_blends_matrices_has_none(tmp_path):
         replace(bulges, residuals=0 * bulges.residuals)
     )
     write_tube(tmp_path / "tube")
-    assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK]) == 0
+    assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK_OPTIONS]) == 0
     names = {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
     assert "surface_frame_features" in names and "half_rotation_matrices" not in names
 
@@ -197,30 +201,34 @@ def test_a_stop_request_cancels_the_measurement(recording):
 
 
 def without_half_rotations(trained_model: TrainedModel) -> TrainedModel:
-    """The trained model fitted to the skin matrices alone."""
+    """Return the trained model without the half-rotation matrices of its fits."""
     prepared = []
-    for own in trained_model.prepared:
-        count = int((own.fit.joints < len(trained_model.rig.joints)).sum())
-        prepared.append(replace(own, fit=JointFit(own.fit.joints[:count], own.fit.factors[: 4 * count])))
+    for partition in trained_model.prepared:
+        count = int((partition.fit.joints < len(trained_model.rig.joints)).sum())
+        prepared.append(
+            replace(partition, fit=JointFit(partition.fit.joints[:count], partition.fit.factors[: 4 * count]))
+        )
     return replace(trained_model, prepared=tuple(prepared))
 
 
-def test_a_warm_start_keeps_half_rotations(recording, trained, tmp_path, capsys):
-    trained_model, model_path = trained
+def test_a_warm_start_keeps_half_rotations(recording, model_and_path, tmp_path, capsys):
+    trained_model, model_path = model_and_path
     path = tmp_path / model_path.name
     for file in (model_path, checkpoint_path(model_path)):
         shutil.copy(file, tmp_path)
     assert trained_model.half_rotation_joints().tolist() == [1, 2] and read_model_info(path).parity_mm < 1e-2
-    assert main([str(recording.path), str(path), *QUICK, "--warm-start"]) == 0
+    assert main([str(recording.path), str(path), *QUICK_OPTIONS, "--warm-start"]) == 0
     assert "The rig blends rotations" in capsys.readouterr().out
     report = json.loads((path.parent / "report.json").read_text())
     assert report["fdda"]["held_out"]["mean"] < 0.1 * report["linear"]["held_out"]["mean"]
 
 
-def test_half_rotations_cost_thirteen_nodes_and_three_parameters_per_vertex(trained, monkeypatch):
-    trained_model = trained[0]
+def test_half_rotations_cost_thirteen_nodes_and_three_parameters_per_vertex(model_and_path, monkeypatch):
+    trained_model = model_and_path[0]
     monkeypatch.setattr(skinning_nodes, "MAX_PADDING_ELEMENTS", 0)
-    graph, plain = (build_graph(each) for each in (trained_model, without_half_rotations(trained_model)))
+    graph, plain = (
+        build_graph(tested_model) for tested_model in (trained_model, without_half_rotations(trained_model))
+    )
     assert len(graph.graph.node) == len(plain.graph.node) + 13
     counts = [(int((p.fit.joints >= 3).sum()), p.vertex_count) for p in trained_model.prepared]
     parameter_count = 3 * sum(joint_count * vertex_count for joint_count, vertex_count in counts)
@@ -228,20 +236,20 @@ def test_half_rotations_cost_thirteen_nodes_and_three_parameters_per_vertex(trai
 
 
 @pytest.mark.parametrize("sheared", [False, True])
-def test_the_graph_agrees_with_pytorch(trained, sheared):
-    trained_model = replace(trained[0], sheared=sheared)
-    poses = pose_chain(trained_model.rig, chain_angles(20, 3, seed=5, reach=1.2 * REACH))
+def test_the_graph_agrees_with_pytorch(model_and_path, sheared):
+    trained_model = replace(model_and_path[0], sheared=sheared)
+    poses = pose_chain(trained_model.rig, chain_angles(20, 3, seed=5, range_scale=1.2 * RANGE_SCALE))
     check_agreement(trained_model, poses)
     poses[:, 1:] = poses[:, 1:] @ np.diag([1.1, 0.9, 1.05, 1]).astype(np.float32)
     check_agreement(trained_model, poses)
-    # Mirrored: the divisor would be negative.
-    check_agreement(trained_model, pose_second(trained_model.rig, np.diag([-3, -3, -3, 1])))
+    # With a mirrored joint, the divisor would be negative.
+    check_agreement(trained_model, pose_second_joint(trained_model.rig, np.diag([-3, -3, -3, 1])))
 
 
 def test_sheared_bones_have_half_rotations(tmp_path, monkeypatch):
-    squash = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
+    slanted_scale = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
     trained_models = collect_trained_models(monkeypatch)
-    sheared = write_volume(tmp_path / "volume", squash=squash)
-    assert main([str(sheared.path), str(tmp_path / "model.onnx"), *QUICK]) == 0
+    sheared = write_volume_recording(tmp_path / "volume", slanted_scale=slanted_scale)
+    assert main([str(sheared.path), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
     assert trained_models[0].sheared and len(trained_models[0].half_rotation_joints())
     assert read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2

@@ -12,10 +12,10 @@ from trainer.inputs import make_inputs, partition_centers
 from .chain import chain_angles, chain_rig, pose_chain
 
 PARENTS = np.array([-1, 0, 1, 1, 3])
-"""0 is the parent of 1, 1 of 2 and 3, 3 of 4."""
+"""Joint 0 is the parent of joint 1, joint 1 of joints 2 and 3, and joint 3 of joint 4."""
 
 
-def partition(joint: int, *influencing: int) -> Partition:
+def make_partition(joint: int, *influencing: int) -> Partition:
     return Partition(joint, influencing, np.zeros(0, np.int32))
 
 
@@ -25,24 +25,26 @@ def pairs(*partitions: Partition) -> list[tuple[int, int]]:
 
 
 def test_pairs_include_siblings_and_grandchildren():
-    assert pairs(partition(2, 2, 3, 4)) == [(2, 3), (2, 4)]
-    assert pairs(partition(0, 1, 3), partition(4, 3, 4)) == [(0, 3), (4, 1)]
+    assert pairs(make_partition(2, 2, 3, 4)) == [(2, 3), (2, 4)]
+    assert pairs(make_partition(0, 1, 3), make_partition(4, 3, 4)) == [(0, 3), (4, 1)]
 
 
 def test_pairs_need_an_influencing_path():
-    assert pairs(partition(2, 2, 4)) == []
+    assert pairs(make_partition(2, 2, 4)) == []
 
 
 def test_columns_of_joints_and_pairs():
-    inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), [partition(2, 2, 3, 4), partition(0, 1, 3), partition(1)])
+    inputs = make_inputs(
+        PARENTS, np.zeros((5, 1, 3)), [make_partition(2, 2, 3, 4), make_partition(0, 1, 3), make_partition(1)]
+    )
     assert inputs.columns[0].tolist() == [*range(24, 60), *range(60, 66)]
     assert inputs.columns[1].tolist() == [*range(12, 24), *range(36, 48), *range(66, 69)]
     assert inputs.columns[2].tolist() == []
 
 
 def test_controls_are_between_joints_and_pairs():
-    own = [Partition(2, (2, 3, 4), np.zeros(0, np.int32), (0, 2)), Partition(1, (), np.zeros(0, np.int32), (1,))]
-    inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), own, control_count=3)
+    partitions = [Partition(2, (2, 3, 4), np.zeros(0, np.int32), (0, 2)), Partition(1, (), np.zeros(0, np.int32), (1,))]
+    inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), partitions, control_count=3)
     assert inputs.columns[0].tolist() == [*range(24, 60), 60, 62, *range(63, 69)]
     assert inputs.columns[1].tolist() == [61]
     poses = np.tile(np.eye(4), (2, 5, 1, 1))
@@ -56,7 +58,7 @@ def test_controls_are_between_joints_and_pairs():
 def test_a_pair_is_the_center_of_a_partition_in_the_space_of_a_joint():
     rig = chain_rig(4)
     partitions = make_partitions(rig)
-    inputs = make_inputs(rig.parents, partition_centers(rig, partitions), [partition(1, 1, 2, 3)])
+    inputs = make_inputs(rig.parents, partition_centers(rig, partitions), [make_partition(1, 1, 2, 3)])
     assert list(zip(inputs.pair_references, inputs.pair_points, strict=True)) == [(1, 3)]
     poses = pose_chain(rig, chain_angles(5, 4, 0))
     features = inputs.compute_features(poses, rig.rest_matrices)

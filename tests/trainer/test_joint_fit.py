@@ -19,9 +19,9 @@ INFLUENCING = {joint: tuple(j for j in (joint, joint + 1) if 0 < j < JOINTS) for
 
 def with_heaviest_joints(rig: Rig) -> Rig:
     """Return the rig with each vertex on its heaviest joint."""
-    heaviest = rig.skin_weights == rig.skin_weights.max(axis=1, keepdims=True)
-    heaviest[:, 1] &= ~heaviest[:, 0]
-    return replace(rig, skin_weights=heaviest.astype(np.float32))
+    is_heaviest = rig.skin_weights == rig.skin_weights.max(axis=1, keepdims=True)
+    is_heaviest[:, 1] &= ~is_heaviest[:, 0]
+    return replace(rig, skin_weights=is_heaviest.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ TRAINING = np.arange(300)
 
 @pytest.mark.parametrize("joint", range(JOINTS))
 def test_smooth_skinning_is_recovered(smooth_rig, poses, joint):
-    """The true rig has smooth weights, and linear skinning one joint per vertex. The fit explains all residuals."""
+    """The true rig has smooth weights, and linear skinning has one joint per vertex. The fit explains all residuals."""
     rig = with_heaviest_joints(smooth_rig)
     partition = make_partitions(rig, INFLUENCING)[joint]
     skinning = LinearSkinning(rig)
@@ -72,8 +72,8 @@ def test_irrelevant_joints_are_removed(smooth_rig, poses):
 
 
 def random_residuals(rig: Rig, partition: Partition, count: int) -> np.ndarray:
-    size = (count, len(partition.vertices), 3)
-    return np.random.default_rng(0).normal(0.01, 0.004, size).astype(np.float32)
+    shape = (count, len(partition.vertices), 3)
+    return np.random.default_rng(0).normal(0.01, 0.004, shape).astype(np.float32)
 
 
 def test_offsets_and_remainder_sum_to_the_residuals(smooth_rig, poses):
@@ -101,7 +101,7 @@ def test_offsets_rotate_with_the_character(smooth_rig, poses):
     )
 
 
-def test_joints_that_only_influencing_joints_move():
+def test_the_fit_has_the_joints_that_only_influencing_joints_move():
     parents = (-1, 0, 1, 1, 3)
     rig = replace(chain_rig(5), joints=tuple(Joint(f"bone_{n}", parent) for n, parent in enumerate(parents)))
     skin = np.tile(np.eye(4, dtype=np.float32), (2, 5, 1, 1))
@@ -127,8 +127,8 @@ def test_the_main_joint_alone_fits_the_mean(smooth_rig, poses):
 def test_joints_that_never_moved_get_small_factors(smooth_rig):
     """If no joint moves, all regressors are equal; one of the joints moves later."""
     partition = make_partitions(smooth_rig, INFLUENCING)[1]
-    still = pose_chain(smooth_rig, np.zeros((30, JOINTS, 2)))
-    skin = skin_matrices(still, smooth_rig.rest_matrices)
+    still_poses = pose_chain(smooth_rig, np.zeros((30, JOINTS, 2)))
+    skin = skin_matrices(still_poses, smooth_rig.rest_matrices)
     residuals = random_residuals(smooth_rig, partition, 30)
     fit, _ = joint_regression(smooth_rig, partition, skin).fit(residuals, np.arange(30))
     assert np.abs(fit.factors).max() < 0.1

@@ -20,7 +20,7 @@ from trainer.inputs import inputs_of_rig, partition_centers
 from trainer.splitting import split_recording
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
-from .conftest import QUICK
+from .conftest import QUICK_OPTIONS
 
 JOINTS, POSES = 4, 160
 METER = "meters"
@@ -35,39 +35,39 @@ UNITS_AND_DISTANCES = {
 OTHER_UNITS = [name for name in UNITS_AND_DISTANCES if name != METER]
 
 
-def write_recording(path, per_metre: float, away: float) -> None:
+def write_recording(path, units_per_metre: float, origin_distance: float) -> None:
     """Write a recording of the chain in another unit, at a distance from the origin in meters."""
     rig = chain_rig(JOINTS)
     angles = chain_angles(POSES, JOINTS, seed=3)
     matrices, residuals = pose_chain(rig, angles).astype(np.float64), chain_residuals(rig, angles)
     matrices[:, -1, 0, 3] += 0.002 * np.sin(3 * angles[:, -1, 0])  # The last joint slides a little.
-    rest, positions = rig.rest_matrices.astype(np.float64), rig.rest_positions.astype(np.float64)
-    for array in (rest, matrices):
-        array[..., :3, 3] = per_metre * (array[..., :3, 3] + away)
+    rest_matrices, rest_positions = rig.rest_matrices.astype(np.float64), rig.rest_positions.astype(np.float64)
+    for array in (rest_matrices, matrices):
+        array[..., :3, 3] = units_per_metre * (array[..., :3, 3] + origin_distance)
     rig = replace(
         rig,
-        rest_positions=(per_metre * (positions + away)).astype(np.float32),
-        rest_matrices=rest.astype(np.float32),
-        metres_per_unit=1 / per_metre,
+        rest_positions=(units_per_metre * (rest_positions + origin_distance)).astype(np.float32),
+        rest_matrices=rest_matrices.astype(np.float32),
+        metres_per_unit=1 / units_per_metre,
     )
-    influencing = {j: tuple(i for i in (j, j + 1) if 0 < i < JOINTS) for j in range(JOINTS)}
+    influencing = {joint: tuple(other for other in (joint, joint + 1) if 0 < other < JOINTS) for joint in range(JOINTS)}
     with RecordingWriter(path, rig, make_partitions(rig, influencing), chain_info(POSES)) as writer:
-        writer.append(matrices.astype(np.float32), per_metre * residuals)
+        writer.append(matrices.astype(np.float32), units_per_metre * residuals)
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> dict:
+def results_by_unit(tmp_path_factory) -> dict:
     """Recording, report and model metadata for each unit and distance."""
-    folder, found = tmp_path_factory.mktemp("lengths"), {}
-    for name, way in UNITS_AND_DISTANCES.items():
+    folder, results = tmp_path_factory.mktemp("lengths"), {}
+    for name, unit_and_distance in UNITS_AND_DISTANCES.items():
         path = folder / name
         path.mkdir()
-        write_recording(path / "recording", *way)
+        write_recording(path / "recording", *unit_and_distance)
         model = path / "m.onnx"
-        assert main([str(path / "recording"), str(model), *QUICK]) == 0, name
+        assert main([str(path / "recording"), str(model), *QUICK_OPTIONS]) == 0, name
         report = json.loads(report_path(model).read_text())
-        found[name] = read_recording(path / "recording"), report, read_model_info(model)
-    return found
+        results[name] = read_recording(path / "recording"), report, read_model_info(model)
+    return results
 
 
 def prepared(recording) -> list:
@@ -79,36 +79,41 @@ def prepared(recording) -> list:
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)
-def test_networks_have_the_same_inputs(trained, name):
+def test_networks_have_the_same_inputs(results_by_unit, name):
     """Constant features with rounding errors are not inputs; features that vary a little are."""
-    for own, meters in zip(*(prepared(trained[n][0]) for n in (name, METER)), strict=True):
-        assert own.columns.tolist() == meters.columns.tolist()
-        assert own.fit.joints.tolist() == meters.fit.joints.tolist()
-        assert abs(len(own.basis.components) - len(meters.basis.components)) <= 1
+    for partition, reference in zip(*(prepared(results_by_unit[n][0]) for n in (name, METER)), strict=True):
+        assert partition.columns.tolist() == reference.columns.tolist()
+        assert partition.fit.joints.tolist() == reference.fit.joints.tolist()
+        assert abs(len(partition.basis.components) - len(reference.basis.components)) <= 1
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)
-def test_models_have_the_same_errors(trained, name):
-    own, meters = (trained[n][1] for n in (name, METER))
-    # One step of float32, mm: positions far from the origin are no more exact than that.
+def test_models_have_the_same_errors(results_by_unit, name):
+    report, reference = (results_by_unit[n][1] for n in (name, METER))
+    # Positions far from the origin are only as exact as one step of float32, mm.
     step = 1000 * float(np.spacing(np.float32(UNITS_AND_DISTANCES[name][1])))
-    for way in ("fdda", "linear"):
-        for statistic, value in meters[way]["held_out"].items():
-            assert own[way]["held_out"][statistic] == pytest.approx(value, rel=0.1, abs=step), (way, statistic)
+    for method in ("fdda", "linear"):
+        for statistic, value in reference[method]["held_out"].items():
+            assert report[method]["held_out"][statistic] == pytest.approx(value, rel=0.1, abs=step), (method, statistic)
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)
-def test_training_ranges_agree_in_meters(trained, name):
+def test_training_ranges_agree_in_meters(results_by_unit, name):
     """The bounds that determine the confidence are equal in meters."""
-    (_, _, own), (_, _, meters) = trained[name], trained[METER]
-    per_metre, _ = UNITS_AND_DISTANCES[name]
-    for mine, theirs in ((own.feature_low, meters.feature_low), (own.feature_high, meters.feature_high)):
-        mine = mine.copy()
-        mine[:, 3::4] /= per_metre
-        assert np.abs(mine - theirs)[1:].max() < 2e-4
+    (_, _, info), (_, _, reference) = results_by_unit[name], results_by_unit[METER]
+    units_per_metre, _ = UNITS_AND_DISTANCES[name]
+    for bounds, reference_bounds in (
+        (info.feature_low, reference.feature_low),
+        (info.feature_high, reference.feature_high),
+    ):
+        bounds = bounds.copy()
+        bounds[:, 3::4] /= units_per_metre
+        assert np.abs(bounds - reference_bounds)[1:].max() < 2e-4
 
 
 @pytest.mark.parametrize("name", UNITS_AND_DISTANCES)
-def test_recording_checks_give_the_same_warnings(trained, name):
-    own, meters = ({warning.name for warning in check_recording(trained[n][0])} for n in (name, METER))
-    assert own == meters
+def test_recording_checks_give_the_same_warnings(results_by_unit, name):
+    warnings, reference_warnings = (
+        {warning.name for warning in check_recording(results_by_unit[n][0])} for n in (name, METER)
+    )
+    assert warnings == reference_warnings

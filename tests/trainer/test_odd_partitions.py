@@ -20,7 +20,7 @@ from trainer.inputs import inputs_of_rig, joints_on_path, partition_centers
 from trainer.joint_fit import joint_regression
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
-from .conftest import QUICK, run_page
+from .conftest import QUICK_OPTIONS, run_page_code
 
 POSES, JOINTS = 120, 4
 STATIC_JOINT_INDEX = JOINTS
@@ -32,11 +32,11 @@ def odd_rig() -> Rig:
     """Create a chain of four joints; the vertices of its first tenth have no bone."""
     rig = chain_rig(JOINTS)
     skin_joints, skin_weights = rig.skin_joints.copy(), rig.skin_weights.copy()
-    start = rig.rest_positions[:, 2] < 0.1
-    skin_joints[start], skin_weights[start] = [STATIC_JOINT_INDEX, 0], [1, 0]
-    rest = np.append(rig.rest_matrices, np.eye(4, dtype=np.float32)[None], axis=0)
+    has_no_bone = rig.rest_positions[:, 2] < 0.1
+    skin_joints[has_no_bone], skin_weights[has_no_bone] = [STATIC_JOINT_INDEX, 0], [1, 0]
+    rest_matrices = np.append(rig.rest_matrices, np.eye(4, dtype=np.float32)[None], axis=0)
     joints = (*rig.joints, Joint(STATIC_JOINT, -1))
-    return replace(rig, joints=joints, rest_matrices=rest, skin_joints=skin_joints, skin_weights=skin_weights)
+    return replace(rig, joints=joints, rest_matrices=rest_matrices, skin_joints=skin_joints, skin_weights=skin_weights)
 
 
 def odd_partitions(rig: Rig) -> tuple[Partition, ...]:
@@ -66,7 +66,7 @@ def model(tmp_path_factory) -> Path:
     partitions, poses = odd_partitions(rig), odd_poses(rig, POSES, 0)
     with RecordingWriter(folder / "recording", rig, partitions, chain_info(POSES)) as writer:
         writer.append(poses, LinearSkinning(rig, partitions).local_residuals(poses, smoothed(rig, poses)))
-    assert main([str(folder / "recording"), str(folder / "model.onnx"), *QUICK]) == 0
+    assert main([str(folder / "recording"), str(folder / "model.onnx"), *QUICK_OPTIONS]) == 0
     return folder / "model.onnx"
 
 
@@ -79,8 +79,8 @@ def test_every_partition_approximates_unseen_poses(model):
         assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
     main_joint = main_joints(rig.skin_joints, rig.skin_weights)
     for joint in (MERGED_JOINT, STATIC_JOINT_INDEX):
-        own = main_joint == joint
-        assert own.sum() > 5 and error[:, own].mean() < 0.1 * linear[:, own].mean()
+        is_own_vertex = main_joint == joint
+        assert is_own_vertex.sum() > 5 and error[:, is_own_vertex].mean() < 0.1 * linear[:, is_own_vertex].mean()
 
 
 def test_model_and_report_name_merged_joints(model):
@@ -89,7 +89,7 @@ def test_model_and_report_name_merged_joints(model):
     assert sum(p.vertices for p in info.partitions) == info.vertex_count
     names = [(p["joint"], p.get("merged")) for p in report["partitions"]]
     assert names == [("bone_0", None), ("bone_1", None), ("bone_2", ["bone_3"]), (STATIC_JOINT, None)]
-    # The recorded positions come back from residuals in the frame of the joint that took others in.
+    # The residuals of merged vertices are in the space of the absorbing joint, so their errors are small.
     assert all(p["held_out"]["mean"] < 0.1 * p["linear"]["mean"] for p in report["partitions"])
     page = model.with_name("report.html").read_text()
     assert '<td title="with bone_3">bone_2</td>' in page and ">no bone</td>" in page
@@ -99,7 +99,7 @@ def test_the_code_in_the_recording_format_page_runs(model):
     rig = odd_rig()
     pose = odd_poses(rig, POSES, 0)[:1]
     expected = distances(smoothed(rig, pose), LinearSkinning(rig).positions(pose)).mean() * 1000
-    shape, residual = run_page("Recording", model.parent).split(" mean residual ")
+    shape, residual = run_page_code("Recording", model.parent).split(" mean residual ")
     assert shape == "(90, 3)" and float(residual.removesuffix(" mm\n")) == pytest.approx(expected, rel=1e-4)
 
 
@@ -112,9 +112,9 @@ def test_vertices_without_a_bone_have_inputs_of_influencing_joints():
     partitions = odd_partitions(rig)
     inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
     pairs = [(a, b) for a, b in zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True)]
-    assert (STATIC_JOINT_INDEX, 1) in pairs, "two joints move the second bone against what follows none"
+    assert (STATIC_JOINT_INDEX, 1) in pairs, "two joints move the second bone relative to vertices without a bone"
     assert (1, STATIC_JOINT_INDEX) in pairs and (2, STATIC_JOINT_INDEX) not in pairs, (
-        "the root does not influence the third"
+        "the root does not influence the third partition"
     )
     skin = skin_matrices(odd_poses(rig, 3, 0), rig.rest_matrices)
     assert joint_regression(rig, partitions[3], skin).joints.tolist() == [STATIC_JOINT_INDEX, 0, 1]

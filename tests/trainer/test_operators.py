@@ -23,16 +23,16 @@ def models(recording, tmp_path_factory) -> list[bytes]:
     """Models with each activation, with one and many joints, with deep and wide networks, and without components."""
     folder = tmp_path_factory.mktemp("models")
     for joints in (1, 12):
-        write_chain(folder / f"chain_{joints}", poses=60, joints=joints)
+        write_chain(folder / f"chain_{joints}", pose_count=60, joint_count=joints)
     trainings = [(recording, "--activation", name, "--hidden", "24", "24") for name in ACTIVATIONS]
     trainings += [(folder / f"chain_{joints}", "--hidden", "16") for joints in (1, 12)]
     trainings += [(recording, "--hidden", "300", "200", "100", "50"), (recording, "--tolerance-mm", "10000")]
-    found = []
-    for number, (path, *options) in enumerate(trainings):
-        model = folder / f"{number}.onnx"
+    contents = []
+    for index, (path, *options) in enumerate(trainings):
+        model = folder / f"{index}.onnx"
         assert main([str(path), str(model), "--epochs", "2", *options]) == 0
-        found.append(model.read_bytes())
-    return found
+        contents.append(model.read_bytes())
+    return contents
 
 
 def test_the_add_on_accepts_every_exported_operator(models):
@@ -54,8 +54,8 @@ def test_the_limits_of_the_add_on_leave_a_margin(models):
 
 def test_changed_weights_are_refused(trained):
     data = bytearray((trained / "model.onnx").read_bytes())
-    largest = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
-    data[bytes(data).index(bytes(largest)) + len(largest) // 2] ^= 1
+    largest_constant = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
+    data[bytes(data).index(bytes(largest_constant)) + len(largest_constant) // 2] ^= 1
     with pytest.raises(ModelError, match="is damaged: its checksum is not that of its weights"):
         check_model(bytes(data), "m.onnx")
 
@@ -63,12 +63,12 @@ def test_changed_weights_are_refused(trained):
 def test_a_graph_larger_than_its_metadata_explains_is_refused(trained):
     """The limits come from the metadata: a graph with more constants than they explain is too large."""
     model = onnx.load_from_string((trained / "model.onnx").read_bytes())
-    text = next(prop for prop in model.metadata_props if prop.key == METADATA_KEY)
-    value = json.loads(text.value)
-    big = np.zeros((2000, 1000), np.float32)
-    model.graph.initializer.append(onnx.numpy_helper.from_array(big, "more"))
-    value["training"]["hidden"] = [8]
-    text.value = json.dumps(value)
+    metadata_property = next(prop for prop in model.metadata_props if prop.key == METADATA_KEY)
+    metadata = json.loads(metadata_property.value)
+    added_constant = np.zeros((2000, 1000), np.float32)
+    model.graph.initializer.append(onnx.numpy_helper.from_array(added_constant, "more"))
+    metadata["training"]["hidden"] = [8]
+    metadata_property.value = json.dumps(metadata)
     model.metadata_props.remove(next(prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY))
     with pytest.raises(ModelError, match="more than its joints, vertices and components explain"):
         check_model(model.SerializeToString(), "m.onnx")

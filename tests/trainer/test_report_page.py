@@ -21,33 +21,33 @@ PNG = base64.b64decode(
 )
 
 
-class Tags(HTMLParser):
-    """Collects tags, and fails on a closing tag without its opening tag."""
+class TagCollector(HTMLParser):
+    """Collects the tags of a page, and fails on a closing tag without its opening tag."""
 
-    VOID = ("meta", "img", "line", "rect", "polyline", "polygon")
+    VOID_TAGS = ("meta", "img", "line", "rect", "polyline", "polygon")
 
     def __init__(self, text: str):
         super().__init__()
-        self.open, self.seen = [], []
+        self.open_tags, self.tags = [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attributes):
-        self.seen.append((tag, dict(attributes)))
-        if tag not in self.VOID:
-            self.open.append(tag)
+        self.tags.append((tag, dict(attributes)))
+        if tag not in self.VOID_TAGS:
+            self.open_tags.append(tag)
 
     def handle_endtag(self, tag):
-        if tag not in self.VOID:
-            assert self.open.pop() == tag
+        if tag not in self.VOID_TAGS:
+            assert self.open_tags.pop() == tag
 
 
 def test_page_is_well_formed_and_loads_nothing(trained, report):
     text = (trained / "report.html").read_text(encoding="utf-8")
-    tags = Tags(text)
-    assert not tags.open
+    collector = TagCollector(text)
+    assert not collector.open_tags
     assert not re.search(r"(src|href)=\"(?!data:)", text) and "url(" not in text and "@import" not in text
-    assert "script" not in {tag for tag, _ in tags.seen}
-    charts = [tag for tag, _ in tags.seen if tag == "svg"]
+    assert "script" not in {tag for tag, _ in collector.tags}
+    charts = [tag for tag, _ in collector.tags if tag == "svg"]
     assert len(charts) == 2 + len(report["partitions"])
     for partition in report["partitions"]:
         assert f"{partition['held_out']['max']:.4f}" in text
@@ -65,7 +65,7 @@ def test_page_is_written_again_with_pictures_and_evaluation(trained, report, tmp
     arguments = ["--pictures", pictures, "--evaluation", tmp_path / "evaluation.json"]
     assert main([str(tmp_path / "report.json"), *map(str, arguments)]) == 0
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    images = [attributes for tag, attributes in Tags(text).seen if tag == "img"]
+    images = [attributes for tag, attributes in TagCollector(text).tags if tag == "img"]
     assert [image["alt"] for image in images] == ["two poses"]
     assert base64.b64decode(images[0]["src"].partition("base64,")[2]) == PNG
     assert "200 poses that training never saw" in text and "0.125 mm" in text
@@ -93,24 +93,24 @@ def value_paths(value, path=()):
             yield from value_paths(inner, (*path, key))
 
 
-def set_value(value, path, new):
+def set_value(value, path, hostile_value):
     *parent_path, last_key = path
     for key in parent_path:
         value = value[key]
-    value[last_key] = new
+    value[last_key] = hostile_value
 
 
 @pytest.mark.parametrize(
-    "new",
+    "hostile_value",
     [SCRIPT_TAG, [SCRIPT_TAG], {SCRIPT_TAG: SCRIPT_TAG}, None, float("nan"), 1e400, -5, 10**400, 1e300, 5e-324, True],
 )
-def test_a_hostile_report_breaks_no_page(report, tmp_path, capsys, new):
+def test_a_report_with_hostile_values_cannot_break_the_page(report, tmp_path, capsys, hostile_value):
     """For any value at any key, the result is a page without script tags, or an error in one sentence."""
-    written = 0
+    written_count = 0
     for path in list(value_paths(report))[1:]:
-        changed = json.loads(json.dumps(report))
-        set_value(changed, path, new)
-        (tmp_path / "report.json").write_text(json.dumps(changed))
+        changed_report = json.loads(json.dumps(report))
+        set_value(changed_report, path, hostile_value)
+        (tmp_path / "report.json").write_text(json.dumps(changed_report))
         (tmp_path / "report.html").unlink(missing_ok=True)
         status = main([str(tmp_path / "report.json")])
         error_text = capsys.readouterr().err
@@ -122,19 +122,19 @@ def test_a_hostile_report_breaks_no_page(report, tmp_path, capsys, new):
                 and len(error_text) < 1200
             )
             continue
-        written += 1
-        tags = Tags((tmp_path / "report.html").read_text(encoding="utf-8"))
-        assert "script" not in {tag for tag, _ in tags.seen}, path
-        assert not tags.open
-    assert written or new != SCRIPT_TAG
+        written_count += 1
+        collector = TagCollector((tmp_path / "report.html").read_text(encoding="utf-8"))
+        assert "script" not in {tag for tag, _ in collector.tags}, path
+        assert not collector.open_tags
+    assert written_count or hostile_value != SCRIPT_TAG
 
 
 @pytest.mark.parametrize("key", ["poses", "fdda", "linear"])
-@pytest.mark.parametrize("new", [SCRIPT_TAG, None, [], {"mean": SCRIPT_TAG}])
-def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, new):
+@pytest.mark.parametrize("hostile_value", [SCRIPT_TAG, None, [], {"mean": SCRIPT_TAG}])
+def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, hostile_value):
     (tmp_path / "report.json").write_text(json.dumps(report))
     statistics = {"mean": 0.125, "rms": 0.25, "p99": 0.5, "p999": 1.0, "max": 2.0}
-    evaluation = {"poses": 200, "fdda": statistics, "linear": statistics, key: new}
+    evaluation = {"poses": 200, "fdda": statistics, "linear": statistics, key: hostile_value}
     (tmp_path / "e.json").write_text(json.dumps(evaluation))
     assert main([str(tmp_path / "report.json"), "--evaluation", str(tmp_path / "e.json")]) == 1
     assert capsys.readouterr().err.startswith(f"The evaluation '{tmp_path / 'e.json'}' is damaged: ")

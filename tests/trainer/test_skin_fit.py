@@ -46,29 +46,29 @@ def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES
     return matrices.astype(np.float32)
 
 
-def random_rig(influences: int, seed: int = 0, away: float = 0.0) -> Rig:
-    """Create a cloud of vertices, `away` from the origin, skinned to joints at random positions in it."""
+def random_rig(influences: int, seed: int = 0, origin_distance: float = 0.0) -> Rig:
+    """Create a cloud of vertices, `origin_distance` from the origin, skinned to joints at random positions in it."""
     rng = np.random.default_rng(seed)
-    heads = rng.uniform(-1, 1, (JOINTS, 3)) + away
-    rest = np.stack([np.eye(4)] * JOINTS)
-    rest[:, :3, 3] = heads
+    heads = rng.uniform(-1, 1, (JOINTS, 3)) + origin_distance
+    rest_matrices = np.stack([np.eye(4)] * JOINTS)
+    rest_matrices[:, :3, 3] = heads
     skin_joints = np.stack([rng.permutation(JOINTS)[:4] for _ in range(VERTICES)]).astype(np.int32)
     weights = rng.uniform(0.1, 1, (VERTICES, 4))
     weights[:, influences:] = 0
     weights[: VERTICES // 3, 1:] = 0
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-    positions = (rng.uniform(-1, 1, (VERTICES, 3)) + away).astype(np.float32)
-    joints = tuple(Joint(str(number), number - 1) for number in range(JOINTS))
-    return Rig(joints, positions, rest.astype(np.float32), skin_joints, weights, Fingerprint("", "", ""))
+    positions = (rng.uniform(-1, 1, (VERTICES, 3)) + origin_distance).astype(np.float32)
+    joints = tuple(Joint(str(index), index - 1) for index in range(JOINTS))
+    return Rig(joints, positions, rest_matrices.astype(np.float32), skin_joints, weights, Fingerprint("", "", ""))
 
 
 def with_one_joint(rig: Rig, joints: np.ndarray) -> Rig:
     """Return the rig with each vertex on one joint."""
     weights = np.zeros((rig.vertex_count, 4), np.float32)
     weights[:, 0] = 1
-    places = np.zeros((rig.vertex_count, 4), np.int32)
-    places[:, 0] = joints
-    return replace(rig, skin_joints=places, skin_weights=weights)
+    joint_indices = np.zeros((rig.vertex_count, 4), np.int32)
+    joint_indices[:, 0] = joints
+    return replace(rig, skin_joints=joint_indices, skin_weights=weights)
 
 
 def make_fit_poses(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> FitPoses:
@@ -83,8 +83,8 @@ def make_fit_poses(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POS
 def fit_rig(poses: FitPoses, kind: str) -> Rig:
     """Return the rig with the fitted weights."""
     joints, weights = np.zeros((VERTICES, 4), np.int32), np.zeros((VERTICES, 4), np.float32)
-    for block, *found in SkinSolver(poses).fit(kind):
-        joints[block], weights[block] = found
+    for block, *fitted in SkinSolver(poses).fit(kind):
+        joints[block], weights[block] = fitted
     return replace(poses.rig, skin_joints=joints, skin_weights=weights)
 
 
@@ -102,17 +102,17 @@ def write_fit_folder(folder: Path, poses: FitPoses) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("influences", "away"), [(2, 0), (4, 0), (4, 1000)])
-def test_smooth_weights_are_recovered(influences, away):
-    rig = random_rig(influences, away=away)
+@pytest.mark.parametrize(("influences", "origin_distance"), [(2, 0), (4, 0), (4, 1000)])
+def test_smooth_weights_are_recovered(influences, origin_distance):
+    rig = random_rig(influences, origin_distance=origin_distance)
     assert np.abs(dense_weights(fit_rig(make_fit_poses(rig), "smooth")) - dense_weights(rig)).max() < 1e-3
 
 
 def test_rigid_weights_are_recovered():
     labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
-    found = fit_rig(make_fit_poses(with_one_joint(random_rig(1), labels), noise=0.01), "hard")
-    np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
-    assert (found.skin_weights == [1, 0, 0, 0]).all() and (found.skin_joints[:, 1:] == 0).all()
+    fitted_rig = fit_rig(make_fit_poses(with_one_joint(random_rig(1), labels), noise=0.01), "hard")
+    np.testing.assert_array_equal(fitted_rig.skin_joints[:, 0], labels)
+    assert (fitted_rig.skin_weights == [1, 0, 0, 0]).all() and (fitted_rig.skin_joints[:, 1:] == 0).all()
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
@@ -128,9 +128,9 @@ def test_constraints_hold_for_random_positions(kind):
 def test_noise_adds_no_joints():
     """Each joint explains a little of any noise, but only the true joint explains enough."""
     labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
-    found = fit_rig(make_fit_poses(with_one_joint(random_rig(1), labels), noise=0.05), "smooth")
-    assert (found.skin_weights > 0).sum(axis=1).mean() < 1.02
-    np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
+    fitted_rig = fit_rig(make_fit_poses(with_one_joint(random_rig(1), labels), noise=0.05), "smooth")
+    assert (fitted_rig.skin_weights > 0).sum(axis=1).mean() < 1.02
+    np.testing.assert_array_equal(fitted_rig.skin_joints[:, 0], labels)
 
 
 def test_five_joints_are_approximated_by_the_best_four():
@@ -143,8 +143,8 @@ def test_five_joints_are_approximated_by_the_best_four():
     )
     poses = make_fit_poses(rig)
     heaviest = replace(rig, skin_joints=rig.skin_joints[:, :4], skin_weights=rig.skin_weights[:, :4] / np.float32(0.9))
-    gain = measure(replace(poses, rig=heaviest), fit_rig(poses, "smooth"))
-    assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
+    fit_errors = measure(replace(poses, rig=heaviest), fit_rig(poses, "smooth"))
+    assert fit_errors.rms_mm["fitted"] < 0.8 * fit_errors.rms_mm["rig"]
 
 
 def test_simplex_weights_are_optimal():
@@ -152,31 +152,31 @@ def test_simplex_weights_are_optimal():
     rng = np.random.default_rng(3)
     factors = rng.normal(size=(50, 6, 8)) + rng.normal(size=(50, 1, 8))
     errors = factors @ factors.transpose(0, 2, 1)
-    usable = rng.random((50, 6)) < 0.8
-    usable[:, 0] = True
-    weights = simplex_weights(errors, usable, 1e-12)
-    assert (weights >= 0).all() and (weights[~usable] == 0).all()
+    is_usable = rng.random((50, 6)) < 0.8
+    is_usable[:, 0] = True
+    weights = simplex_weights(errors, is_usable, 1e-12)
+    assert (weights >= 0).all() and (weights[~is_usable] == 0).all()
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     slopes = np.einsum("vjk,vk->vj", errors, weights)
-    least = (weights * slopes).sum(axis=1, keepdims=True)
-    assert (slopes > least - 1e-9)[usable].all()
-    np.testing.assert_allclose(slopes[weights > 0], np.broadcast_to(least, slopes.shape)[weights > 0], atol=1e-9)
-    assert ((weights > 0).sum(axis=1) > 1).any() and ((weights == 0) & usable).any()
+    min_slopes = (weights * slopes).sum(axis=1, keepdims=True)
+    assert (slopes > min_slopes - 1e-9)[is_usable].all()
+    np.testing.assert_allclose(slopes[weights > 0], np.broadcast_to(min_slopes, slopes.shape)[weights > 0], atol=1e-9)
+    assert ((weights > 0).sum(axis=1) > 1).any() and ((weights == 0) & is_usable).any()
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
 def test_ties_prefer_the_rig_s_joint_then_the_nearest(kind):
     rig = with_one_joint(random_rig(1), np.full(VERTICES, 2))
-    rest = rig.rest_matrices.copy()
-    rest[:6, :3, 3] = [[0, 0, 9], [0, 0, 8], [0, 0, 7], [0, 0, 0], [0, 9, 0], [0, 8, 0]]
-    rig = replace(rig, rest_matrices=rest)
+    rest_matrices = rig.rest_matrices.copy()
+    rest_matrices[:6, :3, 3] = [[0, 0, 9], [0, 0, 8], [0, 0, 7], [0, 0, 0], [0, 9, 0], [0, 8, 0]]
+    rig = replace(rig, rest_matrices=rest_matrices)
     poses = make_fit_poses(rig)
-    moved = poses.pose_matrices[:, 2] @ np.linalg.inv(rest[2])
-    poses.pose_matrices[:, :6] = moved[:, None] @ rest[:6]
-    own = np.where(np.arange(VERTICES) < VERTICES // 2, 4, JOINTS - 1)
-    found = fit_rig(replace(poses, rig=with_one_joint(rig, own)), kind)
-    np.testing.assert_array_equal(found.skin_joints[:, 0], np.where(own == 4, 4, 3))
-    np.testing.assert_allclose(found.skin_weights[:, 0], 1, atol=1e-4)
+    joint_transforms = poses.pose_matrices[:, 2] @ np.linalg.inv(rest_matrices[2])
+    poses.pose_matrices[:, :6] = joint_transforms[:, None] @ rest_matrices[:6]
+    rig_joints = np.where(np.arange(VERTICES) < VERTICES // 2, 4, JOINTS - 1)
+    fitted_rig = fit_rig(replace(poses, rig=with_one_joint(rig, rig_joints)), kind)
+    np.testing.assert_array_equal(fitted_rig.skin_joints[:, 0], np.where(rig_joints == 4, 4, 3))
+    np.testing.assert_allclose(fitted_rig.skin_weights[:, 0], 1, atol=1e-4)
 
 
 def test_static_vertices_follow_the_static_joint():
@@ -185,8 +185,8 @@ def test_static_vertices_follow_the_static_joint():
     rest[7] = np.eye(4)
     poses.pose_matrices[:, 7] = np.eye(4)
     poses.positions[:, :50] = poses.rig.rest_positions[:50]
-    found = fit_rig(replace(poses, rig=replace(poses.rig, rest_matrices=rest)), "smooth")
-    assert (found.skin_joints[:50, 0] == 7).all() and (found.skin_weights[:50, 0] > 0.999).all()
+    fitted_rig = fit_rig(replace(poses, rig=replace(poses.rig, rest_matrices=rest)), "smooth")
+    assert (fitted_rig.skin_joints[:50, 0] == 7).all() and (fitted_rig.skin_weights[:50, 0] > 0.999).all()
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
@@ -197,17 +197,19 @@ def test_the_process_reports_the_errors(kind, tmp_path, capsys):
     assert messages[-2].values == {"done": VERTICES, "total": VERTICES}
     fit = SkinFit.from_json(json.loads(json.dumps(messages[-1].values["fit"])))
     assert (messages[-1].type, fit.kind, fit.poses) == (MessageType.FINISHED, kind, POSES)
-    for gain in (fit.held_out, fit.training):
-        assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
+    for fit_errors in (fit.held_out, fit.training):
+        assert fit_errors.rms_mm["fitted"] < 0.8 * fit_errors.rms_mm["rig"]
     joints, weights = read_fitted_weights(tmp_path, poses.rig)
-    found = LinearSkinning(replace(poses.rig, skin_joints=joints, skin_weights=weights))
+    fitted_skinning = LinearSkinning(replace(poses.rig, skin_joints=joints, skin_weights=weights))
     # Every other pose is held out.
-    for gain, part in ((fit.held_out, slice(1, None, 2)), (fit.training, slice(0, None, 2))):
-        distances = np.linalg.norm(found.positions(poses.pose_matrices[part]) - poses.positions[part], axis=2)
-        np.testing.assert_allclose(gain.rms_mm["fitted"], 1000 * np.sqrt((distances**2).mean()), rtol=1e-4)
-        np.testing.assert_allclose(gain.max_mm["fitted"], 1000 * distances.max(), rtol=1e-4)
+    for fit_errors, pose_slice in ((fit.held_out, slice(1, None, 2)), (fit.training, slice(0, None, 2))):
+        distances = np.linalg.norm(
+            fitted_skinning.positions(poses.pose_matrices[pose_slice]) - poses.positions[pose_slice], axis=2
+        )
+        np.testing.assert_allclose(fit_errors.rms_mm["fitted"], 1000 * np.sqrt((distances**2).mean()), rtol=1e-4)
+        np.testing.assert_allclose(fit_errors.max_mm["fitted"], 1000 * distances.max(), rtol=1e-4)
     if kind == "smooth":
-        # The noise, √3 · 2 mm, remains; a little more on held-out poses.
+        # The noise of √3 · 2 mm remains. Held-out poses have a slightly larger error.
         assert 3.3 < fit.training.rms_mm["fitted"] < fit.held_out.rms_mm["fitted"] < 4
 
 
@@ -219,7 +221,7 @@ def test_a_stopped_fit_writes_nothing(tmp_path):
     assert set(tmp_path.iterdir()) == before
 
 
-def test_a_python_without_scipy(tmp_path):
+def test_a_missing_scipy_is_named(tmp_path):
     code = "import sys; sys.modules['scipy'] = None; from trainer.skin_fit import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, str(write_fit_folder(tmp_path, make_fit_poses(random_rig(2)))), "smooth"]
     process = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
@@ -230,24 +232,24 @@ def test_a_python_without_scipy(tmp_path):
     assert "numpy, scipy and matplotlib there, install the training environment" in message.values["text"]
 
 
-def damage() -> Iterator:
+def damage_cases() -> Iterator:
     def truncate(folder: Path) -> None:
         content = (folder / "positions.npy").read_bytes()
         (folder / "positions.npy").write_bytes(content[:-100])
 
-    def change(name: str, value) -> None:
-        def change_it(folder: Path) -> None:
-            np.save(folder / f"{name}.npy", value(np.load(folder / f"{name}.npy")), allow_pickle=False)
+    def change_array(name: str, change_values) -> None:
+        def damage_folder(folder: Path) -> None:
+            np.save(folder / f"{name}.npy", change_values(np.load(folder / f"{name}.npy")), allow_pickle=False)
 
-        return change_it
+        return damage_folder
 
-    def negative_count(folder: Path) -> None:
+    def write_negative_count(folder: Path) -> None:
         (folder / "parents.npy").write_bytes(array_header((-JOINTS,), np.int32) + bytes(100))
 
-    def pickle(folder: Path) -> None:
+    def write_pickle(folder: Path) -> None:
         (folder / "parents.npy").write_bytes(array_header((JOINTS,), object) + b"cbuiltins\nprint\n(Vpoor\ntR.")
 
-    def with_nan(array: np.ndarray) -> np.ndarray:
+    def add_nan(array: np.ndarray) -> np.ndarray:
         array[3, 5, 1] = np.nan
         return array
 
@@ -262,32 +264,38 @@ def damage() -> Iterator:
         lambda folder: (folder / "positions.npy").write_bytes(b"\x93NUMPY\x01\x00"),
         "'positions.npy' is no",
     )
-    yield "negative", negative_count, "'parents.npy' is no array"
-    yield "pickled", pickle, "'parents.npy' holds something else"
-    yield "type", change("skin_weights", lambda a: a.astype(np.float64)), "'skin_weights.npy' holds something else"
-    yield "size", change("positions", lambda a: a[:, 1:]), "rest_positions has the shape (300, 3)"
-    yield "numbers", change("positions", with_nan), "positions holds values that are not numbers"
-    yield "few", change("pose_matrices", lambda a: a[:3]), "positions has the shape (40, 300, 3)"
-    yield "joints", change("skin_joints", lambda a: a + 99), "the skin weights name no joints"
-    yield "parents", change("parents", lambda a: a + 1), "a joint comes before its parent"
-    yield "flat", change("rest_matrices", lambda a: a * 0), "a rest matrix is singular"
+    yield "negative", write_negative_count, "'parents.npy' is no array"
+    yield "pickled", write_pickle, "'parents.npy' holds something else"
+    yield (
+        "type",
+        change_array("skin_weights", lambda a: a.astype(np.float64)),
+        "'skin_weights.npy' holds something else",
+    )
+    yield "size", change_array("positions", lambda a: a[:, 1:]), "rest_positions has the shape (300, 3)"
+    yield "numbers", change_array("positions", add_nan), "positions holds values that are not numbers"
+    yield "few", change_array("pose_matrices", lambda a: a[:3]), "positions has the shape (40, 300, 3)"
+    yield "joints", change_array("skin_joints", lambda a: a + 99), "the skin weights name no joints"
+    yield "parents", change_array("parents", lambda a: a + 1), "a joint comes before its parent"
+    yield "flat", change_array("rest_matrices", lambda a: a * 0), "a rest matrix is singular"
 
 
-DAMAGE = {name: (break_it, words) for name, break_it, words in damage()}
+DAMAGED_FOLDERS = {name: (damage_folder, expected_text) for name, damage_folder, expected_text in damage_cases()}
 
 
-@pytest.mark.parametrize("name", DAMAGE)
+@pytest.mark.parametrize("name", DAMAGED_FOLDERS)
 def test_a_damaged_folder_is_refused(name, tmp_path, capsys):
-    break_it, words = DAMAGE[name]
-    break_it(write_fit_folder(tmp_path, make_fit_poses(random_rig(2))))
+    damage_folder, expected_text = DAMAGED_FOLDERS[name]
+    damage_folder(write_fit_folder(tmp_path, make_fit_poses(random_rig(2))))
     assert main([str(tmp_path), "smooth"]) == 1
     output = capsys.readouterr()
     text = Message.decode(output.out.splitlines()[-1]).values["text"]
-    assert text.startswith(f"The poses in '{tmp_path}' cannot be fitted: {words}") and text.endswith("; record again.")
+    assert text.startswith(f"The poses in '{tmp_path}' cannot be fitted: {expected_text}") and text.endswith(
+        "; record again."
+    )
     assert output.err == text + "\n"
 
 
-def test_too_few_poses(tmp_path):
+def test_too_few_poses_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="they are 4, and a fit takes 10; record again"):
         read_fit_poses(write_fit_folder(tmp_path, make_fit_poses(random_rig(2), poses=4)))
 

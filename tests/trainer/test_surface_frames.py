@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surface frames are selected only for rigs that smooth, with the rig's smoothing; the graph computes the same."""
+"""Surface frames are selected only for rigs that smooth, with their smoothing; the graph computes the same values."""
 
 import shutil
 from dataclasses import replace
@@ -23,11 +23,11 @@ from trainer.surface_frame_fit import MIN_EXPLAINED_VARIANCE, select_surface_fra
 from trainer.surface_frames import NO_SURFACE_FRAMES, SurfaceFrameFeatures
 
 from .chain import rotation, write_chain
-from .conftest import QUICK
+from .conftest import QUICK_OPTIONS
 from .tube import INFLUENCING, JOINTS, POSES, smoothed, write_tube
 
 
-def select(recording: Recording) -> SurfaceFrameFeatures:
+def select_frames(recording: Recording) -> SurfaceFrameFeatures:
     return select_surface_frames(recording, split_recording(recording, TrainingConfig()), tolerance_mm=0.04)
 
 
@@ -38,57 +38,75 @@ def recording(tmp_path_factory) -> Recording:
 
 @pytest.fixture(scope="module")
 def surface_frames(recording) -> SurfaceFrameFeatures:
-    return select(recording)
+    return select_frames(recording)
 
 
 def test_a_rig_that_smooths_has_surface_frames_in_every_partition(recording, surface_frames):
     assert set(surface_frames.main_joints.tolist()) == set(range(JOINTS))
     assert np.array_equal(np.unique(surface_frames.vertices), surface_frames.vertices)
     for partition in recording.partitions:
-        own = surface_frames.vertices[surface_frames.main_joints == partition.joint]
-        assert np.isin(own, partition.vertices).all()
+        vertices = surface_frames.vertices[surface_frames.main_joints == partition.joint]
+        assert np.isin(vertices, partition.vertices).all()
 
 
 def test_tangents_and_normals_are_those_of_the_smoothed_surface(recording, surface_frames):
     rig, matrices = recording.rig, np.array(recording.pose_matrices[:5])
     for pose, skinned in enumerate(LinearSkinning(rig).positions(matrices).astype(np.float64)):
         faces = smoothed(rig, skinned)[rig.face_vertices.reshape(-1, 4)]
-        before, after = ((np.roll(faces, shift, axis=1) - faces).reshape(-1, 3) for shift in (1, -1))
-        vectors = np.stack([before + after, after - before, np.cross(before, after)])
+        predecessor_edges, successor_edges = (
+            (np.roll(faces, shift, axis=1) - faces).reshape(-1, 3) for shift in (1, -1)
+        )
+        vectors = np.stack(
+            [
+                predecessor_edges + successor_edges,
+                successor_edges - predecessor_edges,
+                np.cross(predecessor_edges, successor_edges),
+            ]
+        )
         vectors /= np.linalg.norm(vectors, axis=2, keepdims=True)
-        for number, vertex in enumerate(surface_frames.vertices):
+        for frame, vertex in enumerate(surface_frames.vertices):
             expected = vectors[:, rig.face_vertices == vertex]
-            found = surface_frames.compute_corner_vectors(matrices[pose, None])[0, :, number, : expected.shape[1]]
-            # Epsilons and the fitted number of iterations make no difference.
-            assert np.abs(found - expected).max() < 1e-3
+            vectors_of_frame = surface_frames.compute_corner_vectors(matrices[pose, None])[
+                0, :, frame, : expected.shape[1]
+            ]
+            # Epsilons and the fitted number of iterations change the vectors by less than this.
+            assert np.abs(vectors_of_frame - expected).max() < 1e-3
 
 
-def test_surface_frames_explain_what_joints_do_not(recording, surface_frames):
+def test_surface_frames_explain_residuals_that_joints_do_not_explain(recording, surface_frames):
     """The errors are measured on held-out poses, with linear functions of the joints as further regressors."""
     split = split_recording(recording, TrainingConfig())
     features = surface_frames.evaluate(recording.pose_matrices).reshape(POSES, -1, 3)
-    rows = np.linalg.inv(recording.pose_matrices[:, 1, None]) @ recording.pose_matrices
-    rows = np.append(rows[:, :, :3].reshape(POSES, -1), np.ones((POSES, 1)), axis=1)
-    for number in np.flatnonzero(surface_frames.main_joints == 1):
-        targets = recording.residuals[:, surface_frames.vertices[number]]
+    joint_regressors = np.linalg.inv(recording.pose_matrices[:, 1, None]) @ recording.pose_matrices
+    joint_regressors = np.append(joint_regressors[:, :, :3].reshape(POSES, -1), np.ones((POSES, 1)), axis=1)
+    for frame in np.flatnonzero(surface_frames.main_joints == 1):
+        targets = recording.residuals[:, surface_frames.vertices[frame]]
         errors = []
-        for inputs in (rows, np.append(rows, features[:, number], axis=1)):
+        for inputs in (joint_regressors, np.append(joint_regressors, features[:, frame], axis=1)):
             factors = np.linalg.lstsq(inputs[split.training], targets[split.training], rcond=1e-6)[0]
             errors.append(((inputs[split.held_out] @ factors - targets[split.held_out]) ** 2).sum())
         assert errors[1] < (1 - MIN_EXPLAINED_VARIANCE) * errors[0]
 
 
-@pytest.mark.parametrize("per_metre, away", [(1000.0, 0.0), (1.0, 100.0), (1000.0, 100.0)])
-def test_selection_does_not_depend_on_unit_and_position(tmp_path, recording, surface_frames, per_metre, away):
-    other = write_tube(tmp_path / "tube", per_metre, away)
-    found = select(other)
-    assert found.vertices.tolist() == surface_frames.vertices.tolist()
-    features, meters = found.evaluate(other.pose_matrices) / per_metre, surface_frames.evaluate(recording.pose_matrices)
+@pytest.mark.parametrize("units_per_metre, origin_distance", [(1000.0, 0.0), (1.0, 100.0), (1000.0, 100.0)])
+def test_selection_does_not_depend_on_unit_and_position(
+    tmp_path, recording, surface_frames, units_per_metre, origin_distance
+):
+    moved_recording = write_tube(tmp_path / "tube", units_per_metre, origin_distance)
+    selected = select_frames(moved_recording)
+    assert selected.vertices.tolist() == surface_frames.vertices.tolist()
+    features, reference_features = (
+        selected.evaluate(moved_recording.pose_matrices) / units_per_metre,
+        surface_frames.evaluate(recording.pose_matrices),
+    )
     # 100 m away, positions have steps of 0.008 mm.
-    assert np.abs(features - meters).max() < (0.02 if away else 1e-4) * np.abs(meters).max()
+    assert (
+        np.abs(features - reference_features).max()
+        < (0.02 if origin_distance else 1e-4) * np.abs(reference_features).max()
+    )
 
 
-def test_a_character_that_is_scaled_and_turned_as_a_whole_has_the_same_surface_frames(recording, surface_frames):
+def test_scale_and_rotation_of_the_character_do_not_change_surface_frames(recording, surface_frames):
     matrices = recording.pose_matrices[:20].astype(np.float64)
     character_transform = rotation(0, 0.7) @ rotation(2, -1.9) @ np.diag([2.5, 2.5, 2.5, 1])
     character_transform[:3, 3] = 3, -2, 1
@@ -100,13 +118,13 @@ def test_a_character_that_is_scaled_and_turned_as_a_whole_has_the_same_surface_f
 
 
 def test_a_rig_that_does_not_smooth_has_no_surface_frames(tmp_path):
-    assert select(write_tube(tmp_path / "tube", smooths=False)) is NO_SURFACE_FRAMES
+    assert select_frames(write_tube(tmp_path / "tube", smooths=False)) is NO_SURFACE_FRAMES
 
 
 def test_chance_correlations_select_nothing(tmp_path):
     """Bulges that grow with the bend correlate with the rotation of the adjacent surface."""
     write_chain(tmp_path / "chain")
-    assert select(read_recording(tmp_path / "chain")) is NO_SURFACE_FRAMES
+    assert select_frames(read_recording(tmp_path / "chain")) is NO_SURFACE_FRAMES
 
 
 def test_a_rig_that_smooths_one_partition_has_no_surface_frames(tmp_path, recording):
@@ -115,19 +133,19 @@ def test_a_rig_that_smooths_one_partition_has_no_surface_frames(tmp_path, record
     residuals = np.array(waves.residuals)
     smooth = recording.partitions[0].vertices
     residuals[:, smooth] = recording.residuals[:, smooth]
-    assert select(replace(recording, residuals=residuals)) is NO_SURFACE_FRAMES
+    assert select_frames(replace(recording, residuals=residuals)) is NO_SURFACE_FRAMES
 
 
-def test_a_vertex_without_a_measure_selects_nothing(recording, monkeypatch):
-    fit = surface_frame_fit._fit_lengths
+def test_a_vertex_whose_fit_is_nan_selects_nothing(recording, monkeypatch):
+    fit_lengths = surface_frame_fit._fit_lengths
 
     def fit_with_nan(*arguments) -> tuple[np.ndarray, np.ndarray]:
-        lengths, explained = fit(*arguments)
+        lengths, explained = fit_lengths(*arguments)
         explained[0] = np.nan
         return lengths, explained
 
     monkeypatch.setattr(surface_frame_fit, "_fit_lengths", fit_with_nan)
-    assert select(recording) is NO_SURFACE_FRAMES
+    assert select_frames(recording) is NO_SURFACE_FRAMES
 
 
 def test_a_stop_request_cancels_the_selection(recording):
@@ -137,25 +155,27 @@ def test_a_stop_request_cancels_the_selection(recording):
 
 
 def test_a_dozen_poses_are_too_few(tmp_path):
-    assert select(write_tube(tmp_path / "tube", poses=12)) is NO_SURFACE_FRAMES
+    assert select_frames(write_tube(tmp_path / "tube", pose_count=12)) is NO_SURFACE_FRAMES
 
 
 def test_vertices_without_faces_are_ignored(recording, surface_frames):
-    rig, more = recording.rig, 4 * recording.rig.vertex_count
-    extended = {
-        name: np.concatenate([getattr(rig, name), np.repeat(getattr(rig, name)[-1:], more, axis=0)])
+    rig, added_count = recording.rig, 4 * recording.rig.vertex_count
+    extended_arrays = {
+        name: np.concatenate([getattr(rig, name), np.repeat(getattr(rig, name)[-1:], added_count, axis=0)])
         for name in ("rest_positions", "skin_joints", "skin_weights")
     }
-    rig = replace(rig, **extended)
-    residuals = np.concatenate([recording.residuals, np.ones((POSES, more, 3), np.float32)], axis=1)
-    found = select(replace(recording, rig=rig, residuals=residuals, partitions=make_partitions(rig, INFLUENCING)))
-    assert found.vertices.tolist() == surface_frames.vertices.tolist()
+    rig = replace(rig, **extended_arrays)
+    residuals = np.concatenate([recording.residuals, np.ones((POSES, added_count, 3), np.float32)], axis=1)
+    selected = select_frames(
+        replace(recording, rig=rig, residuals=residuals, partitions=make_partitions(rig, INFLUENCING))
+    )
+    assert selected.vertices.tolist() == surface_frames.vertices.tolist()
 
 
 def test_a_mesh_without_faces_has_no_surface_frames(recording):
-    none = np.zeros(0, np.int32)
+    no_indices = np.zeros(0, np.int32)
     assert (
-        select(replace(recording, rig=replace(recording.rig, face_starts=none, face_vertices=none)))
+        select_frames(replace(recording, rig=replace(recording.rig, face_starts=no_indices, face_vertices=no_indices)))
         is NO_SURFACE_FRAMES
     )
 
@@ -166,67 +186,71 @@ def test_vertices_within_the_tolerance_have_no_surface_frames(recording):
 
 
 def test_a_degenerate_surface_gives_finite_values(recording, surface_frames):
-    flat = np.zeros((2, JOINTS, 4, 4), np.float32)
-    flat[:, :, 3, 3] = 1
-    assert (surface_frames.evaluate(flat) == 0).all()
+    zero_matrices = np.zeros((2, JOINTS, 4, 4), np.float32)
+    zero_matrices[:, :, 3, 3] = 1
+    assert (surface_frames.evaluate(zero_matrices) == 0).all()
 
 
 @pytest.fixture(scope="module")
-def trained(recording, tmp_path_factory):
+def model_path(recording, tmp_path_factory):
     model = tmp_path_factory.mktemp("models") / "tube.onnx"
-    assert main([str(recording.path), str(model), *QUICK]) == 0
+    assert main([str(recording.path), str(model), *QUICK_OPTIONS]) == 0
     return model
 
 
-def test_the_model_has_surface_frames(trained):
+def test_the_model_has_surface_frames(model_path):
     """The training checks that the graph agrees with PyTorch."""
-    names = {node.name for node in onnx.load(trained).graph.node}
+    names = {node.name for node in onnx.load(model_path).graph.node}
     assert "surface_frame_features" in names
     assert len(names) <= 55 + 23 + JOINTS
 
 
-@pytest.mark.parametrize("way", [{"per_metre": 1000.0, "away": 100.0}, {"sheared": True}], ids=["far away", "sheared"])
-def test_the_graph_agrees_with_pytorch_in_other_rigs(tmp_path, way):
-    write_tube(tmp_path / "tube", **way)
-    assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK, "--epochs", "4"]) == 0
+@pytest.mark.parametrize(
+    "tube_options",
+    [{"units_per_metre": 1000.0, "origin_distance": 100.0}, {"sheared": True}],
+    ids=["far away", "sheared"],
+)
+def test_the_graph_agrees_with_pytorch_in_other_rigs(tmp_path, tube_options):
+    write_tube(tmp_path / "tube", **tube_options)
+    assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK_OPTIONS, "--epochs", "4"]) == 0
     assert "surface_frame_features" in {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
 
 
-def test_a_warm_start_keeps_the_surface_frames(recording, surface_frames, trained, tmp_path, capsys):
-    for file in (trained, checkpoint_path(trained)):
+def test_a_warm_start_keeps_the_surface_frames(recording, surface_frames, model_path, tmp_path, capsys):
+    for file in (model_path, checkpoint_path(model_path)):
         shutil.copy(file, tmp_path)
-    last = read_checkpoint(checkpoint_path(trained)).surface_frames
+    frames_of_checkpoint = read_checkpoint(checkpoint_path(model_path)).surface_frames
     for name, array in vars(surface_frames).items():
-        assert np.array_equal(getattr(last, name), array), name
-    offered = inputs_with_surface_frames(recording.rig, recording.partitions, last).columns
-    assert [len(own) % 3 for own in offered] == [0] * JOINTS
-    assert main([str(recording.path), str(tmp_path / trained.name), *QUICK, "--warm-start"]) == 0
+        assert np.array_equal(getattr(frames_of_checkpoint, name), array), name
+    offered_columns = inputs_with_surface_frames(recording.rig, recording.partitions, frames_of_checkpoint).columns
+    assert [len(columns) % 3 for columns in offered_columns] == [0] * JOINTS
+    assert main([str(recording.path), str(tmp_path / model_path.name), *QUICK_OPTIONS, "--warm-start"]) == 0
     assert (
         f"The rig smooths: networks take surface frames of {len(surface_frames)} vertices as inputs."
         in capsys.readouterr().out
     )
 
 
-DAMAGE = {
+DAMAGED_ARRAYS = {
     "corners without a second tangent": ("tangents", lambda array: array[:1]),
-    "a joint that is none": ("main_joints", lambda array: array + 10_000),
-    "a vertex below zero": ("vertices", lambda array: array - 10_000),
-    "lengths that are no numbers": ("lengths", lambda array: array * np.nan),
-    "corners without a least extent": ("epsilons", lambda array: 0 * array),
+    "a joint that does not exist": ("main_joints", lambda array: array + 10_000),
+    "a negative vertex index": ("vertices", lambda array: array - 10_000),
+    "lengths that are not numbers": ("lengths", lambda array: array * np.nan),
+    "epsilons of zero": ("epsilons", lambda array: 0 * array),
     "tangents of other joints": ("tangents", lambda array: array[..., :4]),
-    "too few": ("vertices", lambda array: array[:1]),
-    "other numbers": ("lengths", lambda array: array.astype(np.float32)),
+    "too few vertices": ("vertices", lambda array: array[:1]),
+    "float32 in place of float64": ("lengths", lambda array: array.astype(np.float32)),
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_surface_frames_are_refused(recording, trained, tmp_path, capsys, damage):
-    name, change = DAMAGE[damage]
-    with np.load(checkpoint_path(trained)) as arrays:
-        changed = {**arrays, f"surface_frames/{name}": change(arrays[f"surface_frames/{name}"])}
+@pytest.mark.parametrize("damage_name", DAMAGED_ARRAYS)
+def test_damaged_surface_frames_are_refused(recording, model_path, tmp_path, capsys, damage_name):
+    name, change = DAMAGED_ARRAYS[damage_name]
+    with np.load(checkpoint_path(model_path)) as arrays:
+        changed_arrays = {**arrays, f"surface_frames/{name}": change(arrays[f"surface_frames/{name}"])}
     model = tmp_path / "tube.onnx"
     with open(checkpoint_path(model), "wb") as file:
-        np.savez(file, **changed)
-    model.write_bytes(trained.read_bytes())
-    assert main([str(recording.path), str(model), *QUICK, "--warm-start"]) == 1
+        np.savez(file, **changed_arrays)
+    model.write_bytes(model_path.read_bytes())
+    assert main([str(recording.path), str(model), *QUICK_OPTIONS, "--warm-start"]) == 1
     assert "train without --warm-start" in capsys.readouterr().err

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The exported model: it agrees with the training, fades outside the training range, and has metadata."""
+"""The exported model approximates the rig, fades to linear skinning outside the training range, and has metadata."""
 
 import json
 
@@ -19,7 +19,7 @@ from trainer.config import ACTIVATIONS, TrainingConfig
 from trainer.partition_refinement import partition_indices
 from trainer.splitting import split_recording
 
-from .chain import LIMIT, chain_angles, chain_residuals, pose_chain, write_chain
+from .chain import MAX_ANGLE, chain_angles, chain_residuals, pose_chain, write_chain
 
 
 @pytest.fixture(scope="module")
@@ -47,28 +47,27 @@ def test_the_model_approximates_unseen_poses(session, rig):
     assert error.mean() < 0.08 * linear.mean()
 
 
-def test_number_of_poses_is_free_and_poses_do_not_mix(session, rig):
+def test_the_poses_of_a_batch_of_any_size_are_independent(session, rig):
     poses = pose_chain(rig, chain_angles(7, 3, seed=5))
-    together, confidence = run_model(session, poses)
-    assert together.shape == (7, rig.vertex_count, 3) and together.dtype == np.float32
-    assert confidence.shape == (7, len(read_model_info_partitions(session)))
-    for number in (0, 6):
-        alone = run_model(session, poses[number : number + 1])[0]
-        np.testing.assert_allclose(alone[0], together[number], atol=2e-6)
+    batch_positions, confidence = run_model(session, poses)
+    assert batch_positions.shape == (7, rig.vertex_count, 3) and batch_positions.dtype == np.float32
+    assert confidence.shape == (7, len(partitions_in_metadata(session)))
+    for index in (0, 6):
+        single_positions = run_model(session, poses[index : index + 1])[0]
+        np.testing.assert_allclose(single_positions[0], batch_positions[index], atol=2e-6)
 
 
-def read_model_info_partitions(session) -> list:
+def partitions_in_metadata(session) -> list:
     return json.loads(session.get_modelmeta().custom_metadata_map["fdda"])["partitions"]
 
 
-def test_moving_the_character_as_a_whole_moves_the_mesh(session, rig):
+def test_linear_skinning_moves_with_the_character(session, rig):
     poses = pose_chain(rig, chain_angles(4, 3, seed=6))
     shift = np.float32([0.5, -2, 1])
-    moved = poses.copy()
-    # The root's own transform is outside the range, so the chain gets a root that only linear skinning uses.
-    moved[:, :, :3, 3] += shift
-    linear = LinearSkinning(rig)
-    np.testing.assert_allclose(linear.positions(moved), linear.positions(poses) + shift, atol=1e-5)
+    moved_poses = poses.copy()
+    moved_poses[:, :, :3, 3] += shift
+    skinning = LinearSkinning(rig)
+    np.testing.assert_allclose(skinning.positions(moved_poses), skinning.positions(poses) + shift, atol=1e-5)
 
 
 def test_confidence_is_one_in_recorded_poses(session, recording):
@@ -76,27 +75,27 @@ def test_confidence_is_one_in_recorded_poses(session, recording):
     assert (confidence == 1).all()
 
 
-def test_confidence_fades_outside(session, rig):
+def test_confidence_fades_outside_the_range(session, rig):
     angles = np.zeros((40, 3, 2))
-    angles[:, 1, 0] = np.linspace(LIMIT, LIMIT * 3, 40)
+    angles[:, 1, 0] = np.linspace(MAX_ANGLE, MAX_ANGLE * 3, 40)
     confidence = run_model(session, pose_chain(rig, angles))[1]
     assert confidence[0].min() == 1
-    assert (np.diff(confidence, axis=0) <= 1e-6).all(), "confidence increases with the distance"
+    assert (np.diff(confidence, axis=0) <= 1e-6).all(), "confidence must not increase with the distance"
     assert 0 < confidence[-1, :2].max() < 0.99
-    assert np.abs(np.diff(confidence, axis=0)).max() < 0.05, "the fade is a jump"
+    assert np.abs(np.diff(confidence, axis=0)).max() < 0.05, "confidence must not jump"
 
 
-def test_far_outside_only_linear_skinning_remains(session, rig, trained):
+def test_only_linear_skinning_remains_far_outside_the_range(session, rig, trained):
     poses = pose_chain(rig, np.zeros((3, 3, 2)))
     poses[:, 1:, :3, :3] *= np.float32([1, 5, 50])[:, None, None, None]
     positions, confidence = run_model(session, poses)
     assert (confidence[0] == 1).all() and (np.diff(confidence[:, :2], axis=0) <= 0).all()
     zero_confidence_partitions = np.flatnonzero(confidence[2] == 0)
-    assert len(zero_confidence_partitions), "a joint fifty times its size still has full confidence"
+    assert len(zero_confidence_partitions), "some partition must lose its confidence when joints are scaled by 50"
     partitions = read_model_info(trained / "model.onnx").partitions_of(rig)
     linear = LinearSkinning(rig).positions(poses)
-    for number in zero_confidence_partitions:
-        vertices = partitions[number].vertices
+    for index in zero_confidence_partitions:
+        vertices = partitions[index].vertices
         np.testing.assert_allclose(positions[2, vertices], linear[2, vertices], atol=1e-4)
 
 
@@ -105,12 +104,12 @@ def test_a_locked_axis_that_rotates_lowers_the_confidence(session, rig):
     angles[1:, 2, 1] = 0.5, 1.5
     confidence = run_model(session, pose_chain(rig, angles))[1]
     assert (confidence[0] == 1).all()
-    assert 1 > confidence[1, 2] > confidence[2, 2], "the last joint never turned about z in the recording"
+    assert 1 > confidence[1, 2] > confidence[2, 2], "the last joint never rotated about z in the recording"
 
 
 @pytest.mark.parametrize("reach", [1.5, 2.0, 3.0])
-def test_beyond_the_range_it_is_never_worse_than_linear_skinning(session, rig, reach):
-    angles = chain_angles(100, 3, seed=8, reach=reach)
+def test_the_model_is_never_worse_than_linear_skinning_beyond_the_range(session, rig, reach):
+    angles = chain_angles(100, 3, seed=8, range_scale=reach)
     poses, skinning = pose_chain(rig, angles), LinearSkinning(rig)
     truth = skinning.complex_positions(poses, chain_residuals(rig, angles))
     positions = run_model(session, poses)[0]
@@ -140,14 +139,14 @@ def test_metadata_describes_rig_and_training(trained, recording, report):
     assert info.feature_low.shape == info.feature_high.shape == (3, 12)
 
 
-def test_graph_uses_standard_operators_of_an_old_runtime(trained):
+def test_the_graph_has_standard_operators_of_an_early_opset(trained):
     model = onnx.load(trained / "model.onnx")
     assert model.ir_version <= 9 and [(o.domain, o.version) for o in model.opset_import] == [("", 17)]
     assert {node.domain for node in model.graph.node} == {""}
     assert not any(t.external_data for t in model.graph.initializer)
 
 
-def test_report_measures_what_the_model_does(report, trained, recording, session):
+def test_the_report_has_the_errors_of_the_model(report, trained, recording, session):
     source = read_recording(recording)
     assert sum(p["vertices"] for p in report["partitions"]) == source.rig.vertex_count
     assert report["model_bytes"] == (trained / "model.onnx").stat().st_size
@@ -163,7 +162,7 @@ def test_report_measures_what_the_model_does(report, trained, recording, session
 
 
 @pytest.mark.parametrize("activation", [name for name in ACTIVATIONS if name != TrainingConfig.activation])
-def test_every_activation_and_any_depth_exports(tmp_path, recording, activation):
+def test_every_activation_and_any_depth_can_be_exported(tmp_path, recording, activation):
     model = tmp_path / "m.onnx"
     options = ["--epochs", "2", "--activation", activation, "--hidden", *(["8"] if activation == "tanh" else ["8"] * 3)]
     assert main([str(recording), str(model), *options]) == 0
@@ -171,7 +170,7 @@ def test_every_activation_and_any_depth_exports(tmp_path, recording, activation)
 
 
 def test_a_rig_of_one_joint_is_exported(tmp_path):
-    rig = write_chain(tmp_path / "one", poses=12, joints=1)
+    rig = write_chain(tmp_path / "one", pose_count=12, joint_count=1)
     model = tmp_path / "m.onnx"
     assert main([str(tmp_path / "one"), str(model), "--epochs", "1"]) == 0
     session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
@@ -187,16 +186,16 @@ def test_the_report_has_the_surface_errors(report, recording, session, trained):
     assert edges["fdda"]["across"] < edges["linear"]["across"]
     skinning, split = LinearSkinning(source.rig), split_recording(source, TrainingConfig())
     triangles = source.rig.face_vertices.reshape(-1, 3)
-    pairs = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    number = partition_indices(read_model_info(trained / "model.onnx").partitions_of(source.rig))
-    crossing = number[pairs[:, 0]] != number[pairs[:, 1]]
-    rest = np.linalg.norm(np.subtract(*source.rig.rest_positions[pairs.T]), axis=1)
+    edge_vertices = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    partition_of_vertex = partition_indices(read_model_info(trained / "model.onnx").partitions_of(source.rig))
+    is_across = partition_of_vertex[edge_vertices[:, 0]] != partition_of_vertex[edge_vertices[:, 1]]
+    rest_lengths = np.linalg.norm(np.subtract(*source.rig.rest_positions[edge_vertices.T]), axis=1)
     errors = []
     for pose in split.held_out:
         matrices = np.array(source.pose_matrices[pose : pose + 1])
         truth = skinning.complex_positions(matrices, np.array(source.residuals[pose : pose + 1]))[0]
-        played = run_model(session, matrices)[0][0]
-        lengths = [np.linalg.norm(np.subtract(*positions[pairs.T]), axis=1) for positions in (played, truth)]
-        errors.append(np.abs(lengths[0] - lengths[1]) / rest)
-    assert edges["fdda"]["across"] == pytest.approx(np.mean(errors, axis=0)[crossing].mean(), rel=1e-3)
-    assert edges["fdda"]["inside"] == pytest.approx(np.mean(errors, axis=0)[~crossing].mean(), rel=1e-3)
+        predicted = run_model(session, matrices)[0][0]
+        lengths = [np.linalg.norm(np.subtract(*positions[edge_vertices.T]), axis=1) for positions in (predicted, truth)]
+        errors.append(np.abs(lengths[0] - lengths[1]) / rest_lengths)
+    assert edges["fdda"]["across"] == pytest.approx(np.mean(errors, axis=0)[is_across].mean(), rel=1e-3)
+    assert edges["fdda"]["inside"] == pytest.approx(np.mean(errors, axis=0)[~is_across].mean(), rel=1e-3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line of the trainer: messages, exit statuses, and the files of unfinished trainings."""
+"""The command line of the trainer sends messages, returns exit statuses, and leaves no unfinished files."""
 
 import errno
 import io
@@ -19,12 +19,12 @@ from trainer.process import run_with_messages
 from trainer.progress import JsonMessageSink
 
 from .chain import write_chain
-from .conftest import QUICK, REPOSITORY, start_trainer
+from .conftest import QUICK_OPTIONS, REPOSITORY, start_trainer
 
 ONLY_POSIX = pytest.mark.skipif(os.name != "posix", reason="Windows has no such signals.")
 
 
-def decode(text: str) -> list[Message]:
+def decode_messages(text: str) -> list[Message]:
     messages = [Message.decode(line) for line in text.splitlines()]
     assert [m.type.is_last for m in messages] == [False] * (len(messages) - 1) + [True]
     return messages
@@ -32,8 +32,8 @@ def decode(text: str) -> list[Message]:
 
 def test_messages_from_start_to_finish(recording, tmp_path, capsys):
     model = tmp_path / "m.onnx"
-    assert main([str(recording), str(model), "--messages", *QUICK]) == 0
-    messages = decode(capsys.readouterr().out)
+    assert main([str(recording), str(model), "--messages", *QUICK_OPTIONS]) == 0
+    messages = decode_messages(capsys.readouterr().out)
     assert messages[0].type is MessageType.STARTED
     assert messages[0].values == {"partitions": 3, "poses": 120, "vertices": 90, "device": "cpu"}
     progress = [m.values for m in messages if m.type is MessageType.PROGRESS]
@@ -45,14 +45,14 @@ def test_messages_from_start_to_finish(recording, tmp_path, capsys):
     assert messages[-1].type is MessageType.FINISHED and messages[-1].values["model"] == str(model)
 
 
-def test_a_message_leaves_the_process_at_once(monkeypatch):
-    sent = io.BytesIO()
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(sent, encoding="utf-8"))
+def test_a_message_is_flushed_immediately(monkeypatch):
+    buffer = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="utf-8"))
     JsonMessageSink().send(MessageType.LOG, text="half way")
-    assert Message.decode(sent.getvalue().decode()).values == {"text": "half way"}
+    assert Message.decode(buffer.getvalue().decode()).values == {"text": "half way"}
 
 
-def test_text_for_a_person(recording, tmp_path, capsys):
+def test_progress_as_text(recording, tmp_path, capsys):
     assert main([str(recording), str(tmp_path / "m.onnx"), "--epochs", "20", "--hidden", "8"]) == 0
     output = capsys.readouterr()
     lines = output.out.splitlines()
@@ -63,7 +63,7 @@ def test_text_for_a_person(recording, tmp_path, capsys):
 
 
 def test_a_second_training_gives_the_same_model(recording, trained, tmp_path):
-    assert main([str(recording), str(tmp_path / "model.onnx"), *QUICK]) == 0
+    assert main([str(recording), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
     reports = [json.loads((folder / "report.json").read_text()) for folder in (trained, tmp_path)]
     for report in reports:
         del report["training"]["seconds"], report["model_bytes"]
@@ -73,7 +73,7 @@ def test_a_second_training_gives_the_same_model(recording, trained, tmp_path):
 def run_failing_training(arguments, capsys) -> str:
     assert main([*map(str, arguments), "--messages", "--epochs", "2"]) == 1
     output = capsys.readouterr()
-    messages = decode(output.out)
+    messages = decode_messages(output.out)
     assert messages[-1].type is MessageType.FAILED
     assert output.err.strip() == messages[-1].values["text"]
     return output.err.strip()
@@ -88,7 +88,7 @@ def test_a_missing_recording_is_refused(tmp_path, capsys):
 
 
 def test_an_incomplete_recording_is_refused(tmp_path, capsys):
-    write_chain(tmp_path / "half", poses=40, complete=13)
+    write_chain(tmp_path / "half", pose_count=40, complete_count=13)
     text = run_failing_training([tmp_path / "half", tmp_path / "m.onnx"], capsys)
     assert "is incomplete: 13 of 40 poses" in text and "--resume" in text
     assert not (tmp_path / "m.onnx").exists()
@@ -110,18 +110,18 @@ def test_a_recording_with_nan_is_refused(recording, tmp_path, capsys):
 
 
 def test_too_few_poses_are_refused(tmp_path, capsys):
-    write_chain(tmp_path / "few", poses=5)
+    write_chain(tmp_path / "few", pose_count=5)
     assert "has 5 poses and training takes at least 10" in run_failing_training(
         [tmp_path / "few", tmp_path / "m.onnx"], capsys
     )
 
 
-def test_output_in_a_folder_that_is_not_there(recording, tmp_path, capsys):
+def test_a_missing_output_folder_is_refused(recording, tmp_path, capsys):
     text = run_failing_training([recording, tmp_path / "no" / "m.onnx"], capsys)
     assert "does not exist; create it first" in text
 
 
-def test_output_that_is_a_folder(recording, tmp_path, capsys):
+def test_a_folder_as_output_is_refused(recording, tmp_path, capsys):
     (tmp_path / "m.onnx").mkdir()
     assert "it is a folder" in run_failing_training([recording, tmp_path / "m.onnx"], capsys)
 
@@ -131,7 +131,7 @@ def test_an_impossible_setting_is_refused(recording, tmp_path, capsys):
     assert "setting learning_rate cannot be -1.0" in text
 
 
-def test_settings_that_diverge_fail_in_a_sentence(recording, tmp_path, capsys):
+def test_a_diverging_training_fails_with_one_sentence(recording, tmp_path, capsys):
     text = run_failing_training([recording, tmp_path / "m.onnx", "--learning-rate", "1e30", "--averaging", "0"], capsys)
     assert "diverged in epoch 1" in text and "smaller learning rate than 1e+30" in text
     assert list(tmp_path.iterdir()) == []
@@ -143,42 +143,42 @@ def test_wrong_usage_exits_with_two(capsys):
     assert exit_.value.code == 2
 
 
-@pytest.mark.parametrize("limit", [pytest.param(20_000, marks=pytest.mark.slow), "after the model"])
-def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
-    if limit == "after the model":
-        # The report is the last to be written, and the largest file.
+@pytest.mark.parametrize("max_file_bytes", [pytest.param(20_000, marks=pytest.mark.slow), "after the model"])
+def test_a_full_disk_leaves_the_old_files(recording, trained, tmp_path, max_file_bytes):
+    if max_file_bytes == "after the model":
+        # The report is written last and is the largest file, so only the report exceeds this limit.
         sizes = sorted(path.stat().st_size for path in trained.iterdir())
-        limit = (sizes[-2] + sizes[-1]) // 2
+        max_file_bytes = (sizes[-2] + sizes[-1]) // 2
 
     resource = pytest.importorskip("resource")
 
-    def small_files() -> None:
+    def limit_file_size() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (max_file_bytes, max_file_bytes))
 
     old_model = trained.joinpath("model.onnx").read_bytes()
     (tmp_path / "m.onnx").write_bytes(old_model)
-    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages", preexec_fn=small_files)
-    out, err = process.communicate(timeout=120)
+    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages", preexec_fn=limit_file_size)
+    output, error_text = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert decode(out)[-1].type is MessageType.FAILED
-    assert err.startswith(
+    assert decode_messages(output)[-1].type is MessageType.FAILED
+    assert error_text.startswith(
         f"Cannot write '{tmp_path / 'm.onnx'}' with 'm.checkpoint.npz', 'report.json', 'report.html': "
     )
-    assert err.endswith("File too large; nothing was changed.\n")
+    assert error_text.endswith("File too large; nothing was changed.\n")
     assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
     assert (tmp_path / "m.onnx").read_bytes() == old_model
 
 
 @pytest.mark.parametrize(
-    "request_",
+    "stop_request",
     [
         "file",
         pytest.param("SIGTERM", marks=ONLY_POSIX),
         *(pytest.param(name, marks=[ONLY_POSIX, pytest.mark.slow]) for name in ("SIGINT", "SIGHUP")),
     ],
 )
-def test_a_request_to_stop_leaves_nothing(recording, tmp_path, monkeypatch, request_):
+def test_a_stopped_training_writes_nothing(recording, tmp_path, monkeypatch, stop_request):
     stop_file, folder = tmp_path / "stop", tmp_path / "models"
     folder.mkdir()
     monkeypatch.setenv(STOP_FILE_VARIABLE, str(stop_file))
@@ -187,18 +187,18 @@ def test_a_request_to_stop_leaves_nothing(recording, tmp_path, monkeypatch, requ
     for line in process.stdout:
         lines.append(line)
         if len(lines) == 5:
-            stop_file.touch() if request_ == "file" else process.send_signal(getattr(signal, request_))
+            stop_file.touch() if stop_request == "file" else process.send_signal(getattr(signal, stop_request))
     process.wait(timeout=30)
     assert process.returncode == 130, process.stderr.read()
-    messages = decode("".join(lines))
+    messages = decode_messages("".join(lines))
     assert messages[-1] == Message(MessageType.CANCELLED)
     assert list(folder.iterdir()) == []
 
 
-def test_a_stop_request_before_the_start(recording, tmp_path, monkeypatch, capsys):
+def test_a_stop_request_before_the_start_cancels_the_training(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv(STOP_FILE_VARIABLE, str(recording))
     assert main([str(recording), str(tmp_path / "m.onnx"), "--messages"]) == 130
-    assert decode(capsys.readouterr().out)[-1] == Message(MessageType.CANCELLED)
+    assert decode_messages(capsys.readouterr().out)[-1] == Message(MessageType.CANCELLED)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -221,18 +221,18 @@ FULL_DISK_ERROR = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")
         (KeyError("x"), 1, "The trainer stopped on an error of its own (KeyError('x')); please report it."),
     ],
 )
-def test_errors_of_the_machine(error, status, text, capsys):
-    def work():
+def test_an_error_has_its_sentence_and_exit_status(error, status, text, capsys):
+    def fail():
         raise error
 
-    assert run_with_messages(work, JsonMessageSink()) == status
-    out, err = capsys.readouterr()
-    values = Message.decode(out).values
+    assert run_with_messages(fail, JsonMessageSink()) == status
+    output, error_text = capsys.readouterr()
+    values = Message.decode(output).values
     assert text in values["text"] and values.get("try_again", False) is (status == 75)
-    assert err.splitlines()[-1] == values["text"]
+    assert error_text.splitlines()[-1] == values["text"]
 
 
-def test_missing_torch_says_what_to_install(recording, tmp_path):
+def test_the_error_for_missing_torch_names_what_to_install(recording, tmp_path):
     code = "import sys; sys.modules['torch'] = None; from trainer.__main__ import main; sys.exit(main(sys.argv[1:]))"
     process = subprocess.run(
         [sys.executable, "-c", code, str(recording), str(tmp_path / "m.onnx"), "--messages"],
@@ -241,6 +241,6 @@ def test_missing_torch_says_what_to_install(recording, tmp_path):
         text=True,
     )
     assert process.returncode == 1
-    text = decode(process.stdout)[-1].values["text"]
+    text = decode_messages(process.stdout)[-1].values["text"]
     assert "needs the Python package 'torch'" in text and "install torch" in text
     assert process.stderr.strip() == text

@@ -31,7 +31,7 @@ def test_an_unknown_setting_is_an_error():
         ("seed", -1),
     ],
 )
-def test_an_impossible_value_is_named(name, value):
+def test_an_impossible_value_is_refused(name, value):
     with pytest.raises(TrainingError, match=f"setting {name} cannot be"):
         TrainingConfig.from_mapping({name: value})
 
@@ -39,12 +39,12 @@ def test_an_impossible_value_is_named(name, value):
 def test_every_setting_is_an_option():
     parser = argparse.ArgumentParser()
     add_options(parser)
-    given = (
+    option_text = (
         "--seed 3 --tolerance-mm 0.2 --hidden 8 9 10 --activation gelu --epochs 7 --batch-size 5 --learning-rate 0.1 "
         "--weight-decay 0.3 --dropout 0.25 --l1 1e-4 --l2 1e-3 --averaging 0.5 --validation-fraction 0.3 "
         "--held-out-fraction 0.2 --goal-mm 0.5 --patience 4 --include-unsettled"
     )
-    assert config_from_arguments(parser.parse_args(given.split())) == TrainingConfig(
+    assert config_from_arguments(parser.parse_args(option_text.split())) == TrainingConfig(
         3, 0.2, (8, 9, 10), "gelu", 7, 5, 0.1, 0.3, 0.25, 1e-4, 1e-3, 0.5, 0.3, 0.2, 0.5, 4, True
     )
     assert config_from_arguments(parser.parse_args([])) == TrainingConfig()

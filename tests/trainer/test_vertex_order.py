@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vertices are reordered to mesh order for any partitions, in blocks for large meshes."""
+"""The graph reorders vertices to mesh order for any partitions, and large meshes in blocks."""
 
 import numpy as np
 import onnx
@@ -11,24 +11,24 @@ from trainer.graph_builder import GraphBuilder
 from trainer.vertex_order import VertexOrder, vertex_order
 
 
-def assign_strips(vertices: int, strip: int, partitions: int) -> list[np.ndarray]:
+def assign_strips(vertex_count: int, strip_length: int, partition_count: int) -> list[np.ndarray]:
     """Assign strips of adjacent vertices to partitions in rotation."""
-    owner = np.arange(vertices) // strip % partitions
-    return [np.flatnonzero(owner == number) for number in range(partitions)]
+    partition_by_vertex = np.arange(vertex_count) // strip_length % partition_count
+    return [np.flatnonzero(partition_by_vertex == index) for index in range(partition_count)]
 
 
-def run_order_graph(order: VertexOrder, poses: int) -> np.ndarray:
+def run_order_graph(order: VertexOrder, pose_count: int) -> np.ndarray:
     """Return the (poses, V, 3) output of the graph for positions that encode their vertex and pose."""
     graph, columns = GraphBuilder(), np.concatenate(order.columns)
     order.add(graph, "joined", "positions")
-    values = [helper.make_tensor_value_info("joined", TensorProto.FLOAT, ["N", len(columns), 3])]
-    result = [helper.make_tensor_value_info("positions", TensorProto.FLOAT, ["N", order.vertex_count, 3])]
-    proto = helper.make_graph(graph.nodes, "order", values, result, graph.constants)
+    inputs = [helper.make_tensor_value_info("joined", TensorProto.FLOAT, ["N", len(columns), 3])]
+    outputs = [helper.make_tensor_value_info("positions", TensorProto.FLOAT, ["N", order.vertex_count, 3])]
+    proto = helper.make_graph(graph.nodes, "order", inputs, outputs, graph.constants)
     model = helper.make_model(proto, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.checker.check_model(model)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    joined = columns[None, :, None] + np.arange(3) * 0.25 + 100_000 * np.arange(poses)[:, None, None]
-    return session.run(None, {"joined": joined.astype(np.float32)})[0]
+    ordered_positions = columns[None, :, None] + np.arange(3) * 0.25 + 100_000 * np.arange(pose_count)[:, None, None]
+    return session.run(None, {"joined": ordered_positions.astype(np.float32)})[0]
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_every_vertex_has_one_column():
 
 
 @pytest.mark.parametrize(("strip", "uses_blocks"), [(500, True), (1, False), (100_000, True)])
-def test_blocks_only_where_strips_are_long(strip, uses_blocks):
+def test_blocks_are_used_only_for_long_strips(strip, uses_blocks):
     assert (vertex_order(assign_strips(50_000, strip, 5)).block_size > 1) == uses_blocks
 
 

@@ -22,7 +22,7 @@ from trainer.warm_start import initial_networks
 
 from .. import systems
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain
-from .conftest import QUICK
+from .conftest import QUICK_OPTIONS
 
 ADDED_POSES = 60
 
@@ -32,70 +32,77 @@ def grown_recording(recording, tmp_path):
     """The recording with refined poses that reach the end of the range."""
     folder = tmp_path / "grown"
     shutil.copytree(recording, folder)
-    read = read_recording(folder)
+    source = read_recording(folder)
     angles = chain_angles(ADDED_POSES, 3, seed=5)
     angles[:, 2, 1] = 0
-    with RecordingExtension(read, "model.onnx") as extension:
-        extension.append(pose_chain(read.rig, angles), chain_residuals(read.rig, angles))
+    with RecordingExtension(source, "model.onnx") as extension:
+        extension.append(pose_chain(source.rig, angles), chain_residuals(source.rig, angles))
     return folder
 
 
 @pytest.fixture
 def model(trained, tmp_path):
-    """A model with its checkpoint, to train on."""
+    """A copy of the model with its checkpoint, from which a test continues the training."""
     for path in (trained / "model.onnx", checkpoint_path(trained / "model.onnx")):
         shutil.copy(path, tmp_path)
     return tmp_path / "model.onnx"
 
 
-def prepared_of(path, config, checkpoint):
+def prepare_recording(path, config, checkpoint):
     recording = read_recording(path)
     split = split_recording(recording, config)
     partitions = checkpoint.reassign(recording.partitions)
     inputs = inputs_with_surface_frames(recording.rig, partitions, checkpoint.surface_frames)
     data = partition_data(recording, partitions, inputs)
-    prepared = [prepare_partition(p, split, config.tolerance_mm, config.seed) for p in data]
-    return split, prepared, [c[p.columns] for c, p in zip(inputs.columns, prepared, strict=True)]
+    prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
+    return (
+        split,
+        prepared,
+        [
+            offered_columns[partition.columns]
+            for offered_columns, partition in zip(inputs.columns, prepared, strict=True)
+        ],
+    )
 
 
 def test_networks_start_with_nearly_their_former_outputs(recording, trained, grown_recording):
     config = TrainingConfig(tolerance_mm=1e-4)
     checkpoint = read_checkpoint(checkpoint_path(trained / "model.onnx"))
-    _, prepared, columns = prepared_of(grown_recording, config, checkpoint)
+    _, prepared, columns = prepare_recording(grown_recording, config, checkpoint)
     networks = initial_networks(checkpoint, prepared, columns)
-    compared = 0
-    for before, now, network in zip(checkpoint.partitions, prepared, networks, strict=True):
+    compared_count = 0
+    for former, current, network in zip(checkpoint.partitions, prepared, networks, strict=True):
         if network is None:
             continue
-        features = now.inputs * now.feature_scale + now.feature_mean
-        assert np.array_equal(before.columns, columns[compared]) or len(before.columns) == len(now.columns)
-        old_coefficients = before.network.evaluate(
-            ((features - before.feature_mean) / before.feature_scale).astype(np.float32), checkpoint.activation
+        features = current.inputs * current.feature_scale + current.feature_mean
+        assert np.array_equal(former.columns, columns[compared_count]) or len(former.columns) == len(current.columns)
+        old_coefficients = former.network.evaluate(
+            ((features - former.feature_mean) / former.feature_scale).astype(np.float32), checkpoint.activation
         )
-        expected = old_coefficients @ before.basis_components + before.basis_mean
-        residuals = now.basis.reconstruct(network.evaluate(now.inputs, checkpoint.activation))
-        # Not exactly: the linear fit and the components are computed from other poses.
+        expected = old_coefficients @ former.basis_components + former.basis_mean
+        residuals = current.basis.reconstruct(network.evaluate(current.inputs, checkpoint.activation))
+        # The outputs differ a little, because the linear fit and the components are computed from other poses.
         assert np.linalg.norm(residuals - expected) < 0.05 * np.linalg.norm(expected)
-        compared += 1
-    assert compared >= 2
+        compared_count += 1
+    assert compared_count >= 2
 
 
 def test_a_warm_start_continues_the_training(grown_recording, model, trained):
-    first = json.loads((trained / "report.json").read_text())["fdda"]["held_out"]["mean"]
-    assert main([str(grown_recording), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
+    first_error = json.loads((trained / "report.json").read_text())["fdda"]["held_out"]["mean"]
+    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--epochs", "12", "--warm-start"]) == 0
     report = json.loads((model.parent / "report.json").read_text())
-    # Six epochs from random weights leave several times the error.
-    assert report["fdda"]["held_out"]["mean"] < 1.5 * first
-    assert main([str(grown_recording), str(model), *QUICK, "--epochs", "6"]) == 0
-    cold_report = json.loads((model.parent / "report.json").read_text())
-    assert cold_report["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
-    assert main([str(grown_recording), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
+    # After six epochs from random weights, the error is several times as large.
+    assert report["fdda"]["held_out"]["mean"] < 1.5 * first_error
+    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--epochs", "6"]) == 0
+    cold_start_report = json.loads((model.parent / "report.json").read_text())
+    assert cold_start_report["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
+    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--epochs", "12", "--warm-start"]) == 0
     assert report["training"]["warm_start"] and report["poses"] == 120 + ADDED_POSES
     history = read_checkpoint(checkpoint_path(model)).history
     assert [entry["poses"] for entry in history] == [120 + ADDED_POSES] * 2
 
 
-def test_refined_poses_train_and_held_out_poses_stay(recording, grown_recording):
+def test_refined_poses_become_training_poses_and_held_out_poses_stay(recording, grown_recording):
     config = TrainingConfig()
     before, after = (
         split_recording(read_recording(recording), config),
@@ -108,12 +115,12 @@ def test_refined_poses_train_and_held_out_poses_stay(recording, grown_recording)
 
 
 def refused_warm_start(capsys, *arguments) -> str:
-    options = arguments[2:] or QUICK
+    options = arguments[2:] or QUICK_OPTIONS
     assert main([*map(str, arguments[:2]), *options, "--warm-start"]) == 1
     return capsys.readouterr().err
 
 
-def test_there_must_be_a_checkpoint(recording, tmp_path, capsys):
+def test_a_missing_checkpoint_is_refused(recording, tmp_path, capsys):
     assert "There is no checkpoint" in refused_warm_start(capsys, recording, tmp_path / "m.onnx")
 
 
@@ -121,14 +128,14 @@ def test_a_checkpoint_of_other_network_or_rig_is_refused(recording, model, tmp_p
     assert "is of networks --hidden 24 24 --activation silu" in refused_warm_start(
         capsys, recording, model, "--hidden", "8"
     )
-    write_chain(tmp_path / "other", joints=4)
+    write_chain(tmp_path / "other", joint_count=4)
     assert "is of another rig" in refused_warm_start(capsys, tmp_path / "other", model)
 
 
 @pytest.mark.parametrize("options", [["--seed", "1"], ["--held-out-fraction", "0.2"], ["--validation-fraction", "0.2"]])
-def test_training_poses_never_become_held_out(recording, model, capsys, options):
+def test_a_split_that_would_hold_out_training_poses_is_refused(recording, model, capsys, options):
     assert "may have been trained on poses that are held out now" in refused_warm_start(
-        capsys, recording, model, *QUICK, *options
+        capsys, recording, model, *QUICK_OPTIONS, *options
     )
 
 
@@ -138,44 +145,48 @@ def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "damage",
+    "damage_kind",
     ["cut", "text", "packed", "version", "sizes", "nan", "types", pytest.param("pipe", marks=systems.named_pipes)],
 )
-def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
+def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage_kind):
     path = checkpoint_path(model)
-    if damage == "cut":
+    if damage_kind == "cut":
         path.write_bytes(path.read_bytes()[:1000])
-    elif damage == "text":
+    elif damage_kind == "text":
         path.write_text("weights")
-    elif damage == "packed":
+    elif damage_kind == "packed":
         with np.load(path) as arrays:
             content = dict(arrays)
         content["1/basis_mean"] = np.zeros(1 << 22, np.float32)
         np.savez_compressed(path, **content)
         assert zipfile.is_zipfile(path)
-    elif damage == "version":
+    elif damage_kind == "version":
         with np.load(path) as arrays:
             content = dict(arrays)
         about = json.loads(content["about"].tobytes()) | {"version": 2}
         content["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
         np.savez(path, **content)
-    elif damage == "pipe":
+    elif damage_kind == "pipe":
         path.unlink()
         os.mkfifo(path)
     else:
         with np.load(path) as arrays:
             content = dict(arrays)
-        changed = {"sizes": content["1/weight_1"][1:], "nan": content["1/weight_1"] * np.nan, "types": np.array("x")}
-        content["1/weight_1"] = changed[damage]
+        changed_arrays = {
+            "sizes": content["1/weight_1"][1:],
+            "nan": content["1/weight_1"] * np.nan,
+            "types": np.array("x"),
+        }
+        content["1/weight_1"] = changed_arrays[damage_kind]
         np.savez(path, **content)
-    before = model.read_bytes()
+    model_before = model.read_bytes()
     text = refused_warm_start(capsys, recording, model)
-    if damage == "pipe":
+    if damage_kind == "pipe":
         assert "it is not a regular file" in text
-    elif damage == "text":
+    elif damage_kind == "text":
         assert "another file is there, which is not the checkpoint of a training" in text
-    elif damage == "version":
+    elif damage_kind == "version":
         assert "cannot be used (version 2); train without --warm-start" in text
     else:
         assert "cannot be used" in text and "train without --warm-start" in text
-    assert model.read_bytes() == before
+    assert model.read_bytes() == model_before

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Warnings about a recording are sent and reported, and end a strict training."""
+"""Warnings about a recording are sent as messages and shown in the report. A strict training fails on them."""
 
 import json
 import shutil
@@ -11,12 +11,12 @@ import pytest
 from fdda_addon.core.messages import Message, MessageType
 from trainer.__main__ import main
 
-from .conftest import QUICK
+from .conftest import QUICK_OPTIONS
 
 
 @pytest.fixture(scope="module")
 def suspicious_recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The chain's recording, with 30 repeated poses of 120, one of them with other residuals."""
+    """The recording of the chain. Thirty of its 120 poses repeat an earlier pose, one of them with other residuals."""
     path = shutil.copytree(recording, tmp_path_factory.mktemp("suspicious") / "recording")
     for name in ("pose_matrices", "residuals"):
         array = np.load(path / f"{name}.npy", mmap_mode="r+")
@@ -27,16 +27,19 @@ def suspicious_recording(recording: Path, tmp_path_factory: pytest.TempPathFacto
     return path
 
 
-WARNINGS = ["duplicate-poses", "hidden-inputs"]
+WARNING_NAMES = ["duplicate-poses", "hidden-inputs"]
 
 
 def test_warnings_are_sent_before_the_training_and_reported(suspicious_recording, tmp_path, capsys):
-    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--messages", *QUICK[2:], "--epochs", "2"]) == 0
+    assert (
+        main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--messages", *QUICK_OPTIONS[2:], "--epochs", "2"])
+        == 0
+    )
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
-    kinds = [MessageType.STARTED, MessageType.LOG, *[MessageType.WARNING] * 2, MessageType.PREPARING]
-    assert [m.type for m in messages[:5]] == kinds
+    first_message_types = [MessageType.STARTED, MessageType.LOG, *[MessageType.WARNING] * 2, MessageType.PREPARING]
+    assert [m.type for m in messages[:5]] == first_message_types
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert [w["name"] for w in report["warnings"]] == WARNINGS
+    assert [w["name"] for w in report["warnings"]] == WARNING_NAMES
     assert [m.values for m in messages[2:4]] == report["warnings"]
     assert report["warnings"][0]["text"].startswith("30 of 120 poses repeat an earlier one, such as pose 21 pose 20")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -45,8 +48,8 @@ def test_warnings_are_sent_before_the_training_and_reported(suspicious_recording
 
 
 @pytest.mark.parametrize("messages", [[], ["--messages"]])
-def test_strict_ends_the_training_before_it_begins(suspicious_recording, tmp_path, capsys, messages):
-    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--strict", *messages, *QUICK]) == 1
+def test_a_strict_training_fails_before_it_starts(suspicious_recording, tmp_path, capsys, messages):
+    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--strict", *messages, *QUICK_OPTIONS]) == 1
     output = capsys.readouterr()
     assert output.err.startswith("30 of 120 poses repeat an earlier one, such as pose 21 pose 20: ")
     assert output.err.endswith(" (duplicate-poses; 1 more: hidden-inputs).\n")
@@ -58,8 +61,8 @@ def test_strict_ends_the_training_before_it_begins(suspicious_recording, tmp_pat
     assert ("epoch" in output.out, list(tmp_path.iterdir())) == (False, [])
 
 
-def test_the_text_for_a_person_has_the_warnings(report, suspicious_recording, tmp_path, capsys):
-    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), *QUICK[2:], "--epochs", "1"]) == 0
+def test_the_text_output_has_the_warnings(report, suspicious_recording, tmp_path, capsys):
+    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), *QUICK_OPTIONS[2:], "--epochs", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines[2:4]] == [f"Warning ({name})" for name in WARNINGS]
+    assert [line.split(":")[0] for line in lines[2:4]] == [f"Warning ({name})" for name in WARNING_NAMES]
     assert report["warnings"] == []
