@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The charts of the report, as inline SVG. The style sheet of the page has their colors."""
+"""Draws the charts of the report as inline SVG. The style sheet of the page defines their colors."""
 
 import math
 from collections.abc import Sequence

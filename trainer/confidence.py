@@ -20,13 +20,13 @@ from fdda_addon.core.skinning import SkinBlock
 MARGIN_RATIO = 0.1
 """Margin of the box on each side, as a part of the range."""
 FADE_RATIO = 6.0
-"""Fade width, as a part of the range. It is large because the residual at the end of the range is a good approximation
-outside of it: docs/experiments.md, Margin around the range of motion."""
+"""Fade width, as a part of the range. It is large, because the residual at the end of the range is a good approximation
+outside the range: docs/experiments.md, Margin around the range of motion."""
 MIN_MARGINS = (0.01, 0.001)
 MIN_FADE_WIDTHS = (4.0, 0.2)
-"""Minimum margin and minimum fade width. The first is of rotation elements, without unit, and of controls, as a part of
-their recorded range. The second is of translations, as a part of the character's size. They apply to a locked axis,
-which has no range."""
+"""Minimum margin and minimum fade width. The first value is for rotation elements, without unit, and for controls, as a
+part of their recorded range. The second is for translations, as a part of the character's size. These minimums apply
+to a locked axis, which has no range."""
 MIN_LOCKED_SPREAD = 1e-4
 """A joint was locked in the recording if its features spread less than this: rotations no unit, translations meters."""
 
@@ -39,8 +39,8 @@ class TrainingRange:
         low, high: (F,) float32, bounds of all features (`NetworkInputs`), with the margin.
         fade_width: (12 J + C,) float32, fade width of the features of joints and controls. Other features have no
             effect on the confidence.
-        counts: (P, 12 J + C) bool, the features that count for a partition: features of the joints and controls that
-            influence it, and of adjacent joints that were locked, because their effect is unknown.
+        counts: (P, 12 J + C) bool, the features on which the confidence of a partition depends. These are features of
+            influencing joints and controls, and of adjacent joints that were locked, whose effect is unknown.
         controls: C controls with their recorded ranges.
     """
 

@@ -21,7 +21,7 @@ class GoalResult:
     Attributes:
         goal_mm: the accuracy goal, mm.
         p999_mm: 99.9th percentile of the held-out errors.
-        verdict: whether it meets the goal, and whether more poses may help.
+        verdict: whether the training meets the goal, and whether more poses may help.
         text: the verdict in sentences, with advice.
     """
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The model's ONNX graph: from pose matrices and controls to positions and confidence, in standard operators.
 
-In each frame of an animation the graph evaluates one pose. Each node then takes nearly a microsecond, whatever it
-computes, and all constants are read once. So the graph has few nodes, little padding, and products with matrices of
-ones and zeros in place of gathers. docs/experiments.md has the measurements. Dimensions in the modules of the graph: N
-poses, J joints, C controls, Q pairs of joints, F features, D surface frames, P partitions, K components, V vertices.
+In each frame of an animation the graph evaluates one pose. Each node then takes nearly a microsecond, even if it
+computes little, and all constants are read once. So the graph has few nodes and little padding, and multiplies by
+matrices of ones and zeros in place of gathering. docs/experiments.md has the measurements.
+
+Dimensions in the modules of the graph: N poses, J joints, C controls, Q pairs of joints, F features, D surface frames,
+P partitions, K components, V vertices.
 """
 
 import onnx

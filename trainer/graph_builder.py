@@ -26,7 +26,7 @@ class GraphBuilder:
         return self._constant(name, np.asarray(value, np.int64))
 
     def short_integers(self, name: str, value: np.ndarray) -> str:
-        """Add an int32 constant. It is for large index arrays, because every evaluation reads all of them."""
+        """Add an int32 constant. Large index arrays use this type, because every evaluation reads all indices."""
         return self._constant(name, np.asarray(value, np.int32))
 
     def add(self, operator: str, inputs: list[str], output: str, **attributes) -> str:

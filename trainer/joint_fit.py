@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Linear regression of a partition's residuals on the transforms of nearby joints.
 
-Near a joint, smoothing mostly makes vertices follow the joints on both sides in part. This motion is linear in the
-joints' transforms, so least squares finds it. The networks learn the remainder, which is small and smooth. Le and
+Near a joint, smoothing mostly makes vertices follow the joints on both sides partly. This motion is linear in the
+joints' transforms, so least squares can fit it. The networks learn the remainder, which is small and smooth. Le and
 Lewis, Direct Delta Mush Skinning and Variants, 2019, show how much of delta mush is linear in this sense. For a rig
 that preserves volume, half-rotation features are also regressors (`half_rotations`).
 """
@@ -18,7 +18,7 @@ from .blocks import BLOCK_ELEMENTS
 from .inputs import joints_on_path, static_joints
 
 RIDGE = 1e-6
-"""Ridge as a part of the number of poses. Joints that move alike share the fit, and factors stay small."""
+"""Ridge, as a part of the number of poses. It makes joints that move alike share the fit, and keeps factors small."""
 MAX_PRUNING_LOSS = 0.01
 """Joints are removed, the least useful first, as long as the error is at most this part larger than with all joints."""
 MIN_EQUATIONS_PER_UNKNOWN = 4
@@ -31,7 +31,7 @@ MIN_SINGULAR_VALUE_RATIO = 1e-5
 class JointFit:
     """The fitted part of the residuals of a partition: vertex v moves by sum_j S_j u_vj, with skin matrices S_j.
 
-    A common motion of all joints moves nothing: the last elements of a vertex's u_vj sum to zero.
+    The last elements of a vertex's u_vj sum to zero, so that a common motion of all joints has no effect.
 
     Attributes:
         joints: (Jf,) int64, indices into the regression matrices, the main joint first; may be empty. Index J + j is

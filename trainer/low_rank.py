@@ -17,7 +17,7 @@ from .joint_fit import JointFit, JointRegression
 TOLERANCE_RATIO = 0.1
 """Maximum error of the factorization, as a part of the tolerance of the basis."""
 PRODUCT_PARAMETERS = 6_000
-"""Number of constants that are read in the time of one more matrix product."""
+"""Cost of one more matrix product, as the number of constants that are read in the same time."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def factorize(
     Args:
         fit, basis: fit and basis of the partition.
         coefficients: (N, K) coefficients of all poses, mesh units.
-        regression: regression of which the fit is the result.
+        regression: regression whose result is the fit.
         training: indices of the training poses.
         weights: weights of the training poses.
         tolerance: rms error over poses and vertices that the components may leave, mesh units.

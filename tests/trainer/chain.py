@@ -44,7 +44,7 @@ def chain_rig(joint_count: int = 3, vertex_count: int = 90, seed: int = 0) -> Ri
 
 
 def chain_faces(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts and vertices of triangles, each of three consecutive vertices along the tube."""
+    """Return starts and vertices of the faces, which are triangles of three consecutive vertices along the tube."""
     order = np.argsort(height)
     vertices = np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
     return np.arange(0, vertices.size, 3, dtype=np.int32), vertices.astype(np.int32).ravel()

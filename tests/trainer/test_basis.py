@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bases: the tolerance determines the number of components, with the Gram matrix and with the covariance matrix."""
+"""The tolerance determines the number of components, both with the Gram matrix and with the covariance matrix."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def test_a_sample_of_the_poses_gives_the_same_components(monkeypatch):
 
 
 def example_errors() -> tuple[list[np.ndarray], list[int]]:
-    """Return errors by number of components, and vertex counts, of a simple, a complex and a small partition."""
+    """Return the errors by number of components and the vertex counts of a simple, a complex and a small partition."""
     return [np.array(by_count) for by_count in ([1.0, 0.1, 0.02, 0.005], 0.8 ** np.arange(25), [0.5, 0.1, 0.05])], [
         400,
         40,

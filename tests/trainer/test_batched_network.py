@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The batched network and its loop: padding has no effect, training converges, and the seed determines the result."""
+"""Networks that are trained as a batch learn, independently of padding, and the seed determines the result."""
 
 from dataclasses import replace
 

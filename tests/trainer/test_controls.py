@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls: the model takes their values as inputs, and learns residuals that depend on them."""
+"""The model takes values of controls as inputs, and learns residuals that depend on controls."""
 
 import json
 import shutil

@@ -173,7 +173,7 @@ def test_translations_are_packed_by_three():
         assert [layout.row_count for layout in layouts] == [6 + 4 * count for count in counts[:-1]] + [
             6 + 4 * counts[-1] + layouts[-1].padding
         ]
-    # The first rows of the next partition complete the slice, so it needs as many joints.
+    # A slice is completed only if the next partition has enough joints, because its first rows complete the slice.
     assert [
         (layout.leading_translation_count, layout.padding)
         for layout in skinning_nodes._pack_translations([make_layout(4), make_layout(1), make_layout(4)])
@@ -186,7 +186,7 @@ def test_translations_are_packed_by_three():
 
 @pytest.mark.parametrize("joints", [(0, 1, 2), (0, 1), (2,)])
 def test_partial_slices_of_translations_agree_with_pytorch(trained_model, joints):
-    """Fewer fitted joints change the slices of translations."""
+    """The fits of some partitions lose joints, so that slices of translations are only partly filled."""
     poses = pose_chain(trained_model.rig, chain_angles(5, 3, 3))
     prepared = list(trained_model.prepared)
     for index in joints:
@@ -199,7 +199,7 @@ def test_partial_slices_of_translations_agree_with_pytorch(trained_model, joints
 
 @pytest.mark.parametrize("chunk_cost, split_cost", [(0, 0), (100, 0), (0, 10**9)])
 def test_networks_in_chunks_have_the_same_outputs(trained_model, monkeypatch, chunk_cost, split_cost):
-    """Chunks have one input or component, several, or all of a network."""
+    """Depending on the costs, a chunk has one, several, or all inputs or components of a network."""
     poses = pose_chain(trained_model.rig, chain_angles(5, 3, 3))
     expected, _ = run_graph(trained_model, poses)
     monkeypatch.setattr(network_nodes, "CHUNK_COST", chunk_cost)
@@ -209,7 +209,7 @@ def test_networks_in_chunks_have_the_same_outputs(trained_model, monkeypatch, ch
 
 
 def test_the_chunk_size_has_the_lowest_cost():
-    # One network has a hundred times as many inputs as nine others: not all are padded to it.
+    # The other networks must not be padded to the first, which has a hundred times as many inputs.
     assert 30 <= network_nodes._chunk_size([3000, *[30] * 9], 192, 10) <= 60
     assert network_nodes._chunk_size([30, 29, 28, 30], 192, 4) == 30
     assert network_nodes._chunks([5, 2], 2) == [(0, slice(0, 2)), (0, slice(2, 4)), (0, slice(4, 6)), (1, slice(0, 2))]

@@ -69,14 +69,14 @@ def write_volume_recording(
     plain_rig, slanted_scale = chain_rig(), np.eye(4) if slanted_scale is None else slanted_scale
     poses = pose_chain(plain_rig, chain_angles(POSES, 3, seed=2, range_scale=RANGE_SCALE))
     positions = blend_rotations(plain_rig, poses)
-    rest, poses = slanted_scale @ plain_rig.rest_matrices, slanted_scale @ poses
+    rest_matrices, poses = slanted_scale @ plain_rig.rest_matrices, slanted_scale @ poses
     rest_positions, positions = (points @ slanted_scale[:3, :3].T for points in (plain_rig.rest_positions, positions))
-    for matrices in (rest, poses):
+    for matrices in (rest_matrices, poses):
         matrices[..., :3, 3] = units_per_metre * (matrices[..., :3, 3] + origin_distance)
     rest_positions, positions = (units_per_metre * (points + origin_distance) for points in (rest_positions, positions))
     rig = replace(
         plain_rig,
-        rest_matrices=rest.astype(np.float32),
+        rest_matrices=rest_matrices.astype(np.float32),
         rest_positions=rest_positions.astype(np.float32),
         metres_per_unit=1 / units_per_metre,
     )
@@ -93,7 +93,7 @@ def recording(tmp_path_factory) -> Recording:
 
 @pytest.fixture(scope="module")
 def model_and_path(recording, tmp_path_factory) -> tuple:
-    """The trained model and the path of its file."""
+    """A trained model and the path of its file."""
     path = tmp_path_factory.mktemp("models") / "volume.onnx"
     with pytest.MonkeyPatch.context() as monkeypatch:
         trained_models = collect_trained_models(monkeypatch)
@@ -107,11 +107,11 @@ def half_rotations_are_selected(recording: Recording) -> bool:
 
 def pose_second_joint(rig: Rig, matrix: np.ndarray) -> np.ndarray:
     """Return (1, J, 4, 4) pose matrices with a transform of the second joint relative to the first."""
-    rest = rig.rest_matrices.astype(np.float64)
-    poses = rest.copy()
-    poses[0] = rotation(1, 0.4) @ rest[0]
-    poses[1] = poses[0] @ np.linalg.inv(rest[0]) @ rest[1] @ matrix
-    poses[2] = poses[1] @ np.linalg.inv(rest[1]) @ rest[2]
+    rest_matrices = rig.rest_matrices.astype(np.float64)
+    poses = rest_matrices.copy()
+    poses[0] = rotation(1, 0.4) @ rest_matrices[0]
+    poses[1] = poses[0] @ np.linalg.inv(rest_matrices[0]) @ rest_matrices[1] @ matrix
+    poses[2] = poses[1] @ np.linalg.inv(rest_matrices[1]) @ rest_matrices[2]
     return poses[None].astype(np.float32)
 
 

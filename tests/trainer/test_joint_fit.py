@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The joint regression: it recovers smooth skinning, and ignores a common motion of the joints."""
+"""The joint regression recovers smooth skinning, and ignores a common motion of the joints."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def smooth_rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def poses(smooth_rig) -> np.ndarray:
-    """(320, J, 4, 4); the chain is far away from the origin."""
+    """(320, J, 4, 4) pose matrices of the chain, far away from the origin."""
     translation = np.eye(4, dtype=np.float32)
     translation[:3, 3] = 7, -5, 3
     return translation @ pose_chain(smooth_rig, chain_angles(320, JOINTS, seed=4))
@@ -56,7 +56,7 @@ def test_smooth_skinning_is_recovered(smooth_rig, poses, joint):
 
 
 def test_irrelevant_joints_are_removed(smooth_rig, poses):
-    """The last joint is a regressor and moves, but the residual of the first depends on the second alone."""
+    """All four joints are regressors, but the residual of the first partition depends on the second joint alone."""
     rig = with_heaviest_joints(smooth_rig)
     partition = make_partitions(rig, {0: (1, 2, 3)})[0]
     skin = skin_matrices(poses, rig.rest_matrices)
@@ -125,7 +125,7 @@ def test_the_main_joint_alone_fits_the_mean(smooth_rig, poses):
 
 
 def test_joints_that_never_moved_get_small_factors(smooth_rig):
-    """If no joint moves, all regressors are equal; one of the joints moves later."""
+    """No joint moves in the training poses, so all regressors are equal. A joint that moves later has little effect."""
     partition = make_partitions(smooth_rig, INFLUENCING)[1]
     still_poses = pose_chain(smooth_rig, np.zeros((30, JOINTS, 2)))
     skin = skin_matrices(still_poses, smooth_rig.rest_matrices)

@@ -57,7 +57,7 @@ def write_recording(path, units_per_metre: float, origin_distance: float) -> Non
 
 @pytest.fixture(scope="module")
 def results_by_unit(tmp_path_factory) -> dict:
-    """Recording, report and model metadata for each unit and distance."""
+    """Recording, report and model metadata, by name of the unit and distance."""
     folder, results = tmp_path_factory.mktemp("lengths"), {}
     for name, unit_and_distance in UNITS_AND_DISTANCES.items():
         path = folder / name
@@ -80,7 +80,7 @@ def prepared(recording) -> list:
 
 @pytest.mark.parametrize("name", OTHER_UNITS)
 def test_networks_have_the_same_inputs(results_by_unit, name):
-    """Constant features with rounding errors are not inputs; features that vary a little are."""
+    """Constant features with rounding errors are not inputs, but features that vary a little are inputs."""
     for partition, reference in zip(*(prepared(results_by_unit[n][0]) for n in (name, METER)), strict=True):
         assert partition.columns.tolist() == reference.columns.tolist()
         assert partition.fit.joints.tolist() == reference.fit.joints.tolist()

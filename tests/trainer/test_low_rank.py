@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Low-rank factors of large partitions: fewer parameters and the same positions, at any position and in any unit."""
+"""Low-rank factors of large partitions have fewer parameters and give the same positions, anywhere and in any unit."""
 
 from dataclasses import replace
 

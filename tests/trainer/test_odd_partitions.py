@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Merged partitions, and vertices without a bone, are trained and evaluated like all others."""
+"""Merged partitions and vertices without a bone are trained and evaluated like other partitions."""
 
 import json
 from dataclasses import replace

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Exported models are accepted by the add-on: operators, sizes, and the checksum."""
+"""The add-on accepts the operators, the sizes and the checksum of exported models."""
 
 import json
 
@@ -61,7 +61,7 @@ def test_changed_weights_are_refused(trained):
 
 
 def test_a_graph_larger_than_its_metadata_explains_is_refused(trained):
-    """The limits come from the metadata: a graph with more constants than they explain is too large."""
+    """The limits come from the metadata. A graph with more constants than its metadata explain is refused."""
     model = onnx.load_from_string((trained / "model.onnx").read_bytes())
     metadata_property = next(prop for prop in model.metadata_props if prop.key == METADATA_KEY)
     metadata = json.loads(metadata_property.value)

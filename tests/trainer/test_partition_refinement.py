@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Partition refinement makes the model smaller, and export, checkpoint and report use the refined partitions."""
+"""Partition refinement makes the model smaller; model, checkpoint and report have the refined partitions."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ ODD_RINGS = np.arange(RING_COUNT // JOINTS, RING_COUNT // JOINTS + 3)
 
 
 def write_odd_recording(path: Path, units_per_metre: float = 1.0, origin_distance: float = 0.0) -> Recording:
-    """Write a tube where the first joint deforms vertices beyond its weights."""
+    """Write a recording of a tube in which the first joint also deforms vertices without a weight on it."""
     plain_rig, rig, angles = (
         tube(),
         tube(units_per_metre, origin_distance),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fitted skin weights: the true weights are recovered, the constraints hold, and poor weights improve."""
+"""The fit of skin weights recovers the true weights, keeps its constraints, and improves poor weights."""
 
 import json
 import subprocess
@@ -36,7 +36,7 @@ class SilentSink:
 
 
 def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES) -> np.ndarray:
-    """Draw (poses, J, 4, 4) float32 matrices: each joint rotates and moves independently, and all move far together."""
+    """Draw (N, J, 4, 4) float32 matrices. Each joint rotates and moves a little; a common translation moves all far."""
     matrices = np.empty((poses, len(heads), 4, 4))
     for pose in matrices:
         root = rng.normal(0, 5, 3)
@@ -72,7 +72,7 @@ def with_one_joint(rig: Rig, joints: np.ndarray) -> Rig:
 
 
 def make_fit_poses(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> FitPoses:
-    """Create poses of the rig; their rig has all weights on the first joint."""
+    """Create poses of the rig for a fit that starts with all weights on the first joint."""
     rng = np.random.default_rng(seed)
     matrices = random_poses(rng, rig.rest_matrices[:, :3, 3], poses)
     positions = LinearSkinning(rig).positions(matrices)
@@ -126,7 +126,7 @@ def test_constraints_hold_for_random_positions(kind):
 
 
 def test_noise_adds_no_joints():
-    """Each joint explains a little of any noise, but only the true joint explains enough."""
+    """Every joint explains a little of the noise, but only the true joint explains enough to get a weight."""
     labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
     fitted_rig = fit_rig(make_fit_poses(with_one_joint(random_rig(1), labels), noise=0.05), "smooth")
     assert (fitted_rig.skin_weights > 0).sum(axis=1).mean() < 1.02
@@ -148,7 +148,7 @@ def test_five_joints_are_approximated_by_the_best_four():
 
 
 def test_simplex_weights_are_optimal():
-    """The conditions of Karush, Kuhn and Tucker: equal slopes where there is a weight, steeper ones elsewhere."""
+    """The Karush-Kuhn-Tucker conditions hold: slopes are equal where weights are positive, and larger elsewhere."""
     rng = np.random.default_rng(3)
     factors = rng.normal(size=(50, 6, 8)) + rng.normal(size=(50, 1, 8))
     errors = factors @ factors.transpose(0, 2, 1)
@@ -181,11 +181,11 @@ def test_ties_prefer_the_rig_s_joint_then_the_nearest(kind):
 
 def test_static_vertices_follow_the_static_joint():
     poses = make_fit_poses(random_rig(4))
-    rest = poses.rig.rest_matrices.copy()
-    rest[7] = np.eye(4)
+    rest_matrices = poses.rig.rest_matrices.copy()
+    rest_matrices[7] = np.eye(4)
     poses.pose_matrices[:, 7] = np.eye(4)
     poses.positions[:, :50] = poses.rig.rest_positions[:50]
-    fitted_rig = fit_rig(replace(poses, rig=replace(poses.rig, rest_matrices=rest)), "smooth")
+    fitted_rig = fit_rig(replace(poses, rig=replace(poses.rig, rest_matrices=rest_matrices)), "smooth")
     assert (fitted_rig.skin_joints[:50, 0] == 7).all() and (fitted_rig.skin_weights[:50, 0] > 0.999).all()
 
 

@@ -99,7 +99,7 @@ def test_selection_does_not_depend_on_unit_and_position(
         selected.evaluate(moved_recording.pose_matrices) / units_per_metre,
         surface_frames.evaluate(recording.pose_matrices),
     )
-    # 100 m away, positions have steps of 0.008 mm.
+    # At 100 m from the origin, positions have steps of 0.008 mm.
     assert (
         np.abs(features - reference_features).max()
         < (0.02 if origin_distance else 1e-4) * np.abs(reference_features).max()
@@ -111,7 +111,7 @@ def test_scale_and_rotation_of_the_character_do_not_change_surface_frames(record
     character_transform = rotation(0, 0.7) @ rotation(2, -1.9) @ np.diag([2.5, 2.5, 2.5, 1])
     character_transform[:3, 3] = 3, -2, 1
     features = surface_frames.evaluate(matrices)
-    # Epsilons damp nearly degenerate corners, relative to their extent at rest.
+    # The result differs slightly, because epsilons damp nearly degenerate corners relative to their size at rest.
     assert (
         np.abs(surface_frames.evaluate(character_transform @ matrices) - features).max() < 1e-3 * np.abs(features).max()
     )
@@ -128,7 +128,7 @@ def test_chance_correlations_select_nothing(tmp_path):
 
 
 def test_a_rig_that_smooths_one_partition_has_no_surface_frames(tmp_path, recording):
-    """Surface frames for one partition cost as much as for all, and reduce the error less."""
+    """Surface frames for a single partition would take as much time as for all, and lower the error less."""
     waves = write_tube(tmp_path / "tube", smooths=False)
     residuals = np.array(waves.residuals)
     smooth = recording.partitions[0].vertices

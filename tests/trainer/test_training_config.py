@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training settings: unknown names and impossible values are errors, and every setting has an option."""
+"""Unknown training settings and impossible values are refused, and every setting has an option."""
 
 import argparse
 

@@ -99,7 +99,7 @@ def write_tube(
     sheared: bool = False,
     pose_count: int = POSES,
 ) -> Recording:
-    """Write a recording of the tube with delta mush, or with bulges that depend on the joints without smoothing."""
+    """Write a recording of the tube with delta mush; with `smooths` False, with bulges that depend on joint angles."""
     plain_rig, rig, angles = (
         tube(),
         tube(units_per_metre, origin_distance),
