@@ -122,7 +122,9 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
         poses[:, index] = poses[:, parents[index]] @ poses[:, index]
     partition = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
     inputs: NetworkInputs = make_inputs(parents, points, [partition])
-    features = inputs.compute_features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
+    features = inputs.compute_features(
+        poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1))
+    )
     residuals = residuals * np.float32(METERS_PER_CM)
     data = PartitionData(
         name,
