@@ -10,7 +10,7 @@ OWNERS = (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS)
 OTHER_OBJECT = "object:"
 """Prefix of the owner of a control on another object; the name of the object follows."""
 MAX_TEXT_LENGTH = 1000
-"""Characters of an owner or a path in a file."""
+"""Largest number of characters of an owner or a path in a file."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,11 @@ class Control:
     """An animatable number that deforms the mesh.
 
     Attributes:
-        owner: the datablock by its role in the rig, one of `OWNERS`, or `OTHER_OBJECT` and the name of an object. So
-            a character that is linked or renamed keeps its controls.
+        owner: the data-block that has the property. It is identified by its role in the rig, one of `OWNERS`, so that a
+            linked or renamed character keeps its controls; or by `OTHER_OBJECT` and the name of an object.
         path: RNA path inside the owner, `key_blocks["Smile"].value`, `pose.bones["hand"]["fist"]`; one element of an
             array is `location[0]`.
-        low, high: its range, in the unit of the property.
+        low, high: range of the control, in the unit of the property.
     """
 
     owner: str
@@ -32,7 +32,7 @@ class Control:
 
     @property
     def name(self) -> str:
-        """Owner and path; unique among the controls of a rig."""
+        """Name of the control: owner and path. It is unique among the controls of a rig."""
         return f"{self.owner}/{self.path}"
 
     def to_json(self) -> dict:
@@ -49,9 +49,9 @@ class Control:
         for text in (control.owner, control.path):
             if not isinstance(text, str) or not 0 < len(text) <= MAX_TEXT_LENGTH:
                 raise ValueError(f"a control is called {text!r}")
-        for end in (value["low"], value["high"]):
-            if type(end) not in (int, float):
-                raise TypeError(f"the range of the control {control.name!r} ends at {end!r}")
+        for limit in (value["low"], value["high"]):
+            if type(limit) not in (int, float):
+                raise TypeError(f"the range of the control {control.name!r} ends at {limit!r}")
         if control.owner not in OWNERS and not control.owner.startswith(OTHER_OBJECT):
             raise ValueError(f"a control belongs to {control.owner!r}")
         if not (np.isfinite([control.low, control.high]).all() and control.low <= control.high):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Joint features: the transforms of joints relative to parent and rest pose, the inputs of a network."""
+"""Joint features: transforms of joints relative to their parents and the rest pose. They are inputs of the networks."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from .rig import Rig
 
 FEATURES_PER_JOINT = 12
 FLOAT32_ROUNDING_RATIO = 2.0**-21
-"""Rounding of float32 as a ratio of the largest coordinate: a few units in the last place."""
+"""Largest rounding error of float32, a few units in the last place, as a ratio of the largest coordinate."""
 
 
 def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
@@ -20,7 +20,7 @@ def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
         rest_matrices: (J, 4, 4), mesh-object space, mesh units.
-        parents: (J,) parent index, -1 for a root; every parent before its children.
+        parents: (J,) parent index, -1 for a root joint; every parent before its children.
 
     Returns:
         (N, J, 12) float32: the upper three rows of F_j, row by row; rotations without unit, translations in mesh units.
@@ -40,20 +40,20 @@ def relative_to_parent(matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
 
 
 def float32_rounding(pose_matrices: np.ndarray) -> float:
-    """Return how far rounding may move a joint at rest in (N, J, 4, 4) pose matrices, mesh units."""
+    """Return the largest motion that rounding may give a joint at rest in (N, J, 4, 4) pose matrices, mesh units."""
     return FLOAT32_ROUNDING_RATIO * float(np.abs(pose_matrices[..., :3, 3]).max(initial=0))
 
 
 def joint_features_in_metres(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
     """Compute `joint_features` with translations in meters.
 
-    A translation that differs by no more than `float32_rounding` is set to its mean.
+    A translation that differs between the poses by no more than `float32_rounding` is set to its mean.
 
     Returns:
         (N, J, 12) float32.
     """
     features = joint_features(pose_matrices, rig.rest_matrices, rig.parents)
     translations = features[:, :, 3::4]
-    still = np.ptp(translations, axis=0) <= float32_rounding(pose_matrices)
-    features[:, :, 3::4] = rig.metres_per_unit * np.where(still, translations.mean(axis=0), translations)
+    is_constant = np.ptp(translations, axis=0) <= float32_rounding(pose_matrices)
+    features[:, :, 3::4] = rig.metres_per_unit * np.where(is_constant, translations.mean(axis=0), translations)
     return features

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Kinds of output files, recognized by their signatures: a file of another kind is never overwritten."""
+"""Kinds of output files, recognized by their signatures, so that a file of another kind is not overwritten."""
 
 import re
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ class FileKind:
     """A kind of output file.
 
     Attributes:
-        name: for messages, with its article.
-        signature: regular expression of the first bytes.
+        name: name of the kind in messages, with its article.
+        signature: regular expression that matches the first bytes of such a file.
     """
 
     name: str
@@ -26,17 +26,17 @@ class FileKind:
         """Return whether a file is of this kind; an empty file is of every kind.
 
         Raises:
-            OSError: it cannot be read.
+            OSError: the file cannot be read.
         """
         with open_input(path) as file:
-            signature = file.read(SIGNATURE_BYTES)
-        return not signature or re.match(self.signature, signature, re.DOTALL) is not None
+            first_bytes = file.read(SIGNATURE_BYTES)
+        return not first_bytes or re.match(self.signature, first_bytes, re.DOTALL) is not None
 
 
 _OBJECTS_PREFIX = rb'\s*\{\s*(?:"objects":\s*\{\s*"(?:[^"\\]|\\.)*":\s*\{\s*)?'
 
 BLEND = FileKind("a .blend file", rb"BLENDER|\x28\xb5\x2f\xfd|\x1f\x8b")
-"""Uncompressed, Zstandard or gzip."""
+"""The signatures of an uncompressed file, of Zstandard and of gzip."""
 MODEL = FileKind("a model", rb"\x08[\x01-\x1f][\x12\x1a\x22\x3a]")
 CHECKPOINT = FileKind("the checkpoint of a training", rb"PK\x03\x04.{26}about\.npy")
 REPORT = FileKind("a training report", rb'\s*\{\s*"format":\s*"fdda-report"')

@@ -9,91 +9,93 @@ STYLE = (
     "td,th{border:1px solid #bbb;padding:.2em .6em;text-align:left}pre{background:#eee;padding:.6em;overflow:auto}"
     "code{background:#eee}img{max-width:100%}h2,h3,h4{margin-top:1.6em}:target{background:#fe8}"
 )
-_BLOCK = r"^(#{1,6} |\||    |<img|- |\d+\. )"
+_BLOCK_START = r"^(#{1,6} |\||    |<img|- |\d+\. )"
 
 
 def heading_anchor(heading: str) -> str:
-    """Return the anchor of a heading."""
+    """Return the HTML anchor of a heading."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def make_page(text: str, folder: str) -> str:
-    """Convert Markdown text to a page; relative links and images are resolved against the URL `folder`."""
-    body = "\n".join(_block(block, folder) for block in _blocks(text))
+    """Convert Markdown text to an HTML page; relative links and images are resolved against the URL `folder`."""
+    body = "\n".join(_block_html(block, folder) for block in _split_blocks(text))
     return f'<!doctype html><meta charset="utf-8"><title>FDDA</title><style>{STYLE}</style>\n{body}\n'
 
 
-def _blocks(text: str) -> list[list[str]]:
-    """Split lines into blocks: heading, table, list, code or paragraph."""
+def _split_blocks(text: str) -> list[list[str]]:
+    """Split Markdown text into blocks of lines: headings, tables, lists, code and paragraphs."""
     blocks: list[list[str]] = [[]]
     for line in text.splitlines():
-        own = re.match(_BLOCK, line)
-        kind = own[1].strip()[:1] if own else ""
-        previous = re.match(_BLOCK, blocks[-1][0]) if blocks[-1] else None
-        is_list = previous is not None and (previous[1] == "- " or previous[1][0].isdigit())
+        block_start = re.match(_BLOCK_START, line)
+        first_character = block_start[1].strip()[:1] if block_start else ""
+        previous_start = re.match(_BLOCK_START, blocks[-1][0]) if blocks[-1] else None
+        is_list = previous_start is not None and (previous_start[1] == "- " or previous_start[1][0].isdigit())
         if not line.strip():
             blocks.append([])
-        elif is_list and (own is None or line.startswith("    ")):
+        elif is_list and (block_start is None or line.startswith("    ")):
             blocks[-1].append(line)
-        elif kind == "#" or (blocks[-1] and own and (previous is None or previous[1][:1] != own[1][:1])):
+        elif first_character == "#" or (
+            blocks[-1] and block_start and (previous_start is None or previous_start[1][:1] != block_start[1][:1])
+        ):
             blocks.append([line])
         else:
             blocks[-1].append(line)
     return [block for block in blocks if block]
 
 
-def _block(lines: list[str], folder: str) -> str:
+def _block_html(lines: list[str], folder: str) -> str:
     first = lines[0]
     if heading := re.match(r"(#{1,6}) (.*)", first):
         level = len(heading[1])
-        text = _inline(" ".join([heading[2], *lines[1:]]), folder)
+        text = _inline_html(" ".join([heading[2], *lines[1:]]), folder)
         return f'<h{level} id="{heading_anchor(heading[2])}">{text}</h{level}>'
     if first.startswith("|"):
-        return _table(lines, folder)
+        return _table_html(lines, folder)
     if first.startswith("    "):
         return f"<pre>{html.escape(chr(10).join(line[4:] for line in lines), quote=False)}</pre>"
     if re.match(r"- |\d+\. ", first):
-        return _list(lines, folder)
-    return f"<p>{_inline(' '.join(lines), folder)}</p>"
+        return _list_html(lines, folder)
+    return f"<p>{_inline_html(' '.join(lines), folder)}</p>"
 
 
-def _table(lines: list[str], folder: str) -> str:
+def _table_html(lines: list[str], folder: str) -> str:
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     rows = [row for row in rows if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
-    cells = ["".join(f"<td>{_inline(cell, folder)}</td>" for cell in row) for row in rows]
+    cells = ["".join(f"<td>{_inline_html(cell, folder)}</td>" for cell in row) for row in rows]
     return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
 
 
-def _list(lines: list[str], folder: str) -> str:
+def _list_html(lines: list[str], folder: str) -> str:
     items: list[str] = []
     for line in lines:
-        if own := re.match(r"(?:- |\d+\. )(.*)", line):
-            items.append(own[1])
+        if item_match := re.match(r"(?:- |\d+\. )(.*)", line):
+            items.append(item_match[1])
         else:
             items[-1] += f" {line.strip()}"
-    kind = "ul" if lines[0].startswith("- ") else "ol"
-    return f"<{kind}>" + "".join(f"<li>{_inline(item, folder)}</li>" for item in items) + f"</{kind}>"
+    tag = "ul" if lines[0].startswith("- ") else "ol"
+    return f"<{tag}>" + "".join(f"<li>{_inline_html(item, folder)}</li>" for item in items) + f"</{tag}>"
 
 
-def _inline(text: str, folder: str) -> str:
-    """Convert code, bold, italic, links and images."""
-    kept: list[str] = []
+def _inline_html(text: str, folder: str) -> str:
+    """Convert code, bold text, italic text, links and images inside a block to HTML."""
+    fragments: list[str] = []
 
-    def keep(made: str) -> str:
-        kept.append(made)
-        return f"\0{len(kept) - 1}\0"
+    def protect(fragment: str) -> str:
+        fragments.append(fragment)
+        return f"\0{len(fragments) - 1}\0"
 
-    def picture(match: re.Match) -> str:
-        return keep(f'<img src="{folder}/{html.escape(match[1])}" alt="{html.escape(match[2])}">')
+    def convert_image(match: re.Match) -> str:
+        return protect(f'<img src="{folder}/{html.escape(match[1])}" alt="{html.escape(match[2])}">')
 
-    def link(match: re.Match) -> str:
+    def convert_link(match: re.Match) -> str:
         target = match[2] if match[2].startswith("#") or "://" in match[2] else f"{folder}/{match[2]}"
-        return keep(f'<a href="{html.escape(target)}">') + match[1] + keep("</a>")
+        return protect(f'<a href="{html.escape(target)}">') + match[1] + protect("</a>")
 
-    text = re.sub(r'<img src="([^"]+)"[^>]*alt="([^"]*)"[^>]*>', picture, text)
-    text = re.sub(r"`([^`]+)`", lambda match: keep(f"<code>{html.escape(match[1], quote=False)}</code>"), text)
-    text = re.sub(r"\[([^\]]+)\]\(([^)]+)\)", link, text)
+    text = re.sub(r'<img src="([^"]+)"[^>]*alt="([^"]*)"[^>]*>', convert_image, text)
+    text = re.sub(r"`([^`]+)`", lambda match: protect(f"<code>{html.escape(match[1], quote=False)}</code>"), text)
+    text = re.sub(r"\[([^\]]+)\]\(([^)]+)\)", convert_link, text)
     text = html.escape(text, quote=False)
     text = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", text)
     text = re.sub(r"\*(\S[^*]*?)\*", r"<i>\1</i>", text)
-    return re.sub(r"\0(\d+)\0", lambda match: kept[int(match[1])], text)
+    return re.sub(r"\0(\d+)\0", lambda match: fragments[int(match[1])], text)

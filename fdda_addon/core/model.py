@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The model: one ONNX file that deforms a character. docs/formats.md describes the format."""
+"""Reading of a model: one ONNX file that deforms a character. docs/formats.md describes the format."""
 
 import json
 from dataclasses import asdict, dataclass, field
@@ -27,12 +27,12 @@ CONTROLS_INPUT = "controls"
 POSITIONS_OUTPUT = "positions"
 CONFIDENCE_OUTPUT = "confidence"
 LIMITS_KEY = "limits"
-"""Key of `ModelInfo.training`."""
+"""Key in `ModelInfo.training` for the range of motion."""
 OBJECT_KEY = "object"
-"""Key of `ModelInfo.training`."""
+"""Key in `ModelInfo.training` for the name of the recorded mesh object."""
 MAX_BYTES = 768 << 20
 MAX_METADATA_LENGTH = 16 << 20
-"""Characters of the metadata."""
+"""Largest number of characters of the metadata."""
 CHECKSUM_KEY = "fdda_checksum"
 """Metadata property with the SHA-256 of the graph."""
 
@@ -45,7 +45,7 @@ class ModelPartition:
         joint, influencing, controls, merged: as in `Partition`.
         vertices: number of vertices.
         basis: number of components.
-        reassigned: indices of its vertices that have another main joint.
+        reassigned: indices of the vertices in this partition that have another main joint.
     """
 
     joint: int
@@ -66,14 +66,14 @@ class ModelInfo:
     """The metadata property `fdda` of a model.
 
     Attributes:
-        joints: of the input `pose_matrices`, every parent before its children.
+        joints: joints of the input `pose_matrices`, every parent before its children.
         rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
-        vertex_count: of the mesh.
-        fingerprint: of the recorded rig.
-        partitions: in ascending order of their main joints, the order of the output `confidence`.
+        vertex_count: number of vertices of the mesh.
+        fingerprint: fingerprint of the recorded rig.
+        partitions: partitions in ascending order of their main joints; the output `confidence` has the same order.
         feature_low, feature_high: (J, 12) float32, range of the joint features (core.features) in training.
-        controls: inputs beside the joints, with their ranges in training.
-        held_out_mm: error over the held-out poses, mm, by the names of `metrics.ErrorStatistics`.
+        controls: controls with their ranges in training.
+        held_out_mm: errors over the held-out poses, mm, by the names of `metrics.ErrorStatistics`.
         parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
         constant_bytes: size of the constants of the graph; 0 where unknown.
         training: settings and seed of the training.
@@ -99,7 +99,7 @@ class ModelInfo:
         return tuple(joint.name for joint in self.joints)
 
     def partitions_of(self, rig: Rig) -> tuple[Partition, ...]:
-        """Make the partitions of the model for a rig with the skin weights of its linear skinning."""
+        """Make the partitions of the model for a rig that has the skin weights of the model."""
         return make_partitions(
             rig,
             {p.joint: p.influencing for p in self.partitions},
@@ -109,7 +109,7 @@ class ModelInfo:
         )
 
     def budget(self) -> Budget:
-        """Compute the budget of its graph."""
+        """Compute the budget of the model's graph from the metadata."""
         partitions = [(p.vertices, p.basis, len(p.influencing) + len(p.controls)) for p in self.partitions]
         return compute_budget(len(self.joints), len(self.controls), partitions, self.training)
 
@@ -120,8 +120,8 @@ class ModelInfo:
 
     @property
     def trained_poses(self) -> int:
-        """Number of poses of the recording, with held-out ones; 0 where unknown."""
-        counts = [self.training.get(f"{part}_poses") for part in ("training", "validation", "held_out")]
+        """Number of poses of the recording, including held-out poses; 0 where unknown."""
+        counts = [self.training.get(f"{subset}_poses") for subset in ("training", "validation", "held_out")]
         return sum(counts) if all(type(count) is int for count in counts) else 0
 
     @property
@@ -154,7 +154,7 @@ class ModelInfo:
         """Read the metadata property.
 
         Raises:
-            ValueError: it is damaged or of another version; the text is a clause about the model.
+            ValueError: the metadata is damaged or of another version; the message is a clause about the model.
         """
         try:
             if len(text) > MAX_METADATA_LENGTH:
@@ -180,8 +180,8 @@ def _read_info(value: dict) -> ModelInfo:
         for p in value["partitions"]
     )
     controls = read_controls(value.get("controls", []))
-    count = len(joints)
-    if not all(0 <= joint < count for p in partitions for joint in (p.joint, *p.influencing, *p.merged)):
+    joint_count = len(joints)
+    if not all(0 <= joint < joint_count for p in partitions for joint in (p.joint, *p.influencing, *p.merged)):
         raise ValueError("a partition names a joint that is none of its joints")
     if not all(0 <= control < len(controls) for p in partitions for control in p.controls):
         raise ValueError("a partition names a control that is none of its controls")
@@ -192,7 +192,7 @@ def _read_info(value: dict) -> ModelInfo:
         raise ValueError("a partition has a reassigned vertex that is none of its vertices, or another's")
     if sum(p.vertices for p in partitions) != int(value["vertices"]):
         raise ValueError("the partitions do not add up to the vertices")
-    rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4)
+    rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(joint_count, 4, 4)
     if not np.isfinite(rest_matrices).all():
         raise ValueError("its rest pose holds values that are not numbers")
     info = ModelInfo(
@@ -201,8 +201,8 @@ def _read_info(value: dict) -> ModelInfo:
         int(value["vertices"]),
         Fingerprint.from_json(value["fingerprint"]),
         partitions,
-        np.array(value["training_ranges"]["low"], np.float32).reshape(count, 12),
-        np.array(value["training_ranges"]["high"], np.float32).reshape(count, 12),
+        np.array(value["training_ranges"]["low"], np.float32).reshape(joint_count, 12),
+        np.array(value["training_ranges"]["high"], np.float32).reshape(joint_count, 12),
         controls,
         {str(name): float(error) for name, error in value["held_out_mm"].items()},
         float(value["parity_mm"]),
@@ -223,10 +223,10 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
     """Read and check a model without running it.
 
     Returns:
-        Its metadata and the checked bytes; only these bytes may be run, because the file may change.
+        The metadata and the checked bytes. Only these bytes may be run, because the file may change.
 
     Raises:
-        ModelError: the file cannot be read, or as `check_model`.
+        ModelError: the file cannot be read, or `check_model` refuses it.
     """
     try:
         data = read_input(path, MAX_BYTES)
@@ -241,12 +241,12 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
     """Check the bytes of a model without running it.
 
     Args:
-        data: the bytes.
-        name: of the model in messages.
+        data: bytes of the file.
+        name: name of the model in messages.
 
     Raises:
-        ModelError: no ONNX file, no model of this add-on, damaged, or with inputs, operators, external data, memory or
-            computation that a model does not need.
+        ModelError: the bytes are not an ONNX file, not a model of this add-on, or damaged; or the graph has inputs,
+            operators, external data or a cost that a model does not need.
     """
     if len(data) > MAX_BYTES:
         raise ModelError(f"'{name}' is larger than {MAX_BYTES >> 20} MB and cannot be a model.")
@@ -265,14 +265,14 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         info = ModelInfo.from_json(contents.metadata[METADATA_KEY])
     except ValueError as error:
         raise ModelError(f"The model '{name}' cannot be used: {error}; train it again.") from error
-    controls = {CONTROLS_INPUT: (len(info.controls),)} if info.controls else {}
-    inputs = {POSE_INPUT: (len(info.joints), 4, 4), **controls}
-    outputs = {POSITIONS_OUTPUT: (info.vertex_count, 3), CONFIDENCE_OUTPUT: (len(info.partitions),)}
-    if extra := sorted(set(contents.inputs) - set(inputs)):
-        raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
+    control_inputs = {CONTROLS_INPUT: (len(info.controls),)} if info.controls else {}
+    expected_inputs = {POSE_INPUT: (len(info.joints), 4, 4), **control_inputs}
+    expected_outputs = {POSITIONS_OUTPUT: (info.vertex_count, 3), CONFIDENCE_OUTPUT: (len(info.partitions),)}
+    if unknown_inputs := sorted(set(contents.inputs) - set(expected_inputs)):
+        raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(unknown_inputs)}); train it again.")
     try:
-        check_inputs_and_outputs(contents, inputs, outputs)
-        check_graph(contents, info.budget(), len(data), outputs, len(info.partitions))
+        check_inputs_and_outputs(contents, expected_inputs, expected_outputs)
+        check_graph(contents, info.budget(), len(data), expected_outputs, len(info.partitions))
     except ValueError as error:
         raise ModelError(f"The model '{name}' is refused: {error}; give one that train made.") from error
     if contents.metadata.get(CHECKSUM_KEY) != contents.checksum:
@@ -281,18 +281,18 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
 
 
 def read_skin(data: bytes, info: ModelInfo, name: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Read the fitted skin weights of a model; None where it uses those of the rig.
+    """Read the fitted skin weights of a model; return None where the model uses the skin weights of the rig.
 
     Args:
         data: bytes of a model that `check_model` has checked.
-        info: its metadata.
-        name: of the model in messages.
+        info: metadata of the model.
+        name: name of the model in messages.
 
     Returns:
         (V, I) int32 joints and (V, I) float32 weights, each row summing to 1.
 
     Raises:
-        ModelError: they are damaged.
+        ModelError: the skin weights are damaged.
     """
     text = read_onnx(data).metadata.get(SKIN_KEY)
     if text is None:
@@ -304,7 +304,7 @@ def read_skin(data: bytes, info: ModelInfo, name: Path | str) -> tuple[np.ndarra
 
 
 def read_model_info(path: Path) -> ModelInfo:
-    """Read the metadata of a model; raises as `read_model`."""
+    """Read the metadata of a model; raise the errors of `read_model`."""
     return read_model(path)[0]
 
 
@@ -314,8 +314,8 @@ def check_rig(path: Path, info: ModelInfo, rig: Rig) -> None:
     Raises:
         ModelError: the rigs differ.
     """
-    found = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
-    if found:
+    differences = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    if differences:
         raise ModelError(
-            f"The model '{path}' was trained for another rig: {'; '.join(found)}. Record and train this rig."
+            f"The model '{path}' was trained for another rig: {'; '.join(differences)}. Record and train this rig."
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Check of a model's graph: operators that `train` writes, and a cost that its metadata explains.
+"""Check that the graph of a model has only operators that `train` writes, and a cost that its metadata explains.
 
 The cost of loading and running a graph is bounded before a runtime loads it. The bounds are several times the largest
 known cost, to permit other graphs for the same deformation.
@@ -14,15 +14,15 @@ from .onnx_cost import GraphCost, Shape, compute_graph_cost
 from .onnx_file import ITEM_BYTES, OnnxContents
 
 INPUT_ITEM_NAMES = {3: "joints", 1: "controls"}
-"""Names of what the first dimension of an input counts, by rank of the shape."""
+"""Names of the things that the first dimension of an input counts, by rank of the shape."""
 COST_FACTOR = 8
 """Largest cost of a graph, as a multiple of its budget."""
 FREE_ELEMENTS = 1 << 16
-"""Number of elements that every graph may have."""
+"""Number of elements that every graph may have in addition to its budget."""
 MAX_NODES = 20_000
 BASE_NODES, NODES_PER_PARTITION = 256, 32
 BATCH_POSES = 32
-"""Number of poses for which the cost is computed again, because it must not grow faster than the poses."""
+"""Number of poses for which the cost is computed again: it must not grow faster than the number of poses."""
 DEFAULT_HIDDEN_UNITS = [128, 128]
 MAX_HIDDEN_LAYERS = 16
 MAX_LAYER_UNITS = 1 << 16
@@ -54,7 +54,7 @@ def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, i
         ValueError: the settings are invalid; the text is a clause about the model.
     """
     vertex_counts, component_counts, input_counts = map(list, zip(*partitions, strict=True))
-    # Joints relative to their parents, and relative to main joints.
+    # Features of joints relative to their parents, and relative to the main joints of partitions.
     features = 16 * joints + 3 * controls + 3 * sum(input_counts)
     layer_units = [(FEATURES_PER_JOINT + 3) * max(input_counts), *_read_hidden_units(training), max(component_counts)]
     network_weights = sum(inputs * outputs for inputs, outputs in pairwise(layer_units))
@@ -86,18 +86,18 @@ def check_inputs_and_outputs(contents: OnnxContents, inputs: dict[str, Shape], o
     """Check that inputs and outputs of a graph match its metadata.
 
     Args:
-        contents: of the file.
-        inputs, outputs: shapes without the dimension of poses, by name; only the first output is required.
+        contents: contents of the file.
+        inputs, outputs: expected shapes without the dimension of poses, by name; only the first output is required.
 
     Raises:
-        ValueError: a clause about the graph.
+        ValueError: the check fails; the message is a clause about the graph.
     """
     for name, shape in inputs.items():
         if contents.inputs.get(name, ())[1:] != shape:
             raise ValueError(f"its input '{name}' does not fit its {shape[0]} {INPUT_ITEM_NAMES[len(shape)]}")
-    positions, shape = next(iter(outputs.items()))
-    if contents.outputs.get(positions, ())[1:] != shape:
-        raise ValueError(f"its output '{positions}' does not fit its {shape[0]} vertices")
+    first_output, shape = next(iter(outputs.items()))
+    if contents.outputs.get(first_output, ())[1:] != shape:
+        raise ValueError(f"its output '{first_output}' does not fit its {shape[0]} vertices")
 
 
 def check_graph(
@@ -106,14 +106,14 @@ def check_graph(
     """Check that a graph has only what `train` writes, and costs no more than its metadata explains.
 
     Args:
-        contents: of the file.
-        budget: by its metadata.
-        size: of the file in bytes.
+        contents: contents of the file.
+        budget: budget from the metadata of the model.
+        size: size of the file in bytes.
         outputs: shapes of the outputs without the dimension of poses, by name.
         partition_count: number of partitions of the model.
 
     Raises:
-        ValueError: a clause about the graph.
+        ValueError: the check fails; the message is a clause about the graph.
     """
     if contents.unsupported:
         raise ValueError(f"it has {contents.unsupported[0]}, which train does not write")
@@ -126,11 +126,11 @@ def check_graph(
         raise ValueError(
             f"its constants have {constant_bytes} bytes, more than its joints, vertices and components explain"
         )
-    single, batch = (compute_graph_cost(contents, poses) for poses in (1, BATCH_POSES))
-    _check_cost(single, budget, size, 1)
-    _check_cost(batch, budget, size, BATCH_POSES)
+    single_cost, batch_cost = (compute_graph_cost(contents, poses) for poses in (1, BATCH_POSES))
+    _check_cost(single_cost, budget, size, 1)
+    _check_cost(batch_cost, budget, size, BATCH_POSES)
     for name, shape in outputs.items():
-        for cost, poses in ((single, 1), (batch, BATCH_POSES)):
+        for cost, poses in ((single_cost, 1), (batch_cost, BATCH_POSES)):
             if name in contents.outputs and cost.shapes.get(name) != (poses, *shape):
                 raise ValueError(f"its output '{name}' comes out as {cost.shapes.get(name)}, not as {(poses, *shape)}")
 

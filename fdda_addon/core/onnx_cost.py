@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cost of running a graph, from shape inference without running it.
+"""Cost of running a graph, computed by shape inference without running it.
 
-`SHAPE_RULES` has the operators that a model may use, which are those that `train` writes. An exporter that needs
-another operator adds it with the rule for its shape (https://onnx.ai/onnx/operators/).
+`SHAPE_RULES` has the operators that a model may use, which are the operators that `train` writes. To support another
+operator, add it with a rule that computes the shapes of its outputs (https://onnx.ai/onnx/operators/).
 """
 
 import math
@@ -13,7 +13,7 @@ from .onnx_file import INT64, ITEM_BYTES, OnnxConstant, OnnxContents, OnnxNode
 
 Shape = tuple[int, ...]
 MAX_ELEMENTS = 1 << 40
-"""Largest number of elements of a value."""
+"""Largest number of elements of the outputs of a node."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class GraphCost:
     Attributes:
         elements: number of elements of all outputs of nodes.
         products: number of multiplications in matrix products.
-        folded: number of elements computed from constants alone, when the graph is loaded.
+        folded: number of elements that are computed from constants alone while the graph is loaded (constant folding).
         shapes: shapes of the values, by name.
     """
 
@@ -35,45 +35,48 @@ class GraphCost:
 
 @dataclass
 class _NodeCall:
-    """A node with the shapes of its inputs, and its constant inputs."""
+    """A node with the shapes of its inputs, and its constant inputs; None for an input that is not constant."""
 
     node: OnnxNode
     shapes: list[Shape]
     constants: list[OnnxConstant | None]
 
     def attribute(self, name: str, default: int) -> int:
+        """Return an integer attribute of the node; raise ValueError where it has another type."""
         value = self.node.attributes.get(name, default)
         if not isinstance(value, int):
             raise ValueError(f"a {self.node.operator} whose {name} is no whole number")
         return value
 
-    def integers(self, number: int) -> tuple[int, ...]:
-        """Read the elements of an input that must be a short constant."""
-        if number >= len(self.constants) or self.constants[number] is None:
+    def integers(self, input_index: int) -> tuple[int, ...]:
+        """Return the elements of an input, which must be a short constant; `input_index` is its index."""
+        if input_index >= len(self.constants) or self.constants[input_index] is None:
             raise ValueError(f"a {self.node.operator} whose sizes are no constants")
-        return self.constants[number].integers()
+        return self.constants[input_index].integers()
 
     def axis(self, rank: int, name: str = "axis", default: int = 0) -> int:
-        return _axis(self.attribute(name, default), rank)
+        """Return an attribute that is an axis of a value with `rank` dimensions, 0 to rank - 1."""
+        return _normalize_axis(self.attribute(name, default), rank)
 
 
-def _axis(axis: int, rank: int) -> int:
+def _normalize_axis(axis: int, rank: int) -> int:
+    """Convert an axis, which may count from the end, to 0 to rank - 1; raise ValueError where it does not exist."""
     if not -rank <= axis < rank:
         raise ValueError(f"a value of {rank} dimensions has no axis {axis}")
     return axis % rank
 
 
-def _broadcast(shapes: Sequence[Shape]) -> Shape:
+def _broadcast_shapes(shapes: Sequence[Shape]) -> Shape:
     result: Shape = ()
     for shape in shapes:
         rank = max(len(result), len(shape))
         pairs = zip((1,) * (rank - len(result)) + result, (1,) * (rank - len(shape)) + shape, strict=True)
-        joined = []
-        for one, other in pairs:
-            if one != other and 1 not in (one, other):
+        broadcast = []
+        for result_size, size in pairs:
+            if result_size != size and 1 not in (result_size, size):
                 raise ValueError(f"values of the shapes {' and '.join(map(str, shapes))} do not fit")
-            joined.append(other if one == 1 else one)
-        result = tuple(joined)
+            broadcast.append(size if result_size == 1 else result_size)
+        result = tuple(broadcast)
     return result
 
 
@@ -82,7 +85,7 @@ def _same_shape(call: _NodeCall) -> list[Shape]:
 
 
 def _elementwise(call: _NodeCall) -> list[Shape]:
-    return [_broadcast(call.shapes)]
+    return [_broadcast_shapes(call.shapes)]
 
 
 def _cast(call: _NodeCall) -> list[Shape]:
@@ -95,7 +98,7 @@ def _matmul(call: _NodeCall) -> list[Shape]:
     left, right = call.shapes[:2]
     if min(len(left), len(right)) < 2 or left[-1] != right[-2]:
         raise ValueError(f"matrices of {left} and {right} have no product")
-    return [(*_broadcast((left[:-2], right[:-2])), left[-2], right[-1])]
+    return [(*_broadcast_shapes((left[:-2], right[:-2])), left[-2], right[-1])]
 
 
 def _gemm(call: _NodeCall) -> list[Shape]:
@@ -106,7 +109,7 @@ def _gemm(call: _NodeCall) -> list[Shape]:
     if len(left) != 2 or len(right) != 2 or left[1] != right[0]:
         raise ValueError(f"matrices of {left} and {right} have no product")
     shape = (left[0], right[1])
-    if _broadcast((shape, *call.shapes[2:])) != shape:
+    if _broadcast_shapes((shape, *call.shapes[2:])) != shape:
         raise ValueError("a Gemm adds what is larger than its product")
     return [shape]
 
@@ -120,25 +123,27 @@ def _transpose(call: _NodeCall) -> list[Shape]:
 
 
 def _reshape(call: _NodeCall) -> list[Shape]:
-    shape, wanted = call.shapes[0], list(call.integers(1))
+    shape, new_shape = call.shapes[0], list(call.integers(1))
     if call.attribute("allowzero", 0) == 0:
-        wanted = [shape[i] if size == 0 and i < len(shape) else size for i, size in enumerate(wanted)]
-    if wanted.count(-1) == 1:
-        rest = math.prod(size for size in wanted if size != -1)
-        wanted[wanted.index(-1)] = math.prod(shape) // rest if rest > 0 else 0
-    if min(wanted, default=0) < 0 or math.prod(wanted) != math.prod(shape):
-        raise ValueError(f"a value of {shape} cannot be given the shape {tuple(wanted)}")
-    return [tuple(wanted)]
+        new_shape = [shape[i] if size == 0 and i < len(shape) else size for i, size in enumerate(new_shape)]
+    if new_shape.count(-1) == 1:
+        known_elements = math.prod(size for size in new_shape if size != -1)
+        new_shape[new_shape.index(-1)] = math.prod(shape) // known_elements if known_elements > 0 else 0
+    if min(new_shape, default=0) < 0 or math.prod(new_shape) != math.prod(shape):
+        raise ValueError(f"a value of {shape} cannot be given the shape {tuple(new_shape)}")
+    return [tuple(new_shape)]
 
 
 def _concat(call: _NodeCall) -> list[Shape]:
-    first = call.shapes[0]
-    axis = call.axis(len(first))
+    first_shape = call.shapes[0]
+    axis = call.axis(len(first_shape))
     if any(
-        len(s) != len(first) or (*s[:axis], *s[axis + 1 :]) != (*first[:axis], *first[axis + 1 :]) for s in call.shapes
+        len(other_shape) != len(first_shape)
+        or (*other_shape[:axis], *other_shape[axis + 1 :]) != (*first_shape[:axis], *first_shape[axis + 1 :])
+        for other_shape in call.shapes
     ):
         raise ValueError("values of different shapes are joined")
-    return [(*first[:axis], sum(shape[axis] for shape in call.shapes), *first[axis + 1 :])]
+    return [(*first_shape[:axis], sum(shape[axis] for shape in call.shapes), *first_shape[axis + 1 :])]
 
 
 def _split(call: _NodeCall) -> list[Shape]:
@@ -157,30 +162,30 @@ def _slice(call: _NodeCall) -> list[Shape]:
     if not len(starts) == len(ends) == len(axes) == len(steps) or 0 in steps:
         raise ValueError("a Slice whose bounds are none")
     for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
-        place = _axis(axis, len(shape))
-        shape[place] = len(range(*slice(start, end, step).indices(shape[place])))
+        axis_index = _normalize_axis(axis, len(shape))
+        shape[axis_index] = len(range(*slice(start, end, step).indices(shape[axis_index])))
     return [tuple(shape)]
 
 
 def _gather(call: _NodeCall) -> list[Shape]:
-    shape, chosen = call.shapes[:2]
+    shape, index_shape = call.shapes[:2]
     axis = call.axis(len(shape))
-    return [(*shape[:axis], *chosen, *shape[axis + 1 :])]
+    return [(*shape[:axis], *index_shape, *shape[axis + 1 :])]
 
 
 def _unsqueeze(call: _NodeCall) -> list[Shape]:
     shape, axes = list(call.shapes[0]), call.integers(1)
-    places = sorted({_axis(axis, len(shape) + len(axes)) for axis in axes})
-    if len(places) != len(axes):
+    new_axes = sorted({_normalize_axis(axis, len(shape) + len(axes)) for axis in axes})
+    if len(new_axes) != len(axes):
         raise ValueError("an Unsqueeze that names an axis twice")
-    for axis in places:
+    for axis in new_axes:
         shape.insert(axis, 1)
     return [tuple(shape)]
 
 
 def _reduce(call: _NodeCall) -> list[Shape]:
     shape = call.shapes[0]
-    axes = {_axis(axis, len(shape)) for axis in call.integers(1)}
+    axes = {_normalize_axis(axis, len(shape)) for axis in call.integers(1)}
     if call.attribute("keepdims", 1):
         return [tuple(1 if axis in axes else size for axis, size in enumerate(shape))]
     return [tuple(size for axis, size in enumerate(shape) if axis not in axes)]
@@ -201,31 +206,32 @@ SHAPE_RULES: dict[str, Callable[[_NodeCall], list[Shape]]] = {
 OPERATORS = tuple(SHAPE_RULES)
 MATRIX_PRODUCT_OPERATORS = ("MatMul", "MatMulInteger", "Gemm")
 CONSTANT_INPUT_OPERATORS = ("Cast", "DequantizeLinear")
-"""Operators whose inputs may all be constants; results of other operators would be stored as constants."""
+"""Operators whose inputs may all be constants. `train` stores the results of other operators as constants."""
 
 
 def compute_graph_cost(contents: OnnxContents, poses: int) -> GraphCost:
-    """Infer the shapes of all values of a graph, and add up its cost.
+    """Infer the shapes of all values of a graph, and compute its cost.
 
     Args:
-        contents: of a file, its inputs with the number of poses as their first dimension.
+        contents: contents of the file. The first dimension of each input is the number of poses.
         poses: number of poses.
 
     Raises:
-        ValueError: an operator is not one of `OPERATORS`, or values do not fit; the text is a clause about the graph.
+        ValueError: an operator is not one of `OPERATORS`, or the shapes of values do not match. The message is a clause
+            about the graph.
     """
-    shapes = {name: (poses, *shape[1:]) for name, shape in contents.inputs.items()}
-    fixed = {name: constant.shape for name, constant in contents.constants.items()}
-    cost = GraphCost(0, 0, 0, {**shapes, **fixed})
-    if len(cost.shapes) != len(shapes) + len(fixed):
+    input_shapes = {name: (poses, *shape[1:]) for name, shape in contents.inputs.items()}
+    constant_shapes = {name: constant.shape for name, constant in contents.constants.items()}
+    cost = GraphCost(0, 0, 0, {**input_shapes, **constant_shapes})
+    if len(cost.shapes) != len(input_shapes) + len(constant_shapes):
         raise ValueError("an input and a constant have one name")
-    constant_names = set(fixed)
+    constant_names = set(constant_shapes)
     for node in contents.nodes:
         _add_node(node, contents.constants, constant_names, cost)
     return cost
 
 
-def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str], cost: GraphCost) -> None:
+def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], constant_names: set[str], cost: GraphCost) -> None:
     if node.operator not in SHAPE_RULES:
         raise ValueError(f"it has the operator {node.operator!r}, which train does not write")
     inputs = [name for name in node.inputs if name]
@@ -235,30 +241,30 @@ def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str
         )
     call = _NodeCall(node, [cost.shapes[name] for name in inputs], [constants.get(name) for name in inputs])
     try:
-        found = SHAPE_RULES[node.operator](call)
+        output_shapes = SHAPE_RULES[node.operator](call)
     except IndexError as error:
         raise ValueError(f"a {node.operator} has too few inputs") from error
-    if len(node.outputs) > len(found):
+    if len(node.outputs) > len(output_shapes):
         raise ValueError(f"a {node.operator} gives too many values")
-    elements = sum(math.prod(shape) for shape in found)
+    elements = sum(math.prod(shape) for shape in output_shapes)
     if elements > MAX_ELEMENTS:
         raise ValueError(
             f"a {node.operator} gives {elements} numbers, more than its joints, vertices and components explain"
         )
     cost.elements += elements
     if node.operator in MATRIX_PRODUCT_OPERATORS:
-        cost.products += math.prod(found[0]) * call.shapes[0][-1 if not call.attribute("transA", 0) else -2]
-    if known.issuperset(inputs):
+        cost.products += math.prod(output_shapes[0]) * call.shapes[0][-1 if not call.attribute("transA", 0) else -2]
+    if constant_names.issuperset(inputs):
         if node.operator not in CONSTANT_INPUT_OPERATORS:
             raise ValueError(f"a {node.operator} of constants alone")
         cost.folded += elements
-        known.update(node.outputs)
-    for name, shape in zip(node.outputs, found, strict=False):
+        constant_names.update(node.outputs)
+    for name, shape in zip(node.outputs, output_shapes, strict=False):
         if name in cost.shapes:
             raise ValueError(f"two values are called {name!r}")
         cost.shapes[name] = shape
 
 
 def constant_elements(contents: OnnxContents) -> int:
-    """Count the elements of the constants of a graph, without indices."""
-    return sum(math.prod(c.shape) for c in contents.constants.values() if c.type != INT64)
+    """Count the elements of the constants of a graph, except for integer constants such as indices and shapes."""
+    return sum(math.prod(constant.shape) for constant in contents.constants.values() if constant.type != INT64)

@@ -15,20 +15,21 @@ from typing import TypeVar
 
 RETRY_SECONDS = 10.0
 OPEN_RETRY_SECONDS = 1.0
-"""How long to retry until a file counts as in use; shorter for reading, because access may simply be denied."""
+"""How long an operation is retried before a file counts as in use. The time for opening is shorter, because the cause
+may be missing permission."""
 MAX_PAUSE_SECONDS = 0.1
 IN_USE_TEXT = "another program has it open"
 SHARING_WINERRORS = {5, 32, 33, 1224}
-"""Windows' access denied, sharing violation, lock violation, and user-mapped file."""
+"""Windows error numbers: access denied, sharing violation, lock violation, and user-mapped file."""
 
 Result = TypeVar("Result")
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Rename a file to a path, and replace a file there.
+    """Rename a file to another path; a file at that path is replaced.
 
     Raises:
-        OSError: as `os.replace`; EBUSY where another program has one of them open for longer than `RETRY_SECONDS`.
+        OSError: `os.replace` raised it; EBUSY where another program has a file open for longer than `RETRY_SECONDS`.
     """
     _retry_while_in_use(lambda: os.replace(source, target), target)
 
@@ -37,7 +38,7 @@ def remove_file(path: Path) -> None:
     """Remove a file where it exists.
 
     Raises:
-        OSError: as `os.unlink`; EBUSY where another program has it open for longer than `RETRY_SECONDS`.
+        OSError: `os.unlink` raised it; EBUSY where another program has the file open for longer than `RETRY_SECONDS`.
     """
     _retry_while_in_use(lambda: path.unlink(missing_ok=True), path)
 
@@ -46,37 +47,37 @@ def open_with_retry(open_file: Callable[[], Result]) -> Result:
     """Call a function that opens a file, and retry while Windows refuses it.
 
     Raises:
-        OSError: as `open_file`.
+        OSError: `open_file` raised it.
     """
-    end = time.monotonic() + OPEN_RETRY_SECONDS
+    deadline = time.monotonic() + OPEN_RETRY_SECONDS
     while True:
         try:
             return open_file()
         except PermissionError:
-            # `open` does not say which error of Windows it was.
-            if sys.platform != "win32" or time.monotonic() > end:
+            # The exception of `open` lacks the error number of Windows.
+            if sys.platform != "win32" or time.monotonic() > deadline:
                 raise
         _pause()
 
 
 def _retry_while_in_use(action: Callable[[], None], path: Path) -> None:
-    end = time.monotonic() + RETRY_SECONDS
+    deadline = time.monotonic() + RETRY_SECONDS
     while True:
         try:
             return action()
         except PermissionError as error:
-            if getattr(error, "winerror", None) not in SHARING_WINERRORS or _is_forbidden(path):
+            if getattr(error, "winerror", None) not in SHARING_WINERRORS or _is_permanently_refused(path):
                 raise
-            if time.monotonic() > end:
+            if time.monotonic() > deadline:
                 raise OSError(errno.EBUSY, IN_USE_TEXT, str(path)) from error
         _pause()
 
 
-def _is_forbidden(path: Path) -> bool:
+def _is_permanently_refused(path: Path) -> bool:
     """Return whether Windows refuses a path permanently, because it is a folder or write-protected."""
     return os.path.isdir(path) or (os.path.lexists(path) and not os.access(path, os.W_OK))
 
 
 def _pause() -> None:
-    # A random pause does not stay in step with a program that opens the file at regular times.
+    # With a constant pause, each attempt might coincide with a program that opens the file at regular intervals.
     time.sleep(random.uniform(0.1, 1) * MAX_PAUSE_SECONDS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of output paths that Windows or Blender would refuse, truncate or map to another file."""
+"""Checks for output paths that Windows or Blender would refuse, truncate or resolve to another file."""
 
 import os
 import re
@@ -23,7 +23,7 @@ def check_path(path: Path, *files: Path) -> None:
 
     Args:
         path: file or folder that the user named.
-        files: files that are written there, with temporary ones.
+        files: all files that are written there, including temporary files.
 
     Raises:
         OutputError: a path is too long or has an invalid name.
@@ -39,7 +39,7 @@ def check_path(path: Path, *files: Path) -> None:
 
 
 def path_length_problem(path: Path) -> str:
-    """Describe why an absolute path is too long for Blender or the system; empty where it is not."""
+    """Describe why an absolute path is too long for Blender or the operating system; empty where it is short enough."""
     text = str(path)
     if (size := len(os.fsencode(text))) > MAX_BLENDER_PATH_BYTES:
         return f"it needs a path of {size:,} bytes, and Blender takes {MAX_BLENDER_PATH_BYTES:,}"
@@ -50,21 +50,21 @@ def path_length_problem(path: Path) -> str:
 
 
 def windows_name_problem(path: PurePath) -> str:
-    """Describe the first name in an absolute path that is invalid on Windows; empty for none."""
+    """Describe the first name in an absolute path that is invalid on Windows; empty where all names are valid."""
     for name in PureWindowsPath(path).parts[1:]:
         if _DEVICE_NAME.fullmatch(name):
             return f"'{name}' is the name of a device on Windows"
-        if found := _FORBIDDEN_CHARACTER.search(name):
-            return f"'{name}' has the character {found.group()!r}, which no name on Windows may have"
+        if match := _FORBIDDEN_CHARACTER.search(name):
+            return f"'{name}' has the character {match.group()!r}, which no name on Windows may have"
         if name.rstrip(". ") != name and name != "..":
             return f"'{name}' ends in a dot or a blank, which Windows drops"
     return ""
 
 
 def comparable_path(path: Path) -> str:
-    """Return a text that is equal for two paths of one file, in lower case where the system ignores case."""
-    place = os.path.realpath(path)
-    return place.casefold() if sys.platform in ("win32", "darwin") else place
+    """Return a text that is the same for all paths of a file. It is in lower case on systems that ignore case."""
+    real_path = os.path.realpath(path)
+    return real_path.casefold() if sys.platform in ("win32", "darwin") else real_path
 
 
 def is_windows() -> bool:
@@ -72,7 +72,7 @@ def is_windows() -> bool:
 
 
 def supports_long_windows_paths() -> bool:
-    """Return whether Windows permits long paths, which system and program must enable."""
+    """Return whether Windows permits long paths; both the system and the program must enable them."""
     import ctypes
 
     try:

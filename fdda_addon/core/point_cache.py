@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Point caches: .pc2 files with the positions of a mesh by frame, which most 3D programs read.
 
-Little-endian: the text "POINTCACHE2" and a zero, int32 version, int32 points, float32 first frame, float32 frames a
-sample, int32 samples; then float32 x, y, z of each point, sample by sample.
+The files are little-endian. The header has the text "POINTCACHE2" and a zero byte, int32 version, int32 number of
+points, float32 first frame, float32 frames per sample, and int32 number of samples. Float32 x, y, z of each point
+follow, sample by sample.
 """
 
 import struct
@@ -25,7 +26,7 @@ class PointCache:
 
     Attributes:
         start: frame of the first sample.
-        rate: frames from one sample to the next.
+        rate: number of frames from one sample to the next.
         positions: (samples, points, 3) float32, mapped from disk.
     """
 
@@ -35,7 +36,7 @@ class PointCache:
 
 
 class PointCacheWriter:
-    """Writes a point cache with one sample per frame, in several parts."""
+    """Writes a point cache with one sample per frame; samples are appended in any number of calls."""
 
     def __init__(self, file: BinaryIO, points: int, start: int, samples: int):
         """Args:
@@ -64,20 +65,20 @@ def read_point_cache(path: Path) -> PointCache:
     """Open a point cache.
 
     Raises:
-        PointCacheError: it cannot be read, is of another format, or its size contradicts its header.
+        PointCacheError: the file cannot be read, has another format, or its size contradicts its header.
     """
     try:
         with open(path, "rb") as file:
-            head, size = file.read(HEADER.size), path.stat().st_size
+            header, size = file.read(HEADER.size), path.stat().st_size
     except OSError as error:
         raise PointCacheError(f"The point cache '{path}' cannot be read: {os_error_text(error)}.") from error
-    if len(head) < HEADER.size or not head.startswith(SIGNATURE):
+    if len(header) < HEADER.size or not header.startswith(SIGNATURE):
         raise PointCacheError(f"'{path}' is not a point cache; give a .pc2 file.")
-    _, version, points, start, rate, samples = HEADER.unpack(head)
+    _, version, points, start, rate, samples = HEADER.unpack(header)
     if version != VERSION:
         raise PointCacheError(f"The point cache '{path}' is of version {version} and only version {VERSION} is read.")
-    expected = HEADER.size + 12 * points * samples
-    if points < 1 or samples < 1 or size != expected or not np.isfinite([start, rate]).all():
+    expected_size = HEADER.size + 12 * points * samples
+    if points < 1 or samples < 1 or size != expected_size or not np.isfinite([start, rate]).all():
         raise PointCacheError(
             f"The point cache '{path}' is damaged: it has {size} bytes and its header says {samples} samples of "
             f"{points} points from frame {start:g} on; write it again."

@@ -9,28 +9,28 @@ from .defaults import SPREAD
 
 ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL = "rotation", "rotation_vector", "location", "scale", "control"
 CHANNEL_KINDS = (ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL)
-"""Kinds of channels."""
+"""All kinds of channels."""
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
 
 MAX_CHANNEL_NAME_LENGTH = 2100
-"""Characters of a channel's name in a file; the name of a control has an owner and a path."""
+"""Largest number of characters of a channel's name in a file; the name of a control has an owner and a path."""
 MARGIN_POSE_RATIO = 0.25
-"""Ratio of the random poses that are drawn from the margin."""
+"""Ratio of the random poses that lie in the margin (`Margin`)."""
 MAX_MARGIN = 4.0
 """Largest scale of the range of motion; animators need no wider poses."""
 LOCKED_AXIS_ANGLE = np.pi / 4
-"""Rotation of a locked axis in the margin, radians per unit of the margin's factor above 1."""
+"""Largest rotation of a locked axis in the margin, radians, for each unit by which the factor exceeds 1."""
 RANGE_TOLERANCE = 1e-4
-"""Radians or meters. Largest difference of two equal ranges, which Blender stores as float32."""
+"""Largest difference of two limits that count as equal, radians or meters. Blender stores them as float32."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A number of a pose that can be sampled.
+    """One number of a pose, such as an angle or a location, that random poses vary.
 
     Attributes:
-        name: of the bone, or of the control (`Control.name`).
+        name: name of the bone, or of the control (`Control.name`).
         kind: `ROTATION` (Euler angle, radians), `ROTATION_VECTOR` (one of three components of axis times angle,
             radians), `LOCATION` (meters) or `SCALE` (factor) of a bone, relative to the rest pose, or `CONTROL` (the
             unit of its property).
@@ -46,17 +46,17 @@ class Channel:
 
     @property
     def rest(self) -> float:
-        """The value of the rest pose, clamped to the range."""
+        """Value of the channel in the rest pose, clamped to the range."""
         return min(max(1.0 if self.kind == SCALE else 0.0, self.low), self.high)
 
     @property
     def can_change(self) -> bool:
-        """Whether the range has values other than that of the rest pose."""
+        """Whether the range has values other than the value in the rest pose."""
         rest = 1.0 if self.kind == SCALE else 0.0
         return self.high - rest > RANGE_TOLERANCE or rest - self.low > RANGE_TOLERANCE
 
     def to_json(self) -> dict:
-        """Return the JSON of a file, whose key for the name is `bone`, also for a control."""
+        """Return the JSON for a file. Its key for the name is `bone`, also for a control."""
         values = asdict(self)
         return {"bone": values.pop("name"), **values}
 
@@ -73,9 +73,9 @@ class Channel:
             raise ValueError(f"its range of motion is of a bone called {channel.name!r}")
         if channel.kind not in CHANNEL_KINDS or type(channel.axis) is not int or channel.axis not in range(3):
             raise ValueError(f"its range of motion of {channel.name!r} is of {channel.kind!r}, axis {channel.axis!r}")
-        for end in (channel.low, channel.high):
-            if type(end) not in (int, float) or not np.isfinite(float(end)):
-                raise ValueError(f"its range of motion of {channel.name!r} ends at {end!r}")
+        for limit in (channel.low, channel.high):
+            if type(limit) not in (int, float) or not np.isfinite(float(limit)):
+                raise ValueError(f"its range of motion of {channel.name!r} ends at {limit!r}")
         if channel.low > channel.high:
             raise ValueError(f"its range of motion of {channel.name!r} is {channel.low} to {channel.high}")
         return channel
@@ -88,19 +88,19 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
 
     Args:
         channels: C channels with their ranges.
-        seed: of the recording.
-        index: of the pose in the recording.
+        seed: seed of the recording.
+        index: index of the pose in the recording.
         spread: standard deviation as a ratio of half the range; larger values are closer to uniform.
 
     Returns:
-        (C,) float64, radians or meters, as the channels say.
+        (C,) float64, each in the unit of its channel.
     """
     rng = np.random.default_rng([seed, index])
     low, high = np.array([(channel.low, channel.high) for channel in channels]).T
     offsets = rng.standard_normal(len(channels)) * spread
     while len(outside := np.flatnonzero(np.abs(offsets) > 1)):
         offsets[outside] = rng.standard_normal(len(outside)) * spread
-    # Rounding must not leave the range.
+    # Rounding may lead to values slightly outside of the range.
     return np.clip((low + high) / 2 + (high - low) / 2 * offsets, low, high)
 
 
@@ -108,8 +108,8 @@ def widen_ranges(channels: tuple[Channel, ...], factor: float) -> tuple[Channel,
     """Widen the ranges of channels by a factor, around their centers."""
     widened = []
     for channel in channels:
-        center, half = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
-        widened.append(replace(channel, low=center - half, high=center + half))
+        center, half_width = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
+        widened.append(replace(channel, low=center - half_width, high=center + half_width))
     return tuple(widened)
 
 
@@ -120,7 +120,8 @@ class Margin:
     Attributes:
         factor: scale of the range of motion from which these poses are drawn.
         poses: number of these poses, which are the last of the random poses.
-        channels: of these poses, with scaled ranges; first those of the other poses, then the locked axes.
+        channels: channels of these poses, with scaled ranges: the channels of the other random poses, then the locked
+            axes.
     """
 
     factor: float
@@ -154,23 +155,25 @@ def make_margin(channels: tuple[Channel, ...], locked: tuple[Channel, ...], fact
     Controls keep their ranges, because their properties clamp them, and scales stay above zero.
 
     Args:
-        channels: of the poses inside the range of motion.
+        channels: channels of the poses inside the range of motion.
         locked: locked rotation axes of the same bones, which the margin rotates (`LOCKED_AXIS_ANGLE`).
         factor: scale of the range of motion; 1 for no margin.
         poses: number of all random poses.
     """
-    count = round(poses * MARGIN_POSE_RATIO)
-    if factor == 1 or not count:
+    margin_poses = round(poses * MARGIN_POSE_RATIO)
+    if factor == 1 or not margin_poses:
         return None
     scaled_channels = []
-    for channel, scaled in zip(channels, widen_ranges(channels, factor), strict=True):
+    for channel, scaled_channel in zip(channels, widen_ranges(channels, factor), strict=True):
         if channel.kind == CONTROL:
-            scaled = channel
+            scaled_channel = channel
         elif channel.kind == SCALE:
-            scaled = replace(scaled, low=max(scaled.low, min(channel.low, channel.low / factor)))
-        scaled_channels.append(scaled)
+            scaled_channel = replace(
+                scaled_channel, low=max(scaled_channel.low, min(channel.low, channel.low / factor))
+            )
+        scaled_channels.append(scaled_channel)
     angle = LOCKED_AXIS_ANGLE * (factor - 1)
-    return Margin(factor, count, (*scaled_channels, *(replace(axis, low=-angle, high=angle) for axis in locked)))
+    return Margin(factor, margin_poses, (*scaled_channels, *(replace(axis, low=-angle, high=angle) for axis in locked)))
 
 
 def bones_with_changed_range(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> list[str]:
@@ -182,10 +185,13 @@ def bones_with_changed_range(before: tuple[Channel, ...], after: tuple[Channel, 
             ranges.setdefault(channel.name, {})[channel.kind, channel.axis] = (channel.low, channel.high)
         return ranges
 
-    old, new = by_bone(before), by_bone(after)
+    old_ranges, new_ranges = by_bone(before), by_bone(after)
     return [
         bone
-        for bone in {**new, **old}
-        if old.get(bone, {}).keys() != new.get(bone, {}).keys()
-        or any(not np.allclose(old[bone][key], new[bone][key], atol=RANGE_TOLERANCE) for key in old[bone])
+        for bone in {**new_ranges, **old_ranges}
+        if old_ranges.get(bone, {}).keys() != new_ranges.get(bone, {}).keys()
+        or any(
+            not np.allclose(old_ranges[bone][key], new_ranges[bone][key], atol=RANGE_TOLERANCE)
+            for key in old_ranges[bone]
+        )
     ]

@@ -8,11 +8,11 @@ import numpy as np
 from .poses import Channel
 
 SPARSE_CHOICE_RATIO = 1 / 3
-"""Ratio of the choices by sparsity of recorded poses; the others are chosen by error."""
+"""Ratio of the probes that are chosen by their distance from recorded poses; the others are chosen by their error."""
 JITTER_RATIO = 0.15
-"""Standard deviation around a chosen probe, as a ratio of half the range of motion."""
+"""Standard deviation of the noise that is added to a chosen probe, as a ratio of half the range of motion."""
 WORST_PROBE_RATIO = 0.1
-"""The weight of a partition is its mean error over this ratio of the worst probes."""
+"""The weight of a partition is its mean error over the probes with the largest errors, this ratio of all probes."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,10 @@ class Probes:
     """M poses in which a model was compared with its rig.
 
     Attributes:
-        values: (M, C) float64, of the channels, radians or meters.
+        values: (M, C) float64, values of the channels, radians or meters.
         errors: (M, P) largest error of each partition, meters.
-        distances: (M, P) distance to the nearest recorded pose, of the joints that influence each partition, no unit.
+        distances: (M, P) distance to the nearest recorded pose, computed from the joints that influence each partition,
+            no unit.
     """
 
     values: np.ndarray
@@ -31,51 +32,58 @@ class Probes:
 
 
 def nearest_recorded_distances(points: np.ndarray, recorded: np.ndarray) -> np.ndarray:
-    """Compute the distance of each point to the nearest recorded one, in units of each feature's standard deviation.
+    """Compute the distance of each point to the nearest recorded point.
+
+    Features are divided by their standard deviations, so distances have no unit.
 
     Args:
-        points: (M, F). recorded: (N, F).
+        points: (M, F) features.
+        recorded: (N, F) features of the recorded poses.
 
     Returns:
         (M,) float64, 0 where no feature varies.
     """
-    spread = recorded.std(axis=0, dtype=np.float64)
-    used = spread > spread.max(initial=0) * 1e-3
-    if not used.any():
+    deviations = recorded.std(axis=0, dtype=np.float64)
+    is_varying = deviations > deviations.max(initial=0) * 1e-3
+    if not is_varying.any():
         return np.zeros(len(points))
-    first, second = (array[:, used] / spread[used] for array in (points, recorded))
-    squared = (first**2).sum(axis=1)[:, None] - 2 * first @ second.T + (second**2).sum(axis=1)
-    return np.sqrt(np.maximum(squared.min(axis=1), 0))
+    scaled_points, scaled_recorded = (array[:, is_varying] / deviations[is_varying] for array in (points, recorded))
+    squared_distances = (
+        (scaled_points**2).sum(axis=1)[:, None]
+        - 2 * scaled_points @ scaled_recorded.T
+        + (scaled_recorded**2).sum(axis=1)
+    )
+    return np.sqrt(np.maximum(squared_distances.min(axis=1), 0))
 
 
 def choose_poses(
     probes: Probes,
     channels: tuple[Channel, ...],
     channels_by_partition: list[np.ndarray],
-    base: np.ndarray,
+    base_poses: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Choose poses that improve a model.
 
-    Each pose combines probes for several partitions. In a random order that prefers large errors, each partition sets
-    its channels to those of one of its probes, unless another partition has set one of them; a channel that no
-    partition sets stays as in `base`.
+    Each pose combines probes for several partitions. In a random order that prefers large errors, each partition copies
+    the values of its channels from a probe, unless another partition has already set one of these channels. A channel
+    that no partition sets keeps its value in `base_poses`.
 
     Args:
-        probes: where the model errs.
+        probes: compared poses and their errors.
         channels: C channels with their ranges.
         channels_by_partition: for each of P partitions, indices of the channels that influence it.
-        base: (n, C) random poses to start from.
+        base_poses: (n, C) random poses to start from.
         rng: random generator.
 
     Returns:
         (n, C) float64, inside the ranges.
     """
     low, high = np.array([(channel.low, channel.high) for channel in channels]).T
-    worst = np.sort(probes.errors, axis=0)[-max(1, round(len(probes.errors) * WORST_PROBE_RATIO)) :]
-    weights = worst.mean(axis=0)
+    worst_errors = np.sort(probes.errors, axis=0)[-max(1, round(len(probes.errors) * WORST_PROBE_RATIO)) :]
+    weights = worst_errors.mean(axis=0)
     by_error, by_distance = (_to_probabilities(scores) for scores in (probes.errors, probes.distances))
-    poses = base.copy()
+    poses = base_poses.copy()
     for pose in poses:
         is_free = np.ones(len(channels), bool)
         # Weighted random order without replacement (Efraimidis and Spirakis, 2006).

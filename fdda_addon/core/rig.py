@@ -10,7 +10,7 @@ from .controls import Control
 from .deformation import check_deformation, deformation_differences
 
 STATIC_JOINT = ""
-"""Name of the static joint, which vertices without a bone follow; no bone has this name.
+"""Name of the static joint, which moves vertices without a bone; no bone has this name.
 
 Its rest and pose matrices are the identity, its parent is -1."""
 STATIC_JOINT_LABEL = "no bone"
@@ -18,16 +18,16 @@ STATIC_JOINT_LABEL = "no bone"
 
 MAX_HASH_LENGTH = 128
 REST_MATRIX_TOLERANCE = 1e-4
-"""Largest difference of two equal rest matrices in one element; meters for translations, no unit for rotations.
+"""Largest difference of an element between two rest matrices that count as equal; meters for translations.
 
 Versions of Blender compute a bone's matrix with different rounding, so the comparison cannot be exact."""
 
 MAX_NAME_LENGTH = 1000
-"""Characters of a name in a file; names in Blender have at most a quarter of it."""
+"""Largest number of characters of a name in a file; names in Blender have at most 255."""
 
 
 def read_name(value: object) -> str:
-    """Read a name from a file; raise TypeError or ValueError where it is invalid."""
+    """Check a name that was read from a file, and return it; raise TypeError or ValueError where it is invalid."""
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is not a name")
     if len(value) > MAX_NAME_LENGTH:
@@ -37,7 +37,7 @@ def read_name(value: object) -> str:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint: the bone's name and the index of its parent joint, -1 for a root."""
+    """A joint: the name of its bone, and the index of its parent joint; -1 for a root joint."""
 
     name: str
     parent: int
@@ -47,7 +47,8 @@ def read_joints(values: list) -> tuple[Joint, ...]:
     """Read the joints of a recording or model.
 
     Raises:
-        KeyError, TypeError, ValueError: they are damaged, two have the same name, or one comes before its parent.
+        KeyError, TypeError, ValueError: the joints are damaged, two have the same name, or a joint comes before its
+            parent.
     """
     if not isinstance(values, list):
         raise TypeError("its joints are not a list")
@@ -62,7 +63,7 @@ def read_joints(values: list) -> tuple[Joint, ...]:
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """Fingerprint of a rig: hashes and settings that show in what two rigs differ.
+    """Hashes and settings of a rig, from which the differences between two rigs are found.
 
     Attributes:
         topology, rest_positions, skin_weights: hashes.
@@ -106,9 +107,9 @@ class Rig:
         joints: J joints, every parent before its children.
         rest_positions: (V, 3) float32, mesh-object space, mesh units (see `metres_per_unit`).
         rest_matrices: (J, 4, 4) float32, rest pose of the joints in mesh-object space, column vectors.
-        skin_joints: (V, I) int32, indices of the joints that a vertex follows; unused entries are 0.
+        skin_joints: (V, I) int32, indices of the joints with a weight on each vertex; unused entries are 0.
         skin_weights: (V, I) float32, weights of these joints; each row sums to 1, unused entries are 0.
-        fingerprint: of topology, rest positions and weights.
+        fingerprint: hashes of topology, rest positions and skin weights.
         face_starts: (F,) int32, first corner of each face in `face_vertices`; empty where faces are unknown.
         face_vertices: (C,) int32, vertex indices of the corners, face by face.
         controls: the inputs beside the joints.
@@ -132,7 +133,7 @@ class Rig:
 
     @property
     def parents(self) -> np.ndarray:
-        """(J,) int32, the parent index of each joint, -1 for a root."""
+        """(J,) int32, index of the parent of each joint; -1 for a root joint."""
         return np.array([joint.parent for joint in self.joints], np.int32)
 
     @property
@@ -155,7 +156,7 @@ def rest_matrices_match(rest_matrices: np.ndarray, rig: Rig) -> bool:
 def rig_differences(
     joints: tuple[Joint, ...], rest_matrices: np.ndarray, vertex_count: int, fingerprint: Fingerprint, rig: Rig
 ) -> list[str]:
-    """List in what a rig differs from the rig of a recording or model.
+    """List the differences between a rig and the rig of a recording or model.
 
     Args:
         joints, rest_matrices, vertex_count, fingerprint: of the recording or model, as in `Rig`.
@@ -170,29 +171,29 @@ def rig_differences(
     file_joints, rig_joints = {j.name for j in joints}, set(rig.joint_names)
     if file_joints != rig_joints:
         if missing := sorted(file_joints - rig_joints):
-            clauses.append(f"the armature lacks {_listed_joints(missing)}")
+            clauses.append(f"the armature lacks {_format_joints(missing)}")
         if STATIC_JOINT in rig_joints - file_joints:
             clauses.append("some vertices follow no bone")
         if extra := sorted(rig_joints - file_joints - {STATIC_JOINT}):
-            clauses.append(f"it does not know {_listed_joints(extra)}")
+            clauses.append(f"it does not know {_format_joints(extra)}")
     elif joints != rig.joints:
         clauses.append("its joints have other parents")
     elif rest_matrices.shape != rig.rest_matrices.shape or (not rest_matrices_match(rest_matrices, rig)):
         clauses.append("the rest pose of the armature differs")
     if not clauses:
-        for attribute, name in (
+        for attribute, label in (
             ("topology", "the topology of the mesh"),
             ("rest_positions", "the rest pose of the mesh"),
             ("skin_weights", "the skin weights"),
         ):
             if getattr(fingerprint, attribute) != getattr(rig.fingerprint, attribute):
-                clauses.append(f"{name} differ" + ("s" if attribute != "skin_weights" else ""))
+                clauses.append(f"{label} differ" + ("s" if attribute != "skin_weights" else ""))
         clauses += deformation_differences(fingerprint.deformation, rig.fingerprint.deformation, rig.controls)
     return clauses
 
 
-def _listed_joints(names: list[str], max_names: int = 3) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:max_names])
-    return f"the {'joint' if len(names) == 1 else 'joints'} {shown}" + (
+def _format_joints(names: list[str], max_names: int = 3) -> str:
+    shown_names = ", ".join(f"'{name}'" for name in names[:max_names])
+    return f"the {'joint' if len(names) == 1 else 'joints'} {shown_names}" + (
         f" and {len(names) - max_names} more" if len(names) > max_names else ""
     )

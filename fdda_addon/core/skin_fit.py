@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fitted skin weights: the report of a fit, and the weights as text for a model's metadata.
+"""Fitted skin weights: the report of a fit, and the encoding of the weights as text for a model's metadata.
 
-docs/formats.md describes both.
+docs/formats.md describes the formats.
 """
 
 import base64
@@ -12,9 +12,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 FIT_KINDS = ("hard", "smooth")
-"""Kinds of fits: one joint per vertex, or at most `INFLUENCES`."""
+"""Kinds of fits: one joint per vertex, or at most `INFLUENCES` joints per vertex."""
 INFLUENCES = 4
+"""Number of fitted skin weights of a vertex."""
 MAX_INFLUENCES = 64
+"""Largest number of skin weights of a vertex in the metadata of a model."""
 
 
 @dataclass(frozen=True)
@@ -22,14 +24,15 @@ class FitReport:
     """Distances of linear skinning from the rig over poses and vertices, mm.
 
     Attributes:
-        rms_mm, max_mm: by "rig" for the rig's own weights, and "fitted".
+        rms_mm, max_mm: distances by the skin weights that were used: "rig" for the rig's own, and "fitted".
     """
 
     rms_mm: dict[str, float]
     max_mm: dict[str, float]
 
-    def format_errors(self, way: str) -> str:
-        return f"{self.rms_mm[way]:.2f} rms and {self.max_mm[way]:.1f} max"
+    def format_errors(self, weights_kind: str) -> str:
+        """Format the distances for "rig" or "fitted": "1.25 rms and 8.0 max"."""
+        return f"{self.rms_mm[weights_kind]:.2f} rms and {self.max_mm[weights_kind]:.1f} max"
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class SkinFit:
         """Read the JSON of `to_json`.
 
         Raises:
-            KeyError, TypeError, ValueError: it is damaged.
+            KeyError, TypeError, ValueError: the JSON is damaged.
         """
         if value["kind"] not in FIT_KINDS or type(value["poses"]) is not int or value["poses"] < 0:
             raise ValueError(f"skin weights were fitted {value['kind']!r} to {value['poses']!r} poses")
@@ -75,10 +78,13 @@ class SkinFit:
 
 
 def _read_fit_report(value: dict) -> FitReport:
-    rows = [{way: float(value[name][way]) for way in ("rig", "fitted")} for name in ("rms_mm", "max_mm")]
-    if not np.isfinite([list(row.values()) for row in rows]).all():
+    distances = [
+        {weights_kind: float(value[name][weights_kind]) for weights_kind in ("rig", "fitted")}
+        for name in ("rms_mm", "max_mm")
+    ]
+    if not np.isfinite([list(values.values()) for values in distances]).all():
         raise ValueError("the errors of a fit are not numbers")
-    return FitReport(*rows)
+    return FitReport(*distances)
 
 
 def are_skin_weights(joints: np.ndarray, weights: np.ndarray, joint_count: int) -> bool:
@@ -106,7 +112,8 @@ def skin_from_text(text: str, vertex_count: int, joint_count: int) -> tuple[np.n
     """Decode the text of `skin_to_text` to (V, I) int32 joints and (V, I) float32 weights.
 
     Raises:
-        ValueError: it is damaged, or for other numbers of vertices and joints; the message is a clause about the model.
+        ValueError: the text is damaged, or has other numbers of vertices or joints. The message is a clause about the
+            model.
     """
     try:
         if len(text) > 2 * (-(-4 * vertex_count * MAX_INFLUENCES // 3) * 4) + (1 << 20):
@@ -114,10 +121,10 @@ def skin_from_text(text: str, vertex_count: int, joint_count: int) -> tuple[np.n
         value = json.loads(text)
         influences = value["influences"]
         if type(influences) is not int or not 1 <= influences <= MAX_INFLUENCES:
-            raise ValueError(f"they have {influences!r} places a vertex")
-        # Before anything is decoded: four bytes a number, four characters for three bytes.
-        length = -(-4 * vertex_count * influences // 3) * 4
-        if any(len(value[name]) != length for name in ("joints", "weights")):
+            raise ValueError(f"they have {influences!r} joints per vertex")
+        # Check the length before decoding. A number has four bytes; Base64 encodes three bytes as four characters.
+        encoded_length = -(-4 * vertex_count * influences // 3) * 4
+        if any(len(value[name]) != encoded_length for name in ("joints", "weights")):
             raise ValueError(f"they are not for {vertex_count} vertices")
         joints, weights = (
             np.frombuffer(base64.b64decode(value[name], validate=True), dtype).reshape(vertex_count, influences)

@@ -28,25 +28,28 @@ def skin_matrices(pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.nd
 
 
 MIN_COLUMN_LENGTH = 1e-12
+"""Smallest length of a column of an invertible matrix."""
 MIN_COLUMN_VOLUME = 1e-6
-"""Smallest volume of the parallelepiped of three normalized columns."""
+"""Smallest volume of the parallelepiped that the three normalized columns of an invertible matrix span."""
 
 
 def are_invertible(matrices: np.ndarray) -> np.ndarray:
-    """Return which of (..., 4, 4) matrices are invertible affine transforms, as (...,) bool."""
+    """Return (...,) bool: which of (..., 4, 4) matrices are invertible affine transforms."""
     columns = matrices[..., :3, :3].astype(np.float64)
     lengths = np.linalg.norm(columns, axis=-2)
-    unit = columns / np.maximum(lengths, MIN_COLUMN_LENGTH)[..., None, :]
-    volume = np.abs(np.einsum("...a,...a->...", np.cross(unit[..., 0], unit[..., 1]), unit[..., 2]))
-    affine = np.abs(matrices[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1) <= 1e-3
-    return (lengths > MIN_COLUMN_LENGTH).all(axis=-1) & (volume > MIN_COLUMN_VOLUME) & affine
+    unit_columns = columns / np.maximum(lengths, MIN_COLUMN_LENGTH)[..., None, :]
+    volume = np.abs(
+        np.einsum("...a,...a->...", np.cross(unit_columns[..., 0], unit_columns[..., 1]), unit_columns[..., 2])
+    )
+    is_affine = np.abs(matrices[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1) <= 1e-3
+    return (lengths > MIN_COLUMN_LENGTH).all(axis=-1) & (volume > MIN_COLUMN_VOLUME) & is_affine
 
 
 class SkinBlock:
-    """Linear skinning of one partition as one constant matrix.
+    """Linear skinning of one partition, expressed as one constant matrix.
 
-    With S the horizontally stacked skin matrices of the partition's joints, `S @ weighted_rest` skins all vertices:
-    one matrix product in place of a gather per weight.
+    Let S be the horizontally stacked skin matrices of the partition's joints. `S @ weighted_rest` skins all vertices:
+    one matrix product replaces a gather for each skin weight.
 
     Attributes:
         joints: (Jp,) int32, joints with a weight in the partition.
@@ -57,14 +60,16 @@ class SkinBlock:
         skin_joints = rig.skin_joints[partition.vertices]
         skin_weights = rig.skin_weights[partition.vertices]
         self.joints = np.unique(skin_joints[skin_weights > 0]).astype(np.int32)
-        dense = np.zeros((len(self.joints), len(partition.vertices)), np.float32)
+        dense_weights = np.zeros((len(self.joints), len(partition.vertices)), np.float32)
         for slot in range(skin_joints.shape[1]):
-            used = np.flatnonzero(skin_weights[:, slot] > 0)
-            dense[np.searchsorted(self.joints, skin_joints[used, slot]), used] += skin_weights[used, slot]
-        rest = np.concatenate(
+            vertices_in_slot = np.flatnonzero(skin_weights[:, slot] > 0)
+            dense_weights[np.searchsorted(self.joints, skin_joints[vertices_in_slot, slot]), vertices_in_slot] += (
+                skin_weights[vertices_in_slot, slot]
+            )
+        homogeneous_rest = np.concatenate(
             [rig.rest_positions[partition.vertices], np.ones((len(partition.vertices), 1), np.float32)], axis=1
         )
-        self.weighted_rest = (dense[:, None, :] * rest.T[None]).reshape(-1, len(partition.vertices))
+        self.weighted_rest = (dense_weights[:, None, :] * homogeneous_rest.T[None]).reshape(-1, len(partition.vertices))
 
 
 class LinearSkinning:
@@ -74,7 +79,7 @@ class LinearSkinning:
         self.rig = rig
         self.partitions = make_partitions(rig) if partitions is None else partitions
         self._blocks = [SkinBlock(rig, partition) for partition in self.partitions]
-        # Vertices sorted by partition, and the inverse: one gather of all is far cheaper than one per partition.
+        # One gather of all vertices, sorted by partition, is far cheaper than one gather per partition.
         self._order = np.concatenate([partition.vertices for partition in self.partitions])
         self._inverse_order = np.argsort(self._order)
 
@@ -98,7 +103,7 @@ class LinearSkinning:
 
         Args:
             pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-            positions: (N, V, 3), evaluated by the rig, mesh-object space, mesh units.
+            positions: (N, V, 3) positions that the rig evaluates, mesh-object space, mesh units.
 
         Returns:
             (N, V, 3) float32, axes of the main joint, mesh units.
@@ -108,17 +113,17 @@ class LinearSkinning:
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         try:
-            inverse = np.linalg.inv(skin[:, :, :, :3])
+            inverse_skin = np.linalg.inv(skin[:, :, :, :3])
         except np.linalg.LinAlgError as error:
-            flat = np.abs(np.linalg.det(pose_matrices[:, :, :3, :3].astype(np.float64))).min(axis=0)
+            smallest_volumes = np.abs(np.linalg.det(pose_matrices[:, :, :3, :3].astype(np.float64))).min(axis=0)
             raise RigError(
-                f"Bone '{self.rig.joint_names[int(flat.argmin())]}' has a scale of zero in some pose; "
+                f"Bone '{self.rig.joint_names[int(smallest_volumes.argmin())]}' has a scale of zero in some pose; "
                 "look for the key, constraint or driver that sets it."
             ) from error
         ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
         for partition, block, values in self._iterate_partitions(ordered):
             values -= _skinned_positions(skin, block)
-            values[:] = values @ inverse[:, partition.joint].transpose(0, 2, 1)
+            values[:] = values @ inverse_skin[:, partition.joint].transpose(0, 2, 1)
         return np.take(ordered, self._inverse_order, axis=1)
 
     def complex_positions(self, pose_matrices: np.ndarray, local_residuals: np.ndarray) -> np.ndarray:
@@ -148,7 +153,7 @@ class LinearSkinning:
 
 def _skinned_positions(skin: np.ndarray, block: SkinBlock) -> np.ndarray:
     """Skin a partition with (N, J, 3, 4) skin matrices; returns (N, Vp, 3), mesh units."""
-    # One product per pose: in one product of all, the last bits would depend on the number of poses, and a resumed
-    # recording must have the same bytes as an uninterrupted one.
+    # One product per pose: in one product for all poses, the last bits would depend on the number of poses. A resumed
+    # recording must have the same bytes as an uninterrupted recording.
     rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
     return (rows @ block.weighted_rest).transpose(0, 2, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The surface of a mesh, and errors that shading shows: angles between normals, lengths of edges."""
+"""Surface of a mesh, and errors that are visible in shading: angles between normals, differences of edge lengths."""
 
 from dataclasses import dataclass
 
@@ -33,19 +33,19 @@ def adjacent_corners(face_starts: np.ndarray, face_vertices: np.ndarray) -> tupl
     Returns:
         (C,) int64 indices of the previous and of the next corners.
     """
-    after = np.arange(1, len(face_vertices) + 1)
-    after[np.append(face_starts[1:], len(face_vertices)) - 1] = face_starts
-    before = np.empty_like(after)
-    before[after] = np.arange(len(face_vertices))
-    return before, after
+    next_corner = np.arange(1, len(face_vertices) + 1)
+    next_corner[np.append(face_starts[1:], len(face_vertices)) - 1] = face_starts
+    previous_corner = np.empty_like(next_corner)
+    previous_corner[next_corner] = np.arange(len(face_vertices))
+    return previous_corner, next_corner
 
 
 class Surface:
     """The faces of a mesh, prepared to compute the normals of many poses.
 
     Attributes:
-        vertices: (n,) int32, ascending indices of the vertices with faces; only these have normals.
-        edges: (E, 2) int32, vertices of the edges of the faces, each edge once, the lower vertex first.
+        vertices: (n,) int32, ascending indices of the vertices that belong to faces; only these have normals.
+        edges: (E, 2) int32, indices of the vertices of each edge, the lower index first; each edge occurs once.
     """
 
     def __init__(self, face_starts: np.ndarray, face_vertices: np.ndarray):
@@ -71,36 +71,40 @@ class Surface:
             positions: (V, 3), one pose.
 
         Returns:
-            (n, 3) float64 unit vectors, of `vertices`; zero where all faces at a vertex have no area.
+            (n, 3) float64 unit vectors for `vertices`; zero where all faces at a vertex have no area.
         """
-        # Differences of corners keep their precision far from the origin.
+        # Far from the origin, differences of corner positions are more precise than the positions.
         corners = positions[self._corners].astype(np.float64)
-        along = corners[self._next] - corners
-        from_first = corners - corners[self._starts][self._face_of_corner]
-        faces = _unit(np.add.reduceat(np.cross(from_first, along), self._starts))
-        along = _unit(along)
-        angles = np.arccos(np.clip(-np.einsum("cx,cx->c", along, along[self._previous]), -1, 1))
-        weighted = faces[self._face_of_corner] * angles[:, None]
-        return _unit(np.add.reduceat(weighted[self._by_vertex], self._vertex_starts))
+        edge_vectors = corners[self._next] - corners
+        from_first_corner = corners - corners[self._starts][self._face_of_corner]
+        face_normals = _normalize(np.add.reduceat(np.cross(from_first_corner, edge_vectors), self._starts))
+        edge_vectors = _normalize(edge_vectors)
+        corner_angles = np.arccos(np.clip(-np.einsum("cx,cx->c", edge_vectors, edge_vectors[self._previous]), -1, 1))
+        weighted_normals = face_normals[self._face_of_corner] * corner_angles[:, None]
+        return _normalize(np.add.reduceat(weighted_normals[self._by_vertex], self._vertex_starts))
 
     def edge_lengths(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the (E,) edge lengths of (V, 3) positions, in their unit."""
+        """Compute the (E,) edge lengths of (V, 3) positions, in the unit of the positions."""
         ends = positions[self.edges]
         return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _normalize(vectors: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
 
 def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Compute the angles between (n, 3) unit vectors; (n,) float64 degrees, 90 where one is zero, 0 where both are."""
+    """Compute the angles between (n, 3) unit vectors.
+
+    Returns:
+        (n,) float64, degrees; 90 where one of two vectors is zero, and 0 where both are zero.
+    """
     # The arc cosine is inexact for small angles: an error of 1e-8 in the dot product is 0.008 degrees.
     cross = np.linalg.norm(np.cross(first, second), axis=-1)
     dot = np.einsum("nx,nx->n", first, second)
-    lost = first.any(axis=-1) != second.any(axis=-1)
-    return np.where(lost, 90.0, np.degrees(np.arctan2(cross, dot)))
+    is_one_zero = first.any(axis=-1) != second.any(axis=-1)
+    return np.where(is_one_zero, 90.0, np.degrees(np.arctan2(cross, dot)))
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,8 @@ class SurfaceErrors:
     Attributes:
         angles: (N, n) float32, between the normals, degrees.
         across: (N,) float64, mean relative error of the lengths of edges between two partitions.
-        beside: (N,) float64, the same for edges inside of partitions that touch a border.
-        inside: (N,) float64, the same for all edges inside of partitions.
+        beside: (N,) float64, mean relative error for edges inside of partitions that touch an edge between partitions.
+        inside: (N,) float64, mean relative error for all edges inside of partitions.
     """
 
     angles: np.ndarray
@@ -125,7 +129,7 @@ class SurfaceErrors:
         return {"mean": float(angles.mean()), "p99": float(np.percentile(angles, 99)), "max": float(angles.max())}
 
     def edges_json(self) -> dict:
-        """Return mean relative errors of edge lengths; None for a kind without edges."""
+        """Return the mean relative error of edge lengths for each kind of edges; None for a kind without edges."""
         mean_errors = {
             kind: float(errors.mean()) if np.isfinite(errors).all() else None
             for kind, errors in (("across", self.across), ("beside", self.beside), ("inside", self.inside))
@@ -135,7 +139,10 @@ class SurfaceErrors:
 
 
 def surface_json(fdda: SurfaceErrors | None, linear: SurfaceErrors | None) -> dict:
-    """Return `normals` (degrees) and `edges` (relative) of the model and of linear skinning; None without faces."""
+    """Return the errors `normals` (degrees) and `edges` (relative) of the model and of linear skinning.
+
+    Both are None where the mesh has no faces.
+    """
     if fdda is None or linear is None:
         return {"normals": None, "edges": None}
     methods = {"fdda": fdda, "linear": linear}
@@ -146,41 +153,43 @@ def surface_json(fdda: SurfaceErrors | None, linear: SurfaceErrors | None) -> di
 
 
 class SurfaceComparison:
-    """Compares surfaces with the surface of the rig, one pose at a time."""
+    """Comparison of deformed surfaces with the surface that the rig evaluates, one pose at a time."""
 
     def __init__(self, surface: Surface, rest_positions: np.ndarray, partitions: tuple[Partition, ...]):
         """Args:
-        surface: of the mesh.
+        surface: surface of the mesh.
         rest_positions: (V, 3), mesh units.
-        partitions: of the mesh.
+        partitions: partitions of the mesh.
         """
         self._surface = surface
         self._rest_lengths = surface.edge_lengths(rest_positions).astype(np.float64)
         partition_of = np.empty(len(rest_positions), np.int32)
         for index, partition in enumerate(partitions):
             partition_of[partition.vertices] = index
-        measured = self._rest_lengths > 0
-        crosses = np.diff(partition_of[surface.edges], axis=1)[:, 0] != 0
-        at_border = np.isin(surface.edges, surface.edges[crosses]).any(axis=1)
-        kinds = (crosses, ~crosses & at_border, ~crosses)
-        self._kinds = [np.flatnonzero(kind & measured) for kind in kinds]
+        has_length = self._rest_lengths > 0
+        crosses_border = np.diff(partition_of[surface.edges], axis=1)[:, 0] != 0
+        at_border = np.isin(surface.edges, surface.edges[crosses_border]).any(axis=1)
+        edge_kinds = (crosses_border, ~crosses_border & at_border, ~crosses_border)
+        self._kinds = [np.flatnonzero(is_of_kind & has_length) for is_of_kind in edge_kinds]
 
-    def compare(self, true: np.ndarray, others: tuple[np.ndarray, ...]) -> list[tuple[np.ndarray, float, float, float]]:
-        """Compare positions of a pose with those of the rig.
+    def compare(
+        self, rig_positions: np.ndarray, compared_positions: tuple[np.ndarray, ...]
+    ) -> list[tuple[np.ndarray, float, float, float]]:
+        """Compare surfaces in one pose with the surface of the rig.
 
         Args:
-            true: (V, 3) of the rig, mesh units.
-            others: one or more arrays of the same shape and unit.
+            rig_positions: (V, 3) positions that the rig evaluates, mesh units.
+            compared_positions: one or more arrays of positions, of the same shape and unit.
 
         Returns:
-            One row of the arrays of `SurfaceErrors` for each of `others`.
+            For each array of `compared_positions`, one row of the arrays of `SurfaceErrors`.
         """
         surface = self._surface
-        normals, lengths = surface.normals(true), surface.edge_lengths(true)
+        normals, lengths = surface.normals(rig_positions), surface.edge_lengths(rig_positions)
         rows = []
-        for other in others:
-            angles = angles_between(normals, surface.normals(other)).astype(np.float32)
-            errors = np.abs(surface.edge_lengths(other) - lengths)
+        for positions in compared_positions:
+            angles = angles_between(normals, surface.normals(positions)).astype(np.float32)
+            errors = np.abs(surface.edge_lengths(positions) - lengths)
             rows.append((angles, *(self._mean(errors, edges) for edges in self._kinds)))
         return rows
 
@@ -189,5 +198,5 @@ class SurfaceComparison:
 
 
 def surface_errors(rows: list[tuple[np.ndarray, float, float, float]]) -> SurfaceErrors:
-    """Collect the rows of `SurfaceComparison.compare` for one method over all poses, at least one."""
+    """Combine the rows of `SurfaceComparison.compare` for one method; `rows` has one row per pose, at least one."""
     return SurfaceErrors(*(np.array(column) for column in zip(*rows, strict=True)))

@@ -4,9 +4,9 @@
 import math
 
 METRES_PER_UNIT = "metres_per_unit"
-"""Key of `recording.json` and of a model's metadata; left out where a unit is one meter."""
+"""Key in `recording.json` and in a model's metadata; left out where a unit is one meter."""
 UNIT_TOLERANCE = 1e-6
-"""A unit counts as one meter within this difference, meters."""
+"""Largest difference in meters at which a unit counts as one meter."""
 
 
 def unit_to_json(metres_per_unit: float) -> dict[str, float]:

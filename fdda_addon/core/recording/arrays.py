@@ -80,7 +80,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
         RecordingError: it is missing, not a regular file, truncated, or of another shape or dtype.
     """
     try:
-        with open_input(path, follow=False) as file:
+        with open_input(path, follow_links=False) as file:
             found_shape, found_dtype = read_array_header(file)
             # An interrupted extension may leave more poses than the index counts.
             longer = path.stem in STREAMED_ARRAY_NAMES and found_shape[:1] > shape[:1] and found_shape[1:] == shape[1:]

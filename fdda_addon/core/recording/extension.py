@@ -48,7 +48,7 @@ class RecordingExtension:
             )
             self._shapes = {name: shapes[name] for name in STREAMED_ARRAY_NAMES if name in shapes}
             for streamed in self._shapes:
-                self._files[streamed] = open_input(self.path / f"{streamed}.npy", "r+b", follow=False)
+                self._files[streamed] = open_input(self.path / f"{streamed}.npy", "r+b", follow_links=False)
         except OSError as error:
             self._close()
             raise self._write_error(error) from error

@@ -194,7 +194,7 @@ def _dtype(name: str) -> type:
 def _read_array(path: Path, dimensions: int, dtype: type) -> np.ndarray:
     """Memory-map an array after its header and size are checked."""
     try:
-        with open_input(path, follow=False) as file:
+        with open_input(path, follow_links=False) as file:
             shape, found_dtype = read_array_header(file)
             if len(shape) != dimensions or found_dtype != np.dtype(dtype):
                 raise _damaged_error(path.parent, f"'{path.name}' holds something else")

@@ -109,7 +109,7 @@ def read_index(path: Path) -> dict:
     try:
         # Python reads NaN and infinity, which JSON does not have.
         constants: list[str] = []
-        data = read_input(index_path, MAX_INDEX_BYTES, follow=False)
+        data = read_input(index_path, MAX_INDEX_BYTES, follow_links=False)
         index = json.loads(data, parse_constant=lambda name: constants.append(name) or float(name.lower()))
     except FileNotFoundError as error:
         raise RecordingError(f"'{path}' is not a recording: it has no {INDEX_NAME}; make one with record.") from error

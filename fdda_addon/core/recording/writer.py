@@ -137,7 +137,7 @@ class RecordingWriter:
             if self.complete:
                 self._check_array(path, header, end)
                 check_poses(self.path, name, open_array(path, shape, dtype, self.complete))
-            self._files[name] = file = open_input(path, "r+b" if self.complete else "x+b", follow=False)
+            self._files[name] = file = open_input(path, "r+b" if self.complete else "x+b", follow_links=False)
             file.write(header)
             file.truncate(end)
             file.seek(0, os.SEEK_END)
@@ -152,7 +152,7 @@ class RecordingWriter:
     def _check_array(self, path: Path, header: bytes, end: int) -> None:
         """Raise RecordingError where an array has fewer poses than the index counts as complete."""
         try:
-            with open_input(path, follow=False) as file:
+            with open_input(path, follow_links=False) as file:
                 is_complete = file.read(len(header)) == header and file.seek(0, os.SEEK_END) >= end
         except OSError:
             is_complete = False
