@@ -95,7 +95,7 @@ def test_a_mesh_with_other_axes_is_reported(clean_recording, axis, angle):
     # A rotation by 180 degrees about X and one about Y look the same on the tube.
     expected_rotation = f"{angle} degrees about {'[XY]' if angle == 180 else 'XYZ'[axis]}"
     assert re.search(
-        f"of the 4 joints that skin the mesh lie outside its bounds.* fit after a rotation of {expected_rotation}:",
+        f"of the 4 joints that skin the mesh lie outside its bounds.* match after a rotation of {expected_rotation}:",
         text,
     )
 

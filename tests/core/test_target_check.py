@@ -77,7 +77,7 @@ def test_a_target_in_other_units_or_at_another_location_is_reported(factor, offs
         with_positions(swinging_recording, target_positions(swinging_recording) * factor + (offset, 0, 0)),
         "target-place",
     )
-    assert text.startswith("The target 'flesh' is ") and "it is in other units or another place" in text
+    assert text.startswith("The target 'flesh' is ") and "it has another unit or location" in text
 
 
 def test_a_low_repeatability_is_reported(swinging_recording):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Statistics of the residuals of a recording, which may be larger than memory."""
+"""Statistics of the residuals of a recording. The residuals may be larger than the memory."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from ..recording.reader import Recording
 
 MAX_SCANNED_POSES = 1000
 MAX_KEPT_VERTICES, MAX_KEPT_IN_PARTITION, MIN_KEPT_IN_PARTITION = 8000, 48, 8
-"""Limits for the number of vertices whose residuals are kept: in total, largest and smallest of one partition."""
+"""Numbers of vertices whose residuals are kept in memory: at most in total, at most and at least for one partition."""
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,12 @@ class ResidualScan:
 
     Attributes:
         poses: (n,) ascending indices of the scanned poses, at most `MAX_SCANNED_POSES`, evenly spaced.
-        rms: (V,) float64, rms length over the poses.
-        largest: (V,) float32, largest length.
-        largest_pose: (V,) int64, index of the pose in which it is largest.
+        rms: (V,) float64, rms of the length over the poses.
+        largest: (V,) float32, largest length over the poses.
+        largest_pose: (V,) int64, index of the pose in which the length is largest.
         change: (V,) float32, largest difference from the residual of the first pose.
-        vertices: for each partition, the (S_p,) int64 vertices that were kept.
-        residuals: for each partition, their (n, S_p, 3) float32 residuals.
+        vertices: for each partition, (S_p,) int64 indices of the vertices whose residuals are kept.
+        residuals: for each partition, (n, S_p, 3) float32 residuals of these vertices.
     """
 
     poses: np.ndarray
@@ -40,41 +40,45 @@ def scan_residuals(recording: Recording) -> ResidualScan:
     """Read the residuals of evenly spaced poses, one pose in memory at a time."""
     pose_count, rig = len(recording.residuals), recording.rig
     poses = np.unique(np.linspace(0, pose_count - 1, min(pose_count, MAX_SCANNED_POSES)).round().astype(np.int64))
-    count = min(MAX_KEPT_IN_PARTITION, max(MIN_KEPT_IN_PARTITION, MAX_KEPT_VERTICES // len(recording.partitions)))
-    vertices = tuple(_choose_vertices(p, rig.skin_weights, count) for p in recording.partitions)
+    vertices_per_partition = min(
+        MAX_KEPT_IN_PARTITION, max(MIN_KEPT_IN_PARTITION, MAX_KEPT_VERTICES // len(recording.partitions))
+    )
+    vertices = tuple(
+        _choose_vertices(partition, rig.skin_weights, vertices_per_partition) for partition in recording.partitions
+    )
     all_vertices = np.concatenate(vertices)
-    kept = np.empty((len(poses), len(all_vertices), 3), np.float32)
-    squares = np.zeros(rig.vertex_count, np.float64)
+    kept_residuals = np.empty((len(poses), len(all_vertices), 3), np.float32)
+    sum_of_squares = np.zeros(rig.vertex_count, np.float64)
     largest = np.full(rig.vertex_count, -1, np.float32)
     change = np.zeros(rig.vertex_count, np.float32)
     largest_pose = np.zeros(rig.vertex_count, np.int64)
-    first = np.array(recording.residuals[0])
+    first_residuals = np.array(recording.residuals[0])
     for row, pose in enumerate(poses):
         residuals = np.array(recording.residuals[pose])
-        kept[row] = residuals[all_vertices]
-        square = np.einsum("vc,vc->v", residuals, residuals)
-        squares += square
-        larger = np.flatnonzero(square > largest)
-        largest[larger], largest_pose[larger] = square[larger], pose
-        residuals -= first
+        kept_residuals[row] = residuals[all_vertices]
+        squared_lengths = np.einsum("vc,vc->v", residuals, residuals)
+        sum_of_squares += squared_lengths
+        larger_vertices = np.flatnonzero(squared_lengths > largest)
+        largest[larger_vertices], largest_pose[larger_vertices] = squared_lengths[larger_vertices], pose
+        residuals -= first_residuals
         np.maximum(change, np.einsum("vc,vc->v", residuals, residuals), out=change)
-    ends = np.cumsum([len(chosen) for chosen in vertices])[:-1]
+    ends = np.cumsum([len(partition_vertices) for partition_vertices in vertices])[:-1]
     return ResidualScan(
         poses,
-        np.sqrt(squares / len(poses)),
+        np.sqrt(sum_of_squares / len(poses)),
         np.sqrt(largest),
         largest_pose,
         np.sqrt(change),
         vertices,
-        tuple(np.split(kept, ends, axis=1)),
+        tuple(np.split(kept_residuals, ends, axis=1)),
     )
 
 
 def _choose_vertices(partition: Partition, skin_weights: np.ndarray, count: int) -> np.ndarray:
-    """Choose vertices of a partition: half of them those with the most blended weights, half evenly spaced."""
+    """Choose `count` vertices of a partition: half with the most blended weights, half evenly spaced."""
     vertices = partition.vertices
     if len(vertices) <= count:
         return vertices.astype(np.int64)
-    blended = vertices[np.argsort(skin_weights[vertices].max(axis=1), kind="stable")[: count // 2]]
-    spread = vertices[np.linspace(0, len(vertices) - 1, count - count // 2).round().astype(np.int64)]
-    return np.union1d(blended, spread).astype(np.int64)
+    most_blended = vertices[np.argsort(skin_weights[vertices].max(axis=1), kind="stable")[: count // 2]]
+    evenly_spaced = vertices[np.linspace(0, len(vertices) - 1, count - count // 2).round().astype(np.int64)]
+    return np.union1d(most_blended, evenly_spaced).astype(np.int64)

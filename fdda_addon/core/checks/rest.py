@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of units and axes: whether the joints of a rig lie inside of its mesh."""
+"""Checks of units and axes in the rest pose: whether the joints of a rig lie inside of its mesh."""
 
 import itertools
 
@@ -10,13 +10,13 @@ from ..rig import STATIC_JOINT, Rig
 from .warning import RecordingWarning, format_length
 
 MIN_SIZE_METRES, MAX_SIZE_METRES = 0.005, 100.0
-"""Range of the size of a mesh; outside of it the unit is probably wrong."""
+"""Range of the size of a mesh; the unit of a smaller or larger mesh is probably wrong."""
 MAX_SCALE_RATIO = 5.0
 """Largest ratio between the extents of joints and of the vertices that follow them."""
 MIN_CORRELATION = 0.8
-"""Correlation of joint positions and vertex centers above which they have the same shape."""
+"""Correlation above which joint positions and vertex centers have the same arrangement."""
 MAX_DISTANCE_RATIO = 0.1
-"""Largest distance of a joint from its vertices, as a ratio of the rig's size."""
+"""Largest median distance of joints from the nearest vertices that follow them, as a ratio of the rig's size."""
 
 
 def check_rest(rig: Rig) -> list[RecordingWarning]:
@@ -28,23 +28,25 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
             "its true size, and record again."
         )
         return [RecordingWarning("units", text)]
-    main = main_joints(rig.skin_joints, rig.skin_weights)
-    joints = np.array([j for j in np.unique(main) if rig.joints[j].name != STATIC_JOINT], np.int64)
+    main_joint_of_vertex = main_joints(rig.skin_joints, rig.skin_weights)
+    joints = np.array(
+        [joint for joint in np.unique(main_joint_of_vertex) if rig.joints[joint].name != STATIC_JOINT], np.int64
+    )
     if len(joints) < 2:
         # A single joint may be anywhere, such as the hinge of a door.
         return []
     joint_positions = rig.rest_matrices[joints, :3, 3].astype(np.float64)
-    vertices_by_joint = [rig.rest_positions[main == joint].astype(np.float64) for joint in joints]
+    vertices_by_joint = [rig.rest_positions[main_joint_of_vertex == joint].astype(np.float64) for joint in joints]
     vertex_centers = np.stack([vertices.mean(axis=0) for vertices in vertices_by_joint])
     rotation, correlation, unrotated_correlation = _best_rotation(joint_positions, vertex_centers)
-    spans = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (joint_positions, vertex_centers)]
-    ratio = spans[1] / max(spans[0], 1e-9)
+    extents = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (joint_positions, vertex_centers)]
+    ratio = extents[1] / max(extents[0], 1e-9)
     if len(joints) > 2 and correlation > MIN_CORRELATION and not 1 / MAX_SCALE_RATIO < ratio < MAX_SCALE_RATIO:
-        of_joints, of_vertices = (format_length(rig, span) for span in spans)
+        joint_extent, vertex_extent = (format_length(rig, extent) for extent in extents)
         text = (
-            f"The {len(joints)} joints that skin the mesh lie {of_joints} apart and their vertices "
-            f"{of_vertices}, {_ratio_label(ratio)}: the scale of mesh or armature is not applied, or one was imported "
-            "in another unit; give both one size in the rest pose and record again."
+            f"The {len(joints)} joints that skin the mesh lie {joint_extent} apart and their vertices "
+            f"{vertex_extent}, {_ratio_label(ratio)}: the scale of mesh or armature is not applied, or one was "
+            "imported in another unit; give both one size in the rest pose and record again."
         )
         return [RecordingWarning("units", text)]
     distances = np.array(
@@ -56,15 +58,15 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
     size = max(rig.size, float(np.linalg.norm(np.ptp(rig.rest_matrices[:, :3, 3], axis=0))))
     if np.median(distances) <= MAX_DISTANCE_RATIO * size:
         return []
-    low, high = rig.rest_positions.min(axis=0), rig.rest_positions.max(axis=0)
-    outside = int(((joint_positions < low) | (joint_positions > high)).any(axis=1).sum())
+    lower_bounds, upper_bounds = rig.rest_positions.min(axis=0), rig.rest_positions.max(axis=0)
+    outside_count = int(((joint_positions < lower_bounds) | (joint_positions > upper_bounds)).any(axis=1).sum())
     hint = (
-        f"their places fit after {rotation}"
+        f"their positions match after {rotation}"
         if rotation and len(joints) > 2 and correlation > max(MIN_CORRELATION, unrotated_correlation + 0.2)
         else f"most of it along {_axis_label(np.median(vertex_centers - joint_positions, axis=0))}"
     )
     text = (
-        f"{outside} of the {len(joints)} joints that skin the mesh lie outside its bounds, and joints lie "
+        f"{outside_count} of the {len(joints)} joints that skin the mesh lie outside its bounds, and joints lie "
         f"{format_length(rig, float(np.median(distances)))} from the nearest vertex that follows them (median), "
         f"{hint}: mesh and armature do not match in the rest pose; bring them together, apply their transforms and "
         "record again."
@@ -73,27 +75,32 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
 
 
 def _best_rotation(joint_positions: np.ndarray, vertex_centers: np.ndarray) -> tuple[str, float, float]:
-    """Find the rotation between joints and their vertices among the 24 rotations of a cube.
+    """Find the rotation, among the 24 rotations of a cube, that best maps joints to their vertices.
 
     Args:
         joint_positions, vertex_centers: (n, 3) positions of joints and mean positions of their vertices, mesh units.
 
     Returns:
-        A label of the best rotation, empty for none; the correlations with it and without rotation.
+        A label of the best rotation, empty for the identity; the correlation with this rotation, and without rotation.
     """
-    a, b = joint_positions - joint_positions.mean(axis=0), vertex_centers - vertex_centers.mean(axis=0)
-    scale = max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
-    unrotated_correlation = float((a * b).sum()) / scale
+    centered_joints, centered_vertices = (
+        joint_positions - joint_positions.mean(axis=0),
+        vertex_centers - vertex_centers.mean(axis=0),
+    )
+    scale = max(float(np.linalg.norm(centered_joints) * np.linalg.norm(centered_vertices)), 1e-12)
+    unrotated_correlation = float((centered_joints * centered_vertices).sum()) / scale
     rotations = [
         rotation
         for order in itertools.permutations(range(3))
         for signs in itertools.product((1, -1), repeat=3)
         if np.linalg.det(rotation := np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
     ]
-    correlation = [round(float(((a @ rotation.T) * b).sum()) / scale, 2) for rotation in rotations]
-    # Joints in a row fit after several rotations: prefer the one that keeps most axes.
-    best = max(range(len(rotations)), key=lambda i: (correlation[i], np.trace(rotations[i])))
-    return _rotation_label(rotations[best]), correlation[best], unrotated_correlation
+    correlations = [
+        round(float(((centered_joints @ rotation.T) * centered_vertices).sum()) / scale, 2) for rotation in rotations
+    ]
+    # Joints in a row match after several rotations: prefer the rotation that keeps most axes.
+    best_index = max(range(len(rotations)), key=lambda i: (correlations[i], np.trace(rotations[i])))
+    return _rotation_label(rotations[best_index]), correlations[best_index], unrotated_correlation
 
 
 def _rotation_label(rotation: np.ndarray) -> str:

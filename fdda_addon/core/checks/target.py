@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of a recorded target: hysteresis, frames that jump or freeze, wrong scale or location."""
+"""Checks of a recorded target: hysteresis, frames in which it jumps or is frozen, wrong scale or location."""
 
 from collections.abc import Iterator
 
@@ -11,10 +11,11 @@ from ..skinning import LinearSkinning
 from .warning import RecordingWarning, format_length, format_list
 
 MAX_DISTANCE_RATIO = 0.2
-"""Largest distance between two approaches to a pose, as a ratio of the error of linear skinning."""
+"""Largest distance between the shapes of a target in a pose that is reached from two directions, as a ratio of the
+error of linear skinning."""
 JUMP_RATIO, MIN_JUMP_RATIO = 8.0, 0.01
-"""A frame jumps when the target moves relative to linear skinning by this multiple of the action's median, and by more
-than this ratio of the rig's size."""
+"""A target jumps in a frame where its motion relative to linear skinning exceeds both this multiple of the action's
+median motion, and this ratio of the rig's size."""
 MAX_FROZEN_RATIO, MIN_MOTION_RATIO = 1e-6, 1e-3
 """Ratios of the rig's size: a target is frozen where it moves by less than the first between two frames while linear
 skinning moves by more than the second."""
@@ -23,7 +24,8 @@ MAX_CHECKED_FRAMES = 2000
 MAX_COMPARED_POSES = 50
 """Number of evenly spaced poses in which location and size of the target are measured."""
 MAX_SCALE, MAX_OFFSET_RATIO = 1.5, 0.25
-"""Limits of a target relative to linear skinning: factor of scale, and offset of its center as a ratio of the size."""
+"""Largest differences between a target and linear skinning: factor of scale, and distance of the centers as a ratio of
+the rig's size."""
 
 
 def check_target(recording: Recording) -> list[RecordingWarning]:
@@ -54,18 +56,31 @@ def _check_repeatability(recording: Recording) -> list[RecordingWarning]:
 def _check_frames(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
     """Warn about frames of actions in which the target jumps or is frozen."""
     jumps, frozen = [], []
-    first = 0
+    first_pose = 0
     for source in recording.info.sampling.sources:
         if source.kind in (ACTION, STRIP) and source.poses > 2:
-            moved, linear = _largest_motions(recording, skinning, first, min(source.poses, MAX_CHECKED_FRAMES))
+            target_motions, linear_motions = _largest_motions(
+                recording, skinning, first_pose, min(source.poses, MAX_CHECKED_FRAMES)
+            )
             size = recording.rig.size
-            still = np.flatnonzero((moved[:, 0] < MAX_FROZEN_RATIO * size) & (linear > MIN_MOTION_RATIO * size)) + 1
-            frozen += [_frame_label(source, number) for number in still.tolist()]
+            frozen_frames = (
+                np.flatnonzero(
+                    (target_motions[:, 0] < MAX_FROZEN_RATIO * size) & (linear_motions > MIN_MOTION_RATIO * size)
+                )
+                + 1
+            )
+            frozen += [_frame_label(source, frame_index) for frame_index in frozen_frames.tolist()]
             # A target that is frozen while the rig moves does not jump.
-            beside = moved.min(axis=1)
-            jumping = np.flatnonzero((beside > JUMP_RATIO * np.median(beside)) & (beside > MIN_JUMP_RATIO * size)) + 1
-            jumps += [(_frame_label(source, number), float(beside[number - 1])) for number in jumping.tolist()]
-        first += source.poses
+            jump_sizes = target_motions.min(axis=1)
+            jumping_frames = (
+                np.flatnonzero((jump_sizes > JUMP_RATIO * np.median(jump_sizes)) & (jump_sizes > MIN_JUMP_RATIO * size))
+                + 1
+            )
+            jumps += [
+                (_frame_label(source, frame_index), float(jump_sizes[frame_index - 1]))
+                for frame_index in jumping_frames.tolist()
+            ]
+        first_pose += source.poses
     warnings = []
     if frozen:
         text = (
@@ -77,34 +92,35 @@ def _check_frames(recording: Recording, skinning: LinearSkinning) -> list[Record
         jumps.sort(key=lambda jump: -jump[1])
         text = (
             f"The target jumps in {len(jumps)} frames, by up to {format_length(recording.rig, jumps[0][1])} from one "
-            f"frame to the next: {format_list([name for name, _ in jumps])}: look at the simulation there, or leave "
+            f"frame to the next: {format_list([label for label, _ in jumps])}: look at the simulation there, or leave "
             "these frames out."
         )
         warnings.append(RecordingWarning("frame-jumps", text))
     return warnings
 
 
-def _frame_label(source: Source, number: int) -> str:
-    return f"{source.name} {source.frames[0] + number}"
+def _frame_label(source: Source, frame_index: int) -> str:
+    return f"{source.name} {source.frames[0] + frame_index}"
 
 
 def _largest_motions(
-    recording: Recording, skinning: LinearSkinning, first: int, count: int
+    recording: Recording, skinning: LinearSkinning, first_pose: int, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Measure the largest motion of a vertex between consecutive frames, mesh units.
+    """Measure the largest motion of a vertex between consecutive frames.
 
     Returns:
-        (count - 1, 2) of the target, absolute and relative to linear skinning; (count - 1,) of linear skinning.
+        (count - 1, 2) motions of the target, absolute and relative to linear skinning; (count - 1,) motions of linear
+        skinning. All are in mesh units.
     """
-    moved, linear, before = [], [], None
-    for positions, skinned in _iterate_positions(recording, skinning, range(first, first + count)):
-        now = positions, skinned
-        if before is not None:
-            whole, rest = positions - before[0], skinned - before[1]
-            moved.append([_max_length(whole), _max_length(whole - rest)])
-            linear.append(_max_length(rest))
-        before = now
-    return np.array(moved), np.array(linear)
+    target_motions, linear_motions, previous = [], [], None
+    for positions, skinned in _iterate_positions(recording, skinning, range(first_pose, first_pose + count)):
+        current = positions, skinned
+        if previous is not None:
+            target_offsets, linear_offsets = positions - previous[0], skinned - previous[1]
+            target_motions.append([_max_length(target_offsets), _max_length(target_offsets - linear_offsets)])
+            linear_motions.append(_max_length(linear_offsets))
+        previous = current
+    return np.array(target_motions), np.array(linear_motions)
 
 
 def _iterate_positions(
@@ -126,7 +142,7 @@ def _check_location(recording: Recording, skinning: LinearSkinning) -> list[Reco
     scales, offsets = [], []
     for positions, skinned in _iterate_positions(recording, skinning, poses):
         centers = positions.mean(axis=0), skinned.mean(axis=0)
-        extents = [np.sqrt(((own - center) ** 2).sum(axis=1).mean()) for own, center in
+        extents = [np.sqrt(((vertices - center) ** 2).sum(axis=1).mean()) for vertices, center in
                    zip((positions, skinned), centers, strict=True)]  # fmt: skip
         scales.append(extents[0] / max(extents[1], 1e-12))
         offsets.append(np.linalg.norm(centers[0] - centers[1]))
@@ -135,7 +151,7 @@ def _check_location(recording: Recording, skinning: LinearSkinning) -> list[Reco
         return []
     text = (
         f"The target '{recording.info.target.object_name}' is {scale:.3g} times as large as linear skinning, and its "
-        f"middle {format_length(recording.rig, offset)} away: it is in other units or another place; scale and move it "
+        f"center is {format_length(recording.rig, offset)} away: it has another unit or location; scale and move it "
         "onto the mesh, and record again."
     )
     return [RecordingWarning("target-place", text)]
@@ -145,7 +161,7 @@ def unsettled_sentence(index: dict) -> str:
     """Describe the poses of a recording that did not come to rest; empty where all did.
 
     Args:
-        index: from `read_index`.
+        index: index of the recording, from `read_index`.
     """
     unsettled = index.get("unsettled", [])
     if not unsettled:

@@ -9,6 +9,7 @@ from ..messages import WARNING_LINE
 from ..rig import STATIC_JOINT_LABEL, Rig
 
 MAX_LISTED = 3
+"""Largest number of names that a message lists."""
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,8 @@ class RecordingWarning:
     """A property of a recording that makes a bad model likely.
 
     Attributes:
-        name: of the kind, a heading in docs/formats.md.
-        text: one sentence for the user: what is wrong, with names and numbers, and what to do.
+        name: name of the kind of warning, a heading in docs/formats.md.
+        text: one sentence that tells the user the problem, with names and numbers, and the remedy.
     """
 
     name: str
@@ -38,17 +39,17 @@ def raise_first_warning(warnings: Sequence[RecordingWarning]) -> None:
     """
     if not warnings:
         return
-    others = [warning.name for warning in warnings[1:]]
-    more = f"; {len(others)} more: {', '.join(others)}" if others else ""
-    raise RecordingError(f"{warnings[0].text.removesuffix('.')} ({warnings[0].name}{more}).")
+    other_names = [warning.name for warning in warnings[1:]]
+    others_text = f"; {len(other_names)} more: {', '.join(other_names)}" if other_names else ""
+    raise RecordingError(f"{warnings[0].text.removesuffix('.')} ({warnings[0].name}{others_text}).")
 
 
 def format_list(names: Sequence[object], max_names: int = MAX_LISTED) -> str:
     """Format the first names or numbers of a list: "'a', 'b', 'c' and 4 more"; strings are quoted."""
-    shown = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:max_names]]
+    shown_names = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:max_names]]
     if len(names) > max_names:
-        return f"{', '.join(shown)} and {len(names) - max_names} more"
-    return f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else "".join(shown)
+        return f"{', '.join(shown_names)} and {len(names) - max_names} more"
+    return f"{', '.join(shown_names[:-1])} and {shown_names[-1]}" if len(shown_names) > 1 else "".join(shown_names)
 
 
 def format_with_noun(names: Sequence[object], noun: str, plural: str = "") -> str:

@@ -14,7 +14,7 @@ from ..input_file import open_input
 from ..skinning import are_invertible
 
 NPY_HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
-"""Errors beside ValueError that numpy raises for a damaged header of a `.npy` file."""
+"""Errors that numpy raises for a damaged header of a `.npy` file, apart from ValueError."""
 MAX_VALUE = 1e12
 """Largest absolute value of an element; sums of squares of larger values may overflow."""
 CHECK_CHUNK_BYTES = 64 << 20
@@ -26,7 +26,7 @@ _VALUE_CHECKS = {
     "values beyond all bounds": lambda values: np.abs(values) <= MAX_VALUE,
     SINGULAR_JOINTS: are_invertible,
 }
-"""Checks of pose arrays, by the words of their errors."""
+"""Checks of pose arrays; the key describes the values that fail the check."""
 
 
 def array_shapes(
@@ -61,10 +61,10 @@ STREAMED_ARRAY_NAMES = (POSE_MATRICES, "residuals", "controls")
 
 
 def streamed_arrays(
-    pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None, count: int
+    pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None, control_count: int
 ) -> dict[str, np.ndarray]:
-    """Return the arrays with one row per pose, by name; `count` is the number of controls."""
-    control_arrays = {"controls": controls} if count else {}
+    """Return the arrays with one row per pose, by name; `control_count` is the number of controls of the rig."""
+    control_arrays = {"controls": controls} if control_count else {}
     return {POSE_MATRICES: pose_matrices, "residuals": residuals, **control_arrays}
 
 
@@ -73,26 +73,30 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
 
     Args:
         path: the file.
-        shape, dtype: expected; arrays in `STREAMED_ARRAY_NAMES` may have more rows.
-        rows: number of rows that must exist and are mapped, at least one; all of `shape` by default.
+        shape, dtype: expected shape and dtype; arrays in `STREAMED_ARRAY_NAMES` may have more rows.
+        rows: number of rows that must exist and are mapped, at least one; by default all rows of `shape`.
 
     Raises:
-        RecordingError: it is missing, not a regular file, truncated, or of another shape or dtype.
+        RecordingError: the file is missing, not a regular file, or truncated, or has another shape or dtype.
     """
     try:
         with open_input(path, follow_links=False) as file:
-            found_shape, found_dtype = read_array_header(file)
-            # An interrupted extension may leave more poses than the index counts.
-            longer = path.stem in STREAMED_ARRAY_NAMES and found_shape[:1] > shape[:1] and found_shape[1:] == shape[1:]
-            if not (found_shape == shape or longer) or found_dtype != np.dtype(dtype):
-                raise ValueError(f"it holds {found_shape} {found_dtype}, not {shape} {np.dtype(dtype)}")
-            start, mapped = file.tell(), shape if rows is None else (rows, *shape[1:])
-            # math.prod, because the counts are untrusted and integers of numpy overflow.
-            expected = start + math.prod(found_shape if rows is None else mapped) * np.dtype(dtype).itemsize
-            size = file.seek(0, os.SEEK_END)
-            if size < expected:
-                raise ValueError(f"it is truncated: {size} of {expected} bytes")
-            return np.memmap(file, dtype, "r", start, mapped)
+            file_shape, file_dtype = read_array_header(file)
+            # After an interrupted extension, arrays may have more poses than the index counts.
+            may_be_longer = (
+                path.stem in STREAMED_ARRAY_NAMES and file_shape[:1] > shape[:1] and file_shape[1:] == shape[1:]
+            )
+            if not (file_shape == shape or may_be_longer) or file_dtype != np.dtype(dtype):
+                raise ValueError(f"it holds {file_shape} {file_dtype}, not {shape} {np.dtype(dtype)}")
+            data_start, mapped_shape = file.tell(), shape if rows is None else (rows, *shape[1:])
+            # Not numpy.prod: the counts are untrusted, and integers of numpy overflow.
+            expected_bytes = (
+                data_start + math.prod(file_shape if rows is None else mapped_shape) * np.dtype(dtype).itemsize
+            )
+            file_bytes = file.seek(0, os.SEEK_END)
+            if file_bytes < expected_bytes:
+                raise ValueError(f"it is truncated: {file_bytes} of {expected_bytes} bytes")
+            return np.memmap(file, dtype, "r", data_start, mapped_shape)
     except OSError as error:
         raise RecordingError(f"'{path}' cannot be used: {os_error_text(error)}; record again.") from error
     except ValueError as error:
@@ -102,16 +106,16 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
 
 
 def read_array_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
-    """Read the header of a `.npy` file up to the first element; returns shape and dtype.
+    """Read the header of a `.npy` file up to the first element; return shape and dtype.
 
     Raises:
-        ValueError: it is no such header, of another version, or of elements in another order.
-        NPY_HEADER_ERRORS: it is damaged.
+        ValueError: the file has no such header, another version, or elements in Fortran order.
+        NPY_HEADER_ERRORS: the header is damaged.
     """
     if np.lib.format.read_magic(file) != (1, 0):
         raise ValueError("its npy version is not 1.0")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    if fortran:
+    shape, is_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
+    if is_fortran_order:
         raise ValueError("its elements are in another order")
     return shape, dtype
 
@@ -120,18 +124,18 @@ def find_invalid_pose(name: str, array: np.ndarray) -> tuple[int, str] | None:
     """Find the first pose with values that cannot be trained on.
 
     Args:
-        name: of the array.
-        array: (n, ...) of n poses.
+        name: name of the array.
+        array: (n, ...) values of n poses.
 
     Returns:
-        Its index and words for the values; None where all poses are valid.
+        The index of the pose and a description of its values; None where all poses are valid.
     """
-    step = max(1, CHECK_CHUNK_BYTES // max(1, array[:1].nbytes))
-    for start in range(0, len(array), step):
-        part = np.asarray(array[start : start + step])
-        for words, check in _VALUE_CHECKS.items():
-            if words != SINGULAR_JOINTS or name == POSE_MATRICES:
-                good = check(part)
-                if not good.all():
-                    return start + int(np.flatnonzero(~good.reshape(len(part), -1).all(axis=1))[0]), words
+    chunk_poses = max(1, CHECK_CHUNK_BYTES // max(1, array[:1].nbytes))
+    for start in range(0, len(array), chunk_poses):
+        chunk = np.asarray(array[start : start + chunk_poses])
+        for description, check in _VALUE_CHECKS.items():
+            if description != SINGULAR_JOINTS or name == POSE_MATRICES:
+                is_valid = check(chunk)
+                if not is_valid.all():
+                    return start + int(np.flatnonzero(~is_valid.reshape(len(chunk), -1).all(axis=1))[0]), description
     return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Estimates of disk space and time of a recording, and a check of the free disk space."""
+"""Estimates of the disk space and the time that a recording needs, and a check of the free disk space."""
 
 import math
 import os
@@ -17,6 +17,7 @@ from .arrays import array_shapes
 from .reader import Recording
 
 MIN_SHOWN_BYTES = 10**6
+"""Smaller sizes are shown as "less than 1 MB"."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,9 @@ class Estimate:
 
     Attributes:
         poses: number of remaining poses.
-        vertices: of all meshes together.
-        size_bytes: of the complete recordings.
-        seconds: for the remaining poses; None where unknown.
+        vertices: number of vertices of all meshes together.
+        size_bytes: size of the complete recordings.
+        seconds: time for the remaining poses; None where unknown.
     """
 
     poses: int
@@ -37,14 +38,14 @@ class Estimate:
 
     def sentence(self) -> str:
         """Format the estimate: "2,000 poses of 200,612 vertices: about 4.8 GB on the disk, about 12 minutes"."""
-        poses = "1 pose" if self.poses == 1 else f"{self.poses:,} poses"
-        time = "" if self.seconds is None else f", {format_duration(self.seconds)}"
-        size = f"{'about ' if self.size_bytes >= MIN_SHOWN_BYTES else ''}{format_size(self.size_bytes)}"
-        return f"{poses} of {self.vertices:,} vertices: {size} on the disk{time}"
+        poses_text = "1 pose" if self.poses == 1 else f"{self.poses:,} poses"
+        time_text = "" if self.seconds is None else f", {format_duration(self.seconds)}"
+        size_text = f"{'about ' if self.size_bytes >= MIN_SHOWN_BYTES else ''}{format_size(self.size_bytes)}"
+        return f"{poses_text} of {self.vertices:,} vertices: {size_text} on the disk{time_text}"
 
 
 def recording_bytes(rig: Rig, poses: int) -> int:
-    """Return the size of the arrays of a recording in bytes; the index is negligible."""
+    """Return the size of the arrays of a recording in bytes; the size of the index is negligible."""
     shapes = array_shapes(
         *(poses, len(rig.joints), rig.vertex_count, rig.skin_joints.shape[1]),
         *(len(rig.face_starts), len(rig.face_vertices), len(rig.controls)),
@@ -53,7 +54,7 @@ def recording_bytes(rig: Rig, poses: int) -> int:
 
 
 def training_size_sentence(recording: Recording) -> str:
-    """Describe the disk space of a recording and the memory that a training needs."""
+    """Describe the disk space of a recording and the memory that its training needs."""
     poses, rig = len(recording.pose_matrices), recording.rig
     largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
     vertices = len(largest.vertices)
@@ -68,26 +69,26 @@ def check_disk_space(sizes: Iterable[tuple[Path, int]]) -> None:
     """Check that the disk has enough free space for recordings.
 
     Args:
-        sizes: folder of each recording, which may hold a part of it already, and its complete size in bytes. All
-            folders are on the same disk.
+        sizes: the folder of each recording and the size of the complete recording in bytes. A folder may already have a
+            part of the recording. All folders are on the same disk.
 
     Raises:
-        DiskFullError: there is too little free space.
-        OutputError: no parent folder exists.
+        DiskFullError: the disk has too little free space.
+        OutputError: a folder has no existing parent.
     """
     sizes = list(sizes)
-    needed = sum(size - min(size, _used_bytes(folder)) for folder, size in sizes)
-    folder = sizes[0][0]
-    free = shutil.disk_usage(nearest_existing_folder(folder)).free
-    if needed > free:
+    needed_bytes = sum(size - min(size, _used_bytes(folder)) for folder, size in sizes)
+    first_folder = sizes[0][0]
+    free_bytes = shutil.disk_usage(nearest_existing_folder(first_folder)).free
+    if needed_bytes > free_bytes:
         raise DiskFullError(
-            f"Cannot write the recording '{folder}': it takes {format_size(needed)} and the disk has "
-            f"{format_size(free)} left; make room, record fewer poses, or choose another folder."
+            f"Cannot write the recording '{first_folder}': it takes {format_size(needed_bytes)} and the disk has "
+            f"{format_size(free_bytes)} left; make room, record fewer poses, or choose another folder."
         )
 
 
 def _used_bytes(folder: Path) -> int:
-    """Return the bytes that a recording occupies on the disk, which may be less than the length of its sparse files."""
+    """Return the number of bytes that a recording occupies on the disk, less than the length of its sparse files."""
     if not os.path.isdir(folder):
         return 0
     stats = [path.stat() for path in folder.glob("*.npy")]

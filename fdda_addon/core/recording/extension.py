@@ -19,15 +19,15 @@ from .writer import array_header, check_pose_values, write_index
 class RecordingExtension:
     """Context manager that appends poses to a recording.
 
-    `append` writes the rows first, then the headers of the arrays, and the index last. So an interruption leaves a
-    complete recording with the poses of every finished `append`.
+    `append` writes the rows first, then the headers of the arrays, and the index last. An interruption therefore leaves
+    a complete recording, which has the poses of all calls of `append` that returned.
     """
 
-    def __init__(self, recording: Recording, name: str, added: int = 0):
+    def __init__(self, recording: Recording, model_name: str, added_count: int = 0):
         """Args:
-            recording: complete.
-            name: file name of the model that the poses refine.
-            added: number of last poses of the recording that were already added for the same model.
+            recording: a complete recording.
+            model_name: file name of the model that the poses refine.
+            added_count: number of poses at the end of the recording that were already added for this model.
 
         Raises:
             RecordingError: another process writes the recording.
@@ -35,8 +35,8 @@ class RecordingExtension:
         """
         self.path = recording.path
         self.complete = len(recording.pose_matrices)
-        self._start, self._is_continued = self.complete - added, added > 0
-        self._name = name
+        self._first_added, self._has_added_poses = self.complete - added_count, added_count > 0
+        self._model_name = model_name
         self._files = {}
         self._lock = RecordingLock(self.path)
         try:
@@ -47,8 +47,8 @@ class RecordingExtension:
                 *(0, len(index["joints"]), index["vertices"], index["influences"]), controls=len(index["controls"])
             )
             self._shapes = {name: shapes[name] for name in STREAMED_ARRAY_NAMES if name in shapes}
-            for streamed in self._shapes:
-                self._files[streamed] = open_input(self.path / f"{streamed}.npy", "r+b", follow_links=False)
+            for array_name in self._shapes:
+                self._files[array_name] = open_input(self.path / f"{array_name}.npy", "r+b", follow_links=False)
         except OSError as error:
             self._close()
             raise self._write_error(error) from error
@@ -57,7 +57,7 @@ class RecordingExtension:
             raise
 
     def _read_index(self) -> dict:
-        """Read the index again under the lock, and check that no other process has changed it."""
+        """Read the index again while the lock is held, and check that no other process has changed the recording."""
         index = read_index(self.path)
         if index["poses"] != self.complete:
             raise BusyError(
@@ -80,31 +80,31 @@ class RecordingExtension:
         """
         arrays = streamed_arrays(pose_matrices, residuals, controls, len(self._index["controls"]))
         check_pose_values(arrays, self.complete)
-        before = self.complete
-        total = before + len(pose_matrices)
+        previous_count = self.complete
+        new_count = previous_count + len(pose_matrices)
         try:
             for name, array in arrays.items():
-                self._write(name, array)
+                self._write_rows(name, array)
             for name in arrays:
-                self._write_header(name, total)
-            self.complete = total
+                self._write_header(name, new_count)
+            self.complete = new_count
             self._write_index()
         except OSError as error:
-            self.complete = before
+            self.complete = previous_count
             raise self._write_error(error) from error
 
-    def _write(self, name: str, array: np.ndarray) -> None:
+    def _write_rows(self, name: str, array: np.ndarray) -> None:
         shape, dtype = self._shapes[name]
-        row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
+        row_bytes = math.prod(shape[1:]) * np.dtype(dtype).itemsize
         file = self._files[name]
-        file.seek(len(self._header(name, self.complete)) + self.complete * row)
+        file.seek(len(self._header(name, self.complete)) + self.complete * row_bytes)
         file.write(np.ascontiguousarray(array, dtype).data)
         file.flush()
         os.fsync(file.fileno())
 
     def _write_header(self, name: str, poses: int) -> None:
         header, file = self._header(name, poses), self._files[name]
-        if len(header) != len(self._header(name, self._start)):
+        if len(header) != len(self._header(name, self._first_added)):
             raise RecordingError(f"'{self.path / name}.npy' has no room for {poses} poses; record again.")
         file.seek(0)
         file.write(header)
@@ -116,9 +116,9 @@ class RecordingExtension:
         return array_header((poses, *shape[1:]), dtype)
 
     def _write_index(self) -> None:
-        source = Source(REFINED, self.complete - self._start, self._name)
-        before = self._index["sampling"]["sources"]
-        sources = [*(before[:-1] if self._is_continued else before), asdict(source)]
+        source = Source(REFINED, self.complete - self._first_added, self._model_name)
+        sources_before = self._index["sampling"]["sources"]
+        sources = [*(sources_before[:-1] if self._has_added_poses else sources_before), asdict(source)]
         sampling = {**self._index["sampling"], "sources": sources}
         index = {**self._index, "poses": self.complete, "complete": self.complete, "sampling": sampling}
         write_index(self.path, index)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Exchange of poses and fitted skin weights between `record` and the trainer, in a temporary folder of arrays.
+"""Temporary folder of arrays in which `record` and the trainer exchange poses and fitted skin weights.
 
-All arrays are checked as untrusted input.
+The arrays are untrusted and are checked when they are read.
 """
 
 import math
@@ -21,7 +21,7 @@ from .arrays import NPY_HEADER_ERRORS, read_array_header
 from .writer import array_header, check_pose_values
 
 MIN_POSES = 10
-"""Smallest number of poses, half of which are held out."""
+"""Smallest number of poses of a fit, half of which are held out."""
 ARRAY_SHAPES = {
     "pose_matrices": ("n", "J", 4, 4),
     "positions": ("n", "V", 3),
@@ -31,6 +31,7 @@ ARRAY_SHAPES = {
     "skin_weights": ("V", "I"),
     "parents": ("J",),
 }
+"""Shapes of the arrays by name: n poses, J joints, V vertices, I skin weights per vertex."""
 INTEGER_ARRAYS = ("skin_joints", "parents")
 STREAMED_ARRAY_NAMES = ("pose_matrices", "positions")
 
@@ -40,9 +41,10 @@ class FitPoses:
     """Poses to which skin weights are fitted.
 
     Attributes:
-        rig: with its own skin weights; its joints have no names.
+        rig: the rig with its own skin weights; its joints have numbers for names.
         pose_matrices: (n, J, 4, 4) float32, mesh-object space, mesh units.
-        positions: (n, V, 3) float32, evaluated by the rig, mesh-object space, mesh units; may be a memory map.
+        positions: (n, V, 3) float32 positions that the rig evaluates, mesh-object space, mesh units; may be a
+            memory map.
     """
 
     rig: Rig
@@ -50,7 +52,7 @@ class FitPoses:
     positions: np.ndarray
 
     def subset(self, poses: slice) -> "FitPoses":
-        """Return a slice of the poses."""
+        """Return the poses of a slice."""
         return FitPoses(self.rig, self.pose_matrices[poses], self.positions[poses])
 
 
@@ -60,18 +62,18 @@ class FitPosesWriter:
     def __init__(self, folder: Path, rig: Rig, count: int):
         """Args:
             folder: an empty folder.
-            rig: with its own skin weights.
+            rig: the rig with its own skin weights.
             count: number of poses that will be appended.
 
         Raises:
             OutputError: the folder cannot be written.
         """
-        self._folder, self._done = folder, 0
+        self._folder, self._appended_count = folder, 0
         self._shapes = {"pose_matrices": (len(rig.joints), 4, 4), "positions": (rig.vertex_count, 3)}
         self._files = {}
         try:
             for name in ARRAY_SHAPES.keys() - set(STREAMED_ARRAY_NAMES):
-                np.save(folder / f"{name}.npy", getattr(rig, name).astype(_dtype(name)), allow_pickle=False)
+                np.save(folder / f"{name}.npy", getattr(rig, name).astype(_array_dtype(name)), allow_pickle=False)
             for name, shape in self._shapes.items():
                 self._files[name] = open(folder / f"{name}.npy", "wb")  # noqa: SIM115 - __exit__
                 self._files[name].write(array_header((count, *shape), np.float32))
@@ -80,15 +82,15 @@ class FitPosesWriter:
             raise self._write_error(error) from error
 
     def append(self, pose_matrices: np.ndarray, positions: np.ndarray) -> None:
-        """Append a pose: (J, 4, 4) and (V, 3), as in `FitPoses`.
+        """Append a pose: (J, 4, 4) pose matrices and (V, 3) positions, as in `FitPoses`.
 
         Raises:
             OutputError: the disk is full.
             RecordingError: a value is not finite.
         """
         arrays = {"pose_matrices": pose_matrices[None], "positions": positions[None]}
-        check_pose_values(arrays, self._done)
-        self._done += 1
+        check_pose_values(arrays, self._appended_count)
+        self._appended_count += 1
         try:
             for name, array in arrays.items():
                 self._files[name].write(np.ascontiguousarray(array, np.float32).data)
@@ -127,13 +129,14 @@ def read_fit_poses(folder: Path) -> FitPoses:
         RecordingError: an array is missing, damaged, or contradicts the others.
     """
     arrays = {
-        name: _read_array(folder / f"{name}.npy", len(shape), _dtype(name)) for name, shape in ARRAY_SHAPES.items()
+        name: _read_array(folder / f"{name}.npy", len(shape), _array_dtype(name))
+        for name, shape in ARRAY_SHAPES.items()
     }
     sizes: dict[str, int] = {}
     for name, shape in ARRAY_SHAPES.items():
-        for expected, found in zip(shape, arrays[name].shape, strict=True):
-            size = sizes.setdefault(expected, found) if isinstance(expected, str) else expected
-            if found != size or not found:
+        for dimension, array_size in zip(shape, arrays[name].shape, strict=True):
+            size = sizes.setdefault(dimension, array_size) if isinstance(dimension, str) else dimension
+            if array_size != size or not array_size:
                 raise _damaged_error(folder, f"{name} has the shape {arrays[name].shape}")
     if sizes["n"] < MIN_POSES:
         raise _damaged_error(folder, f"they are {sizes['n']}, and a fit takes {MIN_POSES}")
@@ -174,7 +177,7 @@ def read_fitted_weights(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]
     """Read fitted skin weights: (V, 4) int32 joints and (V, 4) float32 weights, each row summing to 1.
 
     Raises:
-        RecordingError: they are missing, damaged, or not of this rig.
+        RecordingError: the weights are missing, damaged, or of another rig.
     """
     joints, weights = (
         np.array(_read_array(folder / f"fitted_{name}.npy", 2, dtype))
@@ -187,7 +190,7 @@ def read_fitted_weights(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]
     return joints, weights
 
 
-def _dtype(name: str) -> type:
+def _array_dtype(name: str) -> type:
     return np.int32 if name in INTEGER_ARRAYS else np.float32
 
 
@@ -195,14 +198,14 @@ def _read_array(path: Path, dimensions: int, dtype: type) -> np.ndarray:
     """Memory-map an array after its header and size are checked."""
     try:
         with open_input(path, follow_links=False) as file:
-            shape, found_dtype = read_array_header(file)
-            if len(shape) != dimensions or found_dtype != np.dtype(dtype):
+            shape, file_dtype = read_array_header(file)
+            if len(shape) != dimensions or file_dtype != np.dtype(dtype):
                 raise _damaged_error(path.parent, f"'{path.name}' holds something else")
-            start = file.tell()
-            # Windows refuses to map more than a file holds with the error of a full memory.
-            if min(shape) < 1 or file.seek(0, os.SEEK_END) < start + math.prod(shape) * found_dtype.itemsize:
+            data_start = file.tell()
+            # Otherwise Windows reports full memory when more is mapped than the file has.
+            if min(shape) < 1 or file.seek(0, os.SEEK_END) < data_start + math.prod(shape) * file_dtype.itemsize:
                 raise ValueError("empty or truncated")
-            return np.memmap(file, dtype, "r", start, shape)
+            return np.memmap(file, dtype, "r", data_start, shape)
     except OSError as error:
         raise _damaged_error(path.parent, f"'{path.name}' cannot be read ({os_error_text(error)})") from error
     except (ValueError, *NPY_HEADER_ERRORS) as error:

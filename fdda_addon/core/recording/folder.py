@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""State of the folder of a recording, and removal of a recording."""
+"""State of a recording folder, and removal of a recording."""
 
 import enum
 import os
@@ -22,15 +22,15 @@ class FolderState(enum.Enum):
     """State of a recording folder."""
 
     FREE = "free"
-    """Empty or missing: it can be recorded into."""
+    """The folder is empty or missing: a recording can be written into it."""
     INCOMPLETE = "incomplete"
-    """An interrupted recording of this rig with these settings."""
+    """The folder has an incomplete recording of this rig with these settings."""
     COMPLETE = "complete"
-    """A recording of this rig."""
+    """The folder has a complete recording of this rig."""
     OTHER = "other"
-    """A recording of another rig, or an incomplete one with other settings."""
+    """The folder has a recording of another rig, or an incomplete recording with other settings."""
     FOREIGN = "foreign"
-    """Other files, or a recording that cannot be read."""
+    """The folder has other files, or a recording that cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class FolderContent:
     """Content of a recording folder.
 
     Attributes:
-        state: of the folder.
+        state: state of the folder.
         complete, poses: number of complete poses and of all poses of the recording.
-        sentence: describes a problem; may be empty.
+        sentence: a sentence that describes a problem; may be empty.
         measured_sentences: sentences about fitted weights and about the repeatability of the target.
-        is_recording: the folder has a recording, possibly damaged, that can be removed.
+        is_recording: whether the folder has a recording, possibly damaged, that can be removed.
     """
 
     state: FolderState
@@ -56,13 +56,13 @@ class FolderContent:
 def read_folder(
     path: Path, rig: Rig | None = None, sampling: dict | None = None, fit_linear: str | None = None
 ) -> FolderContent:
-    """Look into the folder of a recording.
+    """Read the state of a recording folder.
 
     Args:
         path: the folder, which may be missing.
         rig: the rig to compare with; None skips the comparison.
         sampling: `Sampling.to_json` to compare with; None skips the comparison.
-        fit_linear: kind of fitted skin weights, empty for the rig's own; None skips the comparison.
+        fit_linear: kind of fitted skin weights to compare with, empty for the rig's own; None skips the comparison.
     """
     content = _read_content(path, rig, sampling, fit_linear)
     return replace(content, is_recording=content.state is not FolderState.FREE and is_recording(path))
@@ -77,31 +77,32 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear
         index = read_index(path)
     except RecordingError as error:
         return FolderContent(FolderState.FOREIGN, sentence=str(error))
-    counts = index["complete"], index["poses"]
-    if rig is not None and (found := _differences(index, rig)):
+    pose_counts = index["complete"], index["poses"]
+    if rig is not None and (rig_clauses := _rig_differences(index, rig)):
         return FolderContent(
             FolderState.OTHER,
-            *counts,
-            f"'{path.name}' holds a recording of another rig: {'; '.join(found)}. Choose another folder, or remove it.",
+            *pose_counts,
+            f"'{path.name}' holds a recording of another rig: {'; '.join(rig_clauses)}. Choose another "
+            "folder, or remove it.",
         )
-    found = find_different_keys(_without_refined(index["sampling"]), sampling) if sampling is not None else []
+    different_keys = find_different_keys(_without_refined(index["sampling"]), sampling) if sampling is not None else []
     info = read_info(index)
     fit = info.fit
     if fit_linear is not None and fit_linear != (fit.kind if fit else ""):
-        found.append("fit")
-    names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in found}))
-    if counts[0] == counts[1]:
-        sentence = f"It was recorded with other settings than those above: {names}." if found else ""
-        measured_sentences = tuple(part.sentence() for part in (fit, info.repeatability) if part)
-        return FolderContent(FolderState.COMPLETE, *counts, sentence, measured_sentences)
-    if found:
+        different_keys.append("fit")
+    setting_names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in different_keys}))
+    if pose_counts[0] == pose_counts[1]:
+        sentence = f"It was recorded with other settings than those above: {setting_names}." if different_keys else ""
+        measured_sentences = tuple(report.sentence() for report in (fit, info.repeatability) if report)
+        return FolderContent(FolderState.COMPLETE, *pose_counts, sentence, measured_sentences)
+    if different_keys:
         return FolderContent(
             FolderState.OTHER,
-            *counts,
-            f"'{path.name}' was begun with other settings ({names}) and has {counts[0]} of {counts[1]} poses. Set them "
-            "as they were to resume, choose another folder, or remove it.",
+            *pose_counts,
+            f"'{path.name}' was begun with other settings ({setting_names}) and has {pose_counts[0]} of "
+            f"{pose_counts[1]} poses. Set them as they were to resume, choose another folder, or remove it.",
         )
-    return FolderContent(FolderState.INCOMPLETE, *counts)
+    return FolderContent(FolderState.INCOMPLETE, *pose_counts)
 
 
 def recordings_in(folder: Path) -> list[Path]:
@@ -112,22 +113,22 @@ def recordings_in(folder: Path) -> list[Path]:
 
 
 def _without_refined(sampling: dict) -> dict:
-    """Return a sampling without refined poses."""
+    """Return the JSON of a sampling without refined poses."""
     return {**sampling, "sources": [source for source in sampling["sources"] if source["kind"] != REFINED]}
 
 
-def _differences(index: dict, rig: Rig) -> list[str]:
+def _rig_differences(index: dict, rig: Rig) -> list[str]:
     joints = read_joints(index["joints"])
     fingerprint = Fingerprint.from_json(index["rig"]["fingerprint"])
-    # The rest matrices are in an array and are compared when the recording is used.
+    # The rest matrices are in an array; they are compared when the recording is used.
     return rig_differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
 
 
 def remove_recording(path: Path) -> None:
-    """Remove the files of a recording, and its folder where it is empty then.
+    """Remove the files of a recording, and the folder where it has no other files.
 
     Raises:
-        RecordingError: there is no recording, or another process writes it.
+        RecordingError: the folder has no recording, or another process writes it.
         OutputError: a file cannot be removed.
     """
     if not os.path.exists(path / INDEX_NAME):
@@ -137,7 +138,7 @@ def remove_recording(path: Path) -> None:
         lock.acquire()
         remove_recording_files(path)
         lock.release()
-        # The folder stays where it has other files, or another program has it open.
+        # The folder cannot be removed where it has other files, or another program has it open.
         with suppress(OSError):
             path.rmdir()
     except OSError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of the folder that a recording is written into, and removal of its files."""
+"""Checks of the folder into which a recording is written, and removal of the files of a recording."""
 
 import os
 from pathlib import Path
@@ -16,11 +16,11 @@ from .reader import check_resumable
 RECORDING_FILES = tuple(
     f"{name}.npy" for name in sorted(ARRAY_NAMES, key=STREAMED_ARRAY_NAMES.__contains__, reverse=True)
 )
-"""File names of the arrays; first those that a training has open, which Windows refuses to remove."""
+"""File names of the arrays. Arrays that a training keeps open come first, because Windows refuses to remove them."""
 
 
 def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
-    """Check before the work that a recording can be started or resumed.
+    """Check before a long job that a recording can be started or resumed.
 
     Args:
         path: the folder.
@@ -29,7 +29,8 @@ def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
 
     Raises:
         OutputError: the folder has other files, or cannot be written.
-        RecordingError: there is a recording and neither is set, it is damaged, or another process writes it.
+        RecordingError: the folder has a recording and neither `resume` nor `overwrite` is set, the recording is
+            damaged, or another process writes it.
     """
     check_folder_writable(path, (*RECORDING_FILES, INDEX_NAME))
     check_folder(path, resume, overwrite)
@@ -45,11 +46,11 @@ def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
 
 
 def check_folder(path: Path, resume: bool, overwrite: bool = False) -> None:
-    """Check a folder as `check_recordable` does, but without its arrays.
+    """Check a folder as `check_recordable` does, but neither its arrays nor its lock.
 
     Raises:
         OutputError: the folder has other files.
-        RecordingError: there is a recording, and neither `resume` nor `overwrite` is set.
+        RecordingError: the folder has a recording, and neither `resume` nor `overwrite` is set.
     """
     if not os.path.exists(path / INDEX_NAME):
         if not is_available(path):
@@ -66,14 +67,14 @@ def check_folder(path: Path, resume: bool, overwrite: bool = False) -> None:
 
 
 def is_available(path: Path) -> bool:
-    """Return whether a folder is missing, empty, or has only temporary files of an interruption."""
+    """Return whether a folder is missing, empty, or has only temporary files of an interrupted recording."""
     if not os.path.exists(path):
         return True
     return os.path.isdir(path) and all(name == LOCK_NAME or is_temporary_name(name) for name in os.listdir(path))
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a folder has a recording, possibly damaged, by the signature of its index or by its arrays."""
+    """Return whether a folder has a recording, possibly damaged: an index with the right signature, or the arrays."""
     try:
         if RECORDING.matches(path / INDEX_NAME):
             return True
@@ -102,5 +103,5 @@ def remove_recording_files(path: Path) -> None:
     for name in RECORDING_FILES:
         remove_file(path / name)
     remove_temporary_files(path)
-    # The index last, so that an interrupted removal still leaves a recognizable recording.
+    # The index is removed last, so that an interrupted removal leaves a folder that is still recognized as a recording.
     remove_file(path / INDEX_NAME)

@@ -21,26 +21,29 @@ FORMAT = "fdda-recording"
 VERSION = 1
 INDEX_NAME = "recording.json"
 MAX_INDEX_BYTES = 16 << 20
+"""Largest size of an index."""
 MAX_INFLUENCES = 1000
 """Largest number of skin weights of a vertex."""
 RANDOM, ACTION, STRIP, MIRRORED = "random", "action", "strip", "mirrored"
 """Kinds of sources of poses: random poses, frames of an action, frames of an NLA strip, and the mirrored frames of the
 previous source."""
 REFINED = "refined"
-"""Kind of poses added where a model was worst. They do not represent the range of motion and are never held out."""
+"""Kind of source for poses that a refinement added where a model had large errors.
+
+They do not represent the range of motion and are never held out."""
 SOURCE_KINDS = (RANDOM, ACTION, STRIP, MIRRORED, REFINED)
 
 
 @dataclass(frozen=True)
 class Source:
-    """A source of consecutive poses of a recording.
+    """The origin of a run of consecutive poses in a recording.
 
     Attributes:
         kind: `RANDOM`, `ACTION`, `STRIP`, `MIRRORED` or `REFINED`.
         poses: number of poses.
-        name: of the action or strip, mirrored or not; file name of the model that refined poses were chosen for; empty
-            for random poses.
-        frames: first frame of the action or strip and the step between poses, (0, 0) for other poses.
+        name: name of the action or strip, also for mirrored frames; file name of the model for refined poses; empty for
+            random poses.
+        frames: first frame of the action or strip, and number of frames between poses; (0, 0) for other poses.
     """
 
     kind: str
@@ -71,19 +74,18 @@ class Sampling:
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """Counts and origin of a recording, from `recording.json`.
+    """Pose counts and origin of a recording, from `recording.json`.
 
     Attributes:
-        poses, complete: number of all poses and of complete ones.
+        poses, complete: number of all poses, and of complete poses.
         rig_file, object_name: names of the .blend file and of the mesh object.
         blender: version of Blender.
-        sampling: of the poses; of a shard, the sampling of all shards together.
-        fit: of the skin weights; None where they are the rig's own.
-        shard: which poses the recording has; None for all.
-        target: whose surface was recorded; None for the rig itself.
+        sampling: sampling of the poses; for a shard, the sampling of all shards together.
+        fit: fit of the skin weights; None where they are the rig's own.
+        shard: range of poses of a shard; None for a recording of all poses.
+        target: target whose surface was recorded; None where the rig itself was recorded.
         unsettled: ascending indices of the poses in which the target did not come to rest.
-        repeatability: of the target; None where it was not measured.
-
+        repeatability: repeatability of the target; None where it was not measured.
     """
 
     poses: int
@@ -103,14 +105,14 @@ def read_index(path: Path) -> dict:
     """Read `recording.json` of a recording, complete or not, and check the types of its values.
 
     Raises:
-        RecordingError: it is missing, damaged, or of another version.
+        RecordingError: the file is missing, damaged, or of another version.
     """
     index_path = path / INDEX_NAME
     try:
-        # Python reads NaN and infinity, which JSON does not have.
-        constants: list[str] = []
+        # Python accepts NaN and infinity, which JSON does not permit.
+        invalid_constants: list[str] = []
         data = read_input(index_path, MAX_INDEX_BYTES, follow_links=False)
-        index = json.loads(data, parse_constant=lambda name: constants.append(name) or float(name.lower()))
+        index = json.loads(data, parse_constant=lambda name: invalid_constants.append(name) or float(name.lower()))
     except FileNotFoundError as error:
         raise RecordingError(f"'{path}' is not a recording: it has no {INDEX_NAME}; make one with record.") from error
     except OSError as error:
@@ -126,8 +128,8 @@ def read_index(path: Path) -> dict:
         )
     try:
         _check_index(index)
-        if constants:
-            raise ValueError(f"it holds {constants[0]}, which is no number")
+        if invalid_constants:
+            raise ValueError(f"it holds {invalid_constants[0]}, which is no number")
     except KeyError as error:
         raise RecordingError(f"'{index_path}' is damaged: it lacks {error}; record again.") from error
     except (TypeError, AttributeError, ValueError, OverflowError) as error:
@@ -152,13 +154,13 @@ def _check_index(index: dict) -> None:
     for text in (index["blender"], index["rig"]["file"], index["rig"]["object"]):
         if not isinstance(text, str):
             raise TypeError(f"{text!r} is not a string")
-    joints = len(read_joints(index["joints"]))
+    joint_count = len(read_joints(index["joints"]))
     if not isinstance(index["partitions"], list):
         raise TypeError("its partitions are not a list")
     for partition in index["partitions"]:
-        _check_indices([partition["joint"]], "joint", joints)
-        _check_indices(partition["influencing"], "joint", joints)
-        _check_indices(partition.get("merged", []), "joint", joints)
+        _check_indices([partition["joint"]], "joint", joint_count)
+        _check_indices(partition["influencing"], "joint", joint_count)
+        _check_indices(partition.get("merged", []), "joint", joint_count)
         _check_indices(partition.get("controls", []), "control", len(controls))
     Fingerprint.from_json(index["rig"]["fingerprint"])
     read_unit(index)
@@ -175,7 +177,7 @@ def _check_index(index: dict) -> None:
 
 
 def _check_indices(values: list, noun: str, count: int, owner: str = "a partition") -> None:
-    """Raise TypeError or ValueError where values are not a list of different indices below a count."""
+    """Raise TypeError or ValueError where values are not a list of distinct indices below a count."""
     if not isinstance(values, list):
         raise TypeError(f"{owner} has {noun}s that are not a list")
     for value in values:
@@ -195,9 +197,9 @@ def _read_sampling(value: dict) -> Sampling:
         raise TypeError("its range of motion or its sources are not a list")
     sources = tuple(_read_source(source) for source in value["sources"])
     margin = Margin.from_json(value["margin"]) if "margin" in value else None
-    random = sum(source.poses for source in sources if source.kind == RANDOM)
-    if margin and margin.poses > random:
-        raise ValueError(f"{margin.poses} of its {random} random poses lie in the margin")
+    random_pose_count = sum(source.poses for source in sources if source.kind == RANDOM)
+    if margin and margin.poses > random_pose_count:
+        raise ValueError(f"{margin.poses} of its {random_pose_count} random poses lie in the margin")
     channels = tuple(Channel.from_json(channel) for channel in value["limits"])
     return Sampling(seed, float(spread), channels, sources, margin)
 
@@ -214,7 +216,7 @@ def _read_source(value: dict) -> Source:
 
 
 def read_info(index: dict) -> RecordingInfo:
-    """Return the counts and the origin of a recording from its index."""
+    """Return the pose counts and the origin of a recording from its index."""
     return RecordingInfo(
         index["poses"],
         index["complete"],

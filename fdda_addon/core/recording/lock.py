@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Lock file of a recording folder, which permits one writer at a time.
 
-The operating system holds the lock, as in the package `filelock`, and releases it when the process ends. The content
-of the file only names the owner in messages.
+As in the package `filelock`, the lock belongs to the operating system, which releases it when the process ends. The
+content of the file serves only to name the owner in messages.
 """
 
 import contextlib
@@ -20,14 +20,14 @@ LOCK_NAME = "recording.lock"
 MAX_OWNER_BYTES = 1000
 _OPTIONAL_FLAGS = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
 _OPEN_FLAGS = os.O_RDWR | os.O_CREAT | sum(_OPTIONAL_FLAGS)
-LOCKED_BYTE = 1 << 30
-"""Windows denies reading of locked bytes, so a byte past the end of the file is locked."""
+LOCKED_BYTE_OFFSET = 1 << 30
+"""Offset of the byte that is locked. It is past the end of the file, because Windows denies reading of locked bytes."""
 
-_held_locks: set[Path] = set()
+_held_lock_paths: set[Path] = set()
 
 
 class RecordingLock:
-    """Lock of a folder for writing, from `acquire` to `release`."""
+    """Lock of a folder for one writer, held from `acquire` to `release`."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -39,7 +39,7 @@ class RecordingLock:
         return self._handle >= 0
 
     def acquire(self) -> None:
-        """Acquire the lock; a file left by a process that has ended does not count.
+        """Acquire the lock. A lock file that an ended process left behind does not block it.
 
         Raises:
             BusyError: another process holds the lock.
@@ -50,7 +50,7 @@ class RecordingLock:
             try:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
                     raise OSError(errno.EINVAL, f"'{LOCK_NAME}' is not a regular file")
-                if not _lock(handle):
+                if not _try_lock(handle):
                     raise BusyError(
                         f"{self._owner(handle)} is recording into '{self._folder}'; wait for it, or choose another "
                         "folder."
@@ -60,21 +60,22 @@ class RecordingLock:
             except BaseException:
                 os.close(handle)
                 raise
-            # The previous owner has removed the file in the meantime.
+            # The previous owner has removed the file since it was opened.
             os.close(handle)
         self._handle = handle
-        _held_locks.add(self._path)
-        # The lock does not depend on the content, which a full disk may refuse.
+        _held_lock_paths.add(self._path)
+        # A full disk may refuse the content, which the lock does not need.
         with contextlib.suppress(OSError):
             os.ftruncate(handle, 0)
             os.write(handle, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
 
     def release(self) -> None:
-        """Release the lock, if it is held."""
+        """Release the lock where it is held."""
         if not self.is_held:
             return
-        _held_locks.discard(self._path)
-        # While the lock is held, the file is this one. Windows does not remove open files.
+        _held_lock_paths.discard(self._path)
+        # Remove the file while the lock is still held, so that it is not the file of another owner. Windows refuses to
+        # remove an open file, so there the file is removed after it is closed.
         with contextlib.suppress(OSError):
             self._path.unlink()
         os.close(self._handle)
@@ -90,8 +91,8 @@ class RecordingLock:
             return False
 
     def _owner(self, handle: int) -> str:
-        """Return words for the owner of the lock."""
-        if self._path in _held_locks:
+        """Describe the owner of the lock for a message."""
+        if self._path in _held_lock_paths:
             return "This Blender"
         try:
             os.lseek(handle, 0, os.SEEK_SET)
@@ -102,12 +103,12 @@ class RecordingLock:
         return f"Another Blender (process {pid}{'' if host == socket.gethostname() else f' on {host!r}'})"
 
 
-def _lock(handle: int) -> bool:
+def _try_lock(handle: int) -> bool:
     """Lock an open file; return False where another process holds the lock."""
     if sys.platform == "win32":
         import msvcrt
 
-        os.lseek(handle, LOCKED_BYTE, os.SEEK_SET)
+        os.lseek(handle, LOCKED_BYTE_OFFSET, os.SEEK_SET)
         try:
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
         except PermissionError:

@@ -28,8 +28,8 @@ SHARD_KEYS = ("poses", "complete", "shard", "unsettled")
 def merge_recordings(shards: Sequence[Path], path: Path) -> Iterator[Progress]:
     """Merge shards into a recording while the generator is iterated.
 
-    Where shards have a subfolder per mesh, so has the result. An interrupted merge is resumed, and a complete one is
-    left unchanged.
+    Where shards have a subfolder per mesh, the result has the same subfolders. An interrupted merge is resumed, and a
+    complete merge is left unchanged.
 
     Args:
         shards: folders of the shards, in any order; a shard with influences but no poses is permitted.
@@ -53,11 +53,15 @@ def merge_recordings(shards: Sequence[Path], path: Path) -> Iterator[Progress]:
         ]
     )
     for name, (folder, shards_in_order) in zip(names, plans, strict=True):
-        yield from _merge(shards_in_order, folder, f"merge of '{name}'" if name else "merge")
+        yield from _merge_mesh(shards_in_order, folder, f"merge of '{name}'" if name else "merge")
 
 
 def _mesh_folders(shards: Sequence[Path]) -> list[str]:
-    """Return the names of the subfolders of each shard; one empty name where shards are recordings themselves."""
+    """Return the names of the subfolders that every shard has; one empty name where shards have no subfolders.
+
+    Raises:
+        RecordingError: there are no shards, or their subfolders differ.
+    """
     if not shards:
         raise RecordingError("There is nothing to merge; give the folders of the shards.")
     names_by_shard = [[folder.name for folder in recordings_in(shard)] or [""] for shard in shards]
@@ -77,7 +81,7 @@ def _open_in_order(paths: Sequence[Path]) -> list[Recording]:
     """Open the shards of one mesh in the order of their poses.
 
     Raises:
-        RecordingError: they are not all shards of one recording.
+        RecordingError: they are not the complete shards of one recording.
     """
     for path in paths:
         if "shard" not in read_index(path):
@@ -130,11 +134,13 @@ def _check_same_recording(shards: Sequence[Recording]) -> None:
             )
 
 
-def _merge(shards_in_order: Sequence[Recording], path: Path, stage: str) -> Iterator[Progress]:
-    first = shards_in_order[0]
-    total = first.info.shard.total
-    info = replace(first.info, poses=total, complete=0, shard=None, unsettled=())
-    with RecordingWriter(path, first.rig, first.partitions, info, resume=(path / INDEX_NAME).exists()) as writer:
+def _merge_mesh(shards_in_order: Sequence[Recording], path: Path, stage: str) -> Iterator[Progress]:
+    first_shard = shards_in_order[0]
+    total = first_shard.info.shard.total
+    info = replace(first_shard.info, poses=total, complete=0, shard=None, unsettled=())
+    with RecordingWriter(
+        path, first_shard.rig, first_shard.partitions, info, resume=(path / INDEX_NAME).exists()
+    ) as writer:
         yield Progress(stage, writer.complete, total)
         for shard in shards_in_order:
             start = writer.complete - shard.info.shard.first
@@ -145,19 +151,28 @@ def _merge(shards_in_order: Sequence[Recording], path: Path, stage: str) -> Iter
 
 
 def _iterate_chunks(shard: Recording, start: int) -> Iterator[tuple[int, list[np.ndarray]]]:
-    """Yield chunks of the poses of a shard from index `start` on: the first index, and (n, ...) of each streamed array.
+    """Yield chunks of the poses of a shard, beginning at index `start`.
 
     Each chunk is mapped separately, because mapped pages count as memory of the process.
+
+    Yields:
+        The index of the first pose of the chunk, and (n, ...) of each streamed array.
     """
     poses = shard.info.poses
-    rows = {name: getattr(shard, name).shape[1:] for name in STREAMED_ARRAY_NAMES}
-    count = max(1, COPY_CHUNK_BYTES // max(1, 4 * sum(math.prod(row) for row in rows.values())))
-    for begin in range(start, poses, count):
-        end = min(begin + count, poses)
-        yield begin, [_read(shard.path / f"{name}.npy", (poses, *row), begin, end) for name, row in rows.items()]
+    row_shapes = {name: getattr(shard, name).shape[1:] for name in STREAMED_ARRAY_NAMES}
+    chunk_poses = max(1, COPY_CHUNK_BYTES // max(1, 4 * sum(math.prod(row_shape) for row_shape in row_shapes.values())))
+    for begin in range(start, poses, chunk_poses):
+        end = min(begin + chunk_poses, poses)
+        yield (
+            begin,
+            [
+                _read_rows(shard.path / f"{name}.npy", (poses, *row_shape), begin, end)
+                for name, row_shape in row_shapes.items()
+            ],
+        )
 
 
-def _read(path: Path, shape: tuple[int, ...], begin: int, end: int) -> np.ndarray:
+def _read_rows(path: Path, shape: tuple[int, ...], begin: int, end: int) -> np.ndarray:
     if not math.prod(shape[1:]):
         return np.zeros((end - begin, *shape[1:]), np.float32)
     return np.array(open_array(path, shape, np.float32)[begin:end])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reading of a recording, a folder of poses and local residuals. docs/formats.md describes the format.
 
-`recording.json` has the number of complete poses; an array file may have more rows, which are never read.
+`recording.json` has the number of complete poses. An array file may have more rows; the further rows are never read.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from .arrays import MAX_VALUE, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_
 from .index import RecordingInfo, read_index, read_info
 
 CHECK_BLOCK_VERTICES = 1 << 16
-"""Number of vertices whose skin weights are checked at once, to bound the memory."""
+"""Number of vertices whose skin weights are checked at once, which limits the use of memory."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Recording:
 
     Attributes:
         path: the folder.
-        info: counts and origin.
+        info: pose counts and origin.
         rig: the recorded rig.
-        partitions: with their influencing joints.
+        partitions: partitions of the mesh with their influences.
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
         residuals: (N, V, 3) float32, local residuals, axes of the main joint, mesh units.
         controls: (N, C) float32, values of the controls of the rig, each in the unit of its property.
@@ -51,8 +51,8 @@ def read_recording(path: Path) -> Recording:
     """Open a complete recording; the large arrays are memory maps.
 
     Raises:
-        RecordingError: it is incomplete, truncated, of another version, holds values that are not numbers, or its
-            files contradict each other.
+        RecordingError: the recording is incomplete, truncated, or of another version, has values that are not numbers,
+            or its files contradict each other.
     """
     recording = open_recording(path)
     poses, shard = recording.info.poses, recording.info.shard
@@ -76,12 +76,15 @@ def open_recording(path: Path) -> Recording:
     """Open a recording or shard, possibly without poses, without reading its large arrays.
 
     Raises:
-        RecordingError: as `read_recording`, but values of poses are not checked.
+        RecordingError: as for `read_recording`, but the values of poses are not checked.
     """
     index = read_index(path)
     if index["complete"] < index["poses"]:
         raise _incomplete_error(path, index["complete"], index["poses"])
-    arrays = {name: open_array(path / f"{name}.npy", *what) for name, what in _array_shapes(index).items()}
+    arrays = {
+        name: open_array(path / f"{name}.npy", *shape_and_dtype)
+        for name, shape_and_dtype in _index_array_shapes(index).items()
+    }
     joints = read_joints(index["joints"])
     _check_rest(path, arrays, len(joints))
     rig = Rig(
@@ -114,7 +117,7 @@ def read_recorded_skin(path: Path, index: dict) -> tuple[np.ndarray, np.ndarray]
         (V, I) int32 joints and (V, I) float32 weights.
 
     Raises:
-        RecordingError: they are missing or damaged.
+        RecordingError: the skin weights are missing or damaged.
     """
     shape = index["vertices"], index["influences"]
     joints, weights = (
@@ -150,33 +153,33 @@ def read_partitions(rig: Rig, values: list[dict]) -> tuple[Partition, ...]:
 
 
 def check_poses(path: Path, name: str, array: np.ndarray) -> None:
-    """Check poses of a recording with `find_invalid_pose`, which describes `name` and `array`.
+    """Check an array of poses with `find_invalid_pose`, which describes `name` and `array`.
 
     Raises:
         RecordingError: a pose has invalid values.
     """
-    if (bad := find_invalid_pose(name, array)) is not None:
-        pose, words = bad
-        raise RecordingError(f"The recording '{path}' holds {words} ({name}, pose {pose}); record again.")
+    if (invalid := find_invalid_pose(name, array)) is not None:
+        pose, description = invalid
+        raise RecordingError(f"The recording '{path}' holds {description} ({name}, pose {pose}); record again.")
 
 
 def check_resumable(path: Path) -> None:
-    """Check before the work that a recording, complete or not, can be resumed.
+    """Check before a long job that a recording, complete or not, can be resumed.
 
     Raises:
-        RecordingError: as `read_recording`, for the complete poses.
+        RecordingError: as for `read_recording`; only the complete poses are checked.
     """
     index = read_index(path)
     if not index["complete"]:
         return
-    for name, (shape, dtype) in _array_shapes(index).items():
+    for name, (shape, dtype) in _index_array_shapes(index).items():
         if name in STREAMED_ARRAY_NAMES:
             check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype, index["complete"]))
         else:
             open_array(path / f"{name}.npy", shape, dtype)
 
 
-def _array_shapes(index: dict) -> dict[str, tuple[tuple, type]]:
+def _index_array_shapes(index: dict) -> dict[str, tuple[tuple, type]]:
     return array_shapes(
         *(index["poses"], len(index["joints"]), index["vertices"], index["influences"]),
         *(index.get(key, 0) for key in ("faces", "corners")),
@@ -184,13 +187,15 @@ def _array_shapes(index: dict) -> dict[str, tuple[tuple, type]]:
     )
 
 
-def _check_rest(path: Path, arrays: dict[str, np.ndarray], joints: int) -> None:
+def _check_rest(path: Path, arrays: dict[str, np.ndarray], joint_count: int) -> None:
     """Raise RecordingError where rest pose or skin weights are invalid."""
-    rest, positions = arrays["rest_matrices"], arrays["rest_positions"]
-    is_valid = bool((np.abs(rest) <= MAX_VALUE).all()) and bool(are_invertible(rest).all())
-    for start in range(0, len(positions), CHECK_BLOCK_VERTICES):
+    rest_matrices, rest_positions = arrays["rest_matrices"], arrays["rest_positions"]
+    is_valid = bool((np.abs(rest_matrices) <= MAX_VALUE).all()) and bool(are_invertible(rest_matrices).all())
+    for start in range(0, len(rest_positions), CHECK_BLOCK_VERTICES):
         block = slice(start, start + CHECK_BLOCK_VERTICES)
-        is_valid = is_valid and bool((np.abs(positions[block]) <= MAX_VALUE).all())
-        is_valid = is_valid and are_skin_weights(arrays["skin_joints"][block], arrays["skin_weights"][block], joints)
+        is_valid = is_valid and bool((np.abs(rest_positions[block]) <= MAX_VALUE).all())
+        is_valid = is_valid and are_skin_weights(
+            arrays["skin_joints"][block], arrays["skin_weights"][block], joint_count
+        )
     if not is_valid:
         raise RecordingError(f"The rest pose or skin weights of '{path}' are damaged; record again.")

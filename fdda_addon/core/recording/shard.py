@@ -8,7 +8,7 @@ MAX_SHARDS = 100_000
 
 @dataclass(frozen=True)
 class Shard:
-    """Range of poses that a shard has; its length is the number of poses in the index.
+    """Range of the poses of a shard. The length of the range is the number of poses in the index of the shard.
 
     Attributes:
         first: index of the first pose.
@@ -24,7 +24,7 @@ class Shard:
 
         Raises:
             ValueError: the counts contradict each other.
-            KeyError, TypeError: it is damaged.
+            KeyError, TypeError: the JSON is damaged.
         """
         first, total = value["first"], value["of"]
         if type(first) is not int or type(total) is not int or not 0 <= first <= first + poses <= total:
@@ -35,18 +35,18 @@ class Shard:
         return {"first": self.first, "of": self.total}
 
     def format_range(self, poses: int) -> str:
-        """Format the range: "poses 250 to 499 of 1,000"; a shard without poses has influences only."""
+        """Format the range: "poses 250 to 499 of 1,000". A shard without poses has influences only."""
         if not poses:
             return f"influences for {self.total:,} poses, and none of these"
         return f"poses {self.first:,} to {self.first + poses - 1:,} of {self.total:,}"
 
 
 def shard_poses(number: int, count: int, total: int) -> range:
-    """Return the indices of the poses of a shard; the shards together have each pose once.
+    """Return the indices of the poses of a shard; each pose is in exactly one shard.
 
     Args:
-        number: of the shard, 1 to `count`.
+        number: number of the shard, 1 to `count`.
         count: number of shards.
-        total: number of poses.
+        total: number of poses of all shards together.
     """
     return range((number - 1) * total // count, number * total // count)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Targets in `recording.json`: objects whose surface is recorded in place of the rig's own."""
+"""Targets in `recording.json`: objects whose surface is recorded in place of the surface of the rig."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,8 @@ from ..rig import read_name
 
 STATISTIC_NAMES = ("mean", "rms", "p99", "p999", "max")
 POSE, FRAMES, SIMULATION = "pose", "frames", "simulation"
-"""What a target depends on: the pose; the frame, as a cache does; or the pose and its history, as a simulation does."""
+"""The dependence of a target: on the pose alone; on the frame, as a cache; or on the pose and earlier poses, as a
+simulation."""
 FOLLOWS_VALUES = (POSE, FRAMES, SIMULATION)
 
 
@@ -17,11 +18,11 @@ class RecordedTarget:
     """How the target of a recording was evaluated.
 
     Attributes:
-        object_name: of the target.
+        object_name: name of the target object.
         follows: `POSE`, `FRAMES` or `SIMULATION`.
-        pre_roll: frames in which the rig went from the rest pose to the first frame of an action.
-        max_settle_frames: most frames for which a random pose was held; 0 where poses were not held.
-        rest_threshold_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
+        pre_roll: number of frames in which the rig moved from the rest pose to the first frame of an action.
+        max_settle_frames: largest number of frames for which a random pose was held; 0 where poses were not held.
+        rest_threshold_mm: the target is at rest when no vertex moves by more than this between two frames, mm.
     """
 
     object_name: str
@@ -31,12 +32,12 @@ class RecordedTarget:
     rest_threshold_mm: float = 0.0
 
     def to_json(self) -> dict:
-        settled = (
+        settle_values = (
             {"max_settle_frames": self.max_settle_frames, "rest_threshold_mm": self.rest_threshold_mm}
             if self.max_settle_frames
             else {}
         )
-        return {"object": self.object_name, "follows": self.follows, "pre_roll": self.pre_roll, **settled}
+        return {"object": self.object_name, "follows": self.follows, "pre_roll": self.pre_roll, **settle_values}
 
     @staticmethod
     def from_json(value: dict) -> "RecordedTarget":
@@ -50,9 +51,9 @@ class RecordedTarget:
         )
         if target.follows not in FOLLOWS_VALUES:
             raise ValueError(f"its target follows {target.follows!r}")
-        for number in (target.pre_roll, target.max_settle_frames):
-            if type(number) is not int or number < 0:
-                raise ValueError(f"its target has {number!r} frames")
+        for frame_count in (target.pre_roll, target.max_settle_frames):
+            if type(frame_count) is not int or frame_count < 0:
+                raise ValueError(f"its target has {frame_count!r} frames")
         if type(target.rest_threshold_mm) not in (int, float) or not 0 <= target.rest_threshold_mm < math.inf:
             raise ValueError(f"its target rests below {target.rest_threshold_mm!r} mm")
         return target
@@ -60,7 +61,9 @@ class RecordedTarget:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Distance of a target from itself in poses reached from two directions, a lower bound of a model's error.
+    """Distance between the two shapes of a target in a pose that is reached from two directions.
+
+    No model can have a smaller error.
 
     Attributes:
         poses: indices of the poses.
@@ -77,7 +80,7 @@ class Repeatability:
 
     @staticmethod
     def from_json(value: dict, poses: int) -> "Repeatability":
-        """Read it from a file; raise ValueError, TypeError or KeyError where it is damaged.
+        """Read a repeatability from a file; raise ValueError, TypeError or KeyError where it is damaged.
 
         Args:
             value: the JSON.
@@ -88,13 +91,13 @@ class Repeatability:
         )
         if not repeatability.poses or not all(type(pose) is int and 0 <= pose < poses for pose in repeatability.poses):
             raise ValueError("its repeated poses are none of its poses")
-        for number in (*repeatability.distance_mm.values(), repeatability.linear_mm):
-            if type(number) not in (int, float) or not 0 <= number < math.inf:
-                raise ValueError(f"repeated poses are {number!r} mm apart")
+        for distance in (*repeatability.distance_mm.values(), repeatability.linear_mm):
+            if type(distance) not in (int, float) or not 0 <= distance < math.inf:
+                raise ValueError(f"repeated poses are {distance!r} mm apart")
         return repeatability
 
     def sentence(self) -> str:
-        """Describe it for the user."""
+        """Describe the repeatability for the user."""
         count = "1 pose" if len(self.poses) == 1 else f"{len(self.poses)} poses"
         return (
             f"The same pose from two directions: {self.distance_mm['mean']:.3g} mm apart on average, "

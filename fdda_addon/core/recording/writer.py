@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writing of a recording (docs/formats.md), which can be resumed after an interruption at any moment."""
+"""Writing of a recording (docs/formats.md). It can be interrupted at any moment and resumed later."""
 
 import contextlib
 import io
@@ -26,16 +26,16 @@ from .lock import RecordingLock
 from .reader import check_poses, partitions_to_json
 from .target import Repeatability
 
-CHANGING_KEYS = ("complete", "unsettled", "repeatability")
+MUTABLE_KEYS = ("complete", "unsettled", "repeatability")
 """Keys of the index that change while poses are appended."""
 
 
 class RecordingWriter:
     """Context manager that writes a recording pose by pose.
 
-    Every `append` first writes the arrays to the disk, then the count of complete poses, so that an interruption
-    leaves a recording that can be resumed and has no partial pose. Arrays are written, not memory-mapped, because a
-    full disk then raises an error. A new recording that fails before its first complete pose is removed.
+    Every `append` first writes the arrays to the disk, then the number of complete poses. An interruption therefore
+    leaves a recording that can be resumed and has no partial pose. Arrays are written instead of memory-mapped, so that
+    a full disk raises an error. A new recording that fails before its first complete pose is removed.
     """
 
     def __init__(
@@ -51,14 +51,14 @@ class RecordingWriter:
 
         Args:
             path: the folder, which is created where it is missing.
-            rig, partitions: of the recording.
-            info: of the recording; `complete` is ignored.
+            rig, partitions: rig and partitions to record.
+            info: origin and number of poses of the recording; `complete` is ignored.
             resume: continue the recording at `path`.
             overwrite: remove the recording at `path` first.
 
         Raises:
-            RecordingError: there is a recording already and neither is set, it differs from this one, or another
-                process writes it.
+            RecordingError: the folder has a recording and neither `resume` nor `overwrite` is set, that recording has
+                another rig or other settings, or another process writes it.
             OutputError: the folder cannot be written.
         """
         self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
@@ -81,7 +81,7 @@ class RecordingWriter:
             remove_temporary_files(path)
             if not self._is_new:
                 self.complete = self._check_resumable()
-            # The index first: a folder with arrays but no index can be neither resumed nor recorded into.
+            # The index is written first: a folder with arrays but no index can neither be resumed nor used again.
             self._write_index()
             self._open_arrays()
         except BaseException as error:
@@ -98,11 +98,11 @@ class RecordingWriter:
         # The scale of an object may be animated; no array depends on it.
         self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
         current = self._index()
-        if different := [
-            key for key in find_different_keys(previous, current) if key.partition(".")[0] not in CHANGING_KEYS
+        if different_keys := [
+            key for key in find_different_keys(previous, current) if key.partition(".")[0] not in MUTABLE_KEYS
         ]:
             raise RecordingError(
-                f"Cannot resume '{self.path}': it was recorded differently ({', '.join(different)}); "
+                f"Cannot resume '{self.path}': it was recorded differently ({', '.join(different_keys)}); "
                 "record with the same rig and options, or into another folder."
             )
         self.unsettled = list(previous.get("unsettled", ()))
@@ -119,7 +119,7 @@ class RecordingWriter:
         for name, (shape, dtype) in shapes.items():
             path = self.path / f"{name}.npy"
             if not self.complete:
-                # The path may be a link, which must not be written through.
+                # The path may be a symbolic link, and the file that it points to must not be overwritten.
                 remove_file(path)
             if name not in STREAMED_ARRAY_NAMES:
                 array = getattr(self.rig, name).astype(dtype)
@@ -132,28 +132,28 @@ class RecordingWriter:
                     )
                 continue
             header = array_header(shape, dtype)
-            row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
-            end = len(header) + self.complete * row
+            row_bytes = math.prod(shape[1:]) * np.dtype(dtype).itemsize
+            end_offset = len(header) + self.complete * row_bytes
             if self.complete:
-                self._check_array(path, header, end)
+                self._check_array(path, header, end_offset)
                 check_poses(self.path, name, open_array(path, shape, dtype, self.complete))
             self._files[name] = file = open_input(path, "r+b" if self.complete else "x+b", follow_links=False)
             file.write(header)
-            file.truncate(end)
+            file.truncate(end_offset)
             file.seek(0, os.SEEK_END)
-            # Allocate all space now, so that a full disk is an error before the work.
+            # Allocate the space of all poses now, so that a full disk is found before any pose is evaluated.
             if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, len(header) + self.info.poses * row)
+                os.posix_fallocate(file.fileno(), 0, len(header) + self.info.poses * row_bytes)
 
     def _matches_rig(self, name: str, recorded: np.ndarray, array: np.ndarray) -> bool:
-        """Return whether a recorded array of constant size equals that of the rig."""
+        """Return whether a recorded array without a row per pose equals the array of the rig."""
         return rest_matrices_match(recorded, self.rig) if name == "rest_matrices" else np.array_equal(recorded, array)
 
-    def _check_array(self, path: Path, header: bytes, end: int) -> None:
+    def _check_array(self, path: Path, header: bytes, end_offset: int) -> None:
         """Raise RecordingError where an array has fewer poses than the index counts as complete."""
         try:
             with open_input(path, follow_links=False) as file:
-                is_complete = file.read(len(header)) == header and file.seek(0, os.SEEK_END) >= end
+                is_complete = file.read(len(header)) == header and file.seek(0, os.SEEK_END) >= end_offset
         except OSError:
             is_complete = False
         if not is_complete:
@@ -188,7 +188,7 @@ class RecordingWriter:
             **({"target": info.target.to_json()} if info.target else {}),
             **({"unsettled": list(self.unsettled)} if self.unsettled else {}),
             **({"repeatability": self.repeatability.to_json()} if self.repeatability else {}),
-            # Through JSON and back, so that it compares equal with the index of a file.
+            # Converted to JSON text and back, so that it equals the value that is read from a file.
             "sampling": json.loads(json.dumps(info.sampling.to_json())),
         }
 
@@ -221,7 +221,7 @@ class RecordingWriter:
         """
         arrays = streamed_arrays(pose_matrices, residuals, controls, len(self.rig.controls))
         check_pose_values(arrays, self.complete)
-        before = self.complete, self.unsettled
+        previous_counts = self.complete, self.unsettled
         try:
             for name, array in arrays.items():
                 self._files[name].write(np.ascontiguousarray(array, np.float32).data)
@@ -231,7 +231,7 @@ class RecordingWriter:
             self.complete += len(pose_matrices)
             self._write_index()
         except OSError as error:
-            self.complete, self.unsettled = before
+            self.complete, self.unsettled = previous_counts
             raise self._write_error(error) from error
 
     def set_repeatability(self, repeatability: Repeatability) -> None:
@@ -264,7 +264,7 @@ class RecordingWriter:
 
     def _close(self) -> None:
         for file in self._files.values():
-            # On a full disk, closing retries the writes whose failure `append` has reported.
+            # On a full disk, closing tries the failed writes again; `append` has already reported their failure.
             with contextlib.suppress(OSError):
                 file.close()
 
@@ -294,35 +294,39 @@ def write_index(path: Path, index: dict) -> None:
         raise error.__cause__ from None
 
 
-def check_pose_values(arrays: dict[str, np.ndarray], first: int) -> None:
-    """Check arrays of poses, by name, with `find_invalid_pose`; `first` is the index of their first pose.
+def check_pose_values(arrays: dict[str, np.ndarray], first_pose: int) -> None:
+    """Check arrays of poses with `find_invalid_pose`.
+
+    Args:
+        arrays: the arrays by name.
+        first_pose: index of the first pose of the arrays.
 
     Raises:
-        RecordingError: names the pose.
+        RecordingError: a pose has invalid values.
     """
     for name, array in arrays.items():
-        if (bad := find_invalid_pose(name, array)) is not None:
-            pose, words = bad
+        if (invalid := find_invalid_pose(name, array)) is not None:
+            pose, description = invalid
             raise RecordingError(
-                f"Pose {first + pose} of the rig evaluates to {words} ({name}); look for a scale of zero or a broken "
-                "driver."
+                f"Pose {first_pose + pose} of the rig evaluates to {description} ({name}); look for a scale of zero "
+                "or a broken driver."
             )
 
 
 def array_header(shape: tuple, dtype: type) -> bytes:
-    """Return the header of a `.npy` file of version 1.0, of the same length for any number of rows."""
+    """Return the header of a `.npy` file of version 1.0; its length is the same for any number of rows."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape})
     return header.getvalue()
 
 
 def find_different_keys(first: dict, second: dict, prefix: str = "") -> list[str]:
-    """Find the keys whose values differ between two dictionaries; nested keys are dotted."""
-    found = []
+    """List the keys whose values differ between two dictionaries; nested keys are joined by dots."""
+    different_keys = []
     for key in sorted(first.keys() | second.keys()):
         values = first.get(key), second.get(key)
         if all(isinstance(value, dict) for value in values):
-            found += find_different_keys(*values, f"{prefix}{key}.")
+            different_keys += find_different_keys(*values, f"{prefix}{key}.")
         elif key not in first or key not in second or values[0] != values[1]:
-            found.append(f"{prefix}{key}")
-    return found
+            different_keys.append(f"{prefix}{key}")
+    return different_keys
