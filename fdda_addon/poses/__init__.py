@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Poses of a rig: its range of motion, the channels of random poses, and the frames of actions."""
+"""Poses of a rig: ranges of motion, channels of random poses, and frames of actions."""

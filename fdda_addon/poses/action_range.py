@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measures the ranges in which actions move the bones and controls of a rig, from their F-curves.
 
-It evaluates nothing and does not change the scene.
+The measurement reads F-curves only: it does not evaluate or change the scene.
 """
 
 import hashlib
@@ -37,13 +37,13 @@ _REST_VALUES = {
 MAX_CACHE_BYTES = 64_000_000
 """Size of the cached rotations at which the cache is cleared."""
 CONTINUOUS_ANGLES_PREFERENCE = 0.9
-"""Euler angles that are continuous over frames are used unless others have ranges narrower by this factor."""
+"""Euler angles that are continuous over frames are used unless wrapped angles have ranges narrower by this factor."""
 
 ChannelRanges = dict[tuple[str, str, int], tuple[float, float]]
-"""Lowest and highest value by bone, kind and axis."""
+"""Lowest and highest value of channels, by bone, kind and axis."""
 
-Curves = dict[str, dict[int, bpy.types.FCurve]]
-"""F-curves of a bone by channel and index."""
+CurvesByChannel = dict[str, dict[int, bpy.types.FCurve]]
+"""F-curves of a bone, by channel and array index."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class _Measurement:
     """The motion that an action keys.
 
     Attributes:
-        content: the keyframes that were measured; None if the motion depends on more than keyframes.
+        content_key: identifies the measured keyframes; None if the motion depends on more than keyframes.
         ranges: ranges of all channels, with Euler angles that are continuous over frames.
         rotations: (F, 4) float32 quaternions by bone, of the bones that are not keyed as Euler angles.
     """
 
-    content: tuple | None
+    content_key: tuple | None
     ranges: ChannelRanges
     rotations: dict[str, np.ndarray]
 
@@ -67,8 +67,8 @@ _cache: dict[tuple[int, int], _Measurement] = {}
 
 def action_frames(action: bpy.types.Action) -> range:
     """Return the whole frames of an action."""
-    first, last = (round(frame) for frame in action.frame_range)
-    return range(first, last + 1)
+    first_frame, last_frame = (round(frame) for frame in action.frame_range)
+    return range(first_frame, last_frame + 1)
 
 
 def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> ChannelRanges:
@@ -81,14 +81,16 @@ def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.typ
     Returns:
         Ranges of the channels that the actions key and change, relative to the rest pose: `ROTATION` in radians,
         `LOCATION` in meters, `SCALE` as factors. Rotations are Euler angles as `armature.Poser` sets them: in the
-        rotation order of the bone (XYZ for quaternions and axis angles), continuous beyond half a turn.
+        rotation order of the bone (XYZ for quaternions and axis angles), and continuous beyond 180 degrees.
     """
     return moving_ranges(keyed_ranges(armature_object, actions))
 
 
-def moving_ranges(keyed: ChannelRanges) -> ChannelRanges:
-    """Select from the ranges of `keyed_ranges` those that `measured_ranges` returns."""
-    return {key: bounds for key, bounds in keyed.items() if key[1] != ROTATION_VECTOR and has_width(bounds)}
+def moving_ranges(keyed_channel_ranges: ChannelRanges) -> ChannelRanges:
+    """Select the ranges of moving channels from the ranges of `keyed_ranges`."""
+    return {
+        key: bounds for key, bounds in keyed_channel_ranges.items() if key[1] != ROTATION_VECTOR and has_width(bounds)
+    }
 
 
 def has_width(bounds: tuple[float, float]) -> bool:
@@ -97,7 +99,7 @@ def has_width(bounds: tuple[float, float]) -> bool:
 
 
 def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> ChannelRanges:
-    """Measure ranges as `measured_ranges` does, with those of constant channels and of `ROTATION_VECTOR`s.
+    """Measure ranges as `measured_ranges` does, including constant channels and rotation vectors (`ROTATION_VECTOR`).
 
     Bones that are keyed as quaternions or axis angles have rotation vectors besides their Euler angles. Euler angles
     wrap, and have wide ranges near gimbal lock; the ranges of rotation vectors are about as wide as the motion.
@@ -127,13 +129,13 @@ def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> ChannelRanges:
 
 
 def _measure(armature_object: bpy.types.Object, action: bpy.types.Action) -> _Measurement:
-    """Measure an action, and cache the result until its keyframes change: an action of many bones takes a second."""
+    """Measure an action, and cache the result until its keyframes change, because many bones take a second."""
     frames, curves = action_frames(action), _curves_by_bone(armature_object, action)
-    content = _keyframe_content(armature_object, frames, curves)
+    content_key = _keyframe_content_key(armature_object, frames, curves)
     cache_key = armature_object.session_uid, action.session_uid
     measurement = _cache.get(cache_key)
-    if content is None or measurement is None or measurement.content != content:
-        measurement = _Measurement(content, {}, {})
+    if content_key is None or measurement is None or measurement.content_key != content_key:
+        measurement = _Measurement(content_key, {}, {})
         for name, bone_curves in curves.items():
             bone = armature_object.pose.bones[name]
             for kind, axis, values in _channel_values(bone, bone_curves, frames, measurement.rotations):
@@ -144,29 +146,29 @@ def _measure(armature_object: bpy.types.Object, action: bpy.types.Action) -> _Me
     return measurement
 
 
-def _keyframe_content(
-    armature_object: bpy.types.Object, frames: range, curves: dict[str, Curves]
+def _keyframe_content_key(
+    armature_object: bpy.types.Object, frames: range, curves: dict[str, CurvesByChannel]
 ) -> tuple[range, bytes, tuple] | None:
-    """Return what the ranges depend on; None if they depend on more than keyframes."""
+    """Return a key that identifies the measured keyframes; None if the motion depends on more than keyframes."""
     digest, curve_settings = hashlib.sha256(), []
     for bone, channels in curves.items():
-        for channel, by_index in channels.items():
-            for index, curve in by_index.items():
-                points = curve.keyframe_points
-                if curve.modifiers or not points:
+        for channel, curves_by_index in channels.items():
+            for index, curve in curves_by_index.items():
+                keyframes = curve.keyframe_points
+                if curve.modifiers or not keyframes:
                     return None
                 rotation_mode = armature_object.pose.bones[bone].rotation_mode
-                curve_settings.append((bone, rotation_mode, channel, index, len(points), curve.extrapolation))
-                for element in KEYFRAME_ELEMENTS:
-                    digest.update(read(points, element))
+                curve_settings.append((bone, rotation_mode, channel, index, len(keyframes), curve.extrapolation))
+                for keyframe_property in KEYFRAME_ELEMENTS:
+                    digest.update(read(keyframes, keyframe_property))
     return frames, digest.digest(), tuple(curve_settings)
 
 
 def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Control, ...]:
     """Measure the numbers of a rig, besides its bones, that actions key and change, as controls with their ranges.
 
-    These are custom properties, influences of constraints and values of shape keys. Numbers that the file lacks, and
-    those with a range too wide for a control, are left out.
+    These are custom properties, influences of constraints and values of shape keys. Numbers that do not exist
+    in the file, and numbers whose range is too wide for a control, are left out.
 
     Args:
         scene_rig: the rig.
@@ -181,7 +183,7 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
 
 
 def constant_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Channel, ...]:
-    """Find numbers, as of `measured_controls`, that actions key at a single value other than the current one."""
+    """Find numbers of a rig that actions key at a single value other than the current one, as constant channels."""
     channels = []
     for (owner, path), (low, high) in _keyed_controls(scene_rig, actions).items():
         datablock = owner_of(scene_rig, owner)
@@ -209,8 +211,8 @@ def _keyed_controls(
     return ranges
 
 
-def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, Curves]:
-    curves: dict[str, Curves] = {}
+def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, CurvesByChannel]:
+    curves: dict[str, CurvesByChannel] = {}
     for curve in _unmuted_curves(action, armature_object):
         match = _BONE_CHANNEL_PATH.fullmatch(curve.data_path)
         name = bpy.utils.unescape_identifier(match["bone"]) if match else ""
@@ -227,7 +229,7 @@ def _unmuted_curves(action: bpy.types.Action, datablock: bpy.types.ID) -> Iterat
 
 
 def _channel_values(
-    bone: bpy.types.PoseBone, curves: Curves, frames: range, rotations: dict[str, np.ndarray]
+    bone: bpy.types.PoseBone, curves: CurvesByChannel, frames: range, rotations: dict[str, np.ndarray]
 ) -> Iterator[tuple[str, int, np.ndarray]]:
     """Evaluate the keyed channels of a bone.
 
@@ -245,40 +247,40 @@ def _channel_values(
             yield kind, axis, _evaluate_curves(curves[kind], kind, frames)[:, axis]
     channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}.get(bone.rotation_mode)
     channel = channel or "rotation_euler"
-    keyed = curves.get(channel)
-    if keyed:
-        values = _evaluate_curves(keyed, channel, frames)
+    keyed_curves = curves.get(channel)
+    if keyed_curves:
+        values = _evaluate_curves(keyed_curves, channel, frames)
         if channel != "rotation_euler":
             if channel == "rotation_axis_angle":
                 values = np.array([_axis_angle_to_quaternion(value) for value in values])
             rotations[bone.name] = values.astype(np.float32)
         angles = _continuous_angles(channel, bone.rotation_mode, values)
-        for axis in keyed if channel == "rotation_euler" else range(3):
+        for axis in keyed_curves if channel == "rotation_euler" else range(3):
             yield ROTATION, axis, angles[:, axis]
 
 
 def _evaluate_curves(curves: dict[int, bpy.types.FCurve], channel: str, frames: range) -> np.ndarray:
-    """Evaluate the F-curves of a channel, (F, 3 or 4) float64; components without an F-curve are at rest."""
+    """Evaluate the F-curves of a channel, (F, 3 or 4) float64; components without an F-curve have their rest values."""
     values = np.tile(np.float64(_REST_VALUES[channel]), (len(frames), 1))
     for index, curve in curves.items():
         values[:, index] = [curve.evaluate(frame) for frame in frames]
     return values
 
 
-def _continuous_angles(channel: str, mode: str, values: np.ndarray) -> np.ndarray:
-    """Convert rotations to Euler angles, (F, 3) radians, that do not jump by a turn between frames.
+def _continuous_angles(channel: str, rotation_mode: str, values: np.ndarray) -> np.ndarray:
+    """Convert rotations to Euler angles, (F, 3) radians, that do not jump by 360 degrees between frames.
 
     Args:
         channel: the channel of the rotations, "rotation_euler" or another one, which holds quaternions.
-        mode: rotation mode of the bone.
+        rotation_mode: rotation mode of the bone.
         values: (F, 3 or 4) values.
     """
     angles, euler = np.empty((len(values), 3)), Euler((0.0, 0.0, 0.0), "XYZ")
     for index, value in enumerate(values):
         if channel == "rotation_euler":
-            euler = Euler(value, mode)
+            euler = Euler(value, rotation_mode)
             if index:
-                euler.make_compatible(Euler(angles[index - 1], mode))
+                euler.make_compatible(Euler(angles[index - 1], rotation_mode))
         else:
             quaternion = Quaternion(value)
             # A quaternion of length 0 is no rotation, as in Blender.

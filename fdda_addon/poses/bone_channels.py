@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Converts between channels of bones and controls: both are numbers of the armature object."""
+"""Relates channels of bones to controls: both may set the same number of the armature object."""
 
 from collections.abc import Iterable
 
@@ -8,22 +8,22 @@ import bpy
 from ..core.controls import ARMATURE_OBJECT
 from ..core.poses import LOCATION, ROTATION, SCALE, Channel
 
-_PATHS = {ROTATION: "rotation_euler", LOCATION: "location", SCALE: "scale"}
+_PROPERTY_NAMES = {ROTATION: "rotation_euler", LOCATION: "location", SCALE: "scale"}
 
 
 def control_name(armature_object: bpy.types.Object, channel: Channel) -> str:
     """Return the name of the control (`Control.name`) for the number that a channel sets; empty if there is none."""
     bone = armature_object.pose.bones.get(channel.name)
-    if channel.kind not in _PATHS or bone is None:
+    if channel.kind not in _PROPERTY_NAMES or bone is None:
         return ""
     if channel.kind == ROTATION and bone.rotation_mode in {"QUATERNION", "AXIS_ANGLE"}:
         return ""
-    escaped = bpy.utils.escape_identifier(channel.name)
-    return f'{ARMATURE_OBJECT}/pose.bones["{escaped}"].{_PATHS[channel.kind]}[{channel.axis}]'
+    escaped_name = bpy.utils.escape_identifier(channel.name)
+    return f'{ARMATURE_OBJECT}/pose.bones["{escaped_name}"].{_PROPERTY_NAMES[channel.kind]}[{channel.axis}]'
 
 
 def ranges_by_control(armature_object: bpy.types.Object, channels: Iterable[Channel]) -> dict[str, tuple[float, float]]:
-    """Return the ranges of channels of bones by the names of the controls for the same numbers."""
+    """Return the ranges of bone channels, by the names of the controls that set the same numbers."""
     ranges = {control_name(armature_object, channel): (channel.low, channel.high) for channel in channels}
     ranges.pop("", None)
     return ranges

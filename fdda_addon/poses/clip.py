@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Clips: actions, or strips of an armature's NLA, whose whole frames are poses."""
+"""Clip: an action, or a strip of an armature's NLA, whose whole frames are used as poses."""
 
 import math
 from collections.abc import Iterable
@@ -14,13 +14,13 @@ from .action_range import action_frames
 
 @dataclass(frozen=True)
 class Clip:
-    """A piece of animation.
+    """An action or an NLA strip whose frames are used as poses.
 
     Attributes:
         kind: `ACTION` or `STRIP`.
         name: name of the action or strip.
-        frames: its whole frames, in scene time.
-        is_mirrored: its poses are mirrored left to right.
+        frames: the whole frames of the clip, in scene time.
+        is_mirrored: the poses of the clip are mirrored left to right.
     """
 
     kind: str

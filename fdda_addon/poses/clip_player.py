@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shows the frames of clips: assigns an action, or enables the NLA, on all datablocks of a rig, and restores them."""
+"""Shows the frames of clips: assigns an action to all datablocks of a rig, or enables their NLA, and restores them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +22,7 @@ PropertyValues = dict[tuple[bpy.types.ID, str], object]
 """Values by datablock and RNA path."""
 
 ControlledRigs = Sequence[tuple[SceneRig, Iterable[str]]]
-"""Rigs of one armature, each with the names of the controls that other code sets between frames."""
+"""Rigs of one armature, each with the names of controls that the caller sets between frames."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class ClipFrame:
 
 
 class ClipPlayer:
-    """Shows frames of clips; a frame does not depend on those that were shown before.
+    """Shows frames of clips. Each frame looks the same, whatever frames were shown before.
 
-    Bones that an action does not key are at rest, and other numbers have the values of the file. An action also
-    animates the shape keys, the mesh object and the armature's data if it has F-curves for them.
+    Bones that an action does not key are in the rest pose, and other numbers have their values in the file. An action
+    also animates the shape keys, the mesh object and the armature's data if it has F-curves for them.
     """
 
     def __init__(self, rigs: ControlledRigs, clips: tuple[Clip, ...]):
@@ -58,17 +58,19 @@ class ClipPlayer:
         self._armature_object, self._clip = rigs[0][0].armature_object, None
         self._other_datablocks = [d for d in _other_datablocks(rigs) if any(_animates(clip, d) for clip in clips)]
         self._idle_states: list[tuple] | None = None
-        animated = {
+        animated_numbers = {
             (datablock, path): value
             for datablock in (self._armature_object, *self._other_datablocks)
-            for path, value in animated_values(datablock, _actions(clips, datablock)).items()
+            for path, value in animated_values(datablock, _actions_of_clips(clips, datablock)).items()
             if not _is_pose_channel(path)
         }
         self._mirror = None
         if any(clip.is_mirrored for clip in clips):
-            self._mirror = Mirror(self._armature_object, animated)
-            animated |= {(datablock, path): datablock.path_resolve(path) for datablock, path in self._mirror.numbers}
-        self._numbers: PropertyValues = animated
+            self._mirror = Mirror(self._armature_object, animated_numbers)
+            animated_numbers |= {
+                (datablock, path): datablock.path_resolve(path) for datablock, path in self._mirror.numbers
+            }
+        self._numbers: PropertyValues = animated_numbers
         self._controls: list[tuple[SceneRig, str, float]] = []
         for scene_rig, names in rigs:
             for name in names:
@@ -80,7 +82,7 @@ class ClipPlayer:
         if clip != self._clip:
             self._start(clip)
         elif clip.is_mirrored:
-            self._reset()
+            self._reset_pose()
         bpy.context.scene.frame_set(frame)
         if clip.is_mirrored:
             self._mirror.apply()
@@ -93,7 +95,7 @@ class ClipPlayer:
         return ClipFrame(tuple(read(bones, channel) for channel in POSE_CHANNELS), numbers)
 
     def set_clip_frame(self, clip_frame: ClipFrame, frame: int) -> None:
-        """Set the values of a shown frame at another frame of the scene, without animation."""
+        """Set the values of a clip frame at any frame of the scene, without animation."""
         self.stop()
         for channel, values in zip(POSE_CHANNELS, clip_frame.channels, strict=True):
             write(self._armature_object.pose.bones, channel, values)
@@ -104,7 +106,7 @@ class ClipPlayer:
         bpy.context.scene.frame_set(frame)
 
     def stop(self) -> None:
-        """Remove the animation of the rig, and set the rest pose and the numbers of the file."""
+        """Remove the animation of the rig, and set the rest pose and the values that the numbers have in the file."""
         if self._clip is not None:
             self._clip = None
             animation = self._armature_object.animation_data
@@ -112,21 +114,21 @@ class ClipPlayer:
                 animation.use_nla, animation.action = False, None
             for datablock, state in zip(self._other_datablocks, self._idle_states, strict=True):
                 _restore_animation(datablock, state)
-            self._reset()
+            self._reset_pose()
 
     def _start(self, clip: Clip) -> None:
         self.stop()
         if self._idle_states is None:
             self._idle_states = [_animation_state(datablock) for datablock in self._other_datablocks]
         self._clip = clip
-        self._reset()
+        self._reset_pose()
         for datablock in [d for d in (self._armature_object, *self._other_datablocks) if _animates(clip, d)]:
             if clip.kind == ACTION:
                 assign_action(datablock, bpy.data.actions[clip.name])
             else:
                 datablock.animation_data.action, datablock.animation_data.use_nla = None, True
 
-    def _reset(self) -> None:
+    def _reset_pose(self) -> None:
         clear_pose(self._armature_object)
         self.restore_numbers()
 
@@ -142,7 +144,7 @@ class ClipPlayer:
 
 @contextmanager
 def clip_player(rigs: ControlledRigs, clips: tuple[Clip, ...]) -> Iterator[ClipPlayer]:
-    """Yield a player of clips; restore the animation of the rigs and the numbers that the clips animate afterwards.
+    """Yield a player of clips; afterwards restore the animation of the rigs and the numbers that the clips animate.
 
     Enter it before `temporary_pose`, which restores the animation of the armature object and the frame.
 
@@ -164,18 +166,18 @@ def clip_player(rigs: ControlledRigs, clips: tuple[Clip, ...]) -> Iterator[ClipP
 
 def clip_actions(armature_object: bpy.types.Object, clips: tuple[Clip, ...]) -> list[bpy.types.Action]:
     """Return the actions that animate the armature object while clips are shown, for `temporary_pose`."""
-    return _actions(clips, armature_object)
+    return _actions_of_clips(clips, armature_object)
 
 
 def _other_datablocks(rigs: ControlledRigs) -> list[bpy.types.ID]:
-    """Return the datablocks of rigs besides the armature object, each once."""
+    """Return the datablocks of rigs except the armature object, without duplicates."""
     meshes = [scene_rig.mesh_object for scene_rig, _ in rigs]
     datablocks = [rigs[0][0].armature_object.data]
     datablocks += [datablock for mesh_object in meshes for datablock in (mesh_object, mesh_object.data.shape_keys)]
     return list(dict.fromkeys(datablock for datablock in datablocks if datablock is not None))
 
 
-def _actions(clips: tuple[Clip, ...], datablock: bpy.types.ID) -> list[bpy.types.Action]:
+def _actions_of_clips(clips: tuple[Clip, ...], datablock: bpy.types.ID) -> list[bpy.types.Action]:
     actions = [bpy.data.actions[clip.name] for clip in clips if clip.kind == ACTION]
     if datablock.animation_data is not None and any(clip.kind != ACTION for clip in clips):
         actions += driving_actions(datablock.animation_data)
@@ -209,7 +211,7 @@ def _animation_state(datablock: bpy.types.ID) -> tuple | None:
 
 
 def _restore_animation(datablock: bpy.types.ID, state: tuple | None) -> None:
-    """Restore what `_animation_state` has returned, if it has changed."""
+    """Restore the state that `_animation_state` returned, if it has changed."""
     if state == _animation_state(datablock):
         return
     if state is None:
@@ -218,6 +220,6 @@ def _restore_animation(datablock: bpy.types.ID, state: tuple | None) -> None:
     animation, (action, slot, use_nla) = datablock.animation_data, state
     animation.action = action
     if action is not None and hasattr(animation, "action_slot"):
-        # Blender chooses a slot when an action is assigned, also where there was none.
+        # Blender chooses a slot when an action is assigned, even if there was none before.
         animation.action_slot = slot
     animation.use_nla = use_nla

@@ -30,7 +30,7 @@ DEFAULT_MARGIN = 0.1
 MAX_WIDENING = 1.5
 """Ratio of the ranges of Euler angles to those of rotation vectors above which a motion is near gimbal lock."""
 
-WIDE_NOTE = "; wider than it rotates, as it comes near gimbal lock: sample the action itself, not these ranges"
+GIMBAL_LOCK_NOTE = "; wider than it rotates, as it comes near gimbal lock: sample the action itself, not these ranges"
 _VERBS_AND_UNITS = {ROTATION: ("turns", "°", 1), LOCATION: ("moves", " mm", 1), SCALE: ("scales", "", 2)}
 """Verb, unit and number of digits by kind of channel."""
 
@@ -41,9 +41,9 @@ class MeasuredLimit:
 
     Attributes:
         bone, kind, axis: as in `Channel`.
-        low, high: the range that was set, or the measured one if it was not; radians, meters or factors.
-        reason_unset: why the range was not set; empty if it was.
-        near_gimbal_lock: the bone rotates less far than its three Euler angles do (`MAX_WIDENING`).
+        low, high: the range that was set, or the measured range if none was set; radians, meters or factors.
+        reason_unset: the reason why the range was not set; empty if it was set.
+        near_gimbal_lock: the bone rotates much less than the ranges of its Euler angles allow (`MAX_WIDENING`).
     """
 
     bone: str
@@ -61,10 +61,10 @@ def set_limits_from_actions(
     """Set the ranges of motion of a rig from actions.
 
     Rotations are stored as IK limits if these can express them and no IK solver uses them. All other ranges are stored
-    in Limit constraints with an influence of 0, so the poses of the rig do not change. A limit that is enforced stays,
+    in Limit constraints with an influence of 0, so the poses of the rig do not change. An enforced limit is kept
     and bounds the range. Locked axes stay locked, and axes that the actions do not move keep their range. If a Limit
-    Rotation constraint is added, its other axes without a range are set to no motion: otherwise they would get the
-    default range.
+    Rotation constraint is added, it fixes the other axes that have no range, because they would get the default range
+    otherwise.
 
     Args:
         scene_rig: the rig.
@@ -72,7 +72,7 @@ def set_limits_from_actions(
         margin: fraction of the width of each range that is added at each end.
 
     Returns:
-        The axes that the actions move, and those that they hold rotated, in the order of the bones.
+        The axes that the actions move or hold at a constant rotation other than rest, in the order of the bones.
 
     Raises:
         RigError: the actions move no bone of the rig, or the rig is linked and cannot be changed.
@@ -83,46 +83,56 @@ def set_limits_from_actions(
             f"'{armature_object.name}' is linked and its limits belong to another file; set them there, or give it a "
             "library override."
         )
-    keyed = keyed_ranges(armature_object, actions)
-    measured = moving_ranges(keyed)
-    held = {key: bounds for key, bounds in keyed.items() if key[1] == ROTATION and _is_held_rotated(bounds)}
-    if not measured:
+    keyed_channel_ranges = keyed_ranges(armature_object, actions)
+    moving_channel_ranges = moving_ranges(keyed_channel_ranges)
+    held_rotations = {
+        key: bounds
+        for key, bounds in keyed_channel_ranges.items()
+        if key[1] == ROTATION and _is_constant_rotation(bounds)
+    }
+    if not moving_channel_ranges:
         names = ", ".join(f"'{action.name}'" for action in actions) or "none"
         raise RigError(f"The actions ({names}) move no bone of '{armature_object.name}'; choose actions of this rig.")
-    gimbal_locked = _bones_near_gimbal_lock(keyed)
+    bones_near_gimbal_lock = _bones_near_gimbal_lock(keyed_channel_ranges)
     # An IK solver uses the limits of any bone that it moves.
     has_ik = any(constraint.type == "IK" for bone in armature_object.pose.bones for constraint in bone.constraints)
     all_limits: list[MeasuredLimit] = []
     for bone in armature_object.pose.bones:
-        bone_ranges = {key[1:]: bounds for key, bounds in (measured | held).items() if key[0] == bone.name}
+        bone_ranges = {
+            key[1:]: bounds for key, bounds in (moving_channel_ranges | held_rotations).items() if key[0] == bone.name
+        }
         limits = [
             _measured_limit(bone, *kind_axis, bounds, margin) for kind_axis, bounds in sorted(bone_ranges.items())
         ]
         for kind in (ROTATION, LOCATION, SCALE):
-            settable = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
+            settable_limits = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
             has_constraint = find_local_limit(bone, LIMIT_CONSTRAINT_TYPES[kind]) is not None
-            if kind == ROTATION and not has_ik and not has_constraint and _fit_ik_limits(settable):
-                for limit in settable:
+            if kind == ROTATION and not has_ik and not has_constraint and _can_be_ik_limits(settable_limits):
+                for limit in settable_limits:
                     set_rotation_range(bone, limit.axis, limit.low, limit.high)
-            elif settable:
-                _set_range_constraint(bone, kind, settable)
+            elif settable_limits:
+                _set_range_constraint(bone, kind, settable_limits)
         for limit in limits:
-            is_near = bone.name in gimbal_locked and limit.kind == ROTATION
+            is_near = bone.name in bones_near_gimbal_lock and limit.kind == ROTATION
             all_limits.append(replace(limit, near_gimbal_lock=is_near))
     return tuple(all_limits)
 
 
-def _bones_near_gimbal_lock(keyed: ChannelRanges) -> set[str]:
+def _bones_near_gimbal_lock(keyed_channel_ranges: ChannelRanges) -> set[str]:
     """Find the bones whose ranges of Euler angles allow much larger rotations than the actions have."""
     widths: dict[tuple[str, str], float] = {}
-    for (bone, kind, _), (low, high) in keyed.items():
+    for (bone, kind, _), (low, high) in keyed_channel_ranges.items():
         widths[bone, kind] = widths.get((bone, kind), 0.0) + high - low
-    vectors = [(bone, width) for (bone, kind), width in widths.items() if kind == ROTATION_VECTOR]
-    return {bone for bone, width in vectors if widths[bone, ROTATION] > MAX_WIDENING * width + RANGE_TOLERANCE}
+    rotation_vector_widths = [(bone, width) for (bone, kind), width in widths.items() if kind == ROTATION_VECTOR]
+    return {
+        bone
+        for bone, width in rotation_vector_widths
+        if widths[bone, ROTATION] > MAX_WIDENING * width + RANGE_TOLERANCE
+    }
 
 
-def _is_held_rotated(bounds: tuple[float, float]) -> bool:
-    """Return whether a rotation is constant and not that of the rest pose."""
+def _is_constant_rotation(bounds: tuple[float, float]) -> bool:
+    """Return whether a rotation is constant and differs from the rest pose."""
     return not has_width(bounds) and abs(bounds[0]) > RANGE_TOLERANCE
 
 
@@ -133,9 +143,12 @@ def _measured_limit(
     if not has_width(bounds):
         return MeasuredLimit(bone.name, kind, axis, *bounds, "constant and not at rest, so it gets no range")
     low, high = bounds
-    extra = (high - low) * margin
+    margin_width = (high - low) * margin
     # Positive scales stay positive, because a scale of zero has no inverse.
-    low, high = low - extra if kind != SCALE or low <= 0 else max(low - extra, low / 2), high + extra
+    low, high = (
+        low - margin_width if kind != SCALE or low <= 0 else max(low - margin_width, low / 2),
+        high + margin_width,
+    )
     if kind == ROTATION:
         is_locked = rotation_ranges(bone)[axis].is_locked
     else:
@@ -151,8 +164,8 @@ def _measured_limit(
     return MeasuredLimit(bone.name, kind, axis, low, high)
 
 
-def _fit_ik_limits(limits: list[MeasuredLimit]) -> bool:
-    """Return whether IK limits can express ranges: they include the rest pose and at most half a turn each way."""
+def _can_be_ik_limits(limits: list[MeasuredLimit]) -> bool:
+    """Return whether IK limits can express ranges, which must include the rest pose and lie within ±180 degrees."""
     return all(-math.pi <= limit.low <= 0 <= limit.high <= math.pi for limit in limits)
 
 
@@ -167,17 +180,18 @@ def _set_range_constraint(bone: bpy.types.PoseBone, kind: str, limits: list[Meas
 
 
 def describe_limits(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimit]) -> list[str]:
-    """Describe the limits in a line for each bone, in degrees and millimeters."""
+    """Describe the limits with one line per bone, in degrees and millimeters."""
     factors = {ROTATION: 180 / math.pi, LOCATION: 1000 * metres_per_unit(armature_object), SCALE: 1.0}
-    limits, by_bone = list(limits), dict[str, list[str]]()
+    limits, descriptions_by_bone = list(limits), dict[str, list[str]]()
     for limit in limits:
         (verb, unit, digits), factor = _VERBS_AND_UNITS[limit.kind], factors[limit.kind]
         # Adding zero turns -0 into 0.
         low, high = (round(bound * factor, digits) + 0.0 for bound in (limit.low, limit.high))
         bounds = f"{low:.{digits}f} to {high:.{digits}f}{unit}"
         reason = f" ({limit.reason_unset})" if limit.reason_unset else ""
-        by_bone.setdefault(limit.bone, []).append(f"{verb} {AXES[limit.axis].upper()} {bounds}{reason}")
-    gimbal_locked = {limit.bone for limit in limits if limit.near_gimbal_lock}
+        descriptions_by_bone.setdefault(limit.bone, []).append(f"{verb} {AXES[limit.axis].upper()} {bounds}{reason}")
+    bones_near_gimbal_lock = {limit.bone for limit in limits if limit.near_gimbal_lock}
     return [
-        f"{bone}: {', '.join(texts)}{WIDE_NOTE if bone in gimbal_locked else ''}" for bone, texts in by_bone.items()
+        f"{bone}: {', '.join(descriptions)}{GIMBAL_LOCK_NOTE if bone in bones_near_gimbal_lock else ''}"
+        for bone, descriptions in descriptions_by_bone.items()
     ]

@@ -13,9 +13,10 @@ from ..scene.temporary_state import set_value
 from ..scene.unit import metres_per_unit
 
 MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE = 1e-3, 1e-3
-"""Largest distance between an end of a bone and its mirror image: in meters, or relative to the armature's size."""
+"""Largest distance between an end of a bone and its mirror image: the larger of a distance in meters and a ratio of the
+armature's size."""
 AXIS_TOLERANCE = 1e-2
-"""Largest angle between an axis of a bone and that of its mirror image, radians."""
+"""Largest angle between an axis of a bone and the same axis of its mirror image, radians."""
 
 _MIRROR_SIGNS = {
     "location": (-1, 1, 1),
@@ -24,11 +25,11 @@ _MIRROR_SIGNS = {
     "rotation_axis_angle": (1, 1, -1, -1),
     "scale": (1, 1, 1),
 }
-_NAME = re.compile(r'\["((?:[^"\\]|\\.)*)"\]')
+_QUOTED_NAME = re.compile(r'\["((?:[^"\\]|\\.)*)"\]')
 
 
 def flipped_name(name: str) -> str:
-    """Return the name of the other side, `arm.R` for `arm.L`, `rig:RightArm` for `rig:LeftArm`, if there is one."""
+    """Return the name for the other side, such as `arm.R` for `arm.L`; a name without a side is returned unchanged."""
     namespace, colon, base_name = name.rpartition(":")
     return namespace + colon + bpy.utils.flip_name(base_name)
 
@@ -36,12 +37,12 @@ def flipped_name(name: str) -> str:
 class Mirror:
     """Mirrors the pose of an armature about its YZ plane, and numbers that have a left and a right side."""
 
-    def __init__(self, armature_object: bpy.types.Object, animated: Iterable[tuple[bpy.types.ID, str]] = ()):
+    def __init__(self, armature_object: bpy.types.Object, animated_numbers: Iterable[tuple[bpy.types.ID, str]] = ()):
         """Prepare to mirror poses.
 
         Args:
             armature_object: the armature object.
-            animated: datablocks and RNA paths of numbers to exchange with those of the other side, in addition to
+            animated_numbers: datablocks and RNA paths of numbers to exchange with the other side, in addition to
                 custom properties of bones.
 
         Raises:
@@ -50,27 +51,41 @@ class Mirror:
         self._armature_object = armature_object
         bones = armature_object.pose.bones
         indices = {bone.name: index for index, bone in enumerate(bones)}
-        self._partners = np.array([indices.get(flipped_name(name), index) for name, index in indices.items()], int)
-        _check_symmetric(armature_object, self._partners)
-        paths = {(armature_object, path) for path in _custom_property_paths(armature_object)} | set(animated)
-        self._pairs = [
-            (datablock, path, other)
+        self._partner_indices = np.array(
+            [indices.get(flipped_name(name), index) for name, index in indices.items()], int
+        )
+        _check_symmetric(armature_object, self._partner_indices)
+        paths = {(armature_object, path) for path in _custom_property_paths(armature_object)} | set(animated_numbers)
+        self._mirrored_paths = [
+            (datablock, path, flipped_path)
             for datablock, path in sorted(paths, key=lambda datablock_path: datablock_path[1])
-            if (other := _flipped_path(path)) != path and _is_number(datablock, path) and _is_number(datablock, other)
+            if (flipped_path := _flipped_path(path)) != path
+            and _is_number(datablock, path)
+            and _is_number(datablock, flipped_path)
         ]
 
     @property
     def numbers(self) -> list[tuple[bpy.types.ID, str]]:
         """Return the datablocks and RNA paths of the numbers that are exchanged."""
-        return [(datablock, number) for datablock, path, other in self._pairs for number in (path, other)]
+        return [
+            (datablock, number)
+            for datablock, path, flipped_path in self._mirrored_paths
+            for number in (path, flipped_path)
+        ]
 
     def apply(self) -> None:
         """Mirror the current pose and numbers without evaluating them."""
         bones = self._armature_object.pose.bones
         for channel in POSE_CHANNELS:
-            write(bones, channel, read(bones, channel)[self._partners] * np.float32(_MIRROR_SIGNS[channel.name]))
-        values = {(datablock, other): datablock.path_resolve(path) for datablock, path, other in self._pairs}
-        values |= {(datablock, path): datablock.path_resolve(other) for datablock, path, other in self._pairs}
+            write(bones, channel, read(bones, channel)[self._partner_indices] * np.float32(_MIRROR_SIGNS[channel.name]))
+        values = {
+            (datablock, flipped_path): datablock.path_resolve(path)
+            for datablock, path, flipped_path in self._mirrored_paths
+        }
+        values |= {
+            (datablock, path): datablock.path_resolve(flipped_path)
+            for datablock, path, flipped_path in self._mirrored_paths
+        }
         for (datablock, path), value in values.items():
             set_value(datablock, path, value)
         for datablock in {datablock for datablock, _ in values} | {self._armature_object}:
@@ -78,42 +93,42 @@ class Mirror:
             datablock.update_tag()
 
 
-def _check_symmetric(armature_object: bpy.types.Object, partners: np.ndarray) -> None:
+def _check_symmetric(armature_object: bpy.types.Object, partner_indices: np.ndarray) -> None:
     """Check that each bone is the mirror image of its partner, given by (B,) int indices.
 
     Raises:
-        RigError: names a bone that is not.
+        RigError: a bone is not symmetric; the message names it.
     """
     bones = armature_object.data.bones
     matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
     tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)
-    flip = np.diag([-1.0, 1.0, 1.0, 1.0])
-    images = flip @ matrices[partners] @ flip
-    ends = np.concatenate([matrices[:, :3, 3], tails])
-    meters = metres_per_unit(armature_object)
-    size = meters * float(np.ptp(ends, axis=0).max())
+    reflection = np.diag([-1.0, 1.0, 1.0, 1.0])
+    mirror_images = reflection @ matrices[partner_indices] @ reflection
+    bone_ends = np.concatenate([matrices[:, :3, 3], tails])
+    metres_per_armature_unit = metres_per_unit(armature_object)
+    size = metres_per_armature_unit * float(np.ptp(bone_ends, axis=0).max())
     tolerance = max(MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE * size)
-    distances = meters * np.maximum(
-        np.linalg.norm(images[:, :3, 3] - matrices[:, :3, 3], axis=1),
-        np.linalg.norm(tails[partners] * [-1, 1, 1] - tails, axis=1),
+    distances = metres_per_armature_unit * np.maximum(
+        np.linalg.norm(mirror_images[:, :3, 3] - matrices[:, :3, 3], axis=1),
+        np.linalg.norm(tails[partner_indices] * [-1, 1, 1] - tails, axis=1),
     )
-    axis_distances = np.linalg.norm(images[:, :3, :3] - matrices[:, :3, :3], axis=1).max(axis=1)
+    axis_distances = np.linalg.norm(mirror_images[:, :3, :3] - matrices[:, :3, :3], axis=1).max(axis=1)
     for index, bone in enumerate(bones):
-        other = bones[int(partners[index])]
+        partner = bones[int(partner_indices[index])]
         if distances[index] > tolerance:
             difference = f"by {distances[index] * 1000:.1f} mm"
         elif axis_distances[index] > AXIS_TOLERANCE:
             angle = np.degrees(2 * np.arcsin(min(1.0, axis_distances[index] / 2)))
             difference = f"in roll or direction, by {angle:.1f}°"
-        elif armature_object.pose.bones[bone.name].rotation_mode != _rotation_mode(armature_object, other.name):
+        elif armature_object.pose.bones[bone.name].rotation_mode != _rotation_mode(armature_object, partner.name):
             difference = "in rotation mode"
         else:
             continue
-        name, flipped = bone.name, flipped_name(bone.name)
-        if other != bone:
-            problem = f"the bones '{name}' and '{other.name}' differ {difference}; symmetrize the armature"
-        elif flipped != name:
-            problem = f"there is no bone '{flipped}' for '{name}'; add it"
+        name, expected_partner_name = bone.name, flipped_name(bone.name)
+        if partner != bone:
+            problem = f"the bones '{name}' and '{partner.name}' differ {difference}; symmetrize the armature"
+        elif expected_partner_name != name:
+            problem = f"there is no bone '{expected_partner_name}' for '{name}'; add it"
         else:
             problem = f"the bone '{name}' differs from its mirror image {difference}; bring it into the middle"
         raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
@@ -136,7 +151,7 @@ def _flipped_path(path: str) -> str:
     def flip(match: re.Match) -> str:
         return f'["{bpy.utils.escape_identifier(flipped_name(bpy.utils.unescape_identifier(match[1])))}"]'
 
-    return _NAME.sub(flip, path)
+    return _QUOTED_NAME.sub(flip, path)
 
 
 def _is_number(datablock: bpy.types.ID, path: str) -> bool:

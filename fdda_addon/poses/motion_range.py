@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads and writes the range of motion of a bone, where Blender's users keep it.
+"""Reads and writes the range of motion of a bone, which is stored in constraints and IK limits.
 
-The range is that of Limit constraints in local space, else that of the bone's IK limits, else the default range; locked
-axes do not move. A Limit constraint with an influence of 0 stores a range without enforcing it.
+The range is stored in Limit constraints in local space, or else in the bone's IK limits. Without these the bone
+has the default range. Locked axes do not move. A Limit constraint with an influence of 0 stores a range without
+enforcing it.
 """
 
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ class RotationRange:
 
     @property
     def moves(self) -> bool:
+        """Return whether the axis can move."""
         return not self.is_locked and self.low < self.high
 
 
@@ -48,29 +50,30 @@ def rotation_ranges(bone: bpy.types.PoseBone) -> tuple[RotationRange, RotationRa
 
 
 def _rotation_range(bone: bpy.types.PoseBone, constraint: bpy.types.Constraint | None, axis: int) -> RotationRange:
-    letter, locked = AXES[axis], bone.lock_rotation[axis]
+    letter, is_locked = AXES[axis], bone.lock_rotation[axis]
     if constraint is not None:
         if getattr(constraint, f"use_limit_{letter}"):
             low, high = getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}")
-            return RotationRange(low, high, CONSTRAINT, locked)
+            return RotationRange(low, high, CONSTRAINT, is_locked)
     elif getattr(bone, f"lock_ik_{letter}"):
         return RotationRange(0.0, 0.0, DEFAULT, True)
     elif getattr(bone, f"use_ik_limit_{letter}"):
-        return RotationRange(getattr(bone, f"ik_min_{letter}"), getattr(bone, f"ik_max_{letter}"), IK, locked)
-    return RotationRange(*DEFAULT_RANGE, DEFAULT, locked)
+        return RotationRange(getattr(bone, f"ik_min_{letter}"), getattr(bone, f"ik_max_{letter}"), IK, is_locked)
+    return RotationRange(*DEFAULT_RANGE, DEFAULT, is_locked)
 
 
 def location_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
     """Return the ranges, in meters, of the axes that a Limit Location constraint limits on both sides."""
-    return _limited(find_local_limit(bone, "LIMIT_LOCATION"))
+    return _two_sided_limits(find_local_limit(bone, "LIMIT_LOCATION"))
 
 
 def scale_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
     """Return the ranges, as factors, of the axes that a Limit Scale constraint limits on both sides."""
-    return _limited(find_local_limit(bone, "LIMIT_SCALE"))
+    return _two_sided_limits(find_local_limit(bone, "LIMIT_SCALE"))
 
 
-def _limited(constraint: bpy.types.Constraint | None) -> dict[int, tuple[float, float]]:
+def _two_sided_limits(constraint: bpy.types.Constraint | None) -> dict[int, tuple[float, float]]:
+    """Return the limits of the axes that a constraint limits on both sides; empty without a constraint."""
     if constraint is None:
         return {}
     return {
@@ -91,9 +94,9 @@ def find_local_limit(bone: bpy.types.PoseBone, constraint_type: str) -> bpy.type
 def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: float) -> None:
     """Set the range of a rotation axis of a bone, and unlock the axis.
 
-    It is stored where the bone has its range. A bone without a range gets IK limits, which do not restrict posing by
-    hand. If the range does not include the rest pose, which IK limits cannot express, it gets a Limit Rotation
-    constraint.
+    The range replaces the bone's range where it is stored. A bone without a range gets IK limits, which do not restrict
+    posing by hand. If the range does not include the rest pose, IK limits cannot express it, and the bone gets a Limit
+    Rotation constraint.
 
     Args:
         bone: the pose bone.
@@ -140,29 +143,29 @@ def clear_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
 def ensure_range_constraint(bone: bpy.types.PoseBone, constraint_type: str) -> bpy.types.Constraint:
     """Return the constraint that stores the ranges of a bone with an influence of 0; add it if there is none.
 
-    An added constraint comes first and takes over the existing ranges.
+    A new constraint becomes the first one of the bone, and gets the existing ranges.
 
     Args:
         bone: the pose bone.
         constraint_type: "LIMIT_ROTATION", "LIMIT_LOCATION" or "LIMIT_SCALE".
     """
-    existing = find_local_limit(bone, constraint_type)
-    if existing is not None and existing.influence == 0:
-        return existing
-    rotations = rotation_ranges(bone)
+    existing_constraint = find_local_limit(bone, constraint_type)
+    if existing_constraint is not None and existing_constraint.influence == 0:
+        return existing_constraint
+    existing_rotation_ranges = rotation_ranges(bone)
     read_ranges = {"LIMIT_LOCATION": location_ranges, "LIMIT_SCALE": scale_ranges}
-    other_ranges = read_ranges[constraint_type](bone) if constraint_type in read_ranges else {}
+    existing_ranges = read_ranges[constraint_type](bone) if constraint_type in read_ranges else {}
     constraint = bone.constraints.new(constraint_type)
     constraint.name, constraint.owner_space, constraint.influence = RANGE_NAME, "LOCAL", 0.0
     bone.constraints.move(len(bone.constraints) - 1, 0)
     if constraint_type == "LIMIT_ROTATION":
-        for axis, rotation_range in enumerate(rotations):
+        for axis, rotation_range in enumerate(existing_rotation_ranges):
             if rotation_range.source != DEFAULT:
                 set_constraint_limit(constraint, axis, rotation_range.low, rotation_range.high)
             elif rotation_range.is_locked and not bone.lock_rotation[axis]:
                 # IK locks are ignored if there is a constraint.
                 set_constraint_limit(constraint, axis, 0.0, 0.0)
-    for axis, bounds in other_ranges.items():
+    for axis, bounds in existing_ranges.items():
         set_constraint_limit(constraint, axis, *bounds)
     return constraint
 
@@ -178,16 +181,16 @@ def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float
 
 
 def enforced_range(bone: bpy.types.PoseBone, constraint_type: str, axis: int) -> tuple[float, float]:
-    """Return the range that Limit constraints in local space enforce on an axis; infinite where there are none."""
+    """Return the range that Limit constraints in local space enforce on an axis; infinite without such a constraint."""
     low, high, letter = -float("inf"), float("inf"), AXES[axis]
     for constraint in bone.constraints:
         if constraint.type != constraint_type or constraint.owner_space != "LOCAL":
             continue
         if constraint.mute or not constraint.influence:
             continue
-        use = f"use_limit_{letter}"
-        if getattr(constraint, use if hasattr(constraint, use) else f"use_min_{letter}"):
+        use_limit_name = f"use_limit_{letter}"
+        if getattr(constraint, use_limit_name if hasattr(constraint, use_limit_name) else f"use_min_{letter}"):
             low = max(low, getattr(constraint, f"min_{letter}"))
-        if getattr(constraint, use if hasattr(constraint, use) else f"use_max_{letter}"):
+        if getattr(constraint, use_limit_name if hasattr(constraint, use_limit_name) else f"use_max_{letter}"):
             high = min(high, getattr(constraint, f"max_{letter}"))
     return low, high

@@ -13,7 +13,7 @@ from .action_range import constant_controls, keyed_ranges, measured_controls
 from .clip import find_action
 
 SELECTED_BONES, COLLECTION_PREFIX, ACTION_PREFIX, BONE_PREFIX = "selected", "collection:", "action:", "bone:"
-"""The forms of an entry: the selected bones, a bone collection, the bones that an action keys, a bone."""
+"""Forms of an entry: the selected bones, and the prefixes of a bone collection, an action and a single bone."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class SampleSelection:
 
     Attributes:
         bones: names of the selected bones; None for the default bones (`default_channels`).
-        measured: ranges of what the selected actions key. Bones that are selected by an action move in these, within
-            the limits of the rig. Other selected bones use them if they have no range of motion.
+        measured: ranges of the channels that the selected actions key. Bones that are selected by an action move in
+            these ranges, within the limits of the rig. Other selected bones use them if they have no range of motion.
         action_bones: names of the bones that are selected by actions alone.
         controls: the controls, listed by the user or keyed by the actions.
         constant_channels: numbers that the actions key at a single value which differs from the current one.
@@ -53,32 +53,36 @@ def select_bones(scene_rig: SceneRig, texts: Iterable[str]) -> SampleSelection:
     texts = list(texts)
     if not texts:
         return DEFAULT_SELECTION
-    selected: set[str] = set()
+    selected_bones: set[str] = set()
     actions = []
     for text in texts:
         if text.startswith(ACTION_PREFIX):
             actions.append(find_action(text.removeprefix(ACTION_PREFIX)))
         else:
-            selected |= _bones_of(scene_rig, text)
-    measured = keyed_ranges(scene_rig.armature_object, actions)
-    keyed = {bone for bone, _, _ in measured}
+            selected_bones |= _parse_bones(scene_rig, text)
+    keyed_channel_ranges = keyed_ranges(scene_rig.armature_object, actions)
+    keyed_bones = {bone for bone, _, _ in keyed_channel_ranges}
     controls, constant_channels = measured_controls(scene_rig, actions), constant_controls(scene_rig, actions)
     return SampleSelection(
-        frozenset(selected | keyed), tuple(measured.items()), frozenset(keyed - selected), controls, constant_channels
+        frozenset(selected_bones | keyed_bones),
+        tuple(keyed_channel_ranges.items()),
+        frozenset(keyed_bones - selected_bones),
+        controls,
+        constant_channels,
     )
 
 
-def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
+def _parse_bones(scene_rig: SceneRig, text: str) -> set[str]:
     armature_object = scene_rig.armature_object
-    bones, data = armature_object.pose.bones, armature_object.data
+    bones, armature = armature_object.pose.bones, armature_object.data
     if text == SELECTED_BONES:
         return {bone.name for bone in bones if is_selected(bone)}
     if text.startswith(COLLECTION_PREFIX):
         name = text.removeprefix(COLLECTION_PREFIX)
-        if name not in data.collections_all:
-            names = ", ".join(f"'{c.name}'" for c in data.collections_all) or "none"
+        if name not in armature.collections_all:
+            names = ", ".join(f"'{c.name}'" for c in armature.collections_all) or "none"
             raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {names}.")
-        return {bone.name for bone in data.collections_all[name].bones_recursive}
+        return {bone.name for bone in armature.collections_all[name].bones_recursive}
     name = text.removeprefix(BONE_PREFIX)
     if not text.startswith(BONE_PREFIX) or name not in bones:
         raise RigError(

@@ -30,8 +30,8 @@ def parse_sample_selection(
 
     Args:
         scene_rig: the rig.
-        texts: `selected` for the selected bones, `collection:NAME` for those of a bone collection and its children,
-            `action:NAME` for everything that an action keys, `bone:NAME`; empty for the default bones.
+        texts: `selected` for the selected bones, `collection:NAME` for the bones of a collection and its children,
+            `action:NAME` for all bones and controls that an action keys, or `bone:NAME`; empty for the default bones.
         find_controls: returns further controls, given the ranges of the sampled numbers of bones (`ranges_by_control`),
             which may be controls too.
 
@@ -50,7 +50,7 @@ def parse_sample_selection(
 
 
 def sampled_numbers(scene_rig: SceneRig, selection: SampleSelection) -> ControlRanges:
-    """Return the ranges of the sampled numbers of bones by the names of controls."""
+    """Return the ranges of the numbers of bones that are sampled, by the names of the controls for these numbers."""
     return ranges_by_control(scene_rig.armature_object, _bone_channels(scene_rig.armature_object, selection, set()))
 
 
@@ -92,14 +92,14 @@ def sampled_channels(
 def _bone_channels(
     armature_object: bpy.types.Object, selection: SampleSelection, names: set[str]
 ) -> tuple[Channel, ...]:
-    """Return the channels of the bones of a selection; `names` as for `default_channels`."""
+    """Return the channels of the bones of a selection; `names` is passed to `default_channels`."""
     if selection.bones is None:
         return default_channels(armature_object, names)
     return selected_channels(armature_object, selection)
 
 
 def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Channel, ...]:
-    """Return the channels of a model's random poses; those of the rig if the model was trained without random poses.
+    """Return the channels of a model's random poses, or the channels of the rig if the model has none.
 
     Raises:
         RigError: the rig lacks a channel, or there is no channel.
@@ -108,10 +108,10 @@ def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Chan
     for channel in info.limits:
         owner, _, path = channel.name.partition("/")
         if channel.kind == CONTROL:
-            exists = is_number(owner_of(scene_rig, owner), path)
+            has_channel = is_number(owner_of(scene_rig, owner), path)
         else:
-            exists = channel.name in bones and channel.kind in CHANNEL_KINDS
-        if not exists or channel.axis not in range(3):
+            has_channel = channel.name in bones and channel.kind in CHANNEL_KINDS
+        if not has_channel or channel.axis not in range(3):
             raise RigError(
                 f"'{scene_rig.armature_object.name}' lacks '{channel.name}', which the random poses of the model "
                 "moved; name it as before, or record and train this rig."
@@ -156,8 +156,8 @@ def _are_free(rotations: tuple[RotationRange, ...]) -> bool:
 def default_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
     """Find the channels of the default bones, in their ranges of motion.
 
-    These are the bones with a range of motion and those in `names`. Locked axes are left out. So are bones with other
-    constraints than limits, because setting their channels may change nothing.
+    These are the bones with a range of motion and those in `names`. Locked axes are left out. Bones with
+    constraints other than limits are left out too, because setting their channels may have no effect.
 
     Args:
         armature_object: the armature object.
@@ -175,56 +175,62 @@ def default_channels(armature_object: bpy.types.Object, names: set[str]) -> tupl
 
 
 def selected_channels(armature_object: bpy.types.Object, selection: SampleSelection) -> tuple[Channel, ...]:
-    """Find the channels of the bones that a user selected, with any constraints.
+    """Find the channels of the bones that a user selected, even of bones with constraints.
 
     Bones that are selected by an action have only the channels that the action keys, in its ranges, narrowed by the
-    limits of the bone. A channel that is keyed at a constant value other than that of the rest pose has this value.
+    limits of the bone. A channel that is keyed at a constant value other than its rest value keeps this value.
     """
-    measured: dict[str, ChannelRanges] = {}
+    ranges_by_bone: dict[str, ChannelRanges] = {}
     for key, bounds in selection.measured:
-        measured.setdefault(key[0], {})[key] = bounds
+        ranges_by_bone.setdefault(key[0], {})[key] = bounds
     channels = []
     for bone in armature_object.pose.bones:
         if bone.name not in selection.bones:
             continue
-        keyed, by_action = measured.get(bone.name, {}), bone.name in selection.action_bones
-        if not by_action:
-            keyed = {key: bounds for key, bounds in keyed.items() if has_width(bounds)}
-        channels += _selected_rotation_channels(bone, keyed, by_action)
-        channels += _selected_location_and_scale_channels(bone, keyed, by_action)
+        keyed_channel_ranges, is_action_bone = ranges_by_bone.get(bone.name, {}), bone.name in selection.action_bones
+        if not is_action_bone:
+            keyed_channel_ranges = {key: bounds for key, bounds in keyed_channel_ranges.items() if has_width(bounds)}
+        channels += _selected_rotation_channels(bone, keyed_channel_ranges, is_action_bone)
+        channels += _selected_location_and_scale_channels(bone, keyed_channel_ranges, is_action_bone)
     return tuple(channels)
 
 
-def _selected_rotation_channels(bone: bpy.types.PoseBone, keyed: ChannelRanges, by_action: bool) -> list[Channel]:
+def _selected_rotation_channels(
+    bone: bpy.types.PoseBone, keyed_channel_ranges: ChannelRanges, is_action_bone: bool
+) -> list[Channel]:
     limits = rotation_ranges(bone)
-    vectors = {key[2]: bounds for key, bounds in keyed.items() if key[1] == ROTATION_VECTOR}
-    if vectors and _are_free(limits):
-        return _changing(Channel(bone.name, ROTATION_VECTOR, axis, *bounds) for axis, bounds in vectors.items())
+    rotation_vector_ranges = {
+        key[2]: bounds for key, bounds in keyed_channel_ranges.items() if key[1] == ROTATION_VECTOR
+    }
+    if rotation_vector_ranges and _are_free(limits):
+        return _without_fixed_channels(
+            Channel(bone.name, ROTATION_VECTOR, axis, *bounds) for axis, bounds in rotation_vector_ranges.items()
+        )
     ranges: dict[int, tuple[float, float]] = {}
     for axis, limit in enumerate(limits):
-        keyed_range = keyed.get((bone.name, ROTATION, axis))
+        keyed_range = keyed_channel_ranges.get((bone.name, ROTATION, axis))
         if limit.is_locked:
             continue
         if keyed_range and limit.source == DEFAULT:
             ranges[axis] = keyed_range
-        elif keyed_range and by_action:
+        elif keyed_range and is_action_bone:
             ranges[axis] = _clamp_range(keyed_range, (limit.low, limit.high))
-        elif limit.moves and not by_action:
+        elif limit.moves and not is_action_bone:
             ranges[axis] = (limit.low, limit.high)
-    return _changing(_rotation_channels(bone, ranges))
+    return _without_fixed_channels(_rotation_channels(bone, ranges))
 
 
 def _selected_location_and_scale_channels(
-    bone: bpy.types.PoseBone, keyed: ChannelRanges, by_action: bool
+    bone: bpy.types.PoseBone, keyed_channel_ranges: ChannelRanges, is_action_bone: bool
 ) -> list[Channel]:
-    channels = {} if by_action else {(c.kind, c.axis): c for c in _location_and_scale_channels(bone)}
+    channels = {} if is_action_bone else {(c.kind, c.axis): c for c in _location_and_scale_channels(bone)}
     limits, locks = _location_and_scale_ranges(bone), {LOCATION: bone.lock_location, SCALE: bone.lock_scale}
-    for (name, kind, axis), bounds in keyed.items():
+    for (name, kind, axis), bounds in keyed_channel_ranges.items():
         # A connected bone cannot move away from the tail of its parent.
         if kind in locks and not locks[kind][axis] and not (kind == LOCATION and bone.bone.use_connect):
-            clamped = _clamp_range(bounds, limits[kind, axis]) if (kind, axis) in limits else bounds
-            channels.setdefault((kind, axis), Channel(name, kind, axis, *clamped))
-    return _changing(channels.values())
+            clamped_range = _clamp_range(bounds, limits[kind, axis]) if (kind, axis) in limits else bounds
+            channels.setdefault((kind, axis), Channel(name, kind, axis, *clamped_range))
+    return _without_fixed_channels(channels.values())
 
 
 def _clamp_range(bounds: tuple[float, float], limit: tuple[float, float]) -> tuple[float, float]:
@@ -232,20 +238,20 @@ def _clamp_range(bounds: tuple[float, float], limit: tuple[float, float]) -> tup
     return tuple(min(max(end, limit[0]), limit[1]) for end in bounds)
 
 
-def _changing(channels: Iterable[Channel]) -> list[Channel]:
+def _without_fixed_channels(channels: Iterable[Channel]) -> list[Channel]:
     return [channel for channel in channels if channel.can_change]
 
 
 def locked_channels(armature_object: bpy.types.Object, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
-    """Return the axes that channels do not rotate, though they rotate the bone: locked axes and empty ranges."""
-    rotated = {channel.name for channel in channels if channel.kind == ROTATION}
-    sampled = {(channel.name, channel.axis) for channel in channels if channel.kind == ROTATION}
+    """Return the locked or fixed rotation axes of the bones that channels rotate about other axes."""
+    rotated_bones = {channel.name for channel in channels if channel.kind == ROTATION}
+    sampled_axes = {(channel.name, channel.axis) for channel in channels if channel.kind == ROTATION}
     return tuple(
         Channel(bone.name, ROTATION, axis, 0.0, 0.0)
         for bone in armature_object.pose.bones
-        if bone.name in rotated
+        if bone.name in rotated_bones
         for axis, rotation_range in enumerate(rotation_ranges(bone))
-        if not rotation_range.moves and (bone.name, axis) not in sampled
+        if not rotation_range.moves and (bone.name, axis) not in sampled_axes
     )
 
 

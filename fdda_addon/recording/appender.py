@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Appending of evaluated poses to a recording in batches, in a thread while Blender evaluates the next poses."""
+"""Appends evaluated poses to a recording in batches, in a thread while Blender evaluates the next poses."""
 
 import contextlib
 from collections.abc import Iterator
@@ -16,15 +16,15 @@ from ..rig.reading import PoseEvaluator
 
 BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
-"""Largest size of a batch; small batches lose little in an interruption."""
+"""Largest size of a batch. Batches are small, because a crash loses those that are not written yet."""
 
 
 class PoseAppender:
     """Context manager that appends the poses of one mesh to its recording.
 
     Attributes:
-        pose_count: number of evaluated poses, with those that the recording had before. All of them are in the
-            recording when the block has ended, also when a generator was closed.
+        pose_count: number of evaluated poses, including the poses that the recording had before. The recording contains
+            all of them when the `with` block ends, even if it ends because a generator was closed.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class PoseAppender:
         self._evaluator, self._skinning, self._writer = evaluator, skinning, writer
         self._batch_size = max(1, min(BATCH_POSES, BATCH_BYTES // (skinning.rig.vertex_count * 12)))
         self._pool = ThreadPoolExecutor(max_workers=1)
-        self._previous: Future | None = None
+        self._pending_append: Future | None = None
         self._batch: list[tuple] = []
 
     def append_current_pose(self) -> None:
-        """Evaluate the current pose, and append it with its batch.
+        """Evaluate the current pose, and append its batch when the batch is full.
 
         Raises:
             FDDAError: an earlier pose could not be appended.
@@ -52,27 +52,27 @@ class PoseAppender:
         self.pose_count += 1
         # A pose that took seconds to settle is written at once.
         if len(self._batch) == self._batch_size or self._pose_setter.settler:
-            self._wait()
-            self._previous = self._pool.submit(self._append, self._batch)
+            self._wait_for_append()
+            self._pending_append = self._pool.submit(self._append, self._batch)
             self._batch = []
 
-    def _wait(self) -> None:
-        if self._previous is not None:
-            self._previous.result()
+    def _wait_for_append(self) -> None:
+        if self._pending_append is not None:
+            self._pending_append.result()
 
     def _append(self, batch: list[tuple]) -> None:
         pose_matrices, positions, controls, are_at_rest = (np.stack(arrays) for arrays in zip(*batch, strict=True))
-        unsettled = np.flatnonzero(~are_at_rest).tolist()
+        unsettled_indices = np.flatnonzero(~are_at_rest).tolist()
         arrays = pose_matrices, self._skinning.local_residuals(pose_matrices, positions), controls
-        self._writer.append(*arrays, *([unsettled] if unsettled else []))
+        self._writer.append(*arrays, *([unsettled_indices] if unsettled_indices else []))
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type | None, *_: object) -> None:
+    def __exit__(self, exception_type: type | None, *_: object) -> None:
         try:
-            if kind is None or kind is GeneratorExit:
-                self._wait()
+            if exception_type is None or exception_type is GeneratorExit:
+                self._wait_for_append()
                 if self._batch:
                     self._append(self._batch)
         finally:
@@ -80,21 +80,21 @@ class PoseAppender:
 
 
 def append_poses(poses: Iterator[object], appenders: list[PoseAppender]) -> Iterator[int]:
-    """Append the pose of each iteration to the recordings that lack it; yield the number of poses of all recordings.
+    """Append each pose to the recordings that lack it, and yield the number of poses that all recordings have.
 
     When the generator is closed, all evaluated poses are appended.
 
     Args:
-        poses: sets one pose per iteration, starting after the smallest `pose_count` of the appenders.
-        appenders: of the meshes.
+        poses: iterator that sets one pose per iteration, from the index of the smallest `pose_count`.
+        appenders: the appenders of all meshes.
     """
     with contextlib.ExitStack() as stack:
         for appender in appenders:
             stack.enter_context(appender)
-        number = min(appender.pose_count for appender in appenders)
+        pose_count = min(appender.pose_count for appender in appenders)
         for _ in poses:
             for appender in appenders:
-                if appender.pose_count == number:
+                if appender.pose_count == pose_count:
                     appender.append_current_pose()
-            number += 1
-            yield number
+            pose_count += 1
+            yield pose_count

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Detection of the joints and controls that influence each partition, by moving one at a time (paper, section 3.3).
+"""Detects the joints and controls that influence each partition, by moving one at a time (paper, section 3.3).
 
 Joints with sampled channels are moved by these channels. In a control rig, control bones move many joints at once
-through constraints. There each joint is set alone to its transform in other poses, with all constraints muted.
-Controls are moved alone in both cases.
+through constraints. So in a control rig, each joint alone is set to its transform in other poses, with all constraints
+muted. Controls are moved one at a time in both cases.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ from .joint_override import JointOverride, override_joints
 MIN_TRANSFORM_CHANGE = 1e-5
 """Smallest change of a joint's relative transform between poses that counts as motion (no unit, or meters)."""
 MAX_BATCH_MOVES, BATCH_BYTES = 50, 6 << 20
-"""Limits of a batch of moves whose residuals are computed together."""
+"""Largest number of moves, and size in bytes, of a batch whose residuals are computed together."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class InfluenceSearch:
     """Settings of the detection of influences.
 
     Attributes:
-        channels: of the random poses; may be empty.
+        channels: channels of the random poses; may be empty.
         draw_values: returns random values of the channels, (C,), for an index from 0.
         show_pose: sets a recorded pose for an index from 0; used without channels.
         stop_playback: ends the playback of `show_pose`.
-        has_target: the surface is that of another object, which other bones than the joints may deform.
-        poses: how many times each joint is moved alone.
+        has_target: the surface is that of a target, which bones other than the joints may deform.
+        poses: number of times that each joint is moved alone.
         tolerance: a joint influences a partition when it changes a local residual by more than this ratio of the
             rig's size.
     """
@@ -59,70 +59,71 @@ class InfluenceSearch:
 
 
 class _InfluenceCollector:
-    """Collects the influences on partitions."""
+    """Collects the influences of joints and controls on partitions."""
 
     def __init__(self, rig: Rig, tolerance: float, partitions: tuple[Partition, ...]):
-        # Far from the origin, rounding moves vertices.
+        # Far from the origin, rounding moves vertices, so the threshold must be larger.
         self._threshold = max(
             tolerance * rig.size, 2 * FLOAT32_ROUNDING_RATIO * float(np.abs(rig.rest_positions).max())
         )
         self.partitions = partitions
-        self._joints: dict[int, set[int]] = {p.joint: set() for p in partitions}
-        self._controls: dict[int, set[int]] = {p.joint: set() for p in partitions}
+        self._influencing_joints: dict[int, set[int]] = {p.joint: set() for p in partitions}
+        self._influencing_controls: dict[int, set[int]] = {p.joint: set() for p in partitions}
 
-    def add(self, moves: list[tuple[str, int]], moved: np.ndarray, base: np.ndarray) -> None:
+    def add(self, moves: list[tuple[str, int]], moved_residuals: np.ndarray, base_residuals: np.ndarray) -> None:
         """Compare (n, V, 3) residuals of n moves with the (1, V, 3) residuals of the base pose."""
-        changes = max_residual_changes(self.partitions, moved, base)
-        for (kind, index), influenced in zip(moves, changes > self._threshold, strict=True):
-            influences = self._controls if kind == CONTROL else self._joints
-            for partition_index in np.flatnonzero(influenced):
+        changes = max_residual_changes(self.partitions, moved_residuals, base_residuals)
+        for (kind, index), is_influenced in zip(moves, changes > self._threshold, strict=True):
+            influences = self._influencing_controls if kind == CONTROL else self._influencing_joints
+            for partition_index in np.flatnonzero(is_influenced):
                 influences[self.partitions[partition_index].joint].add(index)
 
     def add_to_all(self, control: int) -> None:
         """Add a control to all partitions."""
-        for influences in self._controls.values():
+        for influences in self._influencing_controls.values():
             influences.add(control)
 
-    def result(self, rig: Rig) -> tuple[Partition, ...]:
+    def make_partitions(self, rig: Rig) -> tuple[Partition, ...]:
+        """Make the partitions with the collected influences."""
         joints, controls = (
-            {joint: tuple(sorted(influences)) for joint, influences in by_joint.items()}
-            for by_joint in (self._joints, self._controls)
+            {joint: tuple(sorted(influences)) for joint, influences in influences_by_joint.items()}
+            for influences_by_joint in (self._influencing_joints, self._influencing_controls)
         )
-        merged = {joint: partition.joint for partition in self.partitions for joint in partition.merged}
-        return make_partitions(rig, joints, controls, merged)
+        main_joints_of_merged = {joint: partition.joint for partition in self.partitions for joint in partition.merged}
+        return make_partitions(rig, joints, controls, main_joints_of_merged)
 
 
 class _MoveBatch:
-    """Batch of moves from a base pose, whose residuals are computed together, which is faster than one by one."""
+    """Batch of moves from a base pose. Computing their residuals together is faster than one by one."""
 
     def __init__(
         self, rig: Rig, partitions: tuple[Partition, ...], evaluator: PoseEvaluator, collector: _InfluenceCollector
     ):
         self._skinning, self._evaluator, self._collector = LinearSkinning(rig, partitions), evaluator, collector
         self._batch_size = max(1, min(MAX_BATCH_MOVES, BATCH_BYTES // (12 * rig.vertex_count)))
-        self._base: np.ndarray | None = None
+        self._base_residuals: np.ndarray | None = None
         self._moves: list[tuple[str, int]] = []
-        self._evaluated: list[tuple[np.ndarray, np.ndarray]] = []
+        self._evaluated_poses: list[tuple[np.ndarray, np.ndarray]] = []
 
     def set_base(self) -> None:
         """Use the current pose as base pose."""
-        self._base = self._residuals([self._evaluator.evaluate()[:2]])
+        self._base_residuals = self._residuals([self._evaluator.evaluate()[:2]])
 
     def add(self, kind: str, index: int) -> None:
-        """Evaluate the current pose, the base pose with one joint or control moved."""
+        """Evaluate the current pose, which is the base pose with one joint or control moved."""
         self._moves.append((kind, index))
-        self._evaluated.append(self._evaluator.evaluate()[:2])
+        self._evaluated_poses.append(self._evaluator.evaluate()[:2])
         if len(self._moves) == self._batch_size:
             self.flush()
 
     def flush(self) -> None:
-        """Compare the remaining moves with the base pose."""
+        """Compare the remaining moves with the base pose, and empty the batch."""
         if self._moves:
-            self._collector.add(self._moves, self._residuals(self._evaluated), self._base)
-        self._moves, self._evaluated = [], []
+            self._collector.add(self._moves, self._residuals(self._evaluated_poses), self._base_residuals)
+        self._moves, self._evaluated_poses = [], []
 
-    def _residuals(self, evaluated: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        return self._skinning.local_residuals(*(np.stack(arrays) for arrays in zip(*evaluated, strict=True)))
+    def _residuals(self, evaluated_poses: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        return self._skinning.local_residuals(*(np.stack(arrays) for arrays in zip(*evaluated_poses, strict=True)))
 
 
 def detect_influences(
@@ -145,25 +146,27 @@ def detect_influences(
     else:
         yield from _move_channels(scene_rig, rig, search, moves)
     clear_pose(scene_rig.armature_object)
-    return collector.result(rig)
+    return collector.make_partitions(rig)
 
 
 def _follows_control_bones(scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...]) -> bool:
-    """Return whether joints move by other means than their own channels."""
-    sampled = {channel.name for channel in channels}
+    """Return whether joints move otherwise than by their own sampled channels."""
+    sampled_names = {channel.name for channel in channels}
     bones = scene_rig.armature_object.pose.bones
     animation = scene_rig.armature_object.animation_data
     paths = [curve.data_path for curve in (animation.drivers if animation else ())]
-    driven = {bone for bone, _ in map(split_bone_path, paths) if bone}
-    others = [name for name in rig.joint_names if name not in sampled and name != STATIC_JOINT]
-    if any(name not in rig.joint_names for name in sampled if name in bones):
+    driven_bones = {bone for bone, _ in map(split_bone_path, paths) if bone}
+    unsampled_joints = [name for name in rig.joint_names if name not in sampled_names and name != STATIC_JOINT]
+    if any(name not in rig.joint_names for name in sampled_names if name in bones):
         return True
-    return not sampled or any(is_moved_by_constraints(bones[name]) or name in driven for name in others)
+    return not sampled_names or any(
+        is_moved_by_constraints(bones[name]) or name in driven_bones for name in unsampled_joints
+    )
 
 
 def _move_channels(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, moves: _MoveBatch) -> Iterator[Progress]:
     """Move the channels of one joint or control at a time, from the rest pose and from random poses."""
-    channels, count = search.channels, search.poses
+    channels, poses_per_input = search.channels, search.poses
     poser = Poser(scene_rig, channels)
     joints = {name: index for index, name in enumerate(rig.joint_names)}
     controls = {control.name: index for index, control in enumerate(rig.controls)}
@@ -178,71 +181,77 @@ def _move_channels(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, moves
         if (control := controls.get(control_name(scene_rig.armature_object, channel))) is not None:
             channel_indices[CONTROL, control] = [channel_index]
     moved_inputs = dict(sorted(channel_indices.items(), key=lambda item: (item[0][0] == CONTROL, item[0][1])))
-    rest = np.array([channel.rest for channel in channels])
+    rest_values = np.array([channel.rest for channel in channels])
     # All joints share the base poses: the rest pose for half of the moves, random poses for the others.
-    bases = [rest] * (count - count // 2) + [search.draw_values(index) for index in range(count // 2)]
-    total = count * (len(moved_inputs) + 1)
-    for base_index, base in enumerate(bases):
-        poser.set(base)
+    base_poses = [rest_values] * (poses_per_input - poses_per_input // 2) + [
+        search.draw_values(index) for index in range(poses_per_input // 2)
+    ]
+    total_steps = poses_per_input * (len(moved_inputs) + 1)
+    for base_index, base_values in enumerate(base_poses):
+        poser.set(base_values)
         moves.set_base()
         for step, ((kind, index), moved_channels) in enumerate(
             moved_inputs.items(), base_index * (len(moved_inputs) + 1) + 1
         ):
-            yield Progress("influences", step, total)
-            values = base.copy()
-            offset = index if kind != CONTROL else len(joints) + index
-            values[moved_channels] = search.draw_values((offset + 1) * count + base_index)[moved_channels]
+            yield Progress("influences", step, total_steps)
+            values = base_values.copy()
+            sample_offset = index if kind != CONTROL else len(joints) + index
+            values[moved_channels] = search.draw_values((sample_offset + 1) * poses_per_input + base_index)[
+                moved_channels
+            ]
             poser.set(values)
             moves.add(kind, index)
         moves.flush()
-        yield Progress("influences", (base_index + 1) * (len(moved_inputs) + 1), total)
+        yield Progress("influences", (base_index + 1) * (len(moved_inputs) + 1), total_steps)
 
 
 def _override_each_joint(
     scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, collector: _InfluenceCollector, moves: _MoveBatch
 ) -> Iterator[Progress]:
-    """Set one joint or control at a time to its state in other poses, and keep the others."""
-    count = search.poses
-    states = _sample_states(scene_rig, rig, search, 2 * count)
+    """Set one joint or control at a time to its state in another pose, and keep all others."""
+    poses_per_input = search.poses
+    states = _sample_states(scene_rig, rig, search, 2 * poses_per_input)
     clear_pose(scene_rig.armature_object)
-    stacked = np.stack([state.joints for state in states])
-    changes = np.abs(stacked - stacked[0])
+    joint_transforms = np.stack([state.joints for state in states])
+    changes = np.abs(joint_transforms - joint_transforms[0])
     changes[..., :3, 3] *= rig.metres_per_unit
     moving_joints = np.flatnonzero(changes.max(axis=(0, 2, 3)) > MIN_TRANSFORM_CHANGE).tolist()
-    movable = [n for n, c in enumerate(rig.controls) if not is_driven(owner_of(scene_rig, c.owner), c.path)]
-    for control in set(range(len(rig.controls))) - set(movable):
+    movable_controls = [n for n, c in enumerate(rig.controls) if not is_driven(owner_of(scene_rig, c.owner), c.path)]
+    for control in set(range(len(rig.controls))) - set(movable_controls):
         # A driven property cannot be moved alone, so it may influence all partitions.
         collector.add_to_all(control)
-    moved_inputs = [("joint", index) for index in moving_joints] + [(CONTROL, index) for index in movable]
+    moved_inputs = [("joint", index) for index in moving_joints] + [(CONTROL, index) for index in movable_controls]
     with override_joints(scene_rig, rig.joints, search.has_target) as override:
 
         def show_pose(state: _PoseState) -> None:
             override.set(state.joints)
-            for index in movable:
+            for index in movable_controls:
                 set_control(scene_rig, rig.controls[index].name, float(state.controls[index]))
 
         rest_state = _PoseState(override.rest, states[0].controls)
-        bases = [rest_state] * (count - count // 2) + states[: count // 2]
-        for base_index, (base, other) in enumerate(zip(bases, states[count:], strict=True)):
-            show_pose(base)
+        base_states = [rest_state] * (poses_per_input - poses_per_input // 2) + states[: poses_per_input // 2]
+        for base_index, (base_state, other_state) in enumerate(zip(base_states, states[poses_per_input:], strict=True)):
+            show_pose(base_state)
             moves.set_base()
             for step, (kind, index) in enumerate(moved_inputs, base_index * (len(moved_inputs) + 1) + 1):
-                yield Progress("influences", step, count * (len(moved_inputs) + 1))
-                show_pose(base.with_one_of(other, kind, index))
+                yield Progress("influences", step, poses_per_input * (len(moved_inputs) + 1))
+                show_pose(base_state.with_input_of(other_state, kind, index))
                 moves.add(kind, index)
             moves.flush()
-            yield Progress("influences", (base_index + 1) * (len(moved_inputs) + 1), count * (len(moved_inputs) + 1))
+            yield Progress(
+                "influences", (base_index + 1) * (len(moved_inputs) + 1), poses_per_input * (len(moved_inputs) + 1)
+            )
 
 
 @dataclass(frozen=True)
 class _PoseState:
-    """State of a pose: (J, 4, 4) matrices of joints relative to their parents, and (C,) values of controls."""
+    """State of joints and controls in a pose: (J, 4, 4) matrices relative to parent joints, and (C,) control values."""
 
     joints: np.ndarray
     controls: np.ndarray
 
-    def with_one_of(self, other: "_PoseState", kind: str, index: int) -> "_PoseState":
-        """Return a copy with one joint or control of another state."""
+    def with_input_of(self, other: "_PoseState", kind: str, index: int) -> "_PoseState":
+        """Return a copy in which one joint or control has its value in another state."""
         joints, controls = self.joints.copy(), self.controls.copy()
         if kind == CONTROL:
             controls[index] = other.controls[index]
@@ -252,7 +261,7 @@ class _PoseState:
 
 
 def _sample_states(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, count: int) -> list[_PoseState]:
-    """Read the states of joints and controls in poses of the recording."""
+    """Read the states of joints and controls in random or recorded poses."""
     poser = Poser(scene_rig, search.channels)
     override = JointOverride(scene_rig, rig.joints)
     reader = ControlReader(scene_rig, rig.controls)

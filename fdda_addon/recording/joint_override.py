@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Override of joints: sets each joint alone, with constraints and drivers of bones muted."""
+"""Overrides joints: sets each joint alone, while constraints and drivers of bones are muted."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,15 +26,17 @@ class JointOverride:
     """
 
     def __init__(self, scene_rig: SceneRig, joints: tuple[Joint, ...]):
-        """Args:
-        scene_rig: the rig.
-        joints: J joints, every parent before its children.
+        """Prepare to read and set joints.
+
+        Args:
+            scene_rig: the rig.
+            joints: J joints, every parent before its children.
         """
         self._armature_object = scene_rig.armature_object
         self._joints = joints
         names = tuple(joint.name for joint in joints)
-        self._matrices = PoseMatrixReader(scene_rig.armature_object, names)
-        self.rest = self._relative(rest_matrices(scene_rig.armature_object.data, names))
+        self._matrix_reader = PoseMatrixReader(scene_rig.armature_object, names)
+        self.rest = self._to_relative_matrices(rest_matrices(scene_rig.armature_object.data, names))
 
     def read(self) -> np.ndarray:
         """Read the evaluated matrix of each joint relative to its parent joint; (J, 4, 4) float64, mesh units.
@@ -43,25 +45,25 @@ class JointOverride:
             RigError: the armature, or a bone, has a scale of zero.
         """
         armature_object = self._armature_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
-        matrices = self._matrices.read(armature_object).astype(np.float64)
+        matrices = self._matrix_reader.read(armature_object).astype(np.float64)
         is_singular = np.abs(np.linalg.det(matrices[:, :3, :3])) < MIN_VOLUME
         if is_flat(armature_object) or is_singular.any():
             name = armature_object.name if is_flat(armature_object) else self._joints[int(is_singular.argmax())].name
             raise RigError(
                 f"'{name}' has a scale of zero in some pose; look for the key, constraint or driver that sets it."
             )
-        return self._relative(matrices)
+        return self._to_relative_matrices(matrices)
 
-    def _relative(self, matrices: np.ndarray) -> np.ndarray:
+    def _to_relative_matrices(self, matrices: np.ndarray) -> np.ndarray:
         parents = [joint.parent for joint in self._joints]
         return np.array(
             [np.linalg.solve(matrices[p], m) if p >= 0 else m for p, m in zip(parents, matrices, strict=True)]
         )
 
-    def set(self, relative: np.ndarray) -> None:
-        """Set the joints to (J, 4, 4) matrices as of `read`, inside of `override_joints`, without an evaluation."""
+    def set(self, relative_matrices: np.ndarray) -> None:
+        """Set the joints to (J, 4, 4) matrices as `read` returns them, in `override_joints`, without an evaluation."""
         target_matrices: dict[str, Matrix] = {}
-        for joint, matrix in zip(self._joints, relative, strict=True):
+        for joint, matrix in zip(self._joints, relative_matrices, strict=True):
             parent_matrix = target_matrices[self._joints[joint.parent].name] if joint.parent >= 0 else Matrix()
             target_matrices[joint.name] = parent_matrix @ Matrix(matrix)
         target_matrices.pop(STATIC_JOINT, None)
@@ -87,16 +89,16 @@ class JointOverride:
 
 @contextmanager
 def override_joints(
-    scene_rig: SceneRig, joints: tuple[Joint, ...], others_follow: bool = False
+    scene_rig: SceneRig, joints: tuple[Joint, ...], keep_other_bones: bool = False
 ) -> Iterator[JointOverride]:
     """Mute constraints and drivers of bones, so that only their channels move them; restore both afterwards.
 
-    The pose must be at rest before (`armature.clear_pose`), and keeps its last values afterwards.
+    Clear the pose before (`armature.clear_pose`). The last pose that was set stays afterwards.
 
     Args:
         scene_rig: the rig.
         joints: as for `JointOverride`.
-        others_follow: do not mute constraints and drivers of bones that neither are joints nor ancestors of joints.
+        keep_other_bones: do not mute constraints and drivers of bones that are neither joints nor ancestors of joints.
     """
     armature_object = scene_rig.armature_object
     animation = armature_object.animation_data
@@ -105,7 +107,7 @@ def override_joints(
     joints_and_ancestors = {ancestor.name for bone in bones for ancestor in (bone, *bone.parent_recursive)}
 
     def is_overridden(name: str) -> bool:
-        return not others_follow or name in joints_and_ancestors
+        return not keep_other_bones or name in joints_and_ancestors
 
     constraints = [
         constraint
@@ -120,11 +122,11 @@ def override_joints(
         if bone and is_transform_channel(channel_path) and is_overridden(bone) and not curve.mute
     ]
     override = JointOverride(scene_rig, joints)
-    for item in (*constraints, *drivers):
-        item.mute = True
+    for constraint_or_driver in (*constraints, *drivers):
+        constraint_or_driver.mute = True
     try:
         yield override
     finally:
-        for item in (*constraints, *drivers):
-            item.mute = False
+        for constraint_or_driver in (*constraints, *drivers):
+            constraint_or_driver.mute = False
         bpy.context.view_layer.update()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recording of several meshes on one armature together."""
+"""Groups several meshes on one armature, whose recordings share the poses."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,27 +14,27 @@ from .plan import RecordingSettings, listed_controls
 
 
 def common_armature(rigs: Sequence[SceneRig]) -> bpy.types.Object:
-    """Return the armature object of all meshes.
+    """Return the armature object that all meshes follow.
 
     Raises:
         RigError: the meshes follow different armatures.
     """
     armature_object = rigs[0].armature_object
-    for other in rigs:
-        if other.armature_object != armature_object:
+    for other_rig in rigs:
+        if other_rig.armature_object != armature_object:
             raise RigError(
                 f"'{rigs[0].mesh_object.name}' follows the armature '{armature_object.name}' and "
-                f"'{other.mesh_object.name}' follows '{other.armature_object.name}'; record the meshes of each "
+                f"'{other_rig.mesh_object.name}' follows '{other_rig.armature_object.name}'; record the meshes of each "
                 "armature by themselves, with --object."
             )
     return armature_object
 
 
 def split_controls(rigs: Sequence[SceneRig], settings: RecordingSettings) -> list[tuple[str, ...]]:
-    """Return the controls of the settings that each mesh has.
+    """Return for each mesh the controls of the settings that it has.
 
     Raises:
-        RigError: no mesh has a control.
+        RigError: there is a control that no mesh has.
     """
     controls_by_mesh: list[list[str]] = [[] for _ in rigs]
     for text in settings.controls:
@@ -53,10 +53,14 @@ def split_controls(rigs: Sequence[SceneRig], settings: RecordingSettings) -> lis
 def group_into_passes(rigs: Sequence[SceneRig]) -> list[list[int]]:
     """Group the indices of meshes that can be evaluated together.
 
-    Modifiers after the last deforming one are disabled while their mesh is evaluated. A mesh that another mesh reads
-    with these modifiers, such as a subdivided body under a shrinkwrapped sleeve, gets a pass of its own.
+    Downstream modifiers are disabled while a mesh is evaluated. But another mesh may read the mesh with these
+    modifiers, as a shrinkwrapped sleeve reads a subdivided body. Such a mesh gets a pass of its own.
     """
-    read = {mesh_object for scene_rig in rigs for mesh_object in deforming_mesh_objects(scene_rig)}
-    separate = [n for n, rig in enumerate(rigs) if rig.mesh_object in read and read_stack(rig.mesh_object).downstream]
-    together = [n for n in range(len(rigs)) if n not in separate]
-    return [numbers for numbers in (together, *([n] for n in separate)) if numbers]
+    read_objects = {mesh_object for scene_rig in rigs for mesh_object in deforming_mesh_objects(scene_rig)}
+    separate_indices = [
+        index
+        for index, rig in enumerate(rigs)
+        if rig.mesh_object in read_objects and read_stack(rig.mesh_object).downstream
+    ]
+    common_indices = [index for index in range(len(rigs)) if index not in separate_indices]
+    return [indices for indices in (common_indices, *([index] for index in separate_indices)) if indices]

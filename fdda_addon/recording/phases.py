@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""State of a mesh after each phase of its recording: planned, weights fitted, influences ready.
+"""Defines the state of a mesh after each phase of its recording: planned, weights fitted, influences ready.
 
-Each phase takes the state of the previous one, so that no phase can be skipped.
+Each phase needs the state that the previous phase returns, so no phase can be skipped.
 """
 
 import time
@@ -23,24 +23,24 @@ from ..scene.scene_rig import SceneRig
 
 
 class TimedEvaluator:
-    """Evaluates poses and measures the time."""
+    """Evaluates poses and measures how long an evaluation takes."""
 
     def __init__(self, evaluator: PoseEvaluator):
         self._evaluator = evaluator
-        self._count, self._seconds = 0, 0.0
+        self._pose_count, self._seconds = 0, 0.0
 
     def evaluate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `PoseEvaluator.evaluate`."""
-        start = time.perf_counter()
-        evaluated = self._evaluator.evaluate()
-        self._seconds += time.perf_counter() - start
-        self._count += 1
-        return evaluated
+        """Evaluate the current pose, as `PoseEvaluator.evaluate` does."""
+        start_time = time.perf_counter()
+        arrays = self._evaluator.evaluate()
+        self._seconds += time.perf_counter() - start_time
+        self._pose_count += 1
+        return arrays
 
     @property
     def seconds_per_pose(self) -> float | None:
-        """Mean time of a pose in seconds; None before the first one."""
-        return self._seconds / self._count if self._count else None
+        """Return the mean time of an evaluation in seconds; None before the first evaluation."""
+        return self._seconds / self._pose_count if self._pose_count else None
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class MeshPlanned:
     """A mesh whose recording is planned.
 
     Attributes:
-        scene_rig, rig: the rig, with its own skin weights.
+        scene_rig, rig: the rig as scene objects, and as arrays with its own skin weights.
         path: folder of the recording.
-        channels: of the mesh.
-        limits: channels of the recording, with those of meshes that share its poses.
-        previous_path: folder of a recording with weights and influences; None where there is none.
-        target: whose surface is recorded; None for the rig itself.
+        channels: channels of the random poses that belong to the mesh or its armature.
+        limits: channels of the recording, including shared channels of other meshes.
+        previous_path: folder of a recording whose weights and influences are reused; None if there is none.
+        target: the target whose surface is recorded; None for the rig itself.
     """
 
     scene_rig: SceneRig
@@ -66,16 +66,16 @@ class MeshPlanned:
 
     @property
     def name(self) -> str:
-        """Name of the mesh object."""
+        """Return the name of the mesh object."""
         return self.scene_rig.mesh_object.name
 
     def evaluator(self, rig: Rig) -> PoseEvaluator:
-        """Make the evaluator of the poses of the mesh, with the skin weights of `rig`."""
+        """Make an evaluator of the poses of the mesh, for a rig with the final skin weights."""
         return PoseEvaluator(self.scene_rig, rig, self.target)
 
     @property
     def posed_rig(self) -> PosedRig:
-        """The argument for `temporary_rig_states`."""
+        """Return the rig and its channels, as `temporary_rig_states` needs them."""
         return self.scene_rig, self.rig, self.channels
 
 
@@ -84,9 +84,9 @@ class WeightsFitted:
     """A mesh with the skin weights of its linear skinning.
 
     Attributes:
-        planned: the state before.
-        rig: with the skin weights of linear skinning.
-        fit: of the weights; None where they are the rig's own.
+        planned: the state after the previous phase.
+        rig: the rig with the skin weights of linear skinning.
+        fit: result of the fit; None if the weights are the rig's own.
     """
 
     planned: MeshPlanned
@@ -95,7 +95,7 @@ class WeightsFitted:
 
     @property
     def name(self) -> str:
-        """Name of the mesh object."""
+        """Return the name of the mesh object."""
         return self.planned.name
 
 
@@ -104,9 +104,9 @@ class InfluencesReady:
     """A mesh with influences, whose poses can be recorded.
 
     Attributes:
-        fitted: the state before.
-        partitions: with their influencing joints and controls.
-        evaluator: of the poses, which has measured the time of a pose.
+        fitted: the state after the previous phase.
+        partitions: the partitions with their influencing joints and controls.
+        evaluator: the evaluator of the poses, which also measures the time of a pose.
     """
 
     fitted: WeightsFitted
@@ -115,21 +115,23 @@ class InfluencesReady:
 
 
 def describe_estimate(
-    meshes: Sequence[InfluencesReady], poses: int, remaining: int, seconds_per_pose: float | None = None
+    meshes: Sequence[InfluencesReady], pose_count: int, remaining_count: int, seconds_per_pose: float | None = None
 ) -> str:
-    """Describe the remaining work of recordings; empty without remaining poses.
+    """Describe the remaining work of recordings; return an empty text if no poses remain.
 
     Args:
-        meshes: that are evaluated together.
-        poses: number of poses of a complete recording.
-        remaining: number of poses still to be recorded.
+        meshes: the meshes that are evaluated together.
+        pose_count: number of poses of a complete recording.
+        remaining_count: number of poses that are not recorded yet.
         seconds_per_pose: time of a pose; measured by the evaluators by default.
     """
-    if not remaining:
+    if not remaining_count:
         return ""
     rigs = [mesh.fitted.rig for mesh in meshes]
     # The whole scene is evaluated for each pose, so the times of meshes do not add up.
-    times = [seconds_per_pose or mesh.evaluator.seconds_per_pose for mesh in meshes]
-    seconds = None if None in times else max(times) * remaining
-    size = sum(recording_bytes(rig, poses) for rig in rigs)
-    return Estimate(remaining, sum(rig.vertex_count for rig in rigs), size, seconds).sentence()
+    seconds_per_pose_of_meshes = [seconds_per_pose or mesh.evaluator.seconds_per_pose for mesh in meshes]
+    remaining_seconds = (
+        None if None in seconds_per_pose_of_meshes else max(seconds_per_pose_of_meshes) * remaining_count
+    )
+    total_bytes = sum(recording_bytes(rig, pose_count) for rig in rigs)
+    return Estimate(remaining_count, sum(rig.vertex_count for rig in rigs), total_bytes, remaining_seconds).sentence()

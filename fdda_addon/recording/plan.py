@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings of a recording, and what follows from them for a rig before a pose is evaluated."""
+"""Defines the settings of a recording, and derives the rig, channels and sampling from them before any evaluation."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -37,25 +37,26 @@ class RecordingSettings:
 
     Attributes:
         poses: number of random poses.
-        seed: of the random poses.
+        seed: seed of the random poses.
         spread: standard deviation of the random poses as a ratio of half the range of motion.
-        margin: scale of the range of motion for some of the random poses (`core.poses.make_margin`); 1 for none.
+        margin: factor that widens the range of motion for some random poses (`core.poses.make_margin`); 1 for no
+            margin.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
-        influence_poses: how many times each joint is moved alone to find the partitions that it influences.
+        influence_poses: number of times that each joint is moved alone to find the partitions that it influences.
         influence_tolerance: a joint influences a residual that it changes by more than this ratio of the rig's size.
         resume: continue an interrupted recording.
         overwrite: replace a recording in the folder.
         sample: control bones that the random poses move, in the syntax of `sampling.parse_sample_selection`; empty for
             the default bones.
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.FIT_KINDS`); empty for those of the rig.
-        controls: listed properties that are inputs beside the automatic ones, in the syntax of `parse_controls`.
-        min_partition_vertices: partitions with fewer vertices are merged into others; 0 merges none.
-        shard: number, from 1, and count of the shards, to record one of them; None for all poses.
+        controls: properties that are inputs besides the automatic controls, in the syntax of `parse_controls`.
+        min_partition_vertices: partitions with fewer vertices are merged into others; 0 to merge no partitions.
+        shard: number of the shard to record, from 1, and count of all shards; None to record all poses.
         detect_influences: detect the influences of all shards, and record no poses.
-        influences: folder of a recording that was made with `detect_influences` and the same settings; None detects
-            them again. For several meshes it has a subfolder for each.
-        target: whose surface is recorded.
+        influences: folder of a recording that was made with `detect_influences` and the same settings; None to detect
+            the influences. For several meshes it has a subfolder for each mesh.
+        target: settings of the target whose surface is recorded.
     """
 
     poses: int = POSES
@@ -80,7 +81,7 @@ class RecordingSettings:
 
 
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
-    """Read the rig with the controls and the channels of these settings.
+    """Read the rig with the controls of the settings, and find the channels of its random poses.
 
     Raises:
         RigError: the rig cannot be read, or has nothing to sample.
@@ -103,19 +104,19 @@ def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
 def read_sample_selection(
     scene_rig: SceneRig, settings: RecordingSettings
 ) -> tuple[SampleSelection, frozenset[str] | None]:
-    """Read what the settings sample, and the joints of the rig beside the bones with weights (`read_rig`).
+    """Read the sample selection of the settings, and the extra joints of the rig (`read_rig`).
 
-    Where control bones are sampled, the joints are the bones with weights and other bones on which the mesh depends.
-    Control bones are no inputs of a model, only the bones that follow them.
+    If control bones are sampled, the joints are the weighted bones and other bones on which the mesh depends. The
+    inputs of a model are the bones that follow control bones, not the control bones themselves.
 
     Raises:
-        RigError: the rig lacks what the settings name.
+        RigError: the rig lacks a bone, control, collection or action of the settings.
     """
     dependencies = read_dependencies(scene_rig, find_actions(settings))
 
-    def find_controls(sampled: ControlRanges) -> Iterator[Control]:
+    def find_controls(sampled_ranges: ControlRanges) -> Iterator[Control]:
         yield from dependencies.controls
-        yield from parse_controls(scene_rig, settings.controls, sampled)
+        yield from parse_controls(scene_rig, settings.controls, sampled_ranges)
 
     selection = parse_sample_selection(scene_rig, settings.sample, find_controls)
     return selection, None if selection.bones is None else dependencies.bones
@@ -127,8 +128,8 @@ def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[C
     Raises:
         RigError: the rig lacks a control, or its range is unknown.
     """
-    sampled = sampled_numbers(scene_rig, select_bones(scene_rig, settings.sample)) if settings.controls else {}
-    return parse_controls(scene_rig, settings.controls, sampled)
+    sampled_ranges = sampled_numbers(scene_rig, select_bones(scene_rig, settings.sample)) if settings.controls else {}
+    return parse_controls(scene_rig, settings.controls, sampled_ranges)
 
 
 def find_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:
@@ -137,22 +138,22 @@ def find_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:
 
 
 def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
-    """Make the sampling of a recording with these settings.
+    """Make the description of the poses of a recording with these settings.
 
     Raises:
-        RigError: there is no action or strip of a name that the settings have.
+        RigError: an action or strip of the settings does not exist.
     """
     sources = [Source(RANDOM, settings.poses)] if settings.poses else []
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
-    sampled = channels if settings.poses else ()
-    margin = make_recording_margin(scene_rig, settings, sampled)
-    return Sampling(settings.seed, settings.spread, sampled, tuple(sources), margin)
+    sampled_channels_of_recording = channels if settings.poses else ()
+    margin = make_recording_margin(scene_rig, settings, sampled_channels_of_recording)
+    return Sampling(settings.seed, settings.spread, sampled_channels_of_recording, tuple(sources), margin)
 
 
 def make_recording_margin(
     scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]
 ) -> Margin | None:
-    """Make the margin of the random poses, whose `channels` are sampled inside the range of motion."""
-    locked = locked_channels(scene_rig.armature_object, channels)
-    return make_margin(channels, locked, settings.margin, settings.poses if channels else 0)
+    """Make the margin of the random poses; `channels` are sampled within the range of motion."""
+    fixed_channels = locked_channels(scene_rig.armature_object, channels)
+    return make_margin(channels, fixed_channels, settings.margin, settings.poses if channels else 0)

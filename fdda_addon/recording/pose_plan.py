@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The poses of one or several recordings: random poses, then the frames of clips."""
+"""Plans and sets the poses of one or several recordings: random poses, then the frames of clips."""
 
 from collections.abc import Callable, Collection, Container, Iterator, Sequence
 
@@ -16,15 +16,15 @@ from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, make_recording_margin
 
 REPEATABILITY_INDEX_OFFSET = 1 << 36
-"""Offset of the indices of intermediate poses, larger than those of any recording or evaluation."""
+"""Offset of the indices of intermediate random poses, larger than any pose index of a recording or an evaluation."""
 
 
 class PosePlan:
-    """Poses that the meshes on one armature share; channels of a mesh object belong to that mesh alone.
+    """Poses that the meshes on one armature share. Channels of a mesh object apply to that mesh alone.
 
     Attributes:
         total: number of poses.
-        in_range_count: number of random poses inside the range of motion; those of the margin follow.
+        in_range_count: number of random poses inside the range of motion; the poses of the margin follow them.
     """
 
     def __init__(
@@ -34,34 +34,38 @@ class PosePlan:
         clips: tuple[Clip, ...],
         pose_setter: PoseSetter = DIRECT_POSE_SETTER,
     ):
-        """Args:
-        meshes: each with its channels.
-        settings: of the recording.
-        clips: whose frames follow the random poses.
-        pose_setter: sets poses, and brings a target that depends on time to them.
+        """Plan the poses.
+
+        Args:
+            meshes: the rig of each mesh, and its channels.
+            settings: settings of the recording.
+            clips: the clips whose frames follow the random poses.
+            pose_setter: sets the poses, and waits for a target that depends on time.
         """
         self._rigs = [scene_rig for scene_rig, _ in meshes]
         self._settings, self._clips = settings, clips
         self.pose_setter = pose_setter
         self.total = settings.poses + sum(len(clip.frames) for clip in clips)
-        # The first mesh owns the shared channels.
-        unique: dict[tuple, tuple[int, Channel]] = {}
+        # A channel that several meshes share has the owner -1, and the first mesh sets it.
+        unique_channels: dict[tuple, tuple[int, Channel]] = {}
         for mesh_index, (_, channels) in enumerate(meshes):
             for channel in channels:
-                owner = mesh_index if _belongs_to_mesh(channel) else -1
-                unique.setdefault((owner, channel.name, channel.kind, channel.axis), (owner, channel))
-        self._owners = np.array([owner for owner, _ in unique.values()], np.int64)
-        self._channels = tuple(channel for _, channel in unique.values())
+                owner_index = mesh_index if _belongs_to_mesh(channel) else -1
+                unique_channels.setdefault(
+                    (owner_index, channel.name, channel.kind, channel.axis), (owner_index, channel)
+                )
+        self._owner_indices = np.array([owner_index for owner_index, _ in unique_channels.values()], np.int64)
+        self._channels = tuple(channel for _, channel in unique_channels.values())
         self._margin = make_recording_margin(self._rigs[0], settings, self._channels)
         self.in_range_count = settings.poses - (self._margin.poses if self._margin else 0)
 
     def channels_of_mesh(self, mesh_index: int) -> tuple[Channel, ...]:
         """Return the channels of the recording of one mesh: the shared channels and its own."""
-        belongs = np.isin(self._owners, (-1, mesh_index))
-        return tuple(channel for channel, keep in zip(self._channels, belongs, strict=True) if keep)
+        is_of_mesh = np.isin(self._owner_indices, (-1, mesh_index))
+        return tuple(channel for channel, is_kept in zip(self._channels, is_of_mesh, strict=True) if is_kept)
 
     def show_poses(self, player: ClipPlayer, pose_indices: Container[int]) -> Iterator[int]:
-        """Set the poses with the given indices, one per iteration; yield the index.
+        """Set the poses with the given indices, one per iteration, and yield each index.
 
         Limit constraints are disabled while a pose of the margin is set.
         """
@@ -76,56 +80,61 @@ class PosePlan:
                 set_pose = self._make_setter(margin.channels)
                 with SuspendedLimits(self._rigs[0].armature_object, margin.channels) as limits:
 
-                    def set_beyond(values: np.ndarray) -> None:
+                    def set_beyond_range(values: np.ndarray) -> None:
                         set_pose(values)
                         limits.suspend(values)
 
                     for index in range(self.in_range_count, random_count):
                         if index in pose_indices:
-                            self.pose_setter.set_pose(self._make_transition(margin.channels, index, set_beyond))
+                            self.pose_setter.set_pose(self._make_transition(margin.channels, index, set_beyond_range))
                             yield index
-        first = random_count
+        clip_start = random_count
         for clip in self._clips:
-            frame_indices = [index for index in range(len(clip.frames)) if first + index in pose_indices]
+            frame_indices = [index for index in range(len(clip.frames)) if clip_start + index in pose_indices]
             for index in self.pose_setter.show_frames(player, clip, frame_indices):
-                yield first + index
-            first += len(clip.frames)
+                yield clip_start + index
+            clip_start += len(clip.frames)
 
     @property
     def repeatable_poses(self) -> list[int]:
-        """Ascending indices of the poses that `show_poses_again` can set; without those of the margin."""
+        """Return the ascending indices of the poses that `show_poses_again` can set, without poses of the margin."""
         if not self.pose_setter.depends_on_history:
             return []
         if self.pose_setter.settler:
-            # `make_pose_setter` refuses clips with a settler.
+            # `make_pose_setter` raises an error for clips with a settler.
             return list(range(self.in_range_count))
-        first, numbers = self._settings.poses, []
+        clip_start, indices = self._settings.poses, []
         for clip in self._clips:
-            numbers += [first + number for number in reversible_frames(clip)]
-            first += len(clip.frames)
-        return numbers
+            indices += [clip_start + frame_index for frame_index in reversible_frames(clip)]
+            clip_start += len(clip.frames)
+        return indices
 
     def show_poses_again(self, player: ClipPlayer, pose_indices: Collection[int]) -> Iterator[int]:
-        """Set poses again from another direction; yield the index.
+        """Set poses again from another direction, and yield each index.
 
-        Random poses are reached through another random pose, frames of clips by playing the clip backwards.
+        A random pose is reached via another random pose, and a frame of a clip by playing the clip backwards.
         """
         if self.pose_setter.settler:
             set_pose = self._make_setter(self._channels)
             with self.pose_setter.prepared():
                 for index in sorted(pose_indices):
-                    numbers = (index, REPEATABILITY_INDEX_OFFSET + index)
+                    sample_indices = (index, REPEATABILITY_INDEX_OFFSET + index)
                     self.pose_setter.settler.settle(
-                        *(self._make_transition(self._channels, n, set_pose) for n in numbers)
+                        *(
+                            self._make_transition(self._channels, sample_index, set_pose)
+                            for sample_index in sample_indices
+                        )
                     )
                     yield index
             return
-        first = self._settings.poses
+        clip_start = self._settings.poses
         for clip in self._clips:
-            if frame_indices := {index - first for index in pose_indices if 0 <= index - first < len(clip.frames)}:
+            if frame_indices := {
+                index - clip_start for index in pose_indices if 0 <= index - clip_start < len(clip.frames)
+            }:
                 for index in self.pose_setter.show_frames_reversed(player, clip, frame_indices):
-                    yield first + index
-            first += len(clip.frames)
+                    yield clip_start + index
+            clip_start += len(clip.frames)
 
     def _make_transition(
         self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]
@@ -135,16 +144,16 @@ class PosePlan:
         return blend_from_rest(set_pose, np.array([channel.rest for channel in channels]), values)
 
     def _make_setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
-        """Return a function that sets channel values; channels beyond those of the plan belong to the armature."""
-        owners = np.append(self._owners, np.full(len(channels) - len(self._owners), -1))
-        posers = [
-            (Poser(self._rigs[max(owner, 0)], tuple(channels[index] for index in indices)), indices)
-            for owner in np.unique(owners).tolist()
-            for indices in [np.flatnonzero(owners == owner)]
+        """Return a function that sets channel values; channels that are not in the plan belong to the armature."""
+        owner_indices = np.append(self._owner_indices, np.full(len(channels) - len(self._owner_indices), -1))
+        posers_with_indices = [
+            (Poser(self._rigs[max(owner_index, 0)], tuple(channels[index] for index in indices)), indices)
+            for owner_index in np.unique(owner_indices).tolist()
+            for indices in [np.flatnonzero(owner_indices == owner_index)]
         ]
 
         def set_pose(values: np.ndarray) -> None:
-            for poser, indices in posers:
+            for poser, indices in posers_with_indices:
                 poser.set(values[indices])
 
         return set_pose

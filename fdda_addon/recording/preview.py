@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Preview of the random poses of a recording."""
+"""Shows random poses of a recording in advance."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
 
 def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: int) -> int:
-    """Pose a rig as in one of the random poses of a recording.
+    """Set one of the random poses of a recording.
 
     Limit constraints stay on, so a pose of the margin is shown within the limits that they enforce; a recording
     suspends them.
@@ -22,10 +22,10 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
         index: index of the random pose, from 0.
 
     Returns:
-        The index of the pose that is shown, which is that of the last random pose if `index` is larger.
+        The index of the pose that is shown: `index`, or the index of the last random pose if that is smaller.
 
     Raises:
-        RigError: there is nothing to pose.
+        RigError: there is no channel to sample.
     """
     from ..core.poses import sample_pose
     from ..scene.armature import Poser, clear_pose

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Weights and influences of a previous recording, which a resumed recording or a shard reuses."""
+"""Reads weights and influences of a previous recording, which a resumed recording or a shard reuses."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,33 +18,34 @@ def read_previous_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit
 
     Args:
         path: folder of the recording.
-        rig: with its own skin weights.
-        kind: requested kind of fitted weights, empty for the rig's own.
+        rig: the rig with its own skin weights.
+        kind: requested kind of fitted weights; empty for the rig's own weights.
 
     Raises:
-        RecordingError: there is no recording, or its weights are of another kind, or damaged.
+        RecordingError: there is no recording, or its weights are of another kind or damaged.
     """
     index = read_index(path)
     fit = read_info(index).fit
     recorded_kind = fit.kind if fit else ""
     if recorded_kind != kind:
-        option = f"--fit-linear {recorded_kind}" if recorded_kind else "the rig's own weights"
+        recorded_weights = f"--fit-linear {recorded_kind}" if recorded_kind else "the rig's own weights"
         raise RecordingError(
-            f"Cannot resume '{path}': it was recorded with {option}; give that, or record into another folder."
+            f"Cannot resume '{path}': it was recorded with {recorded_weights}; give that, or record into "
+            "another folder."
         )
     if fit is None or (index["vertices"], len(index["joints"])) != (rig.vertex_count, len(rig.joints)):
-        # Of another rig: the writer raises an error that names the differences.
+        # If the recording is of another rig, the writer raises an error that names the differences.
         return rig, fit
     joints, weights = read_recorded_skin(path, index)
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 
 def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Partition, ...] | None:
-    """Return the partitions of a rig with the influences of a recording; None where they are of another rig.
+    """Return the partitions of a rig with the influences of a recording; None if the recording is of another rig.
 
     Args:
         path: folder of the recording.
-        rig: with the skin weights of linear skinning.
+        rig: the rig with the skin weights of linear skinning.
         min_partition_vertices: as in `RecordingSettings`.
 
     Raises:
@@ -56,38 +57,38 @@ def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) 
     if joints != rig.joints or index["controls"] != controls or index["vertices"] != rig.vertex_count:
         return None
     current_partitions = make_merged_partitions(rig, min_partition_vertices)
-    current_joints = [(partition.joint, list(partition.merged)) for partition in current_partitions]
-    if current_joints != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
+    current_partition_joints = [(partition.joint, list(partition.merged)) for partition in current_partitions]
+    if current_partition_joints != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
         return None
     return read_partitions(rig, index["partitions"])
 
 
 def check_influences_match(path: Path, rig: Rig, info: RecordingInfo) -> None:
-    """Check that the influences of a recording were found for this rig and these poses.
+    """Check that the influences of a recording were detected for this rig and these poses.
 
     Args:
-        path: folder with the influences.
+        path: folder of the recording with the influences.
         rig: the rig to compare.
-        info: of the recording that reuses them.
+        info: info of the recording that reuses the influences.
 
     Raises:
-        RecordingError: they differ.
+        RecordingError: the rig, the settings or the version of Blender differ.
     """
     index = read_index(path)
     previous_info = read_info(index)
     joints = read_joints(index["joints"])
-    clauses = rig_differences(
+    differences = rig_differences(
         joints, rig.rest_matrices, index["vertices"], Fingerprint.from_json(index["rig"]["fingerprint"]), rig
     )
     if previous_info.blender != info.blender:
-        clauses.append(f"Blender {previous_info.blender} found them, and this is {info.blender}")
-    keys = find_different_keys(previous_info.sampling.to_json(), info.sampling.to_json())
+        differences.append(f"Blender {previous_info.blender} found them, and this is {info.blender}")
+    different_settings = find_different_keys(previous_info.sampling.to_json(), info.sampling.to_json())
     if previous_info.shard is None or info.shard is None or previous_info.shard.total != info.shard.total:
-        keys.append("poses")
-    if keys:
-        clauses.append(f"they were found with other settings ({', '.join(keys)})")
-    if clauses:
+        different_settings.append("poses")
+    if different_settings:
+        differences.append(f"they were found with other settings ({', '.join(different_settings)})")
+    if differences:
         raise RecordingError(
-            f"The influences in '{path}' are not those of this recording: {'; '.join(clauses)}. Find them with the "
+            f"The influences in '{path}' are not those of this recording: {'; '.join(differences)}. Find them with the "
             "same rig and options (record --detect-influences)."
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Refinement: adds poses to a recording where a model trained on it has its largest errors."""
+"""Refines a recording: adds poses where a model that was trained on it has its largest errors."""
 
 import contextlib
 from collections.abc import Iterator
@@ -32,10 +32,12 @@ from ..scene.scene_rig import SceneRig
 from .appender import PoseAppender, append_poses
 
 PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
-"""Indices of random poses, larger than those of any recording or evaluation."""
+"""First indices of random probe poses and base poses, larger than any pose index of a recording or an evaluation."""
 MIN_PROBES = 200
+"""Smallest number of random poses on which the model is evaluated."""
 WIDE_SPREAD = 10.0
-"""Spread of every second probe, almost uniform: animations reach the ends of the range more often than a recording."""
+"""Spread of every second probe, which is almost uniform, because animations reach the ends of the range more often than
+a recording."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,8 @@ class RefinementSettings:
 
     Attributes:
         poses: number of poses to add.
-        seed: of the random choices, which also depend on the length of the recording.
-        resume: count the poses added since the model was trained, and add only the missing ones.
+        seed: seed of the random choices, which also depend on the length of the recording.
+        resume: count the poses that were added since the model was trained, and add only the remaining poses.
     """
 
     poses: int = REFINEMENT_POSES
@@ -56,20 +58,20 @@ class RefinementSettings:
 def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSettings) -> Iterator[Progress]:
     """Add poses to a complete recording while the generator is iterated.
 
-    The scene is restored when the generator ends, is closed, or raises; the recording stays complete throughout.
+    The scene is restored when the generator ends, is closed, or raises. The recording is complete at any time.
 
     Args:
         scene_rig: the rig that was recorded.
         path: folder of the recording.
         model: file of a model trained on the recording.
-        settings: of the refinement.
+        settings: settings of the refinement.
 
     Yields:
         Progress of the stages "probes" and "poses".
 
     Raises:
         RigError: the rig cannot be recorded.
-        RecordingError: the recording is not complete, or of another rig or range of motion.
+        RecordingError: the recording is incomplete, or of a target, another rig or another range of motion.
         ModelError: the model cannot be read, or is of another rig.
         OutputError: the recording cannot be written.
     """
@@ -85,33 +87,43 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     check_time_inputs(scene_rig, rig.controls, stack)
     channels = model_channels(scene_rig, rig, network.info)
     _check_recording(scene_rig, recording, rig, channels)
-    added = _count_added_poses(recording, model, network.info) if settings.resume else 0
-    if settings.resume and added >= settings.poses:
+    added_count = _count_added_poses(recording, model, network.info) if settings.resume else 0
+    if settings.resume and added_count >= settings.poses:
         yield Progress("poses", settings.poses, settings.poses)
         return
-    first = len(recording.pose_matrices) - added
+    recorded_count = len(recording.pose_matrices) - added_count
     with temporary_rig_state(scene_rig, rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
-        count = max(MIN_PROBES, settings.poses)
-        values = np.stack([_draw_probe_pose(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])
-        matrices, errors = [], []
-        for number, pose in enumerate(values):
+        probe_count = max(MIN_PROBES, settings.poses)
+        probe_values = np.stack(
+            [_draw_probe_pose(channels, settings.seed, PROBE_INDEX + recorded_count + i) for i in range(probe_count)]
+        )
+        probe_matrices, partition_errors = [], []
+        for probe_index, pose in enumerate(probe_values):
             poser.set(pose)
-            pose_matrices, true, controls = evaluator.evaluate()
-            vertex_errors = distances(network.positions(pose_matrices[None], controls[None])[0], true)
-            matrices.append(pose_matrices)
-            errors.append([vertex_errors[partition.vertices].max() for partition in recording.partitions])
-            yield Progress("probes", number + 1, count)
-        probes = Probes(values, np.array(errors), _distances_to_recording(recording, first, np.stack(matrices)))
-        base = np.stack([sample_pose(channels, settings.seed, BASE_INDEX + first + i) for i in range(settings.poses)])
-        rng = np.random.default_rng([settings.seed, first])
-        chosen = choose_poses(probes, channels, _channels_by_partition(recording, channels), base, rng)
-        with RecordingExtension(recording, model.name, added) as extension:
-            posed = (poser.set(pose) for pose in chosen[added:])
+            pose_matrices, rig_positions, controls = evaluator.evaluate()
+            vertex_errors = distances(network.positions(pose_matrices[None], controls[None])[0], rig_positions)
+            probe_matrices.append(pose_matrices)
+            partition_errors.append([vertex_errors[partition.vertices].max() for partition in recording.partitions])
+            yield Progress("probes", probe_index + 1, probe_count)
+        probes = Probes(
+            probe_values,
+            np.array(partition_errors),
+            _distances_to_recording(recording, recorded_count, np.stack(probe_matrices)),
+        )
+        base_poses = np.stack(
+            [sample_pose(channels, settings.seed, BASE_INDEX + recorded_count + i) for i in range(settings.poses)]
+        )
+        rng = np.random.default_rng([settings.seed, recorded_count])
+        chosen_poses = choose_poses(probes, channels, _channels_by_partition(recording, channels), base_poses, rng)
+        with RecordingExtension(recording, model.name, added_count) as extension:
+            pose_steps = (poser.set(pose) for pose in chosen_poses[added_count:])
             skinning = LinearSkinning(recording.rig, recording.partitions)
-            with contextlib.closing(append_poses(posed, [PoseAppender(evaluator, skinning, extension)])) as steps:
-                for done in steps:
-                    yield Progress("poses", done - first, settings.poses)
+            with contextlib.closing(
+                append_poses(pose_steps, [PoseAppender(evaluator, skinning, extension)])
+            ) as pose_counts:
+                for pose_count in pose_counts:
+                    yield Progress("poses", pose_count - recorded_count, settings.poses)
 
 
 def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
@@ -120,12 +132,12 @@ def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np
 
 def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
     recorded_rig = recording.rig
-    clauses = rig_differences(
+    differences = rig_differences(
         recorded_rig.joints, recorded_rig.rest_matrices, recorded_rig.vertex_count, recorded_rig.fingerprint, rig
     )
-    if clauses:
+    if differences:
         raise RecordingError(
-            f"'{recording.path}' is a recording of another rig: {'; '.join(clauses)}. Record this rig."
+            f"'{recording.path}' is a recording of another rig: {'; '.join(differences)}. Record this rig."
         )
     if not recording.info.sampling.channels:
         raise RecordingError(
@@ -140,32 +152,48 @@ def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channe
 
 
 def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> int:
-    """Count the poses added to a recording since a model was trained on it.
+    """Count the poses that were added to a recording since a model was trained on it.
 
     Raises:
         RecordingError: the poses were not chosen for this model.
     """
-    more = len(recording.pose_matrices) - info.trained_poses
-    last = recording.info.sampling.sources[-1]
-    if more == 0 or (last.kind == REFINED and (last.name, last.poses) == (model.name, more)):
-        return more
+    added_count = len(recording.pose_matrices) - info.trained_poses
+    last_source = recording.info.sampling.sources[-1]
+    if added_count == 0 or (
+        last_source.kind == REFINED and (last_source.name, last_source.poses) == (model.name, added_count)
+    ):
+        return added_count
     raise RecordingError(
         f"Cannot resume: '{model}' was trained on {info.trained_poses} poses, and the other "
-        f"{more} of '{recording.path}' were not chosen for it; refine without --resume, or with the last model."
+        f"{added_count} of '{recording.path}' were not chosen for it; refine without --resume, or with the last model."
     )
 
 
-def _distances_to_recording(recording: Recording, first: int, pose_matrices: np.ndarray) -> np.ndarray:
-    """Compute distances of (M, J, 4, 4) poses to the first recorded poses in the inputs of each partition; (M, P)."""
+def _distances_to_recording(recording: Recording, recorded_count: int, pose_matrices: np.ndarray) -> np.ndarray:
+    """Compute the distance of each pose to the nearest recorded pose, in the inputs of each partition.
+
+    Args:
+        recording: the recording, with P partitions.
+        recorded_count: number of recorded poses to consider, from the first.
+        pose_matrices: (M, J, 4, 4), the poses.
+
+    Returns:
+        (M, P) distances.
+    """
     rig = recording.rig
-    probes, recorded = (
+    probe_features, recorded_features = (
         joint_features(matrices, rig.rest_matrices, rig.parents)
-        for matrices in (pose_matrices, np.array(recording.pose_matrices[:first]))
+        for matrices in (pose_matrices, np.array(recording.pose_matrices[:recorded_count]))
     )
     return np.stack(
         [
-            nearest_recorded_distances(*(f[:, list(p.influencing)].reshape(len(f), -1) for f in (probes, recorded)))
-            for p in recording.partitions
+            nearest_recorded_distances(
+                *(
+                    features[:, list(partition.influencing)].reshape(len(features), -1)
+                    for features in (probe_features, recorded_features)
+                )
+            )
+            for partition in recording.partitions
         ],
         axis=1,
     )
@@ -174,11 +202,11 @@ def _distances_to_recording(recording: Recording, first: int, pose_matrices: np.
 def _channels_by_partition(recording: Recording, channels: tuple[Channel, ...]) -> list[np.ndarray]:
     """Return the indices of the channels that influence each partition."""
     names, controls = recording.rig.joint_names, recording.rig.controls
-    influencing = [
+    influencing_names = [
         {names[joint] for joint in partition.influencing} | {controls[control].name for control in partition.controls}
         for partition in recording.partitions
     ]
     return [
-        np.array([i for i, c in enumerate(channels) if c.name in names_of_partition], int)
-        for names_of_partition in influencing
+        np.array([index for index, channel in enumerate(channels) if channel.name in names_of_partition], int)
+        for names_of_partition in influencing_names
     ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Check of a rig before a recording, which reports all problems at once."""
+"""Checks a rig before a recording, and reports all problems at once."""
 
 from dataclasses import dataclass, replace
 
@@ -23,11 +23,11 @@ class RigCheck:
 
     Attributes:
         problems: one sentence for each reason why the rig cannot be recorded.
-        rig: its arrays; None where they cannot be read.
-        channels: of random poses; may be empty.
+        rig: the rig as arrays; None if it cannot be read.
+        channels: channels of random poses; may be empty.
         replaced_modifiers: names of the modifiers that a model replaces.
-        automatic_controls: controls that are not listed in the settings, but read by drivers of the mesh or keyed by
-            sampled actions.
+        automatic_controls: controls that are not listed in the settings: drivers of the mesh read them, or sampled
+            actions key them.
         extra_joints, include_static_joint: arguments of `read_rig`.
     """
 
@@ -45,11 +45,11 @@ class RigCheck:
 
 
 def check_recordable_rig(scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> RigCheck:
-    """Check a rig; while a model plays, the rig's modifiers are disabled and not checked."""
+    """Check a rig. While a model plays, the modifiers of the rig are off, so they are not checked."""
     return _check(scene_rig, settings, None)
 
 
-def _check(scene_rig: SceneRig, settings: RecordingSettings, previous: RigCheck | None) -> RigCheck:
+def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: RigCheck | None) -> RigCheck:
     result = RigCheck((), None, ())
     problems: list[str] = []
     stack = None
@@ -67,19 +67,19 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous: RigCheck 
             except RigError as error:
                 problems.append(str(error))
         include_static_joint = depends_on_time(scene_rig, settings)
-        read_options = extra_joints, include_static_joint
+        read_arguments = extra_joints, include_static_joint
         if (
-            previous is not None
-            and previous.rig is not None
-            and (previous.extra_joints, previous.include_static_joint) == read_options
+            previous_check is not None
+            and previous_check.rig is not None
+            and (previous_check.extra_joints, previous_check.include_static_joint) == read_arguments
         ):
-            rig = previous.rig
+            rig = previous_check.rig
         else:
-            rig = read_rig(scene_rig, *read_options)
+            rig = read_rig(scene_rig, *read_arguments)
         if rig.controls != selection.controls:
             rig = replace(rig, controls=selection.controls)
-        listed = listed_controls(scene_rig, settings)
-        automatic_controls = tuple(control for control in selection.controls if control not in listed)
+        user_controls = listed_controls(scene_rig, settings)
+        automatic_controls = tuple(control for control in selection.controls if control not in user_controls)
         result = replace(
             result,
             rig=rig,

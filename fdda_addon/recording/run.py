@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recording of a rig: runs the phases of a recording."""
+"""Records rigs: runs the phases of a recording."""
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, nullcontext
@@ -39,9 +39,9 @@ from .target_check import check_target_moves
 from .time_check import check_follows_pose
 from .weight_fitting import check_has_weights, choose_fit_poses, fit_weights
 
-Before, After = TypeVar("Before", MeshPlanned, WeightsFitted), TypeVar("After")
+PreviousState, NextState = TypeVar("PreviousState", MeshPlanned, WeightsFitted), TypeVar("NextState")
 INFLUENCE_SEED_OFFSET = 1 << 32
-"""Offset of the indices of poses for the detection of influences, larger than those of any recording."""
+"""Offset of the indices of random poses for the detection of influences, larger than any pose index of a recording."""
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
@@ -52,16 +52,16 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     Args:
         scene_rig: the rig.
         path: folder of the recording.
-        settings: of the recording.
+        settings: settings of the recording.
 
     Yields:
-        Progress of the stages "influences" and "poses", before them "poses to fit" and "fit" where weights are fitted.
-        The first progress of "poses" has a note with the estimated time and disk space.
+        Progress of the stages "influences" and "poses". If weights are fitted, the stages "poses to fit" and "fit" come
+        first. The first progress of "poses" has a note with the estimated time and disk space.
 
     Raises:
         RigError: the rig cannot be recorded.
-        TrainingError: weights cannot be fitted in the trainer's Python.
-        RecordingError: there is a recording already, or the recording to resume differs.
+        TrainingError: the trainer's Python cannot fit the weights.
+        RecordingError: the folder has a recording already, or the recording to resume differs.
         OutputError: the folder cannot be written, or the disk has too little space.
     """
     return record_meshes([(scene_rig, path)], settings)
@@ -77,7 +77,7 @@ def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSett
     """
     meshes = [scene_rig for scene_rig, _ in rigs]
     clips = find_clips(common_armature(meshes), settings.actions, settings.strips, settings.mirror)
-    planned, plan = _plan(rigs, settings, clips)
+    planned, plan = _plan_recordings(rigs, settings, clips)
     target = plan.pose_setter.target
     with target.prepared() if target else nullcontext():
         yield from _record_planned(planned, settings, clips, plan)
@@ -86,56 +86,62 @@ def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSett
 def _record_planned(
     planned: list[MeshPlanned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
 ) -> Iterator[Progress]:
-    meshes, posed_rigs = [mesh.scene_rig for mesh in planned], [mesh.posed_rig for mesh in planned]
+    scene_rigs, posed_rigs = [mesh.scene_rig for mesh in planned], [mesh.posed_rig for mesh in planned]
     with temporary_rig_states(posed_rigs, clips) if settings.fit_linear else nullcontext() as player:
-        fitted = yield from _run_phase(planned, lambda mesh: _fit_mesh_weights(mesh, settings, plan, player))
-    for mesh_indices in group_into_passes(meshes):
-        meshes_in_pass = [fitted[index] for index in mesh_indices]
-        others = [mesh for index, mesh in enumerate(posed_rigs) if index not in mesh_indices]
-        with temporary_rig_states([posed_rigs[index] for index in mesh_indices], clips, others) as player:
+        fitted_meshes = yield from _run_phase(planned, lambda mesh: _fit_mesh_weights(mesh, settings, plan, player))
+    for mesh_indices in group_into_passes(scene_rigs):
+        meshes_in_pass = [fitted_meshes[index] for index in mesh_indices]
+        other_rigs = [mesh for index, mesh in enumerate(posed_rigs) if index not in mesh_indices]
+        with temporary_rig_states([posed_rigs[index] for index in mesh_indices], clips, other_rigs) as player:
             if plan.pose_setter.target:
                 yield from check_target_moves(meshes_in_pass[0], plan, player)
             check_follows_pose(meshes_in_pass, plan, player)
-            ready = yield from _run_phase(meshes_in_pass, lambda mesh: _find_influences(mesh, settings, clips, player))
-            yield from _record_poses(ready, settings, plan, player)
+            ready_meshes = yield from _run_phase(
+                meshes_in_pass, lambda mesh: _find_influences(mesh, settings, clips, player)
+            )
+            yield from _record_poses(ready_meshes, settings, plan, player)
 
 
-def _plan(
+def _plan_recordings(
     rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings, clips: tuple[Clip, ...]
 ) -> tuple[list[MeshPlanned], PosePlan]:
-    """Plan the recordings of meshes and their shared poses, and raise all errors that can be known in advance."""
+    """Plan the recordings of meshes and their shared poses, and raise all errors that can be found in advance."""
     if settings.mirror and not clips:
         raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
-    meshes = [scene_rig for scene_rig, _ in rigs]
-    controls = [settings.controls] if len(rigs) == 1 else split_controls(meshes, settings)
+    scene_rigs = [scene_rig for scene_rig, _ in rigs]
+    controls = [settings.controls] if len(rigs) == 1 else split_controls(scene_rigs, settings)
     if settings.target.name and len(rigs) > 1:
         raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
-    read = []
+    rigs_with_channels = []
     for (scene_rig, path), mesh_controls in zip(rigs, controls, strict=True):
         stack = check_evaluable(scene_rig)
-        read.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
+        rigs_with_channels.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
         if not settings.target.name:
-            check_time_inputs(scene_rig, read[-1][0].controls, stack, find_actions(settings))
+            check_time_inputs(scene_rig, rigs_with_channels[-1][0].controls, stack, find_actions(settings))
         check_recordable(path, settings.resume, settings.overwrite)
-    meshes_with_channels = [(scene_rig, channels) for scene_rig, (_, channels) in zip(meshes, read, strict=True)]
-    pose_setter = make_pose_setter(meshes[0], settings.target, clips, settings.poses)
+    meshes_with_channels = [
+        (scene_rig, channels) for scene_rig, (_, channels) in zip(scene_rigs, rigs_with_channels, strict=True)
+    ]
+    pose_setter = make_pose_setter(scene_rigs[0], settings.target, clips, settings.poses)
     plan = PosePlan(meshes_with_channels, settings, clips, pose_setter)
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     pose_count = len(_pose_indices(settings, plan.total))
-    check_disk_space([(path, recording_bytes(rig, pose_count)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
+    check_disk_space(
+        [(path, recording_bytes(rig, pose_count)) for (_, path), (rig, _) in zip(rigs, rigs_with_channels, strict=True)]
+    )
     previous_paths = [_previous_recording(path, settings, len(rigs) > 1) for _, path in rigs]
     planned = [
         MeshPlanned(
             scene_rig, rig, path, channels, plan.channels_of_mesh(index), previous_paths[index], pose_setter.target
         )
-        for index, ((scene_rig, path), (rig, channels)) in enumerate(zip(rigs, read, strict=True))
+        for index, ((scene_rig, path), (rig, channels)) in enumerate(zip(rigs, rigs_with_channels, strict=True))
     ]
     return planned, plan
 
 
 def _previous_recording(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> Path | None:
-    """Return the recording that has weights and influences for the one at `path`; None where there is none."""
+    """Return the recording whose weights and influences the recording at `path` reuses; None if there is none."""
     if settings.resume and (path / INDEX_NAME).exists():
         return path
     if settings.influences is None:
@@ -151,12 +157,12 @@ def _pose_indices(settings: RecordingSettings, total: int) -> range:
 
 
 def _run_phase(
-    meshes: Sequence[Before], phase: Callable[[Before], Generator[Progress, None, After]]
-) -> Generator[Progress, None, list[After]]:
-    """Run a phase for each mesh, and return the results; stages name the mesh where there are several."""
+    meshes: Sequence[PreviousState], phase: Callable[[PreviousState], Generator[Progress, None, NextState]]
+) -> Generator[Progress, None, list[NextState]]:
+    """Run a phase for each mesh, and return the results. The stages of several meshes include the mesh's name."""
     results = []
 
-    def collect_result(mesh: Before) -> Iterator[Progress]:
+    def collect_result(mesh: PreviousState) -> Iterator[Progress]:
         results.append((yield from phase(mesh)))
 
     for mesh in meshes:
@@ -169,23 +175,23 @@ def _run_phase(
 def _fit_mesh_weights(
     mesh: MeshPlanned, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer | None
 ) -> Generator[Progress, None, WeightsFitted]:
-    """Read, fit or keep the skin weights of a mesh."""
+    """Fit the skin weights of a mesh, read previously fitted weights, or keep the weights of the rig."""
     if mesh.previous_path:
         return WeightsFitted(mesh, *read_previous_weights(mesh.previous_path, mesh.rig, settings.fit_linear))
     if not settings.fit_linear:
         check_has_weights(mesh.scene_rig, mesh.rig)
         return WeightsFitted(mesh, mesh.rig, None)
     fit_poses = choose_fit_poses(plan.total, mesh.rig.vertex_count)
-    posed = plan.show_poses(player, frozenset(fit_poses))
+    shown_poses = plan.show_poses(player, frozenset(fit_poses))
     evaluator = mesh.evaluator(mesh.rig)
-    fitted = yield from fit_weights(mesh.rig, settings.fit_linear, posed, len(fit_poses), evaluator)
-    return WeightsFitted(mesh, *fitted)
+    rig_and_fit = yield from fit_weights(mesh.rig, settings.fit_linear, shown_poses, len(fit_poses), evaluator)
+    return WeightsFitted(mesh, *rig_and_fit)
 
 
 def _find_influences(
     mesh: WeightsFitted, settings: RecordingSettings, clips: tuple[Clip, ...], player: ClipPlayer
 ) -> Generator[Progress, None, InfluencesReady]:
-    """Detect or read the influences on the partitions of a mesh, with the channels of this mesh alone."""
+    """Read previous influences on the partitions of a mesh, or detect them with the channels of this mesh alone."""
     scene_rig, channels = mesh.planned.scene_rig, mesh.planned.channels
     search = InfluenceSearch(
         channels,
@@ -210,7 +216,7 @@ def _find_influences(
     partitions_without_influences = make_merged_partitions(mesh.rig, settings.min_partition_vertices)
     target = mesh.planned.target
     if target and target.follows != POSE:
-        # A target that depends on time does not follow a joint at once.
+        # A target that depends on time does not follow a moved joint immediately, so influences cannot be detected.
         return InfluencesReady(mesh, assume_nearby_influences(mesh.rig, partitions_without_influences), evaluator)
     partitions = yield from detect_influences(scene_rig, mesh.rig, partitions_without_influences, evaluator, search)
     return InfluencesReady(mesh, partitions, evaluator)
@@ -231,19 +237,21 @@ def _record_poses(
             )
             skinning = LinearSkinning(mesh.fitted.rig, mesh.partitions)
             appenders.append(PoseAppender(mesh.evaluator, skinning, stack.enter_context(writer), plan.pose_setter))
-        first, settler = min(appender.pose_count for appender in appenders), plan.pose_setter.settler
-        seconds = settler.last_rest_state.seconds if settler and settler.last_rest_state else None
+        pose_count, settler = min(appender.pose_count for appender in appenders), plan.pose_setter.settler
+        seconds_per_pose = settler.last_rest_state.seconds if settler and settler.last_rest_state else None
         yield Progress(
             "poses",
-            first,
+            pose_count,
             len(pose_indices),
-            describe_estimate(meshes, len(pose_indices), len(pose_indices) - first, seconds),
+            describe_estimate(meshes, len(pose_indices), len(pose_indices) - pose_count, seconds_per_pose),
         )
-        remaining_poses = plan.show_poses(player, pose_indices[first:])
-        # Closed before the writers, so that evaluated poses are kept when the recording is interrupted.
-        with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as steps:
-            for done in steps:
-                yield Progress("poses", done, len(pose_indices), detail=str(settler.last_rest_state) if settler else "")
+        remaining_poses = plan.show_poses(player, pose_indices[pose_count:])
+        # Close the generators before the writers, so that an interrupted recording keeps the evaluated poses.
+        with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as pose_counts:
+            for recorded_count in pose_counts:
+                yield Progress(
+                    "poses", recorded_count, len(pose_indices), detail=str(settler.last_rest_state) if settler else ""
+                )
         if plan.repeatable_poses and settings.target.repeatability_poses and len(pose_indices) == plan.total:
             yield from measure_repeatability(meshes[0], plan, player, writer, settings.target.repeatability_poses)
             yield Progress("poses", len(pose_indices), len(pose_indices))
@@ -255,16 +263,18 @@ def _make_info(
     """Make the info of the recording of a mesh."""
     planned = mesh.fitted.planned
     sampling = make_sampling(planned.scene_rig, settings, planned.limits)
-    file, version = Path(bpy.data.filepath).name, bpy.app.version_string
+    file_name, blender_version = Path(bpy.data.filepath).name, bpy.app.version_string
     is_shard = settings.shard is not None or settings.detect_influences
     shard = Shard(pose_indices.start, plan.total) if is_shard else None
-    info = RecordingInfo(len(pose_indices), 0, file, planned.name, version, sampling, mesh.fitted.fit, shard)
+    info = RecordingInfo(
+        len(pose_indices), 0, file_name, planned.name, blender_version, sampling, mesh.fitted.fit, shard
+    )
     if planned.previous_path and planned.previous_path != planned.path:
         check_influences_match(planned.previous_path, mesh.fitted.rig, info)
     return info
 
 
 def _show_frame(player: ClipPlayer, clips: tuple[Clip, ...], index: int) -> None:
-    """Show a frame of the clips; consecutive indices give frames that are far apart."""
+    """Show a frame of the clips; consecutive indices result in frames that are far apart."""
     frames = [(clip, frame) for clip in clips for frame in clip.frames]
     player.show(*frames[int(index * GOLDEN_RATIO * len(frames)) % len(frames)])

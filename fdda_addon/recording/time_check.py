@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Check that the surface depends on the pose alone: in several frames the same pose must show the same surface."""
+"""Checks that the surface depends on the pose alone: the same pose must have the same surface in several frames."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,7 +17,7 @@ from .phases import WeightsFitted
 from .pose_plan import PosePlan
 
 POSE_TOLERANCE = 1e-5
-"""Largest difference of matrices and controls of equal poses (no unit, or mesh units)."""
+"""Largest difference between matrices and controls of poses that count as equal (no unit, or mesh units)."""
 
 
 def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: ClipPlayer) -> None:
@@ -27,9 +27,9 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
     skipped, and so are poses that change with the frame.
 
     Args:
-        meshes: that are evaluated together, inside of `temporary_rig_states`.
-        plan: of the poses.
-        player: plays its clips.
+        meshes: the meshes that are evaluated together, prepared by `temporary_rig_states`.
+        plan: plan of the poses.
+        player: player of the clips of the plan.
 
     Raises:
         RigError: a surface differs between frames.
@@ -39,19 +39,19 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
         return
     scene = bpy.context.scene
     frame, subframe = scene.frame_current, scene.frame_subframe
-    others = {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end} - {frame}
+    other_frames = {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end} - {frame}
     evaluators = [mesh.planned.evaluator(mesh.rig) for mesh in meshes]
     try:
-        for number in {plan.total // 3, plan.total - 1}:
-            with closing(plan.show_poses(player, {number})) as poses:
+        for pose_index in {plan.total // 3, plan.total - 1}:
+            with closing(plan.show_poses(player, {pose_index})) as poses:
                 next(poses)
                 clip_frame = player.current_clip_frame
                 player.set_clip_frame(clip_frame, frame)
-                first = [evaluator.evaluate() for evaluator in evaluators]
-                for other in sorted(others):
-                    player.set_clip_frame(clip_frame, other)
-                    for mesh, evaluator, before in zip(meshes, evaluators, first, strict=True):
-                        _compare_surfaces(mesh, (frame, other), before, evaluator.evaluate())
+                first_evaluations = [evaluator.evaluate() for evaluator in evaluators]
+                for other_frame in sorted(other_frames):
+                    player.set_clip_frame(clip_frame, other_frame)
+                    for mesh, evaluator, first_evaluation in zip(meshes, evaluators, first_evaluations, strict=True):
+                        _compare_surfaces(mesh, (frame, other_frame), first_evaluation, evaluator.evaluate())
     finally:
         player.stop()
         clear_pose(meshes[0].planned.scene_rig.armature_object)
@@ -60,12 +60,18 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
 
 
 def _compare_surfaces(
-    mesh: WeightsFitted, frames: tuple[int, int], before: Sequence[np.ndarray], after: Sequence[np.ndarray]
+    mesh: WeightsFitted,
+    frames: tuple[int, int],
+    first_evaluation: Sequence[np.ndarray],
+    other_evaluation: Sequence[np.ndarray],
 ) -> None:
-    (pose, positions, controls), (other_pose, other_positions, other_controls) = before, after
+    (pose_matrices, positions, controls), (other_pose_matrices, other_positions, other_controls) = (
+        first_evaluation,
+        other_evaluation,
+    )
     if not all(
         np.allclose(*pair, rtol=POSE_TOLERANCE, atol=POSE_TOLERANCE)
-        for pair in ((pose, other_pose), (controls, other_controls))
+        for pair in ((pose_matrices, other_pose_matrices), (controls, other_controls))
     ):
         return
     largest_difference = float(np.linalg.norm(positions - other_positions, axis=1).max())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fitting of skin weights to poses of a rig, in the trainer's Python."""
+"""Fits skin weights to poses of a rig, in the trainer's Python."""
 
 import tempfile
 import time
@@ -28,71 +28,73 @@ WAIT_SECONDS = 0.02
 
 
 class SkinFitting(TrainerProcess):
-    """Process that fits skin weights; takes the arguments of `trainer.skin_fit`."""
+    """Process that fits skin weights; its arguments are those of `trainer.skin_fit`."""
 
     module = "trainer.skin_fit"
     failure_message = "The skin weights could not be fitted."
     loss_advice = "no skin weights were fitted, record again"
 
 
-def choose_fit_poses(total: int, vertices: int) -> list[int]:
-    """Choose evenly spaced poses of a recording to which weights are fitted.
+def choose_fit_poses(pose_count: int, vertex_count: int) -> list[int]:
+    """Choose evenly spaced poses of a recording to fit weights to, and return their indices.
 
     Raises:
         RecordingError: there are too few poses.
     """
-    if total < MIN_POSES:
+    if pose_count < MIN_POSES:
         raise RecordingError(
-            f"Skin weights are fitted to at least {MIN_POSES} poses, and these are {total}; record more, or leave "
+            f"Skin weights are fitted to at least {MIN_POSES} poses, and these are {pose_count}; record more, or leave "
             "--fit-linear out."
         )
-    count = min(total, MAX_FIT_POSES, max(MIN_POSES, MAX_FIT_BYTES // (12 * vertices)))
-    return np.linspace(0, total - 1, count).round().astype(int).tolist()
+    fit_pose_count = min(pose_count, MAX_FIT_POSES, max(MIN_POSES, MAX_FIT_BYTES // (12 * vertex_count)))
+    return np.linspace(0, pose_count - 1, fit_pose_count).round().astype(int).tolist()
 
 
-def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluator: PoseEvaluator) -> Iterator[Progress]:
+def fit_weights(
+    rig: Rig, kind: str, poses: Iterator[None], pose_count: int, evaluator: PoseEvaluator
+) -> Iterator[Progress]:
     """Fit the weights of a rig to poses.
 
     Args:
-        rig: with its own skin weights.
+        rig: the rig with its own skin weights.
         kind: one of `core.skin_fit.FIT_KINDS`.
-        poses: sets one pose per iteration.
-        count: number of poses.
-        evaluator: of the scene.
+        poses: iterator that sets one pose per iteration.
+        pose_count: number of poses.
+        evaluator: evaluator of the poses.
 
     Returns:
-        The rig with fitted weights and its old fingerprint; and the SkinFit.
+        The rig with the fitted weights and its unchanged fingerprint, and the SkinFit.
 
     Raises:
-        TrainingError: the trainer's Python cannot fit.
+        TrainingError: the trainer's Python cannot fit the weights.
         OutputError: the poses cannot be written.
     """
     try:
         # On Windows a virus scanner may still have a file open.
-        temporary = tempfile.TemporaryDirectory(prefix="fdda-fit-", ignore_cleanup_errors=True)
+        temporary_folder = tempfile.TemporaryDirectory(prefix="fdda-fit-", ignore_cleanup_errors=True)
     except OSError as error:
         raise temporary_folder_error(error) from error
-    with temporary as name:
-        folder = Path(name)
-        with FitPosesWriter(folder, rig, count) as writer:
-            for number, _ in enumerate(poses, 1):
+    with temporary_folder as folder_name:
+        folder = Path(folder_name)
+        with FitPosesWriter(folder, rig, pose_count) as writer:
+            for pose_number, _ in enumerate(poses, 1):
                 pose_matrices, positions, *_ = evaluator.evaluate()
                 writer.append(pose_matrices, positions)
-                yield Progress("poses to fit", number, count)
+                yield Progress("poses to fit", pose_number, pose_count)
         fit = yield from _run_fit(folder, kind, rig)
         joints, weights = read_fitted_weights(folder, rig)
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 
 def _run_fit(folder: Path, kind: str, rig: Rig) -> Iterator[Progress]:
-    """Run the process; yield progress and return the SkinFit."""
-    progress, vertices = Progress("fit", 0, rig.vertex_count), rig.vertex_count
+    """Run the process, yield its progress, and return the SkinFit."""
+    progress, vertex_count = Progress("fit", 0, rig.vertex_count), rig.vertex_count
     with SkinFitting([str(folder), kind, "--metres-per-unit", repr(rig.metres_per_unit)]) as fitting:
         for message in fitting.messages(wait=False):
             if message is None:
                 time.sleep(WAIT_SECONDS)
             elif message.type is MessageType.PROGRESS:
-                progress = Progress("fit", int(message.values["done"]), vertices)
+                progress = Progress("fit", int(message.values["done"]), vertex_count)
             elif message.type is MessageType.FINISHED:
                 return SkinFit.from_json(message.values["fit"])
             yield progress
@@ -105,8 +107,8 @@ def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:
     Raises:
         RigError: no vertex follows a bone.
     """
-    names = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
-    if names <= {STATIC_JOINT}:
+    weighted_joints = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
+    if weighted_joints <= {STATIC_JOINT}:
         raise RigError(
             f"The vertices of '{scene_rig.mesh_object.name}' have no weights on deforming bones of "
             f"'{scene_rig.armature_object.name}', so there is no linear skinning to learn from; have one fitted "
