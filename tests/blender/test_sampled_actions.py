@@ -11,7 +11,7 @@ from mathutils import Euler, Quaternion
 from fdda_addon.core.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
 from fdda_addon.panels.poses import _format_channels
 from fdda_addon.poses.action_range import measured_ranges
-from fdda_addon.poses.measured_limits import WIDE_NOTE, describe_limits, set_limits_from_actions
+from fdda_addon.poses.measured_limits import GIMBAL_LOCK_NOTE, describe_limits, set_limits_from_actions
 from fdda_addon.poses.sample_selection import select_bones
 from fdda_addon.poses.sampling import rig_allows_ranges, sampled_channels, selected_channels
 from fdda_addon.rig.reading import read_rig
@@ -152,7 +152,7 @@ def test_random_poses_are_close_to_the_poses_of_actions(figure, motion, mode):
     apart = 2 * np.arccos(np.clip(np.abs(np.array(drawn) @ keyed.T).max(axis=1), 0, 1))
     assert np.degrees(apart.max()) < 20
     wide = [line for line in describe_limits(figure.armature_object, set_limits_from_actions(figure, bpy.data.actions))]
-    assert [WIDE_NOTE in line for line in wide] == [motion == "gimbal lock"]
+    assert [GIMBAL_LOCK_NOTE in line for line in wide] == [motion == "gimbal lock"]
 
 
 def test_euler_angles_of_several_actions_do_not_wrap(figure):
