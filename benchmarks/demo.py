@@ -11,7 +11,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from fdda_addon import register, unregister
-from fdda_addon.arm.joints import ACTION, ELBOW_FLEXION, FINGERS
+from fdda_addon.arm.joints import ACTION_NAME, ELBOW_FLEXION, FINGERS
 from fdda_addon.cli.evaluate import run_evaluation, table
 from fdda_addon.cli.files import open_file
 from fdda_addon.cli.main import main as run_verb
@@ -106,7 +106,9 @@ def main(folder: Path) -> int:
 def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
     open_file(rig)
     scene_rig = find_rig()
-    settings = EvaluationSettings(HELD_OUT_POSES, actions=(ACTION,), range_scales=(1.5, 2.0, 3.0), named=EXTREME_POSES)
+    settings = EvaluationSettings(
+        HELD_OUT_POSES, actions=(ACTION_NAME,), range_scales=(1.5, 2.0, 3.0), named=EXTREME_POSES
+    )
     evaluation = run_evaluation(scene_rig, model, settings)
     write_json(out, evaluation.to_json())
 

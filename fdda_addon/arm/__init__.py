@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm rig: a sculpted arm with 22 joints, hard skinning, a driven biceps and Corrective Smooth."""
+"""Builds the arm rig: a sculpted arm with 22 joints, hard skinning, a driven biceps and Corrective Smooth."""

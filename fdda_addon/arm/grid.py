@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The quads of the arm before sculpting: a tube from shoulder to webs, and five digits."""
+"""Builds the quads of the arm before sculpting: a tube from the shoulder to the webs, and five digits."""
 
 from .digits import grow_fingers, grow_thumb
 from .quads import DIVISIONS, Grid, GridBuilder
-from .tube import Tube, lay_tube
+from .tube import Tube, add_tube
 
 
 def build_grid(density: int) -> Grid:
@@ -11,7 +11,7 @@ def build_grid(density: int) -> Grid:
     if density not in DIVISIONS:
         raise ValueError(f"The arm has densities 1, 2 and 3; {density!r} is none of them.")
     quads, tube = GridBuilder(), Tube(DIVISIONS[density])
-    rings = lay_tube(quads, tube)
+    rings = add_tube(quads, tube)
     grow_fingers(quads, tube, rings[-1])
     grow_thumb(quads, tube, rings)
-    return quads.grid()
+    return quads.build()

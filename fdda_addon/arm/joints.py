@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The joints of the arm: names, parents, rest pose and range of motion, without bpy.
+"""Defines the joints of the arm: names, parents, rest pose and range of motion, without bpy.
 
-A left arm in a T-pose: shoulder at the origin, arm along +X, palm down (-Z), thumb and elbow crease to the front (-Y),
-the forearm half way between pronation and supination. Lengths in meters, angles in degrees.
+The arm is a left arm in a T-pose, with the shoulder at the origin, the arm along +X, the palm down (-Z), and the thumb
+and the elbow crease to the front (-Y). The forearm is half way between pronation and supination. Lengths are in meters,
+angles in degrees.
 
-Every bone runs along its local Y; its local Z points to where it bends (the elbow crease, the palm, the pad of the
-thumb), so that a positive rotation about local X is flexion everywhere.
+Every bone lies along its local Y axis. Its local Z axis points in the direction in which it bends (to the elbow crease,
+the palm or the pad of the thumb), so that a positive rotation about local X is always flexion.
 """
 
 import math
@@ -13,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-# The pose of every bone is three Euler angles in this order.
+# Every bone is posed with Euler angles in this order.
 ROTATION_MODE = "XYZ"
 ARM_OBJECT = "arm"
 RIG_OBJECT = "arm_rig"
-ACTION = "arm_drive"
+ACTION_NAME = "arm_drive"
 BICEPS_KEY = "biceps"
-# Full flexion: where the biceps key reaches 1.
+# Full flexion of the elbow, degrees, at which the biceps key reaches 1.
 ELBOW_FLEXION = 140.0
 
 FINGERS = ("index", "middle", "ring", "pinky")
@@ -28,16 +29,18 @@ UPPER_ARM_LENGTH = 0.30
 FOREARM_LENGTH = 0.26
 WRIST_X = UPPER_ARM_LENGTH + FOREARM_LENGTH
 
-LOCKED = (0.0, 0.0)
+LOCKED_RANGE = (0.0, 0.0)
 Range = tuple[float, float]
 
 
 class Joint(NamedTuple):
     """One bone in the rest pose.
 
-    head, tail: meters, armature space. bend: unit vector, armature space, the bone's local Z.
-    limits: degrees about local X (flexion), Y (twist) and Z (sideways: positive towards the thumb, and for the thumb
-    itself away from the back of the hand); `LOCKED` for an axis that does not turn.
+    Attributes:
+        head, tail: meters, armature space.
+        bend: unit vector of the bone's local Z axis, armature space.
+        limits: degrees about local X (flexion), Y (twist) and Z (sideways: positive towards the thumb, and for the
+            thumb itself away from the back of the hand); `LOCKED_RANGE` for an axis that does not rotate.
     """
 
     name: str
@@ -49,10 +52,13 @@ class Joint(NamedTuple):
 
 
 class Finger(NamedTuple):
-    """Measures of one finger: joint positions in meters, the heading in degrees (positive: towards the thumb).
+    """Measures of one finger.
 
-    bends: the slight flexion that the finger rests in, at its three free joints.
-    tip: how far the flesh reaches beyond the last bone's tail.
+    Attributes:
+        base, knuckle: head and tail of the metacarpal, meters, armature space.
+        heading: direction of the finger, degrees, positive towards the thumb.
+        lengths: lengths of the three free bones, meters.
+        bends: slight flexion of the three free joints in the rest pose, degrees.
     """
 
     base: tuple[float, float, float]
@@ -62,8 +68,8 @@ class Finger(NamedTuple):
     bends: tuple[float, float, float]
 
 
-# Bone lengths after the usual proportions of a hand of 0.19 m (metacarpal : phalanges as in radiographs).
-HAND: dict[str, Finger] = {
+# Bone lengths have the usual proportions of a hand of 0.19 m; metacarpals and phalanges are as in radiographs.
+FINGER_MEASURES: dict[str, Finger] = {
     "index": Finger((0.588, -0.0140, 0.0000), (0.6495, -0.0290, -0.0005), 6.0, (0.0435, 0.0250, 0.0208), (2, 5, 4)),
     "middle": Finger((0.590, -0.0035, 0.0020), (0.6530, -0.0080, 0.0020), 0.5, (0.0475, 0.0290, 0.0215), (2, 5, 4)),
     "ring": Finger((0.588, 0.0070, 0.0015), (0.6475, 0.0125, 0.0010), -4.5, (0.0440, 0.0278, 0.0213), (2, 6, 4)),
@@ -72,47 +78,53 @@ HAND: dict[str, Finger] = {
 
 THUMB_BASE = (0.5760, -0.0205, -0.0080)
 THUMB_LENGTHS = (0.0450, 0.0325, 0.0270)
-# Heading and dip of the thumb's metacarpal, degrees; the phalanges turn back towards the fingers a little.
+# Heading and dip (downward angle) of the thumb's bones, degrees; the phalanges point more towards the fingers.
 THUMB_HEADINGS = (43.0, 33.0, 30.0)
 THUMB_DIPS = (21.0, 17.0, 17.0)
-# The thumb's pad faces across the palm: its bend direction is turned this much about its own axis, degrees.
+# The pad of the thumb faces across the palm: the bend direction is rotated about the bone by this angle, degrees.
 THUMB_ROTATION = 62.0
 
 _METACARPAL = ((-20.0, 20.0), (-20.0, 20.0), (-20.0, 20.0))
 _FINGER_LIMITS = (
     _METACARPAL,
-    ((-20.0, 90.0), LOCKED, (-15.0, 15.0)),
-    ((-5.0, 100.0), LOCKED, (-5.0, 5.0)),
-    ((-10.0, 80.0), LOCKED, (-5.0, 5.0)),
+    ((-20.0, 90.0), LOCKED_RANGE, (-15.0, 15.0)),
+    ((-5.0, 100.0), LOCKED_RANGE, (-5.0, 5.0)),
+    ((-10.0, 80.0), LOCKED_RANGE, (-5.0, 5.0)),
 )
 _THUMB_LIMITS = (
     ((-20.0, 30.0), (-15.0, 15.0), (-25.0, 25.0)),
-    ((-10.0, 55.0), LOCKED, (-10.0, 10.0)),
-    ((-15.0, 80.0), LOCKED, (-5.0, 5.0)),
+    ((-10.0, 55.0), LOCKED_RANGE, (-10.0, 10.0)),
+    ((-15.0, 80.0), LOCKED_RANGE, (-5.0, 5.0)),
 )
 
 
 def heading_vector(heading: float, dip: float) -> np.ndarray:
     """Return a (3,) unit vector in armature space: +X rotated towards the thumb (-Y) and down (-Z), degrees."""
-    a, b = math.radians(heading), math.radians(dip)
-    return np.array([math.cos(a) * math.cos(b), -math.sin(a) * math.cos(b), -math.sin(b)])
+    heading_radians, dip_radians = math.radians(heading), math.radians(dip)
+    return np.array(
+        [
+            math.cos(heading_radians) * math.cos(dip_radians),
+            -math.sin(heading_radians) * math.cos(dip_radians),
+            -math.sin(dip_radians),
+        ]
+    )
 
 
-def perpendicular(axis: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Return the (3,) unit vector perpendicular to the unit vector `axis` and nearest to `towards`."""
-    flat = towards - axis * float(np.dot(axis, towards))
-    return flat / np.linalg.norm(flat)
+def perpendicular(axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return the (3,) unit vector perpendicular to the unit vector `axis` and nearest to `direction`."""
+    projection = direction - axis * float(np.dot(axis, direction))
+    return projection / np.linalg.norm(projection)
 
 
 def _rotated(vector: np.ndarray, axis: np.ndarray, degrees: float) -> np.ndarray:
-    a = math.radians(degrees)
-    return vector * math.cos(a) + np.cross(axis, vector) * math.sin(a)
+    angle = math.radians(degrees)
+    return vector * math.cos(angle) + np.cross(axis, vector) * math.sin(angle)
 
 
-def _joint(name, parent, head, tail, towards, limits) -> Joint:
+def _joint(name, parent, head, tail, bend_direction, limits) -> Joint:
     head, tail = np.asarray(head, float), np.asarray(tail, float)
     axis = (tail - head) / np.linalg.norm(tail - head)
-    bend = perpendicular(axis, np.asarray(towards, float))
+    bend = perpendicular(axis, np.asarray(bend_direction, float))
     return Joint(name, parent, tuple(head.tolist()), tuple(tail.tolist()), tuple(bend.tolist()), limits)
 
 
@@ -120,10 +132,12 @@ def _finger_joints(name: str, finger: Finger) -> list[Joint]:
     palm = np.array([0.0, 0.0, -1.0])
     joints = [_joint(f"{name}_0", "wrist", finger.base, finger.knuckle, palm, _FINGER_LIMITS[0])]
     head, dip = np.array(finger.knuckle), 0.0
-    for i, (length, bend) in enumerate(zip(finger.lengths, finger.bends, strict=True), start=1):
+    for bone_number, (length, bend) in enumerate(zip(finger.lengths, finger.bends, strict=True), start=1):
         dip += bend
         tail = head + heading_vector(finger.heading, dip) * length
-        joints.append(_joint(f"{name}_{i}", f"{name}_{i - 1}", head, tail, palm, _FINGER_LIMITS[i]))
+        joints.append(
+            _joint(f"{name}_{bone_number}", f"{name}_{bone_number - 1}", head, tail, palm, _FINGER_LIMITS[bone_number])
+        )
         head = tail
     return joints
 
@@ -131,12 +145,12 @@ def _finger_joints(name: str, finger: Finger) -> list[Joint]:
 def _thumb_joints() -> list[Joint]:
     joints = []
     head, parent = np.array(THUMB_BASE), "wrist"
-    for i, length in enumerate(THUMB_LENGTHS):
-        axis = heading_vector(THUMB_HEADINGS[i], THUMB_DIPS[i])
+    for bone_index, length in enumerate(THUMB_LENGTHS):
+        axis = heading_vector(THUMB_HEADINGS[bone_index], THUMB_DIPS[bone_index])
         down = perpendicular(axis, np.array([0.0, 0.0, -1.0]))
         tail = head + axis * length
-        name = f"thumb_{i}"
-        joints.append(_joint(name, parent, head, tail, _rotated(down, axis, THUMB_ROTATION), _THUMB_LIMITS[i]))
+        name = f"thumb_{bone_index}"
+        joints.append(_joint(name, parent, head, tail, _rotated(down, axis, THUMB_ROTATION), _THUMB_LIMITS[bone_index]))
         head, parent = tail, name
     return joints
 
@@ -144,21 +158,21 @@ def _thumb_joints() -> list[Joint]:
 def _arm_joints() -> list[Joint]:
     crease, palm = (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)
     elbow, wrist = (UPPER_ARM_LENGTH, 0.0, 0.0), (WRIST_X, 0.0, 0.0)
-    quarter = (-90.0, 90.0)
+    quarter_turns = (-90.0, 90.0)
     return [
-        _joint("shoulder", None, (0.0, 0.0, 0.0), elbow, crease, (quarter, quarter, quarter)),
-        _joint("elbow", "shoulder", elbow, wrist, crease, ((0.0, ELBOW_FLEXION), LOCKED, LOCKED)),
-        _joint("wrist", "elbow", wrist, (WRIST_X + 0.03, 0.0, 0.0), palm, ((-70.0, 70.0), LOCKED, (-30.0, 20.0))),
+        _joint("shoulder", None, (0.0, 0.0, 0.0), elbow, crease, (quarter_turns, quarter_turns, quarter_turns)),
+        _joint("elbow", "shoulder", elbow, wrist, crease, ((0.0, ELBOW_FLEXION), LOCKED_RANGE, LOCKED_RANGE)),
+        _joint("wrist", "elbow", wrist, (WRIST_X + 0.03, 0.0, 0.0), palm, ((-70.0, 70.0), LOCKED_RANGE, (-30.0, 20.0))),
     ]
 
 
 JOINTS: tuple[Joint, ...] = tuple(
-    _arm_joints() + _thumb_joints() + [j for name in FINGERS for j in _finger_joints(name, HAND[name])]
+    _arm_joints() + _thumb_joints() + [j for name in FINGERS for j in _finger_joints(name, FINGER_MEASURES[name])]
 )
 JOINT_NAMES: tuple[str, ...] = tuple(joint.name for joint in JOINTS)
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 
 
 def joint(name: str) -> Joint:
-    """Return the joint with this name; raise KeyError where there is none."""
+    """Return the joint with this name; raise KeyError if there is none."""
     return JOINTS[JOINT_INDEX[name]]

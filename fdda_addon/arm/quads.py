@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Quad grids in sheets: subdivision, construction, and interpolation from a coarser grid."""
+"""Quad grids: their subdivision and construction, and interpolation from a coarser grid.
+
+The vertices of a grid form sheets. A sheet is a rectangular array of vertices in rows and columns, such as the tube of
+the arm, a finger or a fingertip.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,9 +15,11 @@ import numpy as np
 class Divisions:
     """Numbers of faces in each direction.
 
-    finger, web, side: across a finger, a web, and the side of the hand. rings: along the arm to the elbow, on to the
-    wrist, on to the webs. finger_rings, thumb_rings: along a finger from the webs, along the thumb. thumb_root: along
-    the hand where the thumb grows out of it.
+    Attributes:
+        finger, web, side: across a finger, across a web, and across the side of the hand.
+        rings: along the arm: from the shoulder to the elbow, to the wrist, and to the webs.
+        finger_rings, thumb_rings: along a finger from the webs, and along the thumb.
+        thumb_root: along the hand, where the thumb grows out of it.
     """
 
     finger: int
@@ -25,7 +31,7 @@ class Divisions:
     thumb_rings: int
 
 
-# Density 1 is also the guide from which the finer ones are seeded.
+# By density. The grid of density 1 is also the guide whose sculpted points initialize the finer grids.
 DIVISIONS = {
     1: Divisions(2, 1, 2, (15, 11, 10), 12, 3, 11),
     2: Divisions(5, 3, 5, (39, 30, 26), 31, 8, 28),
@@ -35,7 +41,7 @@ DIVISIONS = {
 
 @dataclass(frozen=True)
 class SheetPosition:
-    """Where a vertex sits in a sheet, counted in the faces of density 1."""
+    """Position of a vertex in a sheet; row and column are in faces of density 1."""
 
     sheet: str
     row: float
@@ -44,20 +50,24 @@ class SheetPosition:
 
 @dataclass
 class Grid:
-    """Unsculpted quads.
+    """Quads before sculpting: n vertices and f faces.
 
-    points: (n, 3) float64, meters, arm space. faces: (f, 4) int32, outward.
-    digit: (n,) int, -1 for arm and palm, else 0 for the thumb, 1..4 from index to little finger.
-    column: (n,) int, in the palm the finger 1..4 in whose columns a vertex runs.
-    plane_point, plane_normal (n, 3), plane_hold (n,) 0..1: the plane of a vertex's ring, and how firmly it keeps to it.
-    loose: (n,) bool, to be drawn out between its neighbors before anything else.
-    sheet_positions: n of them. sheets: vertices of each sheet, (rows, columns) int, -1 where it has a hole.
+    Attributes:
+        points: (n, 3) float64, meters, arm space.
+        faces: (f, 4) int32, oriented outwards.
+        digit: (n,) int; -1 for arm and palm, 0 for the thumb, 1 to 4 from index to little finger.
+        finger_column: (n,) int; number of the finger, 1 to 4, to whose columns a vertex of the palm belongs.
+        plane_point, plane_normal: (n, 3), the plane of the ring of each vertex.
+        plane_hold: (n,) 0 to 1, the fraction by which a vertex is kept in this plane.
+        loose: (n,) bool, whether a vertex is placed between its neighbors before sculpting.
+        sheet_positions: positions of the n vertices in sheets.
+        sheets: (rows, columns) int, the vertices of each sheet; -1 at a hole.
     """
 
     points: np.ndarray
     faces: np.ndarray
     digit: np.ndarray
-    column: np.ndarray
+    finger_column: np.ndarray
     plane_point: np.ndarray
     plane_normal: np.ndarray
     plane_hold: np.ndarray
@@ -72,74 +82,93 @@ class GridBuilder:
     def __init__(self):
         self.points: list[np.ndarray] = []
         self.faces: list[tuple[int, int, int, int]] = []
-        self.marks: list[tuple[int, int]] = []
+        self.digits_and_columns: list[tuple[int, int]] = []
         self.planes: list[tuple[np.ndarray, np.ndarray, float]] = []
         self.loose: list[bool] = []
         self.sheet_positions: list[SheetPosition] = []
         self.sheets: dict[str, list[list[int]]] = {}
 
-    def vertex(
-        self, point, sheet_position: SheetPosition, digit: int, column: int, plane=None, loose: bool = False
+    def add_vertex(
+        self, point, sheet_position: SheetPosition, digit: int, finger_column: int, plane=None, loose: bool = False
     ) -> int:
-        """plane: (point, normal, hold); None for a vertex that is in no ring."""
+        """Add a vertex, and return its index.
+
+        Args:
+            point: (3,) position, meters, arm space.
+            sheet_position: position in a sheet.
+            digit, finger_column, loose: as in `Grid`.
+            plane: point, normal and hold of the plane of its ring; None for a vertex that is not in a ring.
+        """
         point = np.asarray(point, float)
         self.points.append(point)
         self.sheet_positions.append(sheet_position)
-        self.marks.append((digit, column))
+        self.digits_and_columns.append((digit, finger_column))
         self.planes.append(plane if plane is not None else (point, np.array([1.0, 0.0, 0.0]), 0.0))
         self.loose.append(loose)
         return len(self.points) - 1
 
-    def band(self, near: list[int], far: list[int], skip=()):
-        """Faces between two closed rings that run clockwise seen from beyond the far one; `skip`: columns left open."""
-        for i in range(len(near)):
-            k = (i + 1) % len(near)
-            if i not in skip:
-                self.faces.append((near[i], far[i], far[k], near[k]))
+    def add_band(self, near: list[int], far: list[int], skip=()):
+        """Add the faces between two closed rings, which run clockwise when viewed from beyond the far ring.
 
-    def patch(self, rows: list[list[int]]):
-        """Faces between open rows; seen from outside, the rows run to the right and follow each other downwards."""
-        for a, b in pairwise(rows):
-            for i in range(len(a) - 1):
-                self.faces.append((a[i], b[i], b[i + 1], a[i + 1]))
+        Args:
+            near, far: vertices of the rings.
+            skip: columns that stay open.
+        """
+        for column in range(len(near)):
+            next_column = (column + 1) % len(near)
+            if column not in skip:
+                self.faces.append((near[column], far[column], far[next_column], near[next_column]))
 
-    def grid(self) -> Grid:
-        """Return the grid without unused vertices, which the tube has under the thumb."""
-        used, faces = np.unique(np.array(self.faces), return_inverse=True)
-        number = np.full(len(self.points) + 1, -1)
-        number[used] = np.arange(len(used))
-        marks = np.array(self.marks)[used]
+    def add_patch(self, rows: list[list[int]]):
+        """Add the faces between open rows. Viewed from outside, rows run to the right, and each next row is below."""
+        for upper_row, lower_row in pairwise(rows):
+            for column in range(len(upper_row) - 1):
+                self.faces.append((upper_row[column], lower_row[column], lower_row[column + 1], upper_row[column + 1]))
+
+    def build(self) -> Grid:
+        """Build the grid, without the unused vertices of the tube under the thumb."""
+        used_vertices, faces = np.unique(np.array(self.faces), return_inverse=True)
+        new_indices = np.full(len(self.points) + 1, -1)
+        new_indices[used_vertices] = np.arange(len(used_vertices))
+        digits_and_columns = np.array(self.digits_and_columns)[used_vertices]
         plane_points, plane_normals, holds = zip(*self.planes, strict=True)
         return Grid(
-            points=np.array(self.points)[used],
+            points=np.array(self.points)[used_vertices],
             faces=faces.reshape(-1, 4).astype(np.int32),
-            digit=marks[:, 0],
-            column=marks[:, 1],
-            plane_point=np.array(plane_points)[used],
-            plane_normal=np.array(plane_normals)[used],
-            plane_hold=np.array(holds)[used],
-            loose=np.array(self.loose)[used],
-            sheet_positions=[self.sheet_positions[i] for i in used],
-            sheets={name: number[np.array(rows)] for name, rows in self.sheets.items()},
+            digit=digits_and_columns[:, 0],
+            finger_column=digits_and_columns[:, 1],
+            plane_point=np.array(plane_points)[used_vertices],
+            plane_normal=np.array(plane_normals)[used_vertices],
+            plane_hold=np.array(holds)[used_vertices],
+            loose=np.array(self.loose)[used_vertices],
+            sheet_positions=[self.sheet_positions[vertex_index] for vertex_index in used_vertices],
+            sheets={name: new_indices[np.array(rows)] for name, rows in self.sheets.items()},
         )
 
 
 def interpolate_guide_points(grid: Grid, guide: Grid, guide_points: np.ndarray) -> np.ndarray:
-    """Interpolate the (n, 3) float64 points of `grid` between those of a guide grid of density 1, sheet by sheet."""
+    """Interpolate the (n, 3) float64 points of a grid between points of a guide grid of density 1, sheet by sheet."""
     points = grid.points.copy()
-    names = np.array([sheet_position.sheet for sheet_position in grid.sheet_positions])
-    places = np.array([(sheet_position.row, sheet_position.column) for sheet_position in grid.sheet_positions])
+    sheet_names = np.array([sheet_position.sheet for sheet_position in grid.sheet_positions])
+    rows_and_columns = np.array(
+        [(sheet_position.row, sheet_position.column) for sheet_position in grid.sheet_positions]
+    )
     for name, vertices in guide.sheets.items():
-        mine = np.flatnonzero(names == name)
-        sheet = guide_points[vertices]
-        rows, columns = sheet.shape[:2]
-        at = places[mine]
-        row = np.clip(np.floor(at[:, 0]).astype(int), 0, max(rows - 2, 0))
-        column = np.floor(at[:, 1]).astype(int)
-        s, t = (at[:, 0] - row)[:, None], (at[:, 1] - column)[:, None]
-        # A closed sheet goes round; in an open one the last column is never passed.
-        below, right = np.minimum(row + 1, rows - 1), (column + 1) % columns
-        near = sheet[row, column] * (1 - t) + sheet[row, right] * t
-        far = sheet[below, column] * (1 - t) + sheet[below, right] * t
-        points[mine] = near * (1 - s) + far * s
+        vertex_indices = np.flatnonzero(sheet_names == name)
+        sheet_points = guide_points[vertices]
+        row_count, column_count = sheet_points.shape[:2]
+        positions = rows_and_columns[vertex_indices]
+        row = np.clip(np.floor(positions[:, 0]).astype(int), 0, max(row_count - 2, 0))
+        column = np.floor(positions[:, 1]).astype(int)
+        row_fraction, column_fraction = (positions[:, 0] - row)[:, None], (positions[:, 1] - column)[:, None]
+        # The last column of a closed sheet is next to the first; positions in an open sheet end at its last column.
+        next_row, next_column = np.minimum(row + 1, row_count - 1), (column + 1) % column_count
+        row_points = (
+            sheet_points[row, column] * (1 - column_fraction) + sheet_points[row, next_column] * column_fraction
+        )
+        next_row_points = (
+            sheet_points[next_row, column] * (1 - column_fraction)
+            + sheet_points[next_row, next_column] * column_fraction
+        )
+        points[vertex_indices] = row_points * (1 - row_fraction) + next_row_points * row_fraction
     return points

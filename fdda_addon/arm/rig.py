@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm as Blender objects: mesh, armature, range of motion and three deformers."""
+"""Builds the arm as Blender objects: mesh, armature, range of motion and three deformers."""
 
 import math
 
@@ -8,47 +8,50 @@ import numpy as np
 
 from ..scene.arrays import COORDINATE_ELEMENT, MATERIAL_INDEX_ELEMENT, write
 from .action import assign_drive_action
-from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED, RIG_OBJECT, ROTATION_MODE
+from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED_RANGE, RIG_OBJECT, ROTATION_MODE
 from .surface import Surface, sculpt_arm
 
-# Corrective Smooth by density: (iterations, factor). On finer quads each iteration reaches less far.
-SMOOTHING = {1: (10, 0.5), 2: (20, 0.8), 3: (30, 1.0)}
-# Linear RGBA and roughness.
-_SKIN = ((0.72, 0.42, 0.31, 1.0), 0.50)
-_NAIL = ((0.82, 0.50, 0.40, 1.0), 0.35)
+# Iterations and factor of Corrective Smooth, by density. On finer quads, each iteration smooths a smaller distance.
+SMOOTHING_SETTINGS = {1: (10, 0.5), 2: (20, 0.8), 3: (30, 1.0)}
+# Color (linear RGBA) and roughness of a material.
+_SKIN_MATERIAL = ((0.72, 0.42, 0.31, 1.0), 0.50)
+_NAIL_MATERIAL = ((0.82, 0.50, 0.40, 1.0), 0.35)
 
 
 def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
     """Add the arm and its rig to the current scene; return mesh object and armature object.
 
-    Layers: hard skinning through an Armature modifier, the biceps shape key raised by a driver, Corrective Smooth. The
-    action `arm_drive` is assigned and the scene's range set to it. ValueError for a density other than 1, 2 or 3.
+    The arm has three deformers: an Armature modifier with hard skinning, a biceps shape key with a driver, and
+    Corrective Smooth. The action `arm_drive` is assigned, and the scene gets its frame range.
+
+    Raises:
+        ValueError: the density is not 1, 2 or 3.
     """
     surface = sculpt_arm(density)
-    rig = _armature_object()
-    _set_range_of_motion(rig)
-    arm = _mesh_object(surface)
-    arm.parent = rig
-    _add_skinning(arm, rig, surface.joints)
-    _add_biceps(arm, rig, surface)
-    _add_smoothing(arm, density)
-    assign_drive_action(rig)
+    armature_object = _create_armature_object()
+    _set_range_of_motion(armature_object)
+    mesh_object = _create_mesh_object(surface)
+    mesh_object.parent = armature_object
+    _add_skinning(mesh_object, armature_object, surface.joints)
+    _add_biceps(mesh_object, armature_object, surface)
+    _add_smoothing(mesh_object, density)
+    assign_drive_action(armature_object)
     bpy.context.view_layer.update()
-    return arm, rig
+    return mesh_object, armature_object
 
 
-def _armature_object() -> bpy.types.Object:
+def _create_armature_object() -> bpy.types.Object:
     armature = bpy.data.armatures.new(RIG_OBJECT)
     armature.display_type = "STICK"
-    rig = bpy.data.objects.new(RIG_OBJECT, armature)
-    rig.show_in_front = True
-    bpy.context.scene.collection.objects.link(rig)
+    armature_object = bpy.data.objects.new(RIG_OBJECT, armature)
+    armature_object.show_in_front = True
+    bpy.context.scene.collection.objects.link(armature_object)
     # Bones can only be added in edit mode, which works on the active object.
-    layer = bpy.context.view_layer
-    before = layer.objects.active
-    if before is not None and before.mode != "OBJECT":
+    view_layer = bpy.context.view_layer
+    previous_active_object = view_layer.objects.active
+    if previous_active_object is not None and previous_active_object.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
-    layer.objects.active = rig
+    view_layer.objects.active = armature_object
     bpy.ops.object.mode_set(mode="EDIT")
     try:
         for joint in JOINTS:
@@ -61,39 +64,39 @@ def _armature_object() -> bpy.types.Object:
                 bone.use_connect = (parent.tail - bone.head).length < 1e-6
     finally:
         bpy.ops.object.mode_set(mode="OBJECT")
-        layer.objects.active = before if before is not None else rig
-    return rig
+        view_layer.objects.active = previous_active_object if previous_active_object is not None else armature_object
+    return armature_object
 
 
-def _set_range_of_motion(rig: bpy.types.Object):
+def _set_range_of_motion(armature_object: bpy.types.Object):
     """Set the range of motion as IK limits and locks, which do not clamp posing, so an action may exceed it."""
     for joint in JOINTS:
-        bone = rig.pose.bones[joint.name]
+        bone = armature_object.pose.bones[joint.name]
         bone.rotation_mode = ROTATION_MODE
         bone.lock_location = (True, True, True)
         bone.lock_scale = (True, True, True)
-        bone.lock_rotation = tuple(limits == LOCKED for limits in joint.limits)
+        bone.lock_rotation = tuple(limits == LOCKED_RANGE for limits in joint.limits)
         for axis, (low, high) in zip("xyz", joint.limits, strict=True):
-            setattr(bone, f"lock_ik_{axis}", (low, high) == LOCKED)
+            setattr(bone, f"lock_ik_{axis}", (low, high) == LOCKED_RANGE)
             setattr(bone, f"use_ik_limit_{axis}", True)
             setattr(bone, f"ik_min_{axis}", math.radians(low))
             setattr(bone, f"ik_max_{axis}", math.radians(high))
 
 
-def _mesh_object(surface: Surface) -> bpy.types.Object:
+def _create_mesh_object(surface: Surface) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(ARM_OBJECT)
     mesh.from_pydata(surface.points.tolist(), [], surface.faces.tolist())
     mesh.shade_smooth()
-    for name, look in (("arm_skin", _SKIN), ("arm_nail", _NAIL)):
-        mesh.materials.append(_material(name, *look))
+    for name, color_and_roughness in (("arm_skin", _SKIN_MATERIAL), ("arm_nail", _NAIL_MATERIAL)):
+        mesh.materials.append(_create_material(name, *color_and_roughness))
     write(mesh.polygons, MATERIAL_INDEX_ELEMENT, surface.nails.astype(np.int32))
     mesh.update()
-    arm = bpy.data.objects.new(ARM_OBJECT, mesh)
-    bpy.context.scene.collection.objects.link(arm)
-    return arm
+    mesh_object = bpy.data.objects.new(ARM_OBJECT, mesh)
+    bpy.context.scene.collection.objects.link(mesh_object)
+    return mesh_object
 
 
-def _material(name: str, color: tuple[float, float, float, float], roughness: float) -> bpy.types.Material:
+def _create_material(name: str, color: tuple[float, float, float, float], roughness: float) -> bpy.types.Material:
     material = bpy.data.materials.new(name)
     material.diffuse_color = color
     material.roughness = roughness
@@ -107,20 +110,20 @@ def _material(name: str, color: tuple[float, float, float, float], roughness: fl
     return material
 
 
-def _add_skinning(arm: bpy.types.Object, rig: bpy.types.Object, joints: np.ndarray):
+def _add_skinning(mesh_object: bpy.types.Object, armature_object: bpy.types.Object, vertex_joints: np.ndarray):
     for index, name in enumerate(JOINT_NAMES):
-        group = arm.vertex_groups.new(name=name)
-        group.add(np.flatnonzero(joints == index).tolist(), 1.0, "REPLACE")
-    modifier = arm.modifiers.new("Armature", "ARMATURE")
-    modifier.object = rig
+        group = mesh_object.vertex_groups.new(name=name)
+        group.add(np.flatnonzero(vertex_joints == index).tolist(), 1.0, "REPLACE")
+    modifier = mesh_object.modifiers.new("Armature", "ARMATURE")
+    modifier.object = armature_object
     modifier.use_vertex_groups = True
     modifier.use_bone_envelopes = False
     modifier.use_deform_preserve_volume = False
 
 
-def _add_biceps(arm: bpy.types.Object, rig: bpy.types.Object, surface: Surface):
-    basis = arm.shape_key_add(name="Basis", from_mix=False)
-    key = arm.shape_key_add(name=BICEPS_KEY, from_mix=False)
+def _add_biceps(mesh_object: bpy.types.Object, armature_object: bpy.types.Object, surface: Surface):
+    basis = mesh_object.shape_key_add(name="Basis", from_mix=False)
+    key = mesh_object.shape_key_add(name=BICEPS_KEY, from_mix=False)
     key.relative_key = basis
     write(key.data, COORDINATE_ELEMENT, (surface.points + surface.biceps).astype(np.float32))
     driver = key.driver_add("value").driver
@@ -129,16 +132,16 @@ def _add_biceps(arm: bpy.types.Object, rig: bpy.types.Object, surface: Surface):
     variable.name = "elbow"
     variable.type = "TRANSFORMS"
     target = variable.targets[0]
-    target.id = rig
+    target.id = armature_object
     target.bone_target = "elbow"
     target.transform_type = "ROT_X"
     target.transform_space = "LOCAL_SPACE"
-    # A simple expression: Blender works it out itself, also where Python scripts are disabled.
+    # Blender evaluates such a simple expression itself, even if Python scripts are disabled.
     driver.expression = f"clamp(elbow / {math.radians(ELBOW_FLEXION):.6f}, 0, 1)"
 
 
-def _add_smoothing(arm: bpy.types.Object, density: int):
-    modifier = arm.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
+def _add_smoothing(mesh_object: bpy.types.Object, density: int):
+    modifier = mesh_object.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
     modifier.rest_source = "ORCO"
     modifier.smooth_type = "SIMPLE"
-    modifier.iterations, modifier.factor = SMOOTHING[density]
+    modifier.iterations, modifier.factor = SMOOTHING_SETTINGS[density]

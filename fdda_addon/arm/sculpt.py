@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The shape of the arm as strokes of a field: muscles, bones under the skin, palm and fingers; meters.
+"""Defines the shape of the arm as strokes of a field, in meters: muscles, bones under the skin, palm and fingers.
 
 Arm space (see `joints`): +X along the arm, +Z the back of the hand, -Y the elbow crease and the thumb.
 """
@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 
 from .field import Ellipsoid, Field, HalfSpace, Loft, Stroke, axes_along
-from .joints import FINGERS, HAND, joint
+from .joints import FINGER_MEASURES, FINGERS, joint
 
 _X, _Z = np.array([1.0, 0, 0]), np.array([0.0, 0, 1.0])
 
-# x, center y, center z, half-width to +y (triceps, little finger), -y (biceps, thumb), +z (back), -z (palm)
-_LIMB = [
+# Columns: x, center y, center z, half-width to +y (triceps, little finger), -y (biceps, thumb), +z (back), -z (palm).
+_LIMB_STATIONS = [
     (-0.070, 0.000, -0.002, 0.048, 0.047, 0.046, 0.050),
     (0.020, 0.000, -0.002, 0.047, 0.045, 0.044, 0.050),
     (0.080, 0.000, -0.001, 0.041, 0.038, 0.038, 0.044),
@@ -36,19 +36,30 @@ _LIMB = [
 
 
 def _spindle_muscle(start, end, width: float, thickness: float, out) -> Ellipsoid:
-    """Make a round form from `start` to `end`: half as wide as `width`, half as thick as `thickness` along `out`."""
+    """Make an ellipsoid from `start` to `end`, with half-width `width`, and half-thickness `thickness` along `out`."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     radii = (np.linalg.norm(end - start) / 2, width, thickness)
     return Ellipsoid((start + end) / 2, radii, axes_along(end - start, out))
 
 
 def _muscle_belly(start, end, width: float, thickness: float, out, peak: float = 0.45, ends=(0.30, 0.25)) -> Loft:
-    """Make a muscle from `start` to `end`, thickest at the part `peak` of its length, thinner by `ends` at its ends."""
+    """Make a muscle from `start` to `end`.
+
+    Args:
+        start, end: (3,) ends of the muscle.
+        width, thickness: half-width, and half-thickness along `out`.
+        out: direction of the thickness.
+        peak: fraction of the length at which the muscle is thickest.
+        ends: relative thickness at the start and the end.
+    """
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
-    shape = [(0.0, ends[0]), (peak * 0.5, 0.5 * (1 + ends[0])), (peak, 1.0)]
-    shape += [(peak + (1 - peak) * 0.5, 0.5 * (1 + ends[1])), (1.0, ends[1])]
-    stations = [(t * length, 0, 0, width * r, width * r, thickness * r, thickness * r) for t, r in shape]
+    profile = [(0.0, ends[0]), (peak * 0.5, 0.5 * (1 + ends[0])), (peak, 1.0)]
+    profile += [(peak + (1 - peak) * 0.5, 0.5 * (1 + ends[1])), (1.0, ends[1])]
+    stations = [
+        (position * length, 0, 0, width * ratio, width * ratio, thickness * ratio, thickness * ratio)
+        for position, ratio in profile
+    ]
     return Loft(start, axes_along(end - start, out), stations, caps=(0.012, 0.012))
 
 
@@ -56,13 +67,13 @@ def _ball(center, *radii) -> Ellipsoid:
     return Ellipsoid(center, radii if len(radii) == 3 else (radii[0],) * 3)
 
 
-def _upper_arm() -> list[Stroke]:
+def _upper_arm_strokes() -> list[Stroke]:
     return [
-        # Deltoid: front, middle and rear heads run together at its insertion half way down the outer side.
+        # Deltoid: front, middle and rear head join at the insertion, half way down the outer side.
         Stroke(_muscle_belly((-0.040, -0.034, 0.020), (0.150, -0.006, 0.034), 0.025, 0.026, (0, -1, 0.8), 0.40), 0.018),
         Stroke(_muscle_belly((-0.045, 0.000, 0.032), (0.160, 0.000, 0.034), 0.030, 0.028, (0, 0, 1), 0.38), 0.018),
         Stroke(_muscle_belly((-0.040, 0.034, 0.020), (0.150, 0.008, 0.034), 0.025, 0.026, (0, 1, 0.8), 0.40), 0.018),
-        # Biceps: long head above, short head below, one tendon.
+        # Biceps: long head above, short head below, a common tendon.
         Stroke(_muscle_belly((0.010, -0.022, 0.010), (0.290, -0.022, 0.000), 0.021, 0.027, (0, -1, 0.12), 0.55), 0.008),
         Stroke(
             _muscle_belly((0.010, -0.016, -0.018), (0.285, -0.020, -0.006), 0.021, 0.027, (0, -1, -0.30), 0.57), 0.008
@@ -76,14 +87,16 @@ def _upper_arm() -> list[Stroke]:
         Stroke(
             _muscle_belly((0.150, -0.006, -0.020), (0.295, -0.014, -0.014), 0.017, 0.023, (0, -0.35, -1), 0.5), 0.008
         ),
-        # The furrow below the deltoid's point, between biceps and triceps, inside and outside.
+        # The furrow between biceps and triceps, on the lower side of the arm.
         Stroke(
-            _muscle_belly((0.060, 0.002, -0.051), (0.230, 0.000, -0.045), 0.006, 0.005, (0, 0, 1)), 0.012, carve=True
+            _muscle_belly((0.060, 0.002, -0.051), (0.230, 0.000, -0.045), 0.006, 0.005, (0, 0, 1)),
+            0.012,
+            is_subtracted=True,
         ),
     ]
 
 
-def _elbow_and_forearm() -> list[Stroke]:
+def _forearm_strokes() -> list[Stroke]:
     return [
         Stroke(_ball((0.303, 0.028, -0.002), 0.024, 0.014, 0.015), 0.014),
         Stroke(_ball((0.289, 0.004, -0.036), 0.016, 0.013, 0.010), 0.016),
@@ -98,11 +111,13 @@ def _elbow_and_forearm() -> list[Stroke]:
             _muscle_belly((0.265, -0.006, -0.022), (0.520, -0.010, -0.008), 0.028, 0.026, (0, -0.35, -1), 0.38), 0.010
         ),
         Stroke(_muscle_belly((0.275, 0.012, -0.022), (0.520, 0.020, -0.004), 0.018, 0.023, (0, 0.8, -1), 0.38), 0.010),
-        # The crease before the elbow, between the masses on both sides.
+        # The crease of the elbow, between the muscles on both sides.
         Stroke(
-            _spindle_muscle((0.275, -0.047, 0.002), (0.350, -0.050, 0.000), 0.012, 0.010, (0, 1, 0)), 0.016, carve=True
+            _spindle_muscle((0.275, -0.047, 0.002), (0.350, -0.050, 0.000), 0.012, 0.010, (0, 1, 0)),
+            0.016,
+            is_subtracted=True,
         ),
-        # Heads of the ulna and the radius; the two tendons that stand out before the wrist.
+        # Heads of the ulna and the radius, and the tendons that protrude near the wrist.
         Stroke(_ball((0.541, 0.0185, 0.0115), 0.013, 0.0090, 0.0085), 0.010),
         Stroke(_ball((0.552, -0.0205, 0.0000), 0.018, 0.0095, 0.0120), 0.012),
         Stroke(
@@ -111,104 +126,114 @@ def _elbow_and_forearm() -> list[Stroke]:
     ]
 
 
-def _palm() -> list[Stroke]:
+def _palm_strokes() -> list[Stroke]:
     strokes = [
         # Hypothenar along the little finger's side, thenar at the root of the thumb.
         Stroke(_spindle_muscle((0.570, 0.020, -0.009), (0.645, 0.033, -0.007), 0.014, 0.013, (0, 0.4, -1)), 0.010),
         Stroke(
             _spindle_muscle((0.558, -0.008, -0.011), (0.618, -0.045, -0.023), 0.0165, 0.0140, (0.2, -0.1, -1)), 0.010
         ),
-        # The first interosseous fills the fork between thumb and index.
+        # The first interosseous fills the space between thumb and index finger.
         Stroke(_spindle_muscle((0.590, -0.022, -0.003), (0.645, -0.039, -0.004), 0.010, 0.012, (0, -1, 0)), 0.012),
     ]
     for name in FINGERS:
-        knuckle = np.array(HAND[name].knuckle)
-        base = np.array(HAND[name].base)
-        size = 0.88 if name == "pinky" else 1.0
-        along = axes_along(knuckle - base, _Z)
+        knuckle = np.array(FINGER_MEASURES[name].knuckle)
+        base = np.array(FINGER_MEASURES[name].base)
+        relative_size = 0.88 if name == "pinky" else 1.0
+        axes = axes_along(knuckle - base, _Z)
         # Metacarpal with its tendon, its head, and the pad under it.
         strokes.append(
-            Stroke(_spindle_muscle(base, knuckle + along[0] * 0.006, 0.0062 * size, 0.0142 * size, _Z), 0.008)
+            Stroke(
+                _spindle_muscle(base, knuckle + axes[0] * 0.006, 0.0062 * relative_size, 0.0142 * relative_size, _Z),
+                0.008,
+            )
         )
         strokes.append(
-            Stroke(Ellipsoid(knuckle + _Z * 0.0050 * size, np.array((0.0120, 0.0078, 0.0108)) * size, along), 0.005)
+            Stroke(
+                Ellipsoid(
+                    knuckle + _Z * 0.0050 * relative_size, np.array((0.0120, 0.0078, 0.0108)) * relative_size, axes
+                ),
+                0.005,
+            )
         )
-        pad = knuckle + along[0] * 0.006 - _Z * 0.0060
-        strokes.append(Stroke(Ellipsoid(pad, np.array((0.013, 0.0100, 0.0080)) * size, along), 0.007))
-    # The skin of the webs, reaching further out on the palm's side.
-    for a, b in pairwise(FINGERS):
-        ends = [np.array(HAND[name].knuckle) for name in (a, b)]
-        middle = sum(ends) / 2 + _X * (0.0085 if b != "pinky" else 0.0110) - _Z * 0.0030
-        strokes.append(Stroke(Ellipsoid(middle, (0.0085, 0.0080, 0.0070), axes_along((1, 0, -0.25), _Z)), 0.006))
+        pad_center = knuckle + axes[0] * 0.006 - _Z * 0.0060
+        strokes.append(Stroke(Ellipsoid(pad_center, np.array((0.013, 0.0100, 0.0080)) * relative_size, axes), 0.007))
+    # The skin of the webs, which extends further on the side of the palm.
+    for finger, next_finger in pairwise(FINGERS):
+        knuckles = [np.array(FINGER_MEASURES[name].knuckle) for name in (finger, next_finger)]
+        web_center = sum(knuckles) / 2 + _X * (0.0085 if next_finger != "pinky" else 0.0110) - _Z * 0.0030
+        strokes.append(Stroke(Ellipsoid(web_center, (0.0085, 0.0080, 0.0070), axes_along((1, 0, -0.25), _Z)), 0.006))
     # The hollow of the palm.
-    strokes.append(Stroke(_ball((0.612, 0.004, -0.0290), 0.030, 0.017, 0.0140), 0.010, carve=True))
+    strokes.append(Stroke(_ball((0.612, 0.004, -0.0290), 0.030, 0.017, 0.0140), 0.010, is_subtracted=True))
     return strokes
 
 
-def _finger_form(name: str) -> list[Stroke]:
-    """Return the free part of a finger as a loft along its first phalanx, bent with the bones."""
-    bones = [joint(f"{name}_{i}") for i in (1, 2, 3)]
+def _finger_strokes(name: str) -> list[Stroke]:
+    """Return the free part of a finger as a loft along its first phalanx, which follows the bones."""
+    bones = [joint(f"{name}_{bone_index}") for bone_index in (1, 2, 3)]
     heads = [np.array(bone.head) for bone in bones] + [np.array(bones[-1].tail)]
     axes = axes_along(heads[1] - heads[0], _Z)
-    along = [(point - heads[0]) @ axes[0] for point in heads]
-    up = [(point - heads[0]) @ axes[2] for point in heads]
-    tip = along[3] + 0.0035
-    size = {"index": 1.0, "middle": 1.02, "ring": 0.96, "pinky": 0.84}[name]
+    axis_positions = [(point - heads[0]) @ axes[0] for point in heads]
+    up_positions = [(point - heads[0]) @ axes[2] for point in heads]
+    tip_position = axis_positions[3] + 0.0035
+    relative_size = {"index": 1.0, "middle": 1.02, "ring": 0.96, "pinky": 0.84}[name]
 
-    def at(i: int, part: float) -> tuple[float, float]:
-        return along[i] + (along[i + 1] - along[i]) * part, up[i] + (up[i + 1] - up[i]) * part
+    def point_on_bone(bone_index: int, fraction: float) -> tuple[float, float]:
+        return axis_positions[bone_index] + (
+            axis_positions[bone_index + 1] - axis_positions[bone_index]
+        ) * fraction, up_positions[bone_index] + (up_positions[bone_index + 1] - up_positions[bone_index]) * fraction
 
-    # place, half-width, half-thickness of the back, of the palm side; millimeters
+    # Position (meters), half-width, half-thickness towards the back and towards the palm (millimeters).
     profile = [
-        (at(0, -0.25), 8.6, 8.5, 8.6),
-        (at(0, 0.25), 8.8, 8.9, 9.4),
-        (at(0, 0.62), 8.9, 8.3, 9.8),
-        (at(0, 0.90), 9.5, 8.8, 8.7),
-        (at(1, 0.05), 9.5, 9.0, 8.2),
-        (at(1, 0.30), 8.9, 7.8, 8.8),
-        (at(1, 0.60), 8.5, 7.2, 8.8),
-        (at(1, 0.92), 8.5, 7.4, 7.6),
-        (at(2, 0.08), 8.4, 7.4, 7.4),
-        (at(2, 0.40), 8.2, 6.6, 8.2),
-        (at(2, 0.75), 7.7, 5.6, 8.0),
-        ((tip, up[3]), 6.9, 4.8, 6.4),
+        (point_on_bone(0, -0.25), 8.6, 8.5, 8.6),
+        (point_on_bone(0, 0.25), 8.8, 8.9, 9.4),
+        (point_on_bone(0, 0.62), 8.9, 8.3, 9.8),
+        (point_on_bone(0, 0.90), 9.5, 8.8, 8.7),
+        (point_on_bone(1, 0.05), 9.5, 9.0, 8.2),
+        (point_on_bone(1, 0.30), 8.9, 7.8, 8.8),
+        (point_on_bone(1, 0.60), 8.5, 7.2, 8.8),
+        (point_on_bone(1, 0.92), 8.5, 7.4, 7.6),
+        (point_on_bone(2, 0.08), 8.4, 7.4, 7.4),
+        (point_on_bone(2, 0.40), 8.2, 6.6, 8.2),
+        (point_on_bone(2, 0.75), 7.7, 5.6, 8.0),
+        ((tip_position, up_positions[3]), 6.9, 4.8, 6.4),
     ]
-    stations = [(s, 0.0, u, *(np.array((w, w, b, p)) * size * 1e-3)) for (s, u), w, b, p in profile]
-    return [Stroke(Loft(heads[0], axes, stations, caps=(0.010, 0.0095 * size), power=2.1), 0.0055)]
+    stations = [(s, 0.0, u, *(np.array((w, w, b, p)) * relative_size * 1e-3)) for (s, u), w, b, p in profile]
+    return [Stroke(Loft(heads[0], axes, stations, caps=(0.010, 0.0095 * relative_size), power=2.1), 0.0055)]
 
 
-def _thumb_form() -> list[Stroke]:
-    bones = [joint(f"thumb_{i}") for i in range(3)]
+def _thumb_strokes() -> list[Stroke]:
+    bones = [joint(f"thumb_{bone_index}") for bone_index in range(3)]
     heads = [np.array(bone.head) for bone in bones] + [np.array(bones[-1].tail)]
     axes = axes_along(heads[3] - heads[1], -np.array(bones[1].bend))
     origin = heads[1]
-    flat = [(point - origin) @ axes.T for point in heads]
-    tip = flat[3][0] + 0.003
+    local_points = [(point - origin) @ axes.T for point in heads]
+    tip_position = local_points[3][0] + 0.003
 
-    def at(i: int, part: float) -> np.ndarray:
-        return flat[i] + (flat[i + 1] - flat[i]) * part
+    def point_on_bone(bone_index: int, fraction: float) -> np.ndarray:
+        return local_points[bone_index] + (local_points[bone_index + 1] - local_points[bone_index]) * fraction
 
     profile = [
-        (at(0, 0.05), 10.0, 10.0, 12.0),
-        (at(0, 0.55), 11.0, 10.5, 13.0),
-        (at(0, 0.90), 11.6, 11.6, 11.8),
-        (at(1, 0.08), 11.4, 11.4, 11.2),
-        (at(1, 0.50), 9.8, 9.2, 10.8),
-        (at(1, 0.92), 10.6, 9.6, 9.4),
-        (at(2, 0.12), 10.8, 9.2, 9.2),
-        (at(2, 0.45), 10.8, 7.8, 10.4),
-        (at(2, 0.75), 10.0, 6.4, 10.0),
-        (np.array([tip, flat[3][1], flat[3][2]]), 8.4, 5.2, 7.4),
+        (point_on_bone(0, 0.05), 10.0, 10.0, 12.0),
+        (point_on_bone(0, 0.55), 11.0, 10.5, 13.0),
+        (point_on_bone(0, 0.90), 11.6, 11.6, 11.8),
+        (point_on_bone(1, 0.08), 11.4, 11.4, 11.2),
+        (point_on_bone(1, 0.50), 9.8, 9.2, 10.8),
+        (point_on_bone(1, 0.92), 10.6, 9.6, 9.4),
+        (point_on_bone(2, 0.12), 10.8, 9.2, 9.2),
+        (point_on_bone(2, 0.45), 10.8, 7.8, 10.4),
+        (point_on_bone(2, 0.75), 10.0, 6.4, 10.0),
+        (np.array([tip_position, local_points[3][1], local_points[3][2]]), 8.4, 5.2, 7.4),
     ]
     stations = [(p[0], p[1], p[2], *(np.array((w, w, b, d)) * 1e-3)) for p, w, b, d in profile]
     return [Stroke(Loft(origin, axes, stations, caps=(0.008, 0.012), power=2.1), 0.011)]
 
 
 def arm_field() -> Field:
-    """Return the field of the arm, cut at the shoulder with a rounded edge."""
-    limb = Loft((0, 0, 0), axes_along(_X, _Z), _LIMB, caps=(0.030, 0.010), power=2.2)
-    cut = Stroke(HalfSpace((-0.034, 0, 0), (1, 0, 0)), 0.040, carve=True)
-    strokes = [Stroke(limb, 0.01), *_upper_arm(), cut, *_elbow_and_forearm(), *_palm(), *_thumb_form()]
+    """Return the field of the arm, which is cut off at the shoulder with a rounded edge."""
+    limb = Loft((0, 0, 0), axes_along(_X, _Z), _LIMB_STATIONS, caps=(0.030, 0.010), power=2.2)
+    cut = Stroke(HalfSpace((-0.034, 0, 0), (1, 0, 0)), 0.040, is_subtracted=True)
+    strokes = [Stroke(limb, 0.01), *_upper_arm_strokes(), cut, *_forearm_strokes(), *_palm_strokes(), *_thumb_strokes()]
     for name in FINGERS:
-        strokes += _finger_form(name)
+        strokes += _finger_strokes(name)
     return Field(strokes)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm as arrays: rest positions, quads, bone of each vertex, biceps; without bpy."""
+"""Builds the arm as arrays, without bpy: rest positions, quads, bone of each vertex, and biceps."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .biceps import PEAK, biceps_offsets
+from .biceps import PEAK_HEIGHTS, biceps_offsets
 from .digits import nail_faces
 from .grid import build_grid
 from .quads import interpolate_guide_points
 from .relax import relax, smooth_loose_points
 from .sculpt import arm_field
-from .skin import main_joints
+from .skin import assign_joints
 
-# Rounds of relaxation: the guide starts far from the skin, finer grids start on it.
+# Rounds of relaxation. The guide starts far from the skin, and finer grids start on it.
 _GUIDE_ROUNDS, _FINE_ROUNDS = 45, 11
 
 
@@ -23,10 +23,10 @@ class Surface:
 
     Attributes:
         points: (v, 3) float64, meters, arm space.
-        faces: (f, 4) int32, outward.
-        joints: (v,) int32 into `JOINTS`.
+        faces: (f, 4) int32, oriented outwards.
+        joints: (v,) int32, the index into `JOINTS` of the bone of each vertex.
         biceps: (v, 3) float64, offsets at full contraction, meters.
-        nails: (f,) bool, the faces of the nails.
+        nails: (f,) bool, whether a face is part of a nail.
     """
 
     points: np.ndarray
@@ -37,16 +37,20 @@ class Surface:
 
 
 def sculpt_arm(density: int) -> Surface:
-    """Make the arm at density 1, 2 or 3 (about 1,450, 10,000 and 50,000 vertices); raise ValueError for others."""
+    """Build the arm at density 1, 2 or 3 (about 1,450, 10,000 and 50,000 vertices).
+
+    Raises:
+        ValueError: the density is not 1, 2 or 3.
+    """
     grid = build_grid(density)
     field = arm_field()
     guide = build_grid(1)
     points = relax(smooth_loose_points(guide), guide, field, _GUIDE_ROUNDS)
     if density > 1:
-        seeds = interpolate_guide_points(grid, guide, points)
-        # The guide has found where every ring belongs.
-        points = relax(seeds, replace(grid, plane_point=seeds), field, _FINE_ROUNDS)
+        initial_points = interpolate_guide_points(grid, guide, points)
+        # The rings keep the planes to which the relaxation of the guide has moved them.
+        points = relax(initial_points, replace(grid, plane_point=initial_points), field, _FINE_ROUNDS)
     _, normals = field.distance_and_gradient(points)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    joints = main_joints(points, grid)
-    return Surface(points, grid.faces, joints, biceps_offsets(points, normals, PEAK[density]), nail_faces(grid))
+    joints = assign_joints(points, grid)
+    return Surface(points, grid.faces, joints, biceps_offsets(points, normals, PEAK_HEIGHTS[density]), nail_faces(grid))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from blend_fixtures.elbow import build_elbow
-from fdda_addon.arm.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, LOCKED, joint
+from fdda_addon.arm.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, LOCKED_RANGE, joint
 from fdda_addon.arm.rig import build_arm
 from fdda_addon.arm.sculpt import arm_field
 from fdda_addon.arm.surface import Surface, sculpt_arm
@@ -235,8 +235,8 @@ def test_ik_limits_and_locks_define_the_range_of_motion(arm):
             assert getattr(bone, f"use_ik_limit_{axis}")
             assert math.degrees(getattr(bone, f"ik_min_{axis}")) == pytest.approx(low, abs=1e-3)
             assert math.degrees(getattr(bone, f"ik_max_{axis}")) == pytest.approx(high, abs=1e-3)
-            assert bone.lock_rotation[i] == ((low, high) == LOCKED)
-    assert joint("elbow").limits == ((0, 140), LOCKED, LOCKED)
+            assert bone.lock_rotation[i] == ((low, high) == LOCKED_RANGE)
+    assert joint("elbow").limits == ((0, 140), LOCKED_RANGE, LOCKED_RANGE)
     assert joint("shoulder").limits == ((-90, 90),) * 3
     assert all(joint(f"{name}_0").limits == ((-20, 20),) * 3 for name in FINGERS)
 
