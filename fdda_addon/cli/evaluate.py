@@ -92,12 +92,12 @@ def run(options: argparse.Namespace) -> None:
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
     with atomic_write_all(*(path for path, _ in outputs)) as (errors, *pictures):
         for picture in pictures:
-            from ..evaluation.pictures import draw_comparison, worst_poses
+            from ..evaluation.pictures import draw_comparison, representative_poses
 
             ((name, (scene_rig, model)),) = rigs.items()
             reference_name = f"target '{options.target}'" if options.target else "true rig"
-            poses = worst_poses(evaluations[name].held_out)
-            draw_comparison(scene_rig, model, poses, picture, heat=True, reference_label=reference_name)
+            poses = representative_poses(evaluations[name].held_out)
+            draw_comparison(scene_rig, model, poses, picture, is_heat_map=True, reference_label=reference_name)
         content = to_json_by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
         errors.write_text(to_json_text(content), encoding="utf-8")
     for name, evaluation in evaluations.items():

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Colors meshes in the viewport: by the errors of a model (heat map), or by partition.
 
-The colors are drawn over the evaluated meshes, so they follow the animation and change nothing in the file. They are
-kept for the session. Without a window nothing is drawn.
+The colors are drawn over the evaluated meshes, so they follow the animation and do not change the file. They last until
+Blender ends. Without a window nothing is drawn.
 """
 
 from contextlib import suppress
@@ -24,8 +24,12 @@ from ..scene.viewport import redraw_views
 from . import last_evaluation, overlay
 
 ERRORS, PARTITIONS = "ERRORS", "PARTITIONS"
-"""Kinds of colors."""
-BONE_COLOR, SELECTED_COLOR, ACTIVE_COLOR = (0.75, 0.75, 0.75, 1.0), (0.3, 0.85, 1.0, 1.0), (1.0, 1.0, 1.0, 1.0)
+"""Kinds of colors: the errors of a model, or the partitions."""
+BONE_COLOR, SELECTED_BONE_COLOR, ACTIVE_BONE_COLOR = (
+    (0.75, 0.75, 0.75, 1.0),
+    (0.3, 0.85, 1.0, 1.0),
+    (1.0, 1.0, 1.0, 1.0),
+)
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ def paint_errors(mesh_object: bpy.types.Object) -> None:
 
 
 def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PARTITION_VERTICES) -> None:
-    """Show the partitions of the bound model as colors; without a readable model, the partitions of the rig.
+    """Show the partitions of the bound model as colors, or the partitions of the rig if no model can be read.
 
     Args:
         scene_rig: the rig.
@@ -113,15 +117,15 @@ def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
     """Return the errors that the view settings select, (V,) meters; None if there are none at the current frame."""
-    last, view = last_evaluation.get(mesh_object), bpy.context.window_manager.fdda_view
-    if last is None:
+    evaluation, view = last_evaluation.get(mesh_object), bpy.context.window_manager.fdda_view
+    if evaluation is None:
         return None
-    pose = last.pose_at(bpy.context.scene.frame_current) if last.name else view.pose
-    return last.vertex_errors(view.deformation, view.statistic, pose)
+    pose = evaluation.pose_at(bpy.context.scene.frame_current) if evaluation.name else view.pose
+    return evaluation.vertex_errors(view.deformation, view.statistic, pose)
 
 
-def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
-    """Return a range of the heat map in mm that covers almost all shown errors; 0 if there are none."""
+def suggested_range_mm(mesh_object: bpy.types.Object) -> float:
+    """Return a range of the heat map, in mm, that covers almost all shown errors; 0 if no errors are shown."""
     errors = errors_of(mesh_object)
     return 0.0 if errors is None else float(f"{np.percentile(errors, 99.5) * 1000:.2g}")
 
@@ -134,7 +138,7 @@ def _paint(mesh_object: bpy.types.Object, paint: Paint) -> None:
 
 
 def _overlay_meshes(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
-    """Return the meshes to draw, and remove the colors of removed objects."""
+    """Return the meshes to draw, and discard the colors of objects that no longer exist."""
     painted_objects = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _paints}
     for removed_uid in _paints.keys() - painted_objects.keys():
         del _paints[removed_uid]
@@ -151,13 +155,13 @@ def _overlay_meshes(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
     if hidden_uids != _hidden_uids:
         _hidden_uids.clear()
         _hidden_uids.update(hidden_uids)
-        # A draw handler must not request a redraw itself, so a timer does.
+        # A draw handler must not request a redraw itself, so a timer requests it.
         bpy.app.timers.register(redraw_views, first_interval=0)
     return meshes
 
 
 def _overlay_bones(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
-    """Return the bones of armatures in pose mode, to draw them over the colors, which would hide them."""
+    """Return the bones of armatures in pose mode, which are drawn again because the colors cover them."""
     bones = []
     for mesh_object in context.view_layer.objects:
         armature_object = armature_of(mesh_object) if mesh_object.session_uid in _paints else None
@@ -167,7 +171,11 @@ def _overlay_bones(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
         for bone in armature_object.pose.bones:
             if is_bone_hidden(bone):
                 continue
-            color = ACTIVE_COLOR if bone.bone == active_bone else (SELECTED_COLOR if is_selected(bone) else BONE_COLOR)
+            color = (
+                ACTIVE_BONE_COLOR
+                if bone.bone == active_bone
+                else (SELECTED_BONE_COLOR if is_selected(bone) else BONE_COLOR)
+            )
             bones.append(overlay.OverlayBone(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
     return bones
 
@@ -183,22 +191,24 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
     paint = _paints[mesh_object.session_uid]
     if paint.kind == PARTITIONS:
         return [f"{mesh_object.name}: {paint.partition_count} body parts"], None
-    last, view = last_evaluation.get(mesh_object), context.window_manager.fdda_view
-    if last is None:
+    evaluation, view = last_evaluation.get(mesh_object), context.window_manager.fdda_view
+    if evaluation is None:
         return [], None
     errors = errors_of(mesh_object)
     method = "skinning" if view.deformation == "linear" else "model"
-    description = _describe_errors(last, view.statistic, context.scene.frame_current, view.pose)
+    description = _describe_errors(evaluation, view.statistic, context.scene.frame_current, view.pose)
     if errors is None:
         return [f"{mesh_object.name}, {method}: {description}"], None
     statistics = f"mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.2f} mm"
     return [f"{mesh_object.name}, {method}: {description}", statistics], view.range_mm
 
 
-def _describe_errors(last: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:
+def _describe_errors(evaluation: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:
     if statistic != "pose":
-        poses = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
+        poses = (
+            f"{evaluation.poses} frames of {evaluation.name}" if evaluation.name else f"{evaluation.poses} random poses"
+        )
         return f"{'mean' if statistic == 'mean' else 'max'} error over {poses}"
-    if not last.name:
+    if not evaluation.name:
         return f"error in random pose {pose}"
-    return f"error at frame {frame}" if last.pose_at(frame) is not None else f"frame {frame} was not compared"
+    return f"error at frame {frame}" if evaluation.pose_at(frame) is not None else f"frame {frame} was not compared"

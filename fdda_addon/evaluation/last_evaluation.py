@@ -16,12 +16,12 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 MAX_STORED_EVALUATIONS = 4
 """Largest number of stored evaluations, because the errors of a dense mesh take much memory."""
 MIN_FRAMES_APART = 10
-"""Smallest distance between two worst frames; closer frames belong to the same movement."""
+"""Smallest number of frames between two worst frames, because closer frames belong to the same movement."""
 METHODS = ("fdda", "linear")
 """The methods whose errors are evaluated: the model, and linear skinning alone."""
 
 _evaluations: dict[int, "LastEvaluation"] = {}
-"""The stored evaluations, by the session ids of mesh objects, in the order of their age."""
+"""The stored evaluations, by the session ids of mesh objects, oldest first."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,13 @@ class LastEvaluation:
         errors = self.errors[method]
         if statistic == "pose":
             return None if pose is None or not 0 <= pose < len(errors) else errors[pose]
-        # Cached, because viewports ask at every redraw and there are millions of errors.
-        key = (method, statistic)
-        if key not in self._cached_errors:
-            self._cached_errors[key] = errors.mean(axis=0) if statistic == "mean" else errors.max(axis=0)
-        return self._cached_errors[key]
+        # Cache the result, because viewports need it at every redraw and there are millions of errors.
+        cache_key = (method, statistic)
+        if cache_key not in self._cached_errors:
+            self._cached_errors[cache_key] = errors.mean(axis=0) if statistic == "mean" else errors.max(axis=0)
+        return self._cached_errors[cache_key]
 
-    def worst(self, count: int) -> list[tuple[int, float]]:
+    def worst_poses(self, count: int) -> list[tuple[int, float]]:
         """Return the poses with the largest errors of the model, worst first, as pairs of index and error in mm."""
         from ..core.metrics import worst_poses
 

@@ -6,12 +6,12 @@ import re
 import bpy
 
 _NAME_PATTERN = r"FDDA \d+: \d+\.\d+ mm"
-"""Regular expression of the names of our markers. Names identify them, because Blender 5 allows no custom properties on
-markers."""
+"""Regular expression of the names of FDDA's markers. They are identified by their names, because markers have no custom
+properties in Blender 5."""
 
 
 def place(scene: bpy.types.Scene, worst_frames: list[tuple[int, float]]) -> None:
-    """Place a marker at each of the worst frames, and remove our other markers.
+    """Place a marker at each of the worst frames, and remove all other FDDA markers.
 
     Args:
         scene: the scene with the timeline.
@@ -23,12 +23,12 @@ def place(scene: bpy.types.Scene, worst_frames: list[tuple[int, float]]) -> None
 
 
 def find(scene: bpy.types.Scene) -> list[bpy.types.TimelineMarker]:
-    """Find our markers in a scene."""
+    """Find the FDDA markers in a scene."""
     return [marker for marker in scene.timeline_markers if re.fullmatch(_NAME_PATTERN, marker.name)]
 
 
 def remove(scene: bpy.types.Scene) -> int:
-    """Remove our markers from a scene, and return their number."""
+    """Remove the FDDA markers from a scene, and return their number."""
     markers = find(scene)
     for marker in markers:
         scene.timeline_markers.remove(marker)

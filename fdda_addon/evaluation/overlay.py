@@ -15,8 +15,8 @@ from ..scene.arrays import TRIANGLE_ELEMENT, VECTOR_ELEMENT, read
 from ..scene.mesh import mesh_positions
 
 DEPTH_OFFSET = 2e-5
-"""Offset of the colors towards the viewer, in depth: large enough to cover the mesh itself, too small to cover other
-objects in front of it."""
+"""Depth offset of the colors towards the viewer. It is large enough that the colors cover the mesh itself, and too
+small to cover objects in front of the mesh."""
 BONE_WIDTH_PIXELS = 3
 VERTEX_SHADER = """
 void main()
@@ -35,10 +35,10 @@ void main()
 }
 """
 
-_handles: list[object] = []
+_draw_handles: list[object] = []
 _shader: gpu.types.GPUShader | None = None
-_triangles: dict[int, tuple[tuple[int, int, int], gpu.types.GPUIndexBuf]] = {}
-"""By the session id of a mesh object: what identifies its mesh (`_triangles_of`), and the cached triangles."""
+_cached_triangles: dict[int, tuple[tuple[int, int, int], gpu.types.GPUIndexBuf]] = {}
+"""Key of the mesh (`_triangles_of`) and its cached triangles, by the session id of the mesh object."""
 
 
 @dataclass(frozen=True)
@@ -80,19 +80,19 @@ def start(
         get_legend: called at each redraw; returns the lines of the legend, and the range of a heat map in mm or None.
         get_bones: called at each redraw; returns the bones to draw over the meshes.
     """
-    if not _handles:
+    if not _draw_handles:
         add_handler = bpy.types.SpaceView3D.draw_handler_add
-        _handles.append(add_handler(_draw_view, (get_meshes, get_bones), "WINDOW", "POST_VIEW"))
-        _handles.append(add_handler(_draw_legend, (get_legend,), "WINDOW", "POST_PIXEL"))
+        _draw_handles.append(add_handler(_draw_view, (get_meshes, get_bones), "WINDOW", "POST_VIEW"))
+        _draw_handles.append(add_handler(_draw_legend, (get_legend,), "WINDOW", "POST_PIXEL"))
 
 
 def stop() -> None:
     """Stop drawing, and free the GPU resources, which must be freed before Blender's GPU context."""
     global _shader
     _shader = None
-    while _handles:
-        bpy.types.SpaceView3D.draw_handler_remove(_handles.pop(), "WINDOW")
-    _triangles.clear()
+    while _draw_handles:
+        bpy.types.SpaceView3D.draw_handler_remove(_draw_handles.pop(), "WINDOW")
+    _cached_triangles.clear()
 
 
 def overlay_mesh(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray) -> OverlayMesh | None:
@@ -106,8 +106,8 @@ def overlay_mesh(context: bpy.types.Context, mesh_object: bpy.types.Object, colo
     evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())
     mesh = evaluated.data
     if evaluated.mode == "EDIT":
-        # Edits such as Rotate Edge change the triangles without changing the counts.
-        _triangles.pop(mesh_object.session_uid, None)
+        # Edits such as Rotate Edge change the triangles, but not the counts that identify the mesh.
+        _cached_triangles.pop(mesh_object.session_uid, None)
         return None
     if len(mesh.vertices) != len(colors):
         return None
@@ -119,15 +119,18 @@ def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.ty
     """Return the triangles of an evaluated mesh, cached because computing them takes longer than drawing them.
 
     Args:
-        mesh_object: the original object. Other mesh data or another number of vertices or loops replaces the cache.
+        mesh_object: the original object. The cache is replaced if its mesh or the number of elements has changed.
         mesh: the evaluated mesh.
     """
     mesh_key = (mesh_object.data.session_uid, len(mesh.vertices), len(mesh.loops))
-    cached = _triangles.get(mesh_object.session_uid)
+    cached = _cached_triangles.get(mesh_object.session_uid)
     if cached is None or cached[0] != mesh_key:
         mesh.calc_loop_triangles()
         triangles = read(mesh.loop_triangles, TRIANGLE_ELEMENT)
-        cached = _triangles[mesh_object.session_uid] = (mesh_key, gpu.types.GPUIndexBuf(type="TRIS", seq=triangles))
+        cached = _cached_triangles[mesh_object.session_uid] = (
+            mesh_key,
+            gpu.types.GPUIndexBuf(type="TRIS", seq=triangles),
+        )
     return cached[1]
 
 
@@ -164,12 +167,12 @@ def _draw_bones(context: bpy.types.Context, bones: list[OverlayBone]) -> None:
     shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
     shader.uniform_float("viewportSize", (context.region.width, context.region.height))
     for color in {bone.color for bone in bones}:
-        ends = [end for bone in bones if bone.color == color for end in (bone.head, bone.tail)]
+        line_ends = [line_end for bone in bones if bone.color == color for line_end in (bone.head, bone.tail)]
         # A wider dark line below each bone outlines it.
         for width, line_color in ((BONE_WIDTH_PIXELS + 2, (0, 0, 0, 0.6)), (BONE_WIDTH_PIXELS, color)):
             shader.uniform_float("lineWidth", width * context.preferences.system.ui_scale)
             shader.uniform_float("color", line_color)
-            batch_for_shader(shader, "LINES", {"pos": ends}).draw(shader)
+            batch_for_shader(shader, "LINES", {"pos": line_ends}).draw(shader)
 
 
 def _vertex_format(names: Iterable[str]) -> gpu.types.GPUVertFormat:
@@ -210,18 +213,18 @@ def _draw_legend(get_legend: Callable[[bpy.types.Context], tuple[list[str], floa
         return
     ui_scale = context.preferences.system.ui_scale
     visible_regions = [region for region in context.area.regions if region.width > 1]
-    left = 24 * ui_scale + sum(region.width for region in visible_regions if region.type == "TOOLS")
-    # The region HUD is the Adjust Last Operation panel; the legend is above it.
-    bottom = 30 * ui_scale + sum(region.height for region in visible_regions if region.type == "HUD")
+    left_x = 24 * ui_scale + sum(region.width for region in visible_regions if region.type == "TOOLS")
+    # The legend is above the Adjust Last Operation panel, which is the region HUD.
+    bottom_y = 30 * ui_scale + sum(region.height for region in visible_regions if region.type == "HUD")
     blf.size(0, 12 * ui_scale)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0, 0, 0, 0.9)
     if range_mm is not None:
-        _draw_color_scale(left, bottom, ui_scale, range_mm)
-        bottom += 46 * ui_scale
+        _draw_color_scale(left_x, bottom_y, ui_scale, range_mm)
+        bottom_y += 46 * ui_scale
     for line in reversed(lines):
-        _draw_text(line, left, bottom)
-        bottom += 18 * ui_scale
+        _draw_text(line, left_x, bottom_y)
+        bottom_y += 18 * ui_scale
     blf.disable(0, blf.SHADOW)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Renders pictures of meshes and labels in rows and columns, with Workbench, in a scene of its own.
+"""Renders pictures of labeled meshes in rows and columns, with Workbench, in a separate scene.
 
-Blender renders the meshes, the labels and the color scale, so a picture needs no window and no other library.
+Blender also renders the labels and the color scale, so a picture needs neither a window nor another library.
 """
 
 import ctypes.util
@@ -52,8 +52,8 @@ class View:
     """The view direction of a picture.
 
     Attributes:
-        azimuth, elevation: angles in degrees. With 0, 0 the viewer looks along +Y, at the front of a character. With a
-            positive azimuth the viewer is on the left of the character.
+        azimuth, elevation: angles in degrees. If both are 0, the viewer looks along +Y at the front of a character.
+            With a positive azimuth, the viewer is on the character's left.
     """
 
     azimuth: float = 25.0
@@ -62,11 +62,11 @@ class View:
     def axes(self) -> np.ndarray:
         """Return the directions to the right, up and towards the viewer as rows, (3, 3) float64, world space."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
-        towards = np.array(
+        towards_viewer = np.array(
             [math.sin(azimuth) * math.cos(elevation), -math.cos(azimuth) * math.cos(elevation), math.sin(elevation)]
         )
         right = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-        return np.stack([right, np.cross(towards, right), towards])
+        return np.stack([right, np.cross(towards_viewer, right), towards_viewer])
 
 
 def draw(
@@ -75,8 +75,8 @@ def draw(
     path: Path,
     title: str,
     view: View,
-    heat_scale: bool = False,
-    sculpted: bool = False,
+    has_heat_scale: bool = False,
+    is_sculpted: bool = False,
 ) -> None:
     """Render deformations of one mesh into a PNG file.
 
@@ -86,8 +86,8 @@ def draw(
         path: path of the file.
         title: a line of text above all cells.
         view: the view direction.
-        heat_scale: whether to add the color scale of the heat map at the bottom.
-        sculpted: whether to light the meshes so that their shape shows best, instead of their colors.
+        has_heat_scale: whether to add the color scale of the heat map at the bottom.
+        is_sculpted: whether to light the meshes so that their shape shows best, instead of their colors.
 
     Raises:
         OutputError: the file cannot be written, or the machine lacks a library that Workbench needs.
@@ -95,14 +95,14 @@ def draw(
     _check_can_render()
     picture = _Picture(view)
     try:
-        picture.compose(mesh, rows, title, heat_scale)
-        picture.render(path, sculpted)
+        picture.compose(mesh, rows, title, has_heat_scale)
+        picture.render(path, is_sculpted)
     finally:
         picture.remove()
 
 
 def _check_can_render() -> None:
-    """Check for the library EGL: without it, a render without a window ends the process before Python can catch it."""
+    """Check for the library EGL: without it, a render without a window ends the process and raises no error."""
     if bpy.app.background and sys.platform == "linux" and ctypes.util.find_library("EGL") is None:
         raise OutputError("Pictures need the library EGL; install the package libegl1.")
 
@@ -117,7 +117,7 @@ class _Picture:
         self._datablocks: list[bpy.types.ID] = []
         self._width = self._height = 0.0
 
-    def compose(self, mesh: bpy.types.Mesh, rows: list[list[Cell]], title: str, heat_scale: bool) -> None:
+    def compose(self, mesh: bpy.types.Mesh, rows: list[list[Cell]], title: str, has_heat_scale: bool) -> None:
         """Lay out the cells from the top left, with the title above and the color scale below the cells."""
         projections = [cell.positions @ self._axes.T for row in rows for cell in row]
         cell_size = np.max([np.ptp(projected[:, :2], axis=0) for projected in projections], axis=0)
@@ -125,18 +125,18 @@ class _Picture:
         gap = cell_size[0] * CELL_MARGIN_RATIO
         self._width = column_count * (cell_size[0] + gap) + gap
         text_size = self._width * TEXT_SIZE_RATIO
-        step = np.array([cell_size[0] + gap, cell_size[1] + 3.2 * text_size])
+        cell_step = np.array([cell_size[0] + gap, cell_size[1] + 3.2 * text_size])
         self._add_text(title, (gap, -2.0 * text_size), 1.3 * text_size)
         top = 3.2 * text_size
         factory = _MeshFactory(mesh)
         for row_index, row in enumerate(rows):
             for column_index, cell in enumerate(row):
-                left, cell_top = gap + column_index * step[0], top + row_index * step[1]
+                left, cell_top = gap + column_index * cell_step[0], top + row_index * cell_step[1]
                 self._add_text(cell.label, (left, -(cell_top + 1.4 * text_size)), text_size)
                 center = (left + cell_size[0] / 2, -(cell_top + 2.4 * text_size + cell_size[1] / 2))
                 self._add_cell(factory, cell, center)
-        bottom = top + len(rows) * step[1]
-        if heat_scale:
+        bottom = top + len(rows) * cell_step[1]
+        if has_heat_scale:
             self._add_heat_scale((gap, -(bottom + 1.2 * text_size)), text_size)
             bottom += 4.4 * text_size
         self._height = bottom + gap
@@ -159,7 +159,7 @@ class _Picture:
         curve = bpy.data.curves.new("text", "FONT")
         curve.body, curve.size = text, size
         scene_object = self._add_object("text", curve)
-        scene_object.color = (*_linear(TEXT_COLOR), 1)
+        scene_object.color = (*_srgb_to_linear(TEXT_COLOR), 1)
         self._move(scene_object, *position)
 
     def _add_heat_scale(self, position: tuple[float, float], text_size: float) -> None:
@@ -186,7 +186,7 @@ class _Picture:
         _set_colors(mesh, np.repeat(colors, 2, axis=0))
         self._move(self._add_object("scale", mesh), *position)
 
-    def render(self, path: Path, sculpted: bool) -> None:
+    def render(self, path: Path, is_sculpted: bool) -> None:
         """Write the PNG file."""
         scene = self._scene
         camera = self._add_object("camera", bpy.data.cameras.new("camera"))
@@ -201,10 +201,10 @@ class _Picture:
         scene.render.image_settings.file_format = "PNG"
         scene.render.image_settings.color_mode = "RGB"
         scene.render.image_settings.compression = 90
-        # Dithering adds noise, which compresses badly.
+        # Dithering adds noise, which makes the file larger.
         scene.render.dither_intensity = 0
         scene.render.use_file_extension = False
-        # Metadata in the picture would reveal paths and names of its maker.
+        # Metadata would reveal file paths and names of the user.
         property_names = [render_property.identifier for render_property in scene.render.bl_rna.properties]
         for name in [name for name in property_names if name.startswith("use_stamp_")]:
             setattr(scene.render, name, False)
@@ -213,24 +213,24 @@ class _Picture:
         scene.display.render_aa = "8"
         shading = scene.display.shading
         shading.light, shading.color_type = "STUDIO", "VERTEX"
-        shading.studio_light = "Default" if sculpted else "paint.sl"
-        shading.show_specular_highlight = sculpted
+        shading.studio_light = "Default" if is_sculpted else "paint.sl"
+        shading.show_specular_highlight = is_sculpted
         shading.show_cavity = True
         shading.cavity_type = "WORLD"
         shading.cavity_ridge_factor = 0.6
         shading.cavity_valley_factor = 1.0
         world = bpy.data.worlds.new("picture")
-        world.color = _linear(BACKGROUND_COLOR)
+        world.color = _srgb_to_linear(BACKGROUND_COLOR)
         scene.world = world
         self._datablocks.append(world)
-        with atomic_write(path) as temporary:
-            scene.render.filepath = blender_path(temporary)
+        with atomic_write(path) as temporary_path:
+            scene.render.filepath = blender_path(temporary_path)
             try:
                 bpy.ops.render.render(write_still=True, scene=scene.name)
             except RuntimeError as error:
                 raise OSError(str(error).strip()) from error
             # Blender does not check whether the whole file reached the disk.
-            if not (temporary.exists() and temporary.read_bytes().endswith(PNG_END)):
+            if not (temporary_path.exists() and temporary_path.read_bytes().endswith(PNG_END)):
                 raise OSError("Blender wrote no picture or only a part of it, the disk may be full")
 
     def remove(self) -> None:
@@ -261,14 +261,15 @@ class _MeshFactory:
 
 
 def _set_colors(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
+    """Set the colors of the vertices, (V, 3) sRGB."""
     attribute = mesh.color_attributes.new("color", "FLOAT_COLOR", "POINT")
     rgba = np.ones((len(colors), 4), np.float32)
-    rgba[:, :3] = _linear(colors)
+    rgba[:, :3] = _srgb_to_linear(colors)
     write(attribute.data, COLOR_ELEMENT, rgba)
     mesh.color_attributes.active_color = attribute
 
 
-def _linear(srgb: object) -> np.ndarray:
+def _srgb_to_linear(srgb: object) -> np.ndarray:
     """Convert sRGB to linear colors (IEC 61966-2-1)."""
     srgb = np.asarray(srgb, np.float64)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

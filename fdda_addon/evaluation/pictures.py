@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws the pictures of an evaluation: partitions, and rig, linear skinning and model side by side or as heat maps."""
+"""Draws the pictures of an evaluation: the partitions, and the rig, linear skinning and the model side by side."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,11 +49,15 @@ def make_pictured_pose(errors: PoseErrors, index: int, name: str = "") -> Pictur
     )
 
 
-def worst_poses(errors: PoseErrors) -> list[PicturedPose]:
-    """Return the poses with the median, the 90th percentile and the largest mean error."""
-    order = np.argsort(errors.fdda.mean(axis=1))
-    ranks = {"median pose": len(order) // 2, "90th percentile": int(len(order) * 0.9), "worst pose": len(order) - 1}
-    return [make_pictured_pose(errors, int(order[rank]), name) for name, rank in ranks.items()]
+def representative_poses(errors: PoseErrors) -> list[PicturedPose]:
+    """Return three poses: those with the median, the 90th percentile and the largest of the poses' mean errors."""
+    indices_by_error = np.argsort(errors.fdda.mean(axis=1))
+    ranks = {
+        "median pose": len(indices_by_error) // 2,
+        "90th percentile": int(len(indices_by_error) * 0.9),
+        "worst pose": len(indices_by_error) - 1,
+    }
+    return [make_pictured_pose(errors, int(indices_by_error[rank]), name) for name, rank in ranks.items()]
 
 
 def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> None:  # noqa: B008 - frozen
@@ -74,7 +78,7 @@ def draw_comparison(
     model: Path,
     poses: list[PicturedPose],
     path: Path,
-    heat: bool,
+    is_heat_map: bool,
     title: str = "",
     view: View = View(),  # noqa: B008 - frozen
     reference_label: str = "true rig",
@@ -86,7 +90,7 @@ def draw_comparison(
         model: path of the model; it need not be bound.
         poses: the poses.
         path: path of the PNG file.
-        heat: whether to color each vertex by its distance from the rig.
+        is_heat_map: whether to color each vertex by its distance from the rig.
         title: title of the picture; empty for a default.
         view: the view direction.
         reference_label: label of the positions of the poses.
@@ -105,17 +109,20 @@ def draw_comparison(
             fdda = mask.blend(linear, fdda)
         cells = [(pose.positions, f"{pose.name}: {reference_label}"), (linear, "linear skinning"), (fdda, "FDDA")]
         rows.append(
-            [_cell(positions, pose.positions, label, heat, network.info.metres_per_unit) for positions, label in cells]
+            [
+                _cell(positions, pose.positions, label, is_heat_map, network.info.metres_per_unit)
+                for positions, label in cells
+            ]
         )
     if not title:
         capitalized = f"{reference_label[0].upper()}{reference_label[1:]}"
-        title = f"Distance from the {reference_label}" if heat else f"{capitalized}, linear skinning and FDDA"
-    draw(scene_rig.mesh_object.data, rows, path, title, view, heat_scale=heat, sculpted=not heat)
+        title = f"Distance from the {reference_label}" if is_heat_map else f"{capitalized}, linear skinning and FDDA"
+    draw(scene_rig.mesh_object.data, rows, path, title, view, has_heat_scale=is_heat_map, is_sculpted=not is_heat_map)
 
 
-def _cell(positions: np.ndarray, reference: np.ndarray, label: str, heat: bool, metres_per_unit: float) -> Cell:
+def _cell(positions: np.ndarray, reference: np.ndarray, label: str, is_heat_map: bool, metres_per_unit: float) -> Cell:
     errors = distances(positions, reference, metres_per_unit)
     if errors.any():
         label += f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm"
-    colors = heat_colors(errors) if heat else np.tile(np.float32(SURFACE_COLOR), (len(positions), 1))
+    colors = heat_colors(errors) if is_heat_map else np.tile(np.float32(SURFACE_COLOR), (len(positions), 1))
     return Cell(positions, colors, label)

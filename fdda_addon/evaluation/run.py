@@ -38,8 +38,8 @@ from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 
 FIRST_HELD_OUT_INDEX = 1 << 33
-"""Index of the first held-out random pose. No recording has so many poses, so the held-out poses differ from all
-recorded poses, even with the same seed."""
+"""Index of the first held-out random pose. It is larger than the number of poses of any recording, so the held-out
+poses differ from all recorded poses, even with the same seed."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class NamedPose:
 
     Attributes:
         name: name of the pose.
-        rotations: by the name of each bone: Euler angles in the rotation order of the bone, radians.
+        rotations: Euler angles by bone name, in the rotation order of the bone, radians.
     """
 
     name: str
@@ -65,9 +65,9 @@ class EvaluationSettings:
         actions, strips: names of actions and of NLA strips whose frames are compared too.
         range_scales: factors that widen the range of motion for further random poses. Each factor has a quarter as many
             poses as `poses`.
-        named: further poses, each with errors of its own.
+        named: further poses, whose errors are listed separately.
         surface: whether to compare normals and edges too, which takes longer than the rest of the evaluation.
-        target: the target to compare with; by default the rig itself.
+        target: settings of the target to compare with; by default the rig itself.
     """
 
     poses: int = EVALUATION_POSES
@@ -104,6 +104,7 @@ class PoseErrors:
     linear_surface: SurfaceErrors | None = None
 
     def to_json(self) -> dict:
+        """Return the statistics of the errors as JSON, described in docs/formats.md."""
         return {
             "name": self.name,
             "poses": len(self.fdda),
@@ -137,10 +138,12 @@ class Evaluation:
 
     @property
     def fdda(self) -> ErrorStatistics:
+        """Return the statistics of the model's errors on the held-out poses."""
         return error_statistics(self.held_out.fdda)
 
     @property
     def linear(self) -> ErrorStatistics:
+        """Return the statistics of the errors of linear skinning on the held-out poses."""
         return error_statistics(self.held_out.linear)
 
     def to_json(self) -> dict:
@@ -170,7 +173,7 @@ class Evaluation:
 def evaluate(
     scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings
 ) -> Iterator[Progress | Evaluation]:
-    """Compare a model with its rig, as a generator that does its work while it is iterated.
+    """Compare a model with its rig while the generator is iterated.
 
     If the mesh object has a mask, the mask is applied to the model. The scene is restored when the generator ends, is
     closed, or raises.
@@ -190,40 +193,48 @@ def evaluate(
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips)
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
-    random = settings.poses or len(settings.range_scales) or len(settings.named)
-    pose_setter = make_pose_setter(scene_rig, settings.target, clips, random)
-    network, skinning = _prepare(scene_rig, model, is_own=not settings.target.name)
+    random_pose_count = settings.poses or len(settings.range_scales) or len(settings.named)
+    pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count)
+    network, skinning = _prepare(scene_rig, model, is_rig_compared=not settings.target.name)
     rig = skinning.rig
     # A rig that is posed only by actions may have no channels to sample.
     channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.range_scales else ()
-    extra = max(1, settings.poses // 4)
-    total = settings.poses + extra * len(settings.range_scales) + len(settings.named)
-    total += sum(len(clip.frames) for clip in clips)
+    scaled_pose_count = max(1, settings.poses // 4)
+    total_poses = settings.poses + scaled_pose_count * len(settings.range_scales) + len(settings.named)
+    total_poses += sum(len(clip.frames) for clip in clips)
     with ExitStack() as stack:
         if pose_setter.target:
             stack.enter_context(pose_setter.target.prepared())
         player = stack.enter_context(temporary_rig_state(scene_rig, rig, channels, clips))
         evaluator = PoseEvaluator(scene_rig, rig, pose_setter.target)
         mask = read_mask(scene_rig.mesh_object)
-        comparison = _Comparison(evaluator, network, skinning, total, settings.surface, mask)
+        comparison = _Comparison(evaluator, network, skinning, total_poses, settings.surface, mask)
         held_out = None
         if settings.poses:
             poses = _random_poses(scene_rig, channels, settings.seed, FIRST_HELD_OUT_INDEX, settings.poses, pose_setter)
             held_out = yield from comparison.compare("held-out poses", poses)
-        scaled_ranges = []
+        scaled_range_errors = []
         for scale_index, factor in enumerate(settings.range_scales, 1):
-            first = FIRST_HELD_OUT_INDEX * (1 + scale_index)
-            poses = _random_poses(scene_rig, widen_ranges(channels, factor), settings.seed, first, extra, pose_setter)
-            scaled_ranges.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
-        named = []
+            first_index = FIRST_HELD_OUT_INDEX * (1 + scale_index)
+            poses = _random_poses(
+                scene_rig, widen_ranges(channels, factor), settings.seed, first_index, scaled_pose_count, pose_setter
+            )
+            scaled_range_errors.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
+        named_errors = []
         for pose in settings.named:
-            named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, pose_setter))))
-        actions = []
+            named_errors.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, pose_setter))))
+        action_errors = []
         for clip in clips:
             frames = pose_setter.show_frames(player, clip, range(len(clip.frames)))
-            actions.append((yield from comparison.compare(clip.title, frames)))
+            action_errors.append((yield from comparison.compare(clip.title, frames)))
     yield Evaluation(
-        skinning.partitions, rig.joint_names, held_out or actions[0], actions, scaled_ranges, named, channels
+        skinning.partitions,
+        rig.joint_names,
+        held_out or action_errors[0],
+        action_errors,
+        scaled_range_errors,
+        named_errors,
+        channels,
     )
 
 
@@ -238,18 +249,18 @@ def evaluate_action(
         yield step
 
 
-def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[Network, LinearSkinning]:
+def _prepare(scene_rig: SceneRig, model: Path | Network, is_rig_compared: bool) -> tuple[Network, LinearSkinning]:
     """Open a model, and check that the rig can be compared with it.
 
     Args:
         scene_rig: the rig.
         model: path of the model, or the loaded model.
-        is_own: whether the model is compared with the mesh of the rig itself, not with a target.
+        is_rig_compared: whether the model is compared with the mesh of the rig itself, not with a target.
     """
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     rig = opened.linear_rig
-    if is_own:
+    if is_rig_compared:
         check_time_inputs(scene_rig, rig.controls, stack)
     return opened.network, LinearSkinning(rig, opened.network.info.partitions_of(rig))
 
@@ -271,15 +282,15 @@ def _random_poses(
     scene_rig: SceneRig,
     channels: tuple[Channel, ...],
     seed: int,
-    first: int,
+    first_index: int,
     count: int,
     pose_setter: PoseSetter = DIRECT_POSE_SETTER,
 ) -> Iterator[None]:
-    poser, rest = Poser(scene_rig, channels), np.array([channel.rest for channel in channels])
+    poser, rest_values = Poser(scene_rig, channels), np.array([channel.rest for channel in channels])
     with pose_setter.prepared():
-        for index in range(first, first + count):
+        for index in range(first_index, first_index + count):
             values = sample_pose(channels, seed, index)
-            pose_setter.set_pose(blend_from_rest(poser.set, rest, values))
+            pose_setter.set_pose(blend_from_rest(poser.set, rest_values, values))
             yield
 
 
@@ -293,7 +304,7 @@ def _named_pose(scene_rig: SceneRig, pose: NamedPose, pose_setter: PoseSetter) -
 
 
 class _Comparison:
-    """Compares rig, model and linear skinning in poses, and counts the poses for the progress."""
+    """Compares rig, model and linear skinning in sets of poses, and counts the poses to report progress."""
 
     def __init__(
         self,
@@ -306,7 +317,7 @@ class _Comparison:
     ):
         self._mask = mask
         self._evaluator, self._network, self._skinning = evaluator, network, skinning
-        self._done, self._total = 0, total
+        self._compared_count, self._total_count = 0, total
         rig, self._surface = skinning.rig, None
         self._metres_per_unit = rig.metres_per_unit
         if surface and len(rig.face_starts):
@@ -326,17 +337,24 @@ class _Comparison:
         Returns:
             The PoseErrors.
         """
-        all_matrices, all_positions, all_controls, fdda, linear, surface = [], [], [], [], [], []
+        all_matrices, all_positions, all_controls, fdda_errors, linear_errors, surface_comparisons = (
+            [],
+            [],
+            [],
+            [],
+            [],
+            [],
+        )
         for _ in poses:
             pose_matrices, rig_positions, controls = self._evaluator.evaluate()
             model_positions = self._network.positions(pose_matrices[None], controls[None])[0]
-            for positions, source in (
+            for positions, subject in (
                 (rig_positions, "The rig"),
                 (model_positions, f"The model '{self._network.path}'"),
             ):
                 if not np.isfinite(positions).all():
                     raise FDDAError(
-                        f"{source} gives positions that are not numbers ({name}, pose {len(fdda)}); "
+                        f"{subject} gives positions that are not numbers ({name}, pose {len(fdda_errors)}); "
                         "look for a scale of zero or a broken driver in the rig, else train again."
                     )
             all_matrices.append(pose_matrices)
@@ -345,11 +363,15 @@ class _Comparison:
             linear_positions = self._skinning.positions(pose_matrices[None])[0]
             if self._mask is not None:
                 model_positions = self._mask.blend(linear_positions, model_positions)
-            fdda.append(distances(model_positions, rig_positions, self._metres_per_unit))
-            linear.append(distances(linear_positions, rig_positions, self._metres_per_unit))
+            fdda_errors.append(distances(model_positions, rig_positions, self._metres_per_unit))
+            linear_errors.append(distances(linear_positions, rig_positions, self._metres_per_unit))
             if self._surface:
-                surface.append(self._surface.compare(rig_positions, (model_positions, linear_positions)))
-            self._done += 1
-            yield Progress("evaluation", self._done, self._total)
-        stacked = (np.stack(arrays) for arrays in (all_matrices, all_positions, all_controls, fdda, linear))
-        return PoseErrors(name, *stacked, *(surface_errors(rows) for rows in zip(*surface, strict=True)))
+                surface_comparisons.append(self._surface.compare(rig_positions, (model_positions, linear_positions)))
+            self._compared_count += 1
+            yield Progress("evaluation", self._compared_count, self._total_count)
+        stacked_arrays = (
+            np.stack(arrays) for arrays in (all_matrices, all_positions, all_controls, fdda_errors, linear_errors)
+        )
+        return PoseErrors(
+            name, *stacked_arrays, *(surface_errors(rows) for rows in zip(*surface_comparisons, strict=True))
+        )

@@ -14,6 +14,7 @@ from ..scene.comparison import COMPARISON_KEY, comparison_objects
 from ..scene.draw_cache import draw_cached
 
 BESIDE, OVERLAY, NONE = "BESIDE", "OVERLAY", "NONE"
+"""Display modes of the rig: beside the character, over it as a wireframe, or hidden."""
 DISTANCE_IN_WIDTHS = 1.15
 """Default distance between character and copy, in widths of the character."""
 
@@ -55,7 +56,7 @@ def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> Non
     hide(mesh_object)
     if mode == NONE:
         return
-    # Local, because modifiers of a library override cannot be removed.
+    # Make the copy local, because modifiers of a library override cannot be removed.
     comparison_object = mesh_object.copy().make_local()
     comparison_object.is_runtime_data = True
     unbind(comparison_object)
@@ -83,7 +84,7 @@ def hide_all() -> None:
 
 def _remove(comparison_object: bpy.types.Object | None) -> None:
     if comparison_object is not None:
-        # Its mesh belongs to the character.
+        # Remove only the object, because its mesh belongs to the character.
         bpy.data.objects.remove(comparison_object)
 
 

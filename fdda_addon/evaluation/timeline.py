@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws a graph of the largest error of a model in each frame, in the timeline and the dope sheet."""
+"""Draws a graph of the largest error of a model in each frame, into the timeline and the Dope Sheet."""
 
 import weakref
 
@@ -12,10 +12,10 @@ from ..scene.scene_rig import armature_of
 from . import last_evaluation
 
 GRAPH_HEIGHT, GRAPH_BOTTOM = 34, 18
-"""Height of the graph, and its distance from the bottom of the region, in pixels, for a resolution scale of 1."""
+"""Height of the graph, and its distance from the bottom of the region, in pixels at a UI scale of 1."""
 FILL_COLOR, LINE_COLOR = (0.9, 0.3, 0.2, 0.35), (1.0, 0.45, 0.3, 0.9)
 
-_handles: list[object] = []
+_draw_handles: list[object] = []
 _cached_curve: list[object] = []
 """A weak reference to the last evaluation whose errors were computed, and the errors by frame."""
 _cached_batches: list[object] = []
@@ -24,9 +24,9 @@ _cached_batches: list[object] = []
 
 def start() -> None:
     """Start drawing the errors of evaluations."""
-    if not _handles and not bpy.app.background:
+    if not _draw_handles and not bpy.app.background:
         add_handler = bpy.types.SpaceDopeSheetEditor.draw_handler_add
-        _handles.append(add_handler(_draw, (), "WINDOW", "POST_PIXEL"))
+        _draw_handles.append(add_handler(_draw, (), "WINDOW", "POST_PIXEL"))
     redraw()
 
 
@@ -34,8 +34,8 @@ def stop() -> None:
     """Stop drawing."""
     _cached_curve.clear()
     _cached_batches.clear()
-    while _handles:
-        bpy.types.SpaceDopeSheetEditor.draw_handler_remove(_handles.pop(), "WINDOW")
+    while _draw_handles:
+        bpy.types.SpaceDopeSheetEditor.draw_handler_remove(_draw_handles.pop(), "WINDOW")
     redraw()
 
 
@@ -51,7 +51,7 @@ def errors_by_frame(evaluation: last_evaluation.LastEvaluation) -> list[tuple[in
     """Return pairs of frame and largest error of the model in mm for each compared frame; empty for random poses."""
     if not evaluation.name:
         return []
-    # Cached, because the timeline is redrawn in every frame and there are millions of errors.
+    # Cache the errors, because the timeline is redrawn in every frame and there are millions of errors.
     if not _cached_curve or _cached_curve[0]() is not evaluation:
         errors_mm = evaluation.errors["fdda"].max(axis=1) * 1000
         curve = [(evaluation.first_frame + index, float(error)) for index, error in enumerate(errors_mm)]
@@ -65,7 +65,7 @@ def _active_evaluation() -> last_evaluation.LastEvaluation | None:
     if active_object is None:
         return None
     if active_object.type == "ARMATURE":
-        # Few objects have an evaluation, and finding the armature of an object takes longer.
+        # Look for evaluations first: few objects have one, and finding the armature of an object takes longer.
         evaluations = ((o, last_evaluation.get(o)) for o in bpy.context.scene.objects)
         return next(
             (evaluation for o, evaluation in evaluations if evaluation is not None and armature_of(o) == active_object),
@@ -80,10 +80,10 @@ def _draw() -> None:
     if len(curve) < 2:
         return
     context = bpy.context
-    scale, view = context.preferences.system.ui_scale, context.region.view2d
+    ui_scale, view = context.preferences.system.ui_scale, context.region.view2d
     max_error_mm = max(error for _, error in curve) or 1.0
-    bottom, height = GRAPH_BOTTOM * scale, GRAPH_HEIGHT * scale
-    # The view maps frames linearly, so the positions of two frames define the positions of all frames.
+    bottom, height = GRAPH_BOTTOM * ui_scale, GRAPH_HEIGHT * ui_scale
+    # The view maps frames linearly to pixels, so the positions of the first and last frame define all others.
     (first_frame, _), (last_frame, _) = curve[0], curve[-1]
     left, right = (view.view_to_region(frame, 0, clip=False)[0] for frame in (first_frame, last_frame))
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
@@ -93,9 +93,9 @@ def _draw() -> None:
         shader.uniform_float("color", color)
         batch.draw(shader)
     gpu.state.blend_set("NONE")
-    blf.size(0, 11 * scale)
+    blf.size(0, 11 * ui_scale)
     blf.color(0, 1, 1, 1, 0.9)
-    blf.position(0, 8 * scale, bottom + 3 * scale, 0)
+    blf.position(0, 8 * ui_scale, bottom + 3 * ui_scale, 0)
     blf.draw(0, f"FDDA: max error per frame, up to {max_error_mm:.2f} mm")
 
 
@@ -114,16 +114,17 @@ def _batches(
     if not _cached_batches or _cached_batches[0]() is not evaluation or _cached_batches[1] != rectangle:
         left, right, bottom, height = rectangle
         curve = errors_by_frame(evaluation)
-        max_error_mm, step = max(error for _, error in curve) or 1.0, (right - left) / (len(curve) - 1)
+        max_error_mm, frame_width = max(error for _, error in curve) or 1.0, (right - left) / (len(curve) - 1)
         points = [
-            (left + index * step, bottom + height * error / max_error_mm) for index, (_, error) in enumerate(curve)
+            (left + index * frame_width, bottom + height * error / max_error_mm)
+            for index, (_, error) in enumerate(curve)
         ]
-        area = [corner for x, y in points for corner in ((x, bottom), (x, y))]
+        area_corners = [corner for x, y in points for corner in ((x, bottom), (x, y))]
         _cached_batches[:] = (
             weakref.ref(evaluation),
             rectangle,
             (
-                batch_for_shader(shader, "TRI_STRIP", {"pos": area}),
+                batch_for_shader(shader, "TRI_STRIP", {"pos": area_corners}),
                 batch_for_shader(shader, "LINE_STRIP", {"pos": points}),
             ),
         )

@@ -171,7 +171,7 @@ class FDDA_OT_color_mesh(EvaluationOperator, bpy.types.Operator):
             heat_map.paint_errors(scene_rig.mesh_object)
             view = context.window_manager.fdda_view
             if not view.is_property_set("range_mm"):
-                view.range_mm = heat_map.fitting_range_mm(scene_rig.mesh_object) or view.range_mm
+                view.range_mm = heat_map.suggested_range_mm(scene_rig.mesh_object) or view.range_mm
         elif self.colors == "PARTITIONS":
             scene_rig = self.rig(context)
             heat_map.paint_partitions(scene_rig, scene_rig.mesh_object.fdda.settings.min_partition_vertices)
@@ -195,7 +195,7 @@ class FDDA_OT_fit_color_range(EvaluationOperator, bpy.types.Operator):
         from ..evaluation import heat_map
 
         scene_rig, _ = self.last_evaluation(context)
-        range_mm = heat_map.fitting_range_mm(scene_rig.mesh_object)
+        range_mm = heat_map.suggested_range_mm(scene_rig.mesh_object)
         if not range_mm:
             raise ModelError("No errors are shown to fit the range to; choose another frame, or show the mean.")
         view = context.window_manager.fdda_view

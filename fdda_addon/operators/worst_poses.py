@@ -20,7 +20,7 @@ class WorstPosesOperator(EvaluationOperator):
             FDDAError: there is no evaluation, or all errors are zero.
         """
         scene_rig, last = self.last_evaluation(context)
-        poses = last.worst(count)
+        poses = last.worst_poses(count)
         if not poses:
             raise ModelError("The model is exact in all compared poses; there is no worst one.")
         return scene_rig, last, poses

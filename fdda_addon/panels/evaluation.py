@@ -210,7 +210,7 @@ def _worst_poses(last: last_evaluation.LastEvaluation, count: int) -> list[tuple
     """Return index and largest error in mm of the worst poses. They are computed once for each evaluation."""
     global _worst_cache
     if _worst_cache is None or _worst_cache[0] is not last or _worst_cache[1] != count:
-        _worst_cache = (last, count, last.worst(count))
+        _worst_cache = (last, count, last.worst_poses(count))
     return _worst_cache[2]
 
 

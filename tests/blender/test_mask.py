@@ -199,7 +199,7 @@ def test_picture_shows_the_masked_model(masked, elbow_files, tmp_path, monkeypat
     with model_disabled(masked):
         evaluation = drain(evaluate_action(scene_rig, elbow_files.model, "elbow_wave"))
     posed = pictures.make_pictured_pose(evaluation.held_out, 11)
-    pictures.draw_comparison(scene_rig, elbow_files.model, [posed], tmp_path / "heat_map.png", heat=True)
+    pictures.draw_comparison(scene_rig, elbow_files.model, [posed], tmp_path / "heat_map.png", is_heat_map=True)
     ((_, _, model_cell),) = drawn_rows
     errors = np.linalg.norm(model_cell.positions - posed.positions, axis=1)
     np.testing.assert_allclose(errors, evaluation.held_out.fdda[11], atol=1e-6)

@@ -115,7 +115,7 @@ def test_mean_and_largest_errors_are_computed_once(active, evaluated_action):
 
 def test_overlay_follows_edited_and_replaced_faces(active, monkeypatch):
     monkeypatch.setattr(overlay, "gpu", SimpleNamespace(types=SimpleNamespace(GPUIndexBuf=lambda type, seq: seq)))
-    monkeypatch.setattr(overlay, "_triangles", {})
+    monkeypatch.setattr(overlay, "_cached_triangles", {})
     colors = np.zeros((len(active.data.vertices), 3), np.float32)
 
     def drawn_triangles() -> np.ndarray:

@@ -74,7 +74,7 @@ def test_a_section_of_a_bound_model_draws(bound_elbow: bpy.types.Object, name: s
 def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(bound_elbow: bpy.types.Object, capfd):
     bpy.context.view_layer.objects.active = bound_elbow
     bpy.ops.fdda.evaluate(source="RANDOM", poses=3)
-    index, error_mm = last_evaluation.get(bound_elbow).worst(1)[0]
+    index, error_mm = last_evaluation.get(bound_elbow).worst_poses(1)[0]
     assert f"Pose {index + 1}: {error_mm:.2f} mm" in texts_of(draw_section("evaluation"))
     bpy.ops.fdda.jump_to_worst()
     assert f"Random pose {index + 1}: max error {error_mm:.2f} mm." in capfd.readouterr().out

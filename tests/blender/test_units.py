@@ -164,11 +164,11 @@ def test_the_heat_map_shows_millimetres(characters, name):
     rig = find_rig()
     *_, evaluation = evaluate(rig, character.model, EvaluationSettings(poses=4, surface=False))
     last = last_evaluation.store(rig.mesh_object, evaluation, character.model.name)
-    assert last.worst(1)[0][1] == pytest.approx(last.total["fdda"].max, rel=1e-5)
+    assert last.worst_poses(1)[0][1] == pytest.approx(last.total["fdda"].max, rel=1e-5)
     assert 0.05 < last.total["fdda"].max < 50
     heat_map.paint_errors(rig.mesh_object)
     bpy.context.window_manager.fdda_view.statistic = "max"
-    assert 0 < heat_map.fitting_range_mm(rig.mesh_object) <= last.total["fdda"].max * 1.1
+    assert 0 < heat_map.suggested_range_mm(rig.mesh_object) <= last.total["fdda"].max * 1.1
 
 
 @pytest.mark.parametrize(

@@ -329,7 +329,7 @@ def _show_colors(colors: str, folder: Path) -> Iterator[float]:
 def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
     """Press Add Markers, jump to the worst frame, and show the errors of that frame only."""
     yield from sidebar.press_button("fdda.add_worst_markers", across=0.8)
-    worst = extension_module("evaluation.last_evaluation").get(arm_object()).worst(5)
+    worst = extension_module("evaluation.last_evaluation").get(arm_object()).worst_poses(5)
     timeline_markers = extension_module("evaluation.markers").find(bpy.context.scene)
     require(
         {marker.frame for marker in timeline_markers} == {index + 1 for index, _ in worst},
