@@ -138,7 +138,7 @@ def test_the_study_writes_tables_and_pictures(study_folder, result):
     for configuration in result["configurations"]:
         hidden = f"{configuration['units']} {configuration['units']}"
         assert f"| {hidden} | {configuration['activation']} | {configuration['learning_rate']:g} |" in text
-    assert "24 units in place of 8" in text and "relu in place of silu" in text
+    assert "24 units instead of 8" in text and "relu instead of silu" in text
     for picture in ("study_curves.png", "study_errors.png"):
         assert (study_folder / picture).read_bytes().startswith(b"\x89PNG")
 
@@ -180,13 +180,13 @@ def test_a_missing_partition_is_refused(recording, held_out, tmp_path):
 
 
 def test_training_poses_as_held_out_poses_are_refused(recording, tmp_path):
-    with pytest.raises(RecordingError, match=r"has seed 0, as .* its poses are no held-out ones"):
+    with pytest.raises(RecordingError, match=r"has seed 0, like .* its poses are not held-out poses"):
         study(recording, recording, tmp_path, PLAN, PARTITION_NAMES)
 
 
 def test_recordings_of_two_rigs_are_refused(recording, tmp_path):
     write_chain(tmp_path / "other", pose_count=20, joint_count=4, seed=3)
-    with pytest.raises(RecordingError, match="is of another rig than"):
+    with pytest.raises(RecordingError, match="is a recording of a different rig than"):
         study(recording, tmp_path / "other", tmp_path, PLAN, PARTITION_NAMES)
 
 
