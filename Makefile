@@ -83,7 +83,7 @@ sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
 soak: .venv  ## test damaged files, kills, full disks, many frames and undo, into out/soak (20 minutes at most)
 	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
 
-faults: .venv  ## seed faults into a copy of the code and list the tests that catch them, into out/faults (OPTIONS="--only ID"; 30 minutes)
+faults: .venv  ## seed faults into a copy of the code and list the tests that catch them, into out/faults (OPTIONS="--only ID"; 6 minutes)
 	.venv/bin/python benchmarks/faults.py out/faults $(OPTIONS)
 
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
