@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A plain elbow: two bones and a few hundred vertices, small enough for every test."""
+"""Build a plain elbow: two bones and a few hundred vertices, small enough for every test."""
 
 import math
 from typing import TYPE_CHECKING
@@ -14,60 +14,67 @@ RIG_OBJECT = "elbow_rig"
 ACTION = "elbow_wave"
 FRAMES = 30
 
-# Meters along +X: the tube from its start to its end, the joint between the two bones, how far the weights blend.
+# Meters along +X: start of the tube, joint between the two bones, end of the tube; width over which the weights blend.
 START, JOINT, END = 0.0, 0.25, 0.50
-BLEND = 0.06
-_AROUND, _RINGS = 12, 24
+BLEND_WIDTH = 0.06
+_RING_VERTICES, _SEGMENTS = 12, 24
 
-# Degrees, local space: the lower bone turns about X only.
+# Degrees about X, Y and Z in local space: the lower bone rotates about X only.
 LOWER_RANGE = ((0.0, 120.0), (0.0, 0.0), (0.0, 0.0))
 UPPER_RANGE = ((-45.0, 45.0), (-45.0, 45.0), (-45.0, 45.0))
 
 
 def elbow_surface() -> tuple[np.ndarray, np.ndarray]:
-    """points (v, 3) float64, meters, and faces (f, 4) int32, outward: a tube that is thick above the joint, closed."""
-    along = np.linspace(START, END, _RINGS + 1)
-    radius = np.interp(along, (START, 0.10, 0.22, 0.27, 0.34, END), (0.047, 0.052, 0.041, 0.042, 0.046, 0.030))
-    angle = np.arange(_AROUND) * (2 * np.pi / _AROUND) + np.pi / _AROUND
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    """Return the points and faces of a closed tube that is thicker above the joint.
+
+    Returns:
+        (V, 3) float64 points, meters, and (F, 4) int32 faces, oriented outward.
+    """
+    along = np.linspace(START, END, _SEGMENTS + 1)
+    radii = np.interp(along, (START, 0.10, 0.22, 0.27, 0.34, END), (0.047, 0.052, 0.041, 0.042, 0.046, 0.030))
+    angles = np.arange(_RING_VERTICES) * (2 * np.pi / _RING_VERTICES) + np.pi / _RING_VERTICES
+    ring_directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = [
-        np.column_stack([np.full(_AROUND, x), ring[:, 0] * r * 1.08, ring[:, 1] * r * 0.94])
-        for x, r in zip(along, radius, strict=True)
+        np.column_stack(
+            [np.full(_RING_VERTICES, x), ring_directions[:, 0] * r * 1.08, ring_directions[:, 1] * r * 0.94]
+        )
+        for x, r in zip(along, radii, strict=True)
     ]
     faces = []
-    for i in range(_RINGS):
-        for j in range(_AROUND):
-            k = (j + 1) % _AROUND
-            a, b = i * _AROUND, (i + 1) * _AROUND
+    for i in range(_SEGMENTS):
+        for j in range(_RING_VERTICES):
+            k = (j + 1) % _RING_VERTICES
+            a, b = i * _RING_VERTICES, (i + 1) * _RING_VERTICES
             faces.append((a + j, a + k, b + k, b + j))
-    faces += _cap(0, outward=False) + _cap(_RINGS * _AROUND, outward=True)
-    # The caps are quads across the ring; drawn in a little, the end rings look like cut flesh.
+    faces += _cap(0, outward=False) + _cap(_SEGMENTS * _RING_VERTICES, outward=True)
+    # Shrink the end rings a little, because the caps are flat.
     points[0][:, 1:] *= 0.8
     points[-1][:, 1:] *= 0.8
     return np.concatenate(points), np.array(faces, np.int32)
 
 
-def _cap(first: int, outward: bool) -> list[tuple[int, int, int, int]]:
-    """The ring's vertices sewn across in quads: facing is the ring's own turn when `outward`."""
-    half = _AROUND // 2
+def _cap(first_vertex: int, outward: bool) -> list[tuple[int, int, int, int]]:
+    """Close a ring with quads across it; the normal follows the direction of the ring's vertices if `outward`."""
+    half = _RING_VERTICES // 2
     quads = []
     for j in range(half - 1):
-        quad = (first + j, first + j + 1, first + _AROUND - 2 - j, first + _AROUND - 1 - j)
+        last_vertex = first_vertex + _RING_VERTICES - 1
+        quad = (first_vertex + j, first_vertex + j + 1, last_vertex - 1 - j, last_vertex - j)
         quads.append(quad if outward else quad[::-1])
     return quads
 
 
 def lower_weights(points: np.ndarray) -> np.ndarray:
-    """(v,) weight of the lower bone, 0..1: a smooth step across the joint."""
-    t = np.clip((points[:, 0] - JOINT) / BLEND + 0.5, 0.0, 1.0)
+    """Return the (V,) weights of the lower bone, 0 to 1: a smooth step across the joint."""
+    t = np.clip((points[:, 0] - JOINT) / BLEND_WIDTH + 0.5, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def build_elbow() -> "tuple[bpy.types.Object, bpy.types.Object]":
-    """Adds the elbow to the current scene: (mesh object `elbow`, armature object `elbow_rig`).
+    """Add the elbow to the current scene; return the mesh object `elbow` and the armature object `elbow_rig`.
 
-    Bones `upper` and `lower`, their range of motion in Limit Rotation constraints in local space; smooth weights, an
-    Armature modifier and Corrective Smooth; an action `elbow_wave` of 30 frames inside the range.
+    The bones are `upper` and `lower`; Limit Rotation constraints in local space set their range of motion. The mesh has
+    smooth weights, an Armature modifier and Corrective Smooth. The action `elbow_wave` has 30 frames inside the range.
     """
     import bpy
 
@@ -104,8 +111,8 @@ def _add_bones(rig: "bpy.types.Object"):
     import bpy
 
     layer = bpy.context.view_layer
-    before = layer.objects.active
-    if before is not None and before.mode != "OBJECT":
+    previous_active = layer.objects.active
+    if previous_active is not None and previous_active.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
     layer.objects.active = rig
     bpy.ops.object.mode_set(mode="EDIT")
@@ -115,13 +122,13 @@ def _add_bones(rig: "bpy.types.Object"):
         for name, head, tail in (("upper", START, JOINT), ("lower", JOINT, END)):
             bone = bones.new(name)
             bone.head, bone.tail = (head, 0.0, 0.0), (tail, 0.0, 0.0)
-            # Local Z to the front, so that a positive turn about X bends the elbow forwards.
+            # Align local Z to the front, so that a positive rotation about X bends the elbow forward.
             bone.align_roll((0.0, -1.0, 0.0))
             bone.parent, bone.use_connect = parent, parent is not None
             parent = bone
     finally:
         bpy.ops.object.mode_set(mode="OBJECT")
-        layer.objects.active = before if before is not None else rig
+        layer.objects.active = previous_active if previous_active is not None else rig
 
 
 def _limit_rotation(bone: "bpy.types.PoseBone", ranges):
@@ -141,11 +148,11 @@ def _add_wave(rig: "bpy.types.Object"):
     rig.animation_data_create().action = bpy.data.actions.new(ACTION)
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, FRAMES
-    wave = {1: (0, 0, 0, 0), 10: (100, 20, 0, -15), 20: (30, -25, 10, 30), FRAMES: (0, 0, 0, 0)}
-    for frame, (bend, *turn) in wave.items():
+    keyed_angles = {1: (0, 0, 0, 0), 10: (100, 20, 0, -15), 20: (30, -25, 10, 30), FRAMES: (0, 0, 0, 0)}
+    for frame, (lower_angle, *upper_angles) in keyed_angles.items():
         upper, lower = rig.pose.bones["upper"], rig.pose.bones["lower"]
-        upper.rotation_euler = [math.radians(angle) for angle in turn]
-        lower.rotation_euler = (math.radians(bend), 0.0, 0.0)
+        upper.rotation_euler = [math.radians(angle) for angle in upper_angles]
+        lower.rotation_euler = (math.radians(lower_angle), 0.0, 0.0)
         for bone in (upper, lower):
             bone.keyframe_insert("rotation_euler", frame=frame, group=bone.name)
     scene.frame_set(1)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Creation of a virtual environment with the pinned requirements, for the running Python.
+"""Create a virtual environment with the pinned requirements, for the running Python.
 
-On Windows `py -3.13 setup\\environment.py make .venv everything` starts it, elsewhere `setup/environment`, which finds
-the Python.
+On Windows, start it with `py -3.13 setup\\environment.py make .venv everything`. On other systems `setup/environment`
+finds a Python and starts it.
 
-An environment is complete when its stamp is there, and the stamp is written last: whatever was interrupted, or made
-from other requirements or by another Python, is made anew.
+The last step writes the stamp of the environment, a file with a fingerprint. An environment without a stamp was
+interrupted; one with another fingerprint has other requirements or another Python. Both are created again.
 """
 
 import argparse
@@ -21,18 +21,18 @@ from typing import IO
 
 ROOT = Path(__file__).resolve().parent.parent
 STAMP = "fdda-complete"
-PYTHONS = ("3.13", "3.11")
+PYTHON_VERSIONS = ("3.13", "3.11")
 SYSTEM_LIBRARIES = ROOT / "setup" / "system-libraries.txt"
 
-# The dependency groups of pyproject.toml that an environment holds, and the imports that prove that it works.
+# By name of the contents: dependency groups of pyproject.toml to install, and modules whose import checks the result.
 CONTENTS = {
     "everything": (("setup", "blender", "trainer", "test", "lint"), ("bpy", "onnxruntime", "torch")),
     "farm": (("setup", "blender", "trainer", "test", "farm"), ("bpy", "onnxruntime", "torch", "distributed")),
     "blender": (("setup", "blender", "test"), ("bpy", "onnxruntime")),
 }
 
-# pip's settings, as `pip config list` names them, and what uv calls them: whoever taught pip about a mirror or a
-# certificate need not teach uv as well.
+# Settings of pip, as `pip config list` names them, and the matching environment variables of uv. A mirror or
+# certificate that is configured for pip thus applies to uv.
 UV_SETTINGS = {
     "index-url": "UV_DEFAULT_INDEX",
     "extra-index-url": "UV_INDEX",
@@ -50,110 +50,113 @@ class SetupError(Exception):
     """The environment cannot be created; the message says what to do."""
 
 
-def program(folder: Path, name: str) -> Path:
+def program_path(folder: Path, name: str) -> Path:
     """Return the path of a program in the virtual environment `folder`."""
     return folder / "Scripts" / f"{name}.exe" if os.name == "nt" else folder / "bin" / name
 
 
-def pins() -> Path:
+def pins_path() -> Path:
     """Return the file with pinned versions for the running Python."""
     return ROOT / "requirements" / "python-{}.{}.txt".format(*sys.version_info)
 
 
 def check_python() -> None:
-    """Check that a Blender LTS line has the version of the running Python.
+    """Check that a Blender LTS line uses the version of the running Python.
 
     Raises:
-        SetupError: naming the versions to start this with.
+        SetupError: no Blender LTS line uses this version; the message names the supported versions.
     """
     version = "{}.{}".format(*sys.version_info)
-    if version not in PYTHONS:
+    if version not in PYTHON_VERSIONS:
         raise SetupError(
-            f"FDDA needs Python {' or '.join(PYTHONS)} and this is {version}; on Windows 'py -{PYTHONS[0]}' starts the "
-            "right one, elsewhere setup/environment finds it."
+            f"FDDA needs Python {' or '.join(PYTHON_VERSIONS)} and this is {version}; on Windows "
+            f"'py -{PYTHON_VERSIONS[0]}' starts a supported one; on other systems setup/environment finds it."
         )
 
 
 def fingerprint(contents: str) -> str:
-    """Compute the fingerprint of an environment; when it changes, the environment is created again."""
+    """Compute the fingerprint of an environment. When it changes, the environment is created again."""
     digest = hashlib.sha256(repr((contents, CONTENTS[contents], sys.version, sys.base_prefix)).encode())
-    digest.update(pins().read_bytes())
+    digest.update(pins_path().read_bytes())
     return digest.hexdigest()
 
 
 def is_current(folder: Path, contents: str, python: str = "") -> bool:
-    """Return whether `folder` is complete and was created by the running Python, or by `python` where given."""
-    if not program(folder, "python").exists() or (python and os.path.realpath(sys.executable) != python):
+    """Return whether `folder` is complete and was created by the running Python.
+
+    If `python` is not empty, the path of the running Python must be `python`.
+    """
+    if not program_path(folder, "python").exists() or (python and os.path.realpath(sys.executable) != python):
         return False
     stamp = folder / STAMP
     return stamp.is_file() and stamp.read_text() == fingerprint(contents)
 
 
-def check_own(folder: Path) -> None:
-    """Check that an environment is no link, because `venv --clear` would empty the linked folder.
+def check_not_linked(folder: Path) -> None:
+    """Check that the folder of an environment is not a link, because `venv --clear` would empty the linked folder.
 
     Raises:
-        SetupError: the folder is a link or a junction, as in a second working tree that shares an environment.
+        SetupError: the folder is a link or a junction, for example in a second working tree that shares an environment.
     """
     try:
         target = os.readlink(folder)
     except OSError:  # not a link
         return
     raise SetupError(
-        f"{folder.name} is a link to '{target}' and is not up to date; make it anew there, or remove the link to have "
-        "one here."
+        f"{folder.name} is a link to '{target}' and is not up to date; create the environment again in that folder, or "
+        "remove the link to create one here."
     )
 
 
-def check_system_libraries(listing: Path = SYSTEM_LIBRARIES) -> None:
-    """Check for system libraries before the download; wheels for other systems than Linux include them.
+def check_system_libraries(libraries_path: Path = SYSTEM_LIBRARIES) -> None:
+    """Check before the download that all system libraries can be loaded; wheels for Windows and macOS include them.
 
     Raises:
-        SetupError: naming the Debian packages of all the libraries that cannot be loaded.
+        SetupError: some libraries cannot be loaded; the message names their Debian packages.
     """
     if sys.platform != "linux":
         return
-    missing = []
-    for line in listing.read_text().splitlines():
+    missing_packages = []
+    for line in libraries_path.read_text().splitlines():
         if line.startswith("#"):
             continue
         library, package = line.split()
         try:
             ctypes.CDLL(library)
         except OSError:
-            missing.append(package)
-    if missing:
-        packages = " ".join(missing)
+            missing_packages.append(package)
+    if missing_packages:
+        packages = " ".join(missing_packages)
         raise SetupError(f"Blender needs system libraries that are missing; as root: apt-get install {packages}")
 
 
 def uv_environment(python: Path) -> dict[str, str]:
-    """Return the environment variables for uv, with pip's settings where uv has none."""
+    """Return the environment variables for uv; pip's settings apply unless a variable of uv is set."""
     environment = {"UV_PYTHON_DOWNLOADS": "never"}
-    listing = subprocess.run([python, "-m", "pip", "config", "list"], capture_output=True, text=True, check=False)
-    for line in listing.stdout.splitlines():
+    configuration = subprocess.run([python, "-m", "pip", "config", "list"], capture_output=True, text=True, check=False)
+    for line in configuration.stdout.splitlines():
         key, _, value = line.partition("=")
         name = UV_SETTINGS.get(key.rpartition(".")[2])
         if name:
             values = str(ast.literal_eval(value)).split()
             environment[name] = ("," if name == "UV_FIND_LINKS" else " ").join(values)
-    if "UV_INDEX" in environment:  # pip looks into all its indexes, uv only into the first that knows the name
+    if "UV_INDEX" in environment:  # pip searches all its indexes, uv by default only the first that has the package
         environment["UV_INDEX_STRATEGY"] = "unsafe-best-match"
     return environment | os.environ
 
 
-def run(*command: str | Path, why: str, env: dict[str, str] | None = None) -> None:
+def run_step(*command: str | Path, error_message: str, env: dict[str, str] | None = None) -> None:
     """Run one step with its output on the terminal.
 
     Raises:
-        SetupError: with `why`, when the step fails.
+        SetupError: the step failed; the message is `error_message`.
     """
     if subprocess.run(command, cwd=ROOT, env=env, check=False).returncode:
-        raise SetupError(why)
+        raise SetupError(error_message)
 
 
 def lock(file: IO[str]) -> None:
-    """Wait for the lock of `file`, and hold it until the file is closed."""
+    """Wait for the lock of a file; closing the file releases it."""
     if os.name != "nt":
         import fcntl
 
@@ -166,7 +169,7 @@ def lock(file: IO[str]) -> None:
             msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
             return
         except OSError as error:
-            if error.errno != errno.EDEADLOCK:  # it tries for ten seconds
+            if error.errno != errno.EDEADLOCK:  # LK_LOCK gives up after ten seconds
                 raise
 
 
@@ -177,18 +180,32 @@ def make(folder: Path, contents: str) -> None:
         SetupError: a library is missing or a step failed; `folder` then has no stamp.
     """
     groups, imports = CONTENTS[contents]
-    check_own(folder)
+    check_not_linked(folder)
     check_system_libraries()
     print(f"Setting up {folder.name} with Python {sys.version.split()[0]}: {', '.join(groups)} …", flush=True)
-    python = program(folder, "python")
-    why = "The Python packages could not be installed (see above): is the package index reachable, the disk full?"
-    (folder / STAMP).unlink(missing_ok=True)  # first: --clear may be interrupted half-way too
-    run(sys.executable, "-m", "venv", "--clear", folder, why=f"{folder.name} could not be made a virtual environment.")
-    run(python, "-m", "pip", "install", "--quiet", "--constraint", pins(), "uv", why=why)
+    python = program_path(folder, "python")
+    install_error = (
+        "The Python packages could not be installed (see above): is the package index reachable, the disk full?"
+    )
+    (folder / STAMP).unlink(missing_ok=True)  # first, because --clear may be interrupted
+    run_step(
+        sys.executable,
+        "-m",
+        "venv",
+        "--clear",
+        folder,
+        error_message=f"The virtual environment {folder.name} could not be created.",
+    )
+    run_step(python, "-m", "pip", "install", "--quiet", "--constraint", pins_path(), "uv", error_message=install_error)
     options = [f"--group=pyproject.toml:{group}" for group in groups]
-    uv = [program(folder, "uv"), "pip", "install", "--python", python, "--constraint", pins()]
-    run(*uv, *options, why=why, env=uv_environment(python))
-    run(python, "-c", f"import {', '.join(imports)}", why="The packages are installed but do not import (see above).")
+    uv_install = [program_path(folder, "uv"), "pip", "install", "--python", python, "--constraint", pins_path()]
+    run_step(*uv_install, *options, error_message=install_error, env=uv_environment(python))
+    run_step(
+        python,
+        "-c",
+        f"import {', '.join(imports)}",
+        error_message="The packages are installed but do not import (see above).",
+    )
     (folder / STAMP).write_text(fingerprint(contents))
 
 
@@ -197,7 +214,9 @@ def main() -> int:
     parser.add_argument("action", choices=("is-current", "make"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("contents", choices=CONTENTS)
-    parser.add_argument("python", nargs="?", default="", help="is-current: the Python it must have been made by")
+    parser.add_argument(
+        "python", nargs="?", default="", help="is-current: the Python that must have created the environment"
+    )
     arguments = parser.parse_args()
     folder = ROOT / arguments.folder
     if arguments.action == "is-current":
@@ -205,14 +224,14 @@ def main() -> int:
     try:
         check_python()
         with open(f"{folder}.lock", "w") as file:
-            lock(file)  # two makes in one tree take turns
+            lock(file)  # a second `make` in the same tree waits
             if not is_current(folder, arguments.contents):
                 make(folder, arguments.contents)
     except SetupError as error:
         print(error, file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("Interrupted; the next run starts the set-up anew.", file=sys.stderr)
+        print("Interrupted; the next run creates the environment again.", file=sys.stderr)
         return 130
     return 0
 

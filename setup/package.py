@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Building of dist/fdda_addon-VERSION.zip, the extension for Blender, for one platform or all.
+"""Build dist/fdda_addon-VERSION.zip, the extension for Blender, for one platform or for all.
 
-On Linux there is a second one, dist/fdda_addon-VERSION-python3.14.zip: Blender as distributions build it runs on the
-system's Python, and all Pythons together would be too large a zip.
+For Linux it builds a second zip, dist/fdda_addon-VERSION-python3.14.zip. The Blender of a Linux distribution runs on
+the system's Python, and one zip for all Python versions would be too large.
 
-An extension is a package with the manifest beside its `__init__.py`, but here the manifest is at the root and the code
-in `fdda_addon/`. So a copy is staged, with the trainer, its pinned requirements and the wheels of onnxruntime for the
-Pythons of these Blenders, and Blender's own extension tool, which comes with the bpy wheel and does not import it,
-builds and checks the zip.
+Blender expects the manifest of an extension beside its `__init__.py`. Here the manifest is at the root and the code is
+in `fdda_addon/`, so the files are first copied to dist/stage. The copy includes the trainer, its pinned requirements,
+and the wheels of onnxruntime for the Python versions. Blender's extension tool then builds and validates the zip. The
+tool is part of the bpy wheel and does not import bpy.
 """
 
 import argparse
@@ -21,10 +21,10 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-DIST = ROOT / "dist"
-STAGE = DIST / "stage"
+DIST_FOLDER = ROOT / "dist"
+STAGE_FOLDER = DIST_FOLDER / "stage"
 
-# Blender's names of the platforms, and pip's, oldest system first. Not macos-x64: onnxruntime has no wheels for it.
+# By Blender's name of a platform: platform tags of pip, oldest system first. onnxruntime has no wheels for macos-x64.
 PLATFORMS = {
     "linux-x64": ("manylinux_2_27_x86_64", "manylinux_2_28_x86_64"),
     "linux-arm64": ("manylinux_2_27_aarch64", "manylinux_2_28_aarch64"),
@@ -32,16 +32,16 @@ PLATFORMS = {
     "windows-x64": ("win_amd64",),
     "windows-arm64": ("win_arm64",),
 }
-ALL = "all"
-# Of blender.org: 4.5 and 5.0 run on Python 3.11, later ones on 3.13. Of distributions: on the system's, in 2026 that of
-# Debian, Arch and Fedora is 3.14.
-PYTHONS = ("3.11", "3.13")
-SYSTEM_PYTHONS = ("3.14",)
-# What a zip may have at most: it is downloaded by hand, and kept a second time where it is installed.
+ALL_PLATFORMS = "all"
+# Blender 4.5 and 5.0 from blender.org run on Python 3.11, later versions on 3.13. The Blender of a distribution runs on
+# the system's Python: in 2026 Debian, Arch and Fedora have 3.14.
+PYTHON_VERSIONS = ("3.11", "3.13")
+SYSTEM_PYTHON_VERSIONS = ("3.14",)
+# Limit for the size of a zip. Users download the zip by hand, and Blender keeps a second copy when it installs it.
 MAX_PACKAGE_MB = 60
 
-INIT = '''# SPDX-License-Identifier: GPL-3.0-or-later
-"""The extension's entry: Blender calls `register` and `unregister`."""
+INIT_CODE = '''# SPDX-License-Identifier: GPL-3.0-or-later
+"""Entry point of the extension: Blender calls `register` and `unregister`."""
 
 from .fdda_addon import register, unregister
 
@@ -53,43 +53,44 @@ class PackageError(Exception):
     """The extension cannot be built; the message says what to do."""
 
 
-def this_platform() -> str:
+def current_platform() -> str:
     """Return Blender's name of the current platform."""
     system = {"darwin": "macos"}.get(platform.system().lower(), platform.system().lower())
     machine = {"x86_64": "x64", "amd64": "x64", "aarch64": "arm64"}.get(platform.machine().lower(), platform.machine())
     return f"{system}-{machine}"
 
 
-def asked_platforms(names: list[str]) -> list[str]:
-    """Return the platforms to build for: the named ones, all, or the current one.
+def select_platforms(names: list[str]) -> list[str]:
+    """Return the platforms to build for: the named platforms, all platforms, or by default the current one.
 
     Raises:
-        PackageError: there are no wheels for one of them.
+        PackageError: onnxruntime has no wheels for one of the platforms.
     """
-    platforms = list(PLATFORMS) if ALL in names else names or [this_platform()]
+    platforms = list(PLATFORMS) if ALL_PLATFORMS in names else names or [current_platform()]
     if unknown := sorted(set(platforms) - set(PLATFORMS)):
-        known = ", ".join(PLATFORMS)
+        platform_names = ", ".join(PLATFORMS)
         raise PackageError(
-            f"ONNX Runtime has no wheels for the platform {unknown[0]}; set PLATFORM to {ALL} or one of {known}."
+            f"ONNX Runtime has no wheels for the platform {unknown[0]}; "
+            f"set PLATFORM to {ALL_PLATFORMS} or one of {platform_names}."
         )
     return platforms
 
 
-def builds(name: str) -> list[tuple[str, ...]]:
-    """Return the Python versions of each zip of a platform: Blender's own, and on Linux that of distributions."""
-    return [PYTHONS, *((python,) for python in SYSTEM_PYTHONS if name.startswith("linux"))]
+def python_versions_of_zips(name: str) -> list[tuple[str, ...]]:
+    """Return the Python versions of each zip for a platform; Linux has an extra zip for Blenders of distributions."""
+    return [PYTHON_VERSIONS, *((python,) for python in SYSTEM_PYTHON_VERSIONS if name.startswith("linux"))]
 
 
 def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
     """Return the pinned onnxruntime wheels of a platform; pip downloads those that are not in dist/wheels.
 
-    Its dependencies are left out: numpy is Blender's, and playing a model needs no other.
+    The dependencies of onnxruntime are left out: Blender includes numpy, and playback needs no other package.
     """
     wheels = []
     for python in pythons:
         pins = (ROOT / "requirements" / f"python-{python}.txt").read_text().splitlines()
         requirement = next(pin for pin in pins if pin.startswith("onnxruntime=="))
-        folder = DIST / "wheels" / f"{requirement}-{python}-{name}"
+        folder = DIST_FOLDER / "wheels" / f"{requirement}-{python}-{name}"
         if not list(folder.glob("*.whl")):
             command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
             command += [f"--dest={folder}", f"--python-version={python}", requirement]
@@ -99,64 +100,71 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
     return wheels
 
 
-def stage(name: str, wheels: list[Path]) -> None:
+def stage_files(name: str, wheels: list[Path]) -> None:
     """Copy the files of the extension for a platform to dist/stage."""
-    shutil.rmtree(STAGE, ignore_errors=True)
+    shutil.rmtree(STAGE_FOLDER, ignore_errors=True)
     for folder in ("fdda_addon", "trainer", "requirements"):
-        shutil.copytree(ROOT / folder, STAGE / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    # The help buttons open the manual.
-    (STAGE / "docs").mkdir()
-    shutil.copy(ROOT / "docs" / "manual.md", STAGE / "docs")
-    (STAGE / "__init__.py").write_text(INIT)
-    shutil.copy(ROOT / "LICENSE", STAGE)
-    (STAGE / "wheels").mkdir()
+        shutil.copytree(ROOT / folder, STAGE_FOLDER / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    # The help buttons of the sidebar open the manual.
+    (STAGE_FOLDER / "docs").mkdir()
+    shutil.copy(ROOT / "docs" / "manual.md", STAGE_FOLDER / "docs")
+    (STAGE_FOLDER / "__init__.py").write_text(INIT_CODE)
+    shutil.copy(ROOT / "LICENSE", STAGE_FOLDER)
+    (STAGE_FOLDER / "wheels").mkdir()
     for wheel in wheels:
-        shutil.copy(wheel, STAGE / "wheels")
+        shutil.copy(wheel, STAGE_FOLDER / "wheels")
     manifest = (ROOT / "blender_manifest.toml").read_text()
-    built = f"platforms = {json.dumps([name])}\nwheels = {json.dumps([f'./wheels/{w.name}' for w in wheels])}\n"
-    (STAGE / "blender_manifest.toml").write_text(manifest.replace("\n[permissions]", f"\n{built}\n[permissions]"))
+    built_tables = f"platforms = {json.dumps([name])}\nwheels = {json.dumps([f'./wheels/{w.name}' for w in wheels])}\n"
+    (STAGE_FOLDER / "blender_manifest.toml").write_text(
+        manifest.replace("\n[permissions]", f"\n{built_tables}\n[permissions]")
+    )
 
 
 def build(package: Path) -> None:
     """Build and validate the zip from dist/stage with the extension tool of the bpy wheel.
 
     Raises:
-        PackageError: it is too large.
+        PackageError: the zip is too large.
     """
-    blender = Path(sysconfig.get_path("platlib")) / "bpy"
-    (tool,) = blender.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py")
-    subprocess.run([sys.executable, tool, "build", "--source-dir", STAGE, "--output-filepath", package], check=True)
+    bpy_folder = Path(sysconfig.get_path("platlib")) / "bpy"
+    (tool,) = bpy_folder.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py")
+    subprocess.run(
+        [sys.executable, tool, "build", "--source-dir", STAGE_FOLDER, "--output-filepath", package], check=True
+    )
     subprocess.run([sys.executable, tool, "validate", package], check=True)
     check_size(package)
 
 
 def check_size(package: Path) -> None:
-    """Check that a zip is not too large.
+    """Check the size of a zip.
 
     Raises:
-        PackageError: it is.
+        PackageError: the zip is larger than `MAX_PACKAGE_MB`.
     """
     size = package.stat().st_size / 1e6
     if size > MAX_PACKAGE_MB:
         raise PackageError(
-            f"{package.name} has {size:.0f} MB and may have {MAX_PACKAGE_MB}; look for what is too much in dist/stage."
+            f"{package.name} has {size:.0f} MB, more than the limit of {MAX_PACKAGE_MB} MB; "
+            "look for large files in dist/stage."
         )
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    known = ", ".join(PLATFORMS)
-    parser.add_argument("platforms", nargs="*", help=f"{ALL}, or of {known}; when left out, the one that runs this")
+    platform_names = ", ".join(PLATFORMS)
+    parser.add_argument(
+        "platforms", nargs="*", help=f"{ALL_PLATFORMS}, or some of {platform_names}; by default the current platform"
+    )
     names = parser.parse_args().platforms
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
     try:
-        for name in asked_platforms(names):
-            for pythons in builds(name):
-                # As Blender's `--split-platforms` calls them, where there are several.
+        for name in select_platforms(names):
+            for pythons in python_versions_of_zips(name):
+                # Several zips are named as Blender's option `--split-platforms` names them.
                 suffix = f"-{name.replace('-', '_')}" if names else ""
-                suffix += "" if pythons == PYTHONS else f"-python{pythons[0]}"
-                package = DIST / f"fdda_addon-{version}{suffix}.zip"
-                stage(name, fetch_wheels(name, pythons))
+                suffix += "" if pythons == PYTHON_VERSIONS else f"-python{pythons[0]}"
+                package = DIST_FOLDER / f"fdda_addon-{version}{suffix}.zip"
+                stage_files(name, fetch_wheels(name, pythons))
                 build(package)
                 size = package.stat().st_size / 1e6
                 print(f"{package.relative_to(ROOT)} ({size:.0f} MB) for {name}, Python {' and '.join(pythons)}")

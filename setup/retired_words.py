@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("fdda_addon", "trainer", "farm", "tests", "benchmarks", "blend_fixtures", "setup", "examples", "docs")
 SUFFIXES = {".py", ".md", ".toml", ".mjs", ".js", ".html", ".c", ""}
 """Suffixes of the files that are searched; scripts have none."""
-PAGES = ("Makefile", "pyproject.toml", ".ci/run")
+EXTRA_FILES = ("Makefile", "pyproject.toml", ".ci/run")
 """Searched files outside `FOLDERS`."""
 GENERATED_FOLDERS = {"node_modules", "__pycache__", "dist"}
 
@@ -39,8 +39,8 @@ REPLACEMENTS = {
 
 def list_files() -> list[Path]:
     """List the files that people write, without this one."""
-    pages = [*ROOT.glob("*.md"), *(ROOT / name for name in PAGES)]
-    files = [*pages, *(path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*")))]
+    root_files = [*ROOT.glob("*.md"), *(ROOT / name for name in EXTRA_FILES)]
+    files = [*root_files, *(path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*")))]
     return [
         path
         for path in files

@@ -111,7 +111,7 @@ def _build_time_dependent(random: np.random.Generator) -> str:
     start_value = getattr(owner, path)
     end_value = start_value + float(random.uniform(0.05, 1.0))
     if dependency == "keys":
-        in_time.key(owner, path, start_value, end_value)
+        in_time.insert_keys(owner, path, start_value, end_value)
     else:
         _add_driver(owner, path, dependency, start_value, end_value - start_value)
     bpy.context.scene.frame_set(1)
@@ -148,7 +148,7 @@ def _add_driver(owner: bpy.types.bpy_struct, path: str, dependency: str, start: 
         holder = bpy.data.objects.new("holder", None)
         bpy.context.scene.collection.objects.link(holder)
         holder["progress"] = 0.0
-        in_time.key(holder, '["progress"]', 0.0, 1.0)
+        in_time.insert_keys(holder, '["progress"]', 0.0, 1.0)
         variable = driver.variables.new()
         variable.name, variable.targets[0].id, variable.targets[0].data_path = "progress", holder, '["progress"]'
         progress = "progress"
@@ -159,21 +159,21 @@ def _build_second_armature(random: np.random.Generator) -> str:
     builders = (*second_armature.REFUSED, *second_armature.TOLD)
     build = builders[random.integers(len(builders))]
     build()
-    bone = second_armature.bone()
+    bone = second_armature.muscle_bone()
     bone.rotation_mode = str(random.choice(["QUATERNION", "AXIS_ANGLE", "XYZ", "ZYX"]))
     for locks in (bone.lock_location, bone.lock_rotation, bone.lock_scale):
         for axis in range(3):
             # With few locks, nearly all recordings would be refused.
             locks[axis] = random.random() < 0.85
     if random.random() < 0.3:
-        in_time.key(bone, "location", (0.0, 0.0, 0.0), (0.0, 0.02, 0.02))
+        in_time.insert_keys(bone, "location", (0.0, 0.0, 0.0), (0.0, 0.02, 0.02))
     return f"{bone.rotation_mode} in {build.__name__}"
 
 
 def _move_second_armature(_rig: SceneRig, random: np.random.Generator) -> object:
     """Move the bones of the second armature along all unlocked axes, yielding after each pose."""
     for _ in range(6):
-        for bone in bpy.data.objects[second_armature.MUSCLES].pose.bones:
+        for bone in bpy.data.objects[second_armature.ARMATURE].pose.bones:
             for axis in range(3):
                 if not bone.lock_location[axis]:
                     bone.location[axis] = random.uniform(-0.05, 0.05)

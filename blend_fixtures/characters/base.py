@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the characters of this folder are made of: a tube with two bones, cages around it, shapes that the pose drives.
+"""Build the parts of the characters in this folder: a tube with two bones, cages around it, driven shape keys.
 
-All build in the current scene. A character's mesh object is `elbow`, its armature object `elbow_rig`.
+All functions build in the current scene. The mesh object of a character is `elbow`, its armature object `elbow_rig`.
 """
 
 from collections.abc import Callable
@@ -13,14 +13,14 @@ from blend_fixtures.elbow import JOINT, build_elbow, elbow_surface, lower_weight
 
 
 def tube() -> tuple[bpy.types.Object, bpy.types.Object]:
-    """The mesh object and the armature object of an elbow that its Armature modifier alone deforms."""
+    """Build an elbow with only an Armature modifier; return its mesh object and its armature object."""
     mesh_object, armature_object = build_elbow()
     mesh_object.modifiers.remove(mesh_object.modifiers["CorrectiveSmooth"])
     return mesh_object, armature_object
 
 
 def cage(name: str, thickness: float) -> bpy.types.Object:
-    """A mesh object around the tube, so many times as thick; nothing deforms it."""
+    """Build a mesh object around the tube that is `thickness` times as thick and has no modifiers."""
     points, faces = elbow_surface()
     points[:, 0] = JOINT + (points[:, 0] - JOINT) * 1.05
     points[:, 1:] *= thickness
@@ -31,13 +31,13 @@ def cage(name: str, thickness: float) -> bpy.types.Object:
 
 
 def link(scene_object: bpy.types.Object) -> bpy.types.Object:
-    """Put an object into the scene."""
+    """Link an object to the scene and return it."""
     bpy.context.scene.collection.objects.link(scene_object)
     return scene_object
 
 
 def skin(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> None:
-    """Give a mesh object the weights of the tube and an Armature modifier."""
+    """Add the weights of the tube and an Armature modifier to a mesh object."""
     weights = lower_weights(np.array([vertex.co for vertex in mesh_object.data.vertices]))
     for name, values in (("upper", 1.0 - weights), ("lower", weights)):
         group = mesh_object.vertex_groups.new(name=name)
@@ -49,12 +49,12 @@ def skin(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> No
 def add_driven_key(
     owner: bpy.types.Object, armature_object: bpy.types.Object, move: Callable[[np.ndarray], np.ndarray]
 ) -> bpy.types.ShapeKey:
-    """Add a shape key whose value follows the bend of the lower bone: 0 at rest, 1 at a radian.
+    """Add a shape key whose value is the angle of the lower bone: 0 at rest, 1 at one radian.
 
     Args:
         owner: a mesh, lattice or curve object.
-        armature_object: of the tube.
-        move: points of the basis to those of the key, (n, 3) each, the owner's space.
+        armature_object: armature object of the tube.
+        move: function from the points of the basis to the points of the key, (N, 3) each, in the owner's space.
     """
     if owner.data.shape_keys is None:
         owner.shape_key_add(name="Basis", from_mix=False)
@@ -67,7 +67,7 @@ def add_driven_key(
 
 
 def drive(owner: bpy.types.bpy_struct, path: str, armature_object: bpy.types.Object, expression: str) -> None:
-    """Let a property follow `bend`, the angle of the lower bone in radians."""
+    """Drive a property with an expression of `bend`, the angle of the lower bone in radians."""
     driver = owner.driver_add(path).driver
     variable = driver.variables.new()
     variable.name = "bend"
@@ -77,6 +77,6 @@ def drive(owner: bpy.types.bpy_struct, path: str, armature_object: bpy.types.Obj
 
 
 def bulge(points: np.ndarray) -> np.ndarray:
-    """Points near the joint, half as far again from the axis of the tube."""
-    near = np.exp(-(((points[:, :1] - JOINT) / 0.08) ** 2))
-    return np.hstack([points[:, :1], points[:, 1:] * (1.0 + 0.5 * near)])
+    """Move the points near the joint away from the axis of the tube by up to half their distance."""
+    joint_proximity = np.exp(-(((points[:, :1] - JOINT) / 0.08) ** 2))
+    return np.hstack([points[:, :1], points[:, 1:] * (1.0 + 0.5 * joint_proximity)])

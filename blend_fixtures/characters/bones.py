@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bones for the characters of this folder: added to an armature, limited, and a limb with a chain of them."""
+"""Add bones to the armatures of characters, limit their motion, and build a limb with a chain of bones."""
 
 from dataclasses import dataclass
 from math import radians
@@ -13,12 +13,12 @@ from fdda_addon.poses.motion_range import set_constraint_limit
 from .base import link
 
 Point = tuple[float, float, float]
-KINDS = {"LIMIT_ROTATION": "lock_rotation", "LIMIT_LOCATION": "lock_location", "LIMIT_SCALE": "lock_scale"}
+LOCK_PROPERTIES = {"LIMIT_ROTATION": "lock_rotation", "LIMIT_LOCATION": "lock_location", "LIMIT_SCALE": "lock_scale"}
 
 
 @dataclass(frozen=True)
 class NewBone:
-    """A bone to be added; ends in armature space, meters."""
+    """A bone to add; head and tail are in armature space, meters."""
 
     name: str
     head: Point
@@ -28,61 +28,64 @@ class NewBone:
     is_connected: bool = False
 
 
-def add_bones(armature_object: bpy.types.Object, *wanted: NewBone) -> None:
-    """Add bones, parents before their children. They rotate by Euler angles, as far as a limit lets them."""
+def add_bones(armature_object: bpy.types.Object, *new_bones: NewBone) -> None:
+    """Add bones with Euler rotation and locked transforms; `limit` unlocks axes. Parents come before their children."""
     bpy.context.view_layer.objects.active = armature_object
     bpy.ops.object.mode_set(mode="EDIT")
     try:
         bones = armature_object.data.edit_bones
-        for new in wanted:
-            bone = bones.new(new.name)
-            bone.head, bone.tail, bone.use_deform = new.head, new.tail, new.is_deforming
+        for new_bone in new_bones:
+            bone = bones.new(new_bone.name)
+            bone.head, bone.tail, bone.use_deform = new_bone.head, new_bone.tail, new_bone.is_deforming
             bone.align_roll((0.0, -1.0, 0.0))
-            bone.parent, bone.use_connect = bones.get(new.parent), new.is_connected
+            bone.parent, bone.use_connect = bones.get(new_bone.parent), new_bone.is_connected
     finally:
         bpy.ops.object.mode_set(mode="OBJECT")
-    for new in wanted:
-        bone = armature_object.pose.bones[new.name]
+    for new_bone in new_bones:
+        bone = armature_object.pose.bones[new_bone.name]
         bone.rotation_mode = "XYZ"
         bone.lock_location = bone.lock_rotation = bone.lock_scale = (True, True, True)
 
 
 def limit(bone: bpy.types.PoseBone, kind: str, ranges: dict[int, tuple[float, float]]) -> None:
-    """Let a bone move on some axes, in local space, and on no others.
+    """Limit the motion of a bone to ranges on some axes of local space, and lock the other axes.
 
     Args:
         bone: the pose bone.
-        kind: of the constraint, one of `KINDS`.
-        ranges: by axis; degrees, meters or factors.
+        kind: type of the constraint, a key of `LOCK_PROPERTIES`.
+        ranges: lower and upper limit by index of the axis; degrees, meters or scale factors.
     """
     constraint = bone.constraints.new(kind)
     constraint.owner_space = "LOCAL"
     for axis, bounds in ranges.items():
         low, high = map(radians, bounds) if kind == "LIMIT_ROTATION" else bounds
         set_constraint_limit(constraint, axis, low, high)
-    setattr(bone, KINDS[kind], [axis not in ranges for axis in range(3)])
+    setattr(bone, LOCK_PROPERTIES[kind], [axis not in ranges for axis in range(3)])
 
 
-def free(bone: bpy.types.PoseBone) -> None:
+def remove_constraints(bone: bpy.types.PoseBone) -> None:
     """Remove the constraints of a bone."""
     for constraint in list(bone.constraints):
         bone.constraints.remove(constraint)
 
 
-def in_collection(armature_object: bpy.types.Object, name: str, *bones: str) -> None:
-    """Put bones into a bone collection of their own."""
+def add_bone_collection(armature_object: bpy.types.Object, name: str, *bone_names: str) -> None:
+    """Add a bone collection with the given bones."""
     collection = armature_object.data.collections.new(name)
-    for bone in bones:
-        collection.assign(armature_object.data.bones[bone])
+    for bone_name in bone_names:
+        collection.assign(armature_object.data.bones[bone_name])
 
 
 def limb(count: int, degrees: float = 30.0, twist: float = 0.0) -> tuple[bpy.types.Object, bpy.types.Object]:
-    """A tube along a chain of bones, `bone.0` and so on: mesh object `limb`, armature object `limb_rig`, no weights.
+    """Build a tube without weights along a chain of bones named `bone.0`, `bone.1` and so on.
 
     Args:
         count: number of bones.
-        degrees: how far each bends to all sides.
-        twist: degrees by which each turns about its own axis.
+        degrees: limit of each bone's rotation about its x and z axes.
+        twist: limit of each bone's rotation about its y axis, degrees.
+
+    Returns:
+        The mesh object `limb` and the armature object `limb_rig`.
     """
     armature_object = link(bpy.data.objects.new("limb_rig", bpy.data.armatures.new("limb_rig")))
     ends = np.linspace(START, END, count + 1).tolist()
@@ -94,7 +97,11 @@ def limb(count: int, degrees: float = 30.0, twist: float = 0.0) -> tuple[bpy.typ
         ),
     )
     for bone in armature_object.pose.bones:
-        ranges = {axis: (-most, most) for axis, most in enumerate((degrees, twist, degrees)) if most}
+        ranges = {
+            axis: (-limit_degrees, limit_degrees)
+            for axis, limit_degrees in enumerate((degrees, twist, degrees))
+            if limit_degrees
+        }
         limit(bone, "LIMIT_ROTATION", ranges)
     points, faces = elbow_surface()
     mesh = bpy.data.meshes.new("limb")
@@ -107,28 +114,28 @@ def limb(count: int, degrees: float = 30.0, twist: float = 0.0) -> tuple[bpy.typ
 
 
 def add_smooth_weights(
-    mesh_object: bpy.types.Object, armature_object: bpy.types.Object, most: int, width: float
+    mesh_object: bpy.types.Object, armature_object: bpy.types.Object, max_influences: int, width: float
 ) -> None:
-    """Weights that fall off with the distance from the middle of each bone.
+    """Add weights that fall off with the distance from the middle of each bone.
 
     Args:
-        mesh_object, armature_object: of a `limb`.
-        most: bones a vertex.
-        width: meters over which weights fall off.
+        mesh_object, armature_object: objects of a `limb`.
+        max_influences: largest number of bones per vertex.
+        width: width of the falloff, meters.
     """
-    along = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
+    x_positions = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
     bones = [bone for bone in armature_object.data.bones if bone.use_deform]
-    middles = np.array([(bone.head_local.x + bone.tail_local.x) / 2 for bone in bones])
-    weights = np.exp(-(((along[:, None] - middles) / width) ** 2))
-    weights[weights < np.sort(weights, axis=1)[:, -most][:, None]] = 0.0
+    bone_centers = np.array([(bone.head_local.x + bone.tail_local.x) / 2 for bone in bones])
+    weights = np.exp(-(((x_positions[:, None] - bone_centers) / width) ** 2))
+    weights[weights < np.sort(weights, axis=1)[:, -max_influences][:, None]] = 0.0
     weights /= weights.sum(axis=1, keepdims=True)
-    for bone, own in zip(bones, weights.T, strict=True):
+    for bone, bone_weights in zip(bones, weights.T, strict=True):
         group = mesh_object.vertex_groups.new(name=bone.name)
-        for vertex in np.flatnonzero(own):
-            group.add([int(vertex)], float(own[vertex]), "REPLACE")
+        for vertex in np.flatnonzero(bone_weights):
+            group.add([int(vertex)], float(bone_weights[vertex]), "REPLACE")
 
 
-def mush(mesh_object: bpy.types.Object, iterations: int = 6) -> None:
-    """Delta mush at the end of the modifiers: what plain skinning does not do."""
+def add_delta_mush(mesh_object: bpy.types.Object, iterations: int = 6) -> None:
+    """Add delta mush as the last modifier, so that the rig differs from linear skinning."""
     modifier = mesh_object.modifiers.new("Mush", "CORRECTIVE_SMOOTH")
     modifier.rest_source, modifier.factor, modifier.iterations = "ORCO", 0.6, iterations

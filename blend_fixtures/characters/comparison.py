@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Records, binds and compares the characters of `rows`; the training in between is that of `training`."""
+"""Record, bind and compare the characters of `rows`. Between recording and binding, `training` trains the models."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,20 +25,20 @@ from fdda_addon.scene.unit import metres_per_unit
 
 from .rows import Row
 
-HELD_OUT = EvaluationSettings(poses=25, seed=1, surface=False)
-PLAYED = 5
-"""Poses that are played and compared with the model's output."""
+HELD_OUT_SETTINGS = EvaluationSettings(poses=25, seed=1, surface=False)
+PLAYED_POSES = 5
+"""Number of poses in which the shown mesh is compared with the model's output."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What came of one mesh of a character.
+    """Errors of the model of one mesh of a character.
 
     Attributes:
         mesh: name of the mesh object.
         linear_mm, fdda_mm: mean error of linear skinning and of the model on held-out poses.
-        moved_mm: how far the rig moves a vertex from its rest position in these poses, mean.
-        difference: the largest between the evaluated mesh and the model's output, in any coordinate; meters.
+        moved_mm: mean distance of the vertices from their rest positions in these poses.
+        difference: largest difference of a coordinate between the shown mesh and the model's output, meters.
     """
 
     mesh: str
@@ -53,10 +53,10 @@ def record_row(row: Row, folder: Path) -> Iterator[tuple[Path, Path]]:
 
     Args:
         row: the character.
-        folder: an empty folder of its own.
+        folder: an empty folder for the character.
 
     Yields:
-        The recording of a mesh, and where its model is to go.
+        For each mesh, the folder of the recording and the path for the model.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     row.build()
@@ -71,68 +71,69 @@ def record_row(row: Row, folder: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def model_path(row: Row, folder: Path, mesh: str) -> Path:
-    """Where the model of a mesh goes; each has a folder of its own, for its report lies beside it."""
+    """Return the path for the model of a mesh. Each model has a separate folder, because its report is beside it."""
     assert mesh in row.meshes
     return folder / mesh / f"{mesh}.onnx"
 
 
 def compare_row(row: Row, folder: Path) -> list[Result]:
-    """Measure the errors of the models of a character, bind all of them and play; a result for each mesh."""
+    """Measure the errors of the models of a character, bind and play all of them; return one result per mesh."""
     bpy.ops.wm.open_mainfile(filepath=str(folder / "rig.blend"))
     rigs = [find_rig(name) for name in row.meshes]
     networks = [Network(model_path(row, folder, name)) for name in row.meshes]
-    errors = [_errors(row, scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
+    errors = [_measure_errors(row, scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
     units = [metres_per_unit(scene_rig.mesh_object) for scene_rig in rigs]
     channels = model_channels(rigs[0], read_model_rig(rigs[0], networks[0].info), networks[0].info)
     for scene_rig, network in zip(rigs, networks, strict=True):
-        live = read_stack(scene_rig.mesh_object).downstream
+        downstream_names = read_stack(scene_rig.mesh_object).downstream
         bind(scene_rig, network.path)
-        for name in live:
+        for name in downstream_names:
             scene_rig.mesh_object.modifiers[name].show_viewport = False
     if row.is_linked:
-        rigs = _overrides(rigs[0], folder)
-        differences = [max(_play(rigs, networks * len(rigs), channels))]
+        rigs = _link_and_override(rigs[0], folder)
+        differences = [max(_measure_differences(rigs, networks * len(rigs), channels))]
     else:
-        differences = _play(rigs, networks, channels)
+        differences = _measure_differences(rigs, networks, channels)
     return [
-        Result(name, *own, difference * unit)
-        for name, own, difference, unit in zip(row.meshes, errors, differences, units, strict=True)
+        Result(name, *mesh_errors, difference * unit)
+        for name, mesh_errors, difference, unit in zip(row.meshes, errors, differences, units, strict=True)
     ]
 
 
-def _errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[float, float, float]:
-    """`linear_mm`, `fdda_mm` and `moved_mm` of a Result."""
-    settings = replace(HELD_OUT, target=row.recording.target)
+def _measure_errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[float, float, float]:
+    """Return `linear_mm`, `fdda_mm` and `moved_mm` of a Result."""
+    settings = replace(HELD_OUT_SETTINGS, target=row.recording.target)
     if not row.recording.poses:
         settings = replace(settings, poses=0, actions=row.recording.actions)
     *_, evaluation = evaluate(scene_rig, network, settings)
     held_out = evaluation.held_out
     rest = rest_positions(scene_rig.mesh_object.data)
-    moved = distances(held_out.positions, rest, metres_per_unit(scene_rig.mesh_object))
-    return tuple(float(meters.mean()) * 1000 for meters in (held_out.linear, held_out.fdda, moved))
+    moved_distances = distances(held_out.positions, rest, metres_per_unit(scene_rig.mesh_object))
+    return tuple(float(meters.mean()) * 1000 for meters in (held_out.linear, held_out.fdda, moved_distances))
 
 
-def _play(rigs: list[SceneRig], networks: list[Network], channels: tuple[Channel, ...]) -> list[float]:
-    """Play bound rigs; the largest difference of each from its model, in units of its mesh.
+def _measure_differences(rigs: list[SceneRig], networks: list[Network], channels: tuple[Channel, ...]) -> list[float]:
+    """Play bound rigs, each armature with different poses.
 
-    Each armature takes poses of its own.
+    Returns:
+        For each rig, the largest difference between the shown mesh and the model's output, in units of its mesh.
     """
     armatures = {scene_rig.armature_object: scene_rig for scene_rig in rigs}
     for armature_object in armatures:
         if armature_object.animation_data is not None:
             armature_object.animation_data.action = None
     differences = [0.0] * len(rigs)
-    for pose in range(PLAYED):
-        for seed, scene_rig in enumerate(armatures.values(), HELD_OUT.seed + 1):
+    for pose in range(PLAYED_POSES):
+        for seed, scene_rig in enumerate(armatures.values(), HELD_OUT_SETTINGS.seed + 1):
             set_held_out_pose(scene_rig, channels, seed, pose)
         bpy.context.view_layer.update()
-        now = [_difference(scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
-        differences = [max(pair) for pair in zip(differences, now, strict=True)]
+        pose_differences = [_difference(scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
+        differences = [max(pair) for pair in zip(differences, pose_differences, strict=True)]
     return differences
 
 
 def _difference(scene_rig: SceneRig, network: Network) -> float:
-    """The largest between what Blender shows and what the model says of the pose; nothing of the playback is used."""
+    """Return the largest difference between the shown mesh and the model's output, computed without the player."""
     if problem := scene_rig.mesh_object.fdda.status:
         raise AssertionError(problem)
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -142,12 +143,12 @@ def _difference(scene_rig: SceneRig, network: Network) -> float:
         scene_rig.mesh_object.evaluated_get(depsgraph), scene_rig.armature_object.evaluated_get(depsgraph)
     )
     controls = ControlReader(scene_rig, info.controls).read(scene_rig, depsgraph)
-    shown = evaluated_positions(scene_rig.mesh_object, depsgraph)
-    return float(np.abs(shown - network.positions(matrices[None], controls[None])[0]).max())
+    shown_positions = evaluated_positions(scene_rig.mesh_object, depsgraph)
+    return float(np.abs(shown_positions - network.positions(matrices[None], controls[None])[0]).max())
 
 
-def _overrides(scene_rig: SceneRig, folder: Path) -> list[SceneRig]:
-    """Save the bound character as a library, link it into a new file, and override it twice."""
+def _link_and_override(scene_rig: SceneRig, folder: Path) -> list[SceneRig]:
+    """Save the bound character as a library, link it into a new file, and create two library overrides of it."""
     collection = bpy.data.collections.new("Character")
     bpy.context.scene.collection.children.link(collection)
     for scene_object in (scene_rig.mesh_object, scene_rig.armature_object):
@@ -157,13 +158,13 @@ def _overrides(scene_rig: SceneRig, folder: Path) -> list[SceneRig]:
     save_copy(library)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
-    with bpy.data.libraries.load(str(library), link=True, relative=True) as (_, wanted):
-        wanted.collections = ["Character"]
+    with bpy.data.libraries.load(str(library), link=True, relative=True) as (_, linked_data):
+        linked_data.collections = ["Character"]
     rigs = []
     for _ in range(2):
-        own = wanted.collections[0].override_hierarchy_create(
+        override = linked_data.collections[0].override_hierarchy_create(
             bpy.context.scene, bpy.context.view_layer, do_fully_editable=True
         )
-        mesh_object = next(o for o in own.all_objects if o.type == "MESH")
+        mesh_object = next(o for o in override.all_objects if o.type == "MESH")
         rigs.append(SceneRig(mesh_object, armature_of(mesh_object)))
     return rigs

@@ -1,30 +1,30 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters that animators pose with control bones: one function each, which builds a tube as in `base`.
+"""Build characters that animators pose with control bones; each function builds one from the tube of `base`.
 
-What animators pose is in the bone collection `Controls`.
+The control bones are in the bone collection `Controls`.
 """
 
 from collections.abc import Callable
 
 from .base import bulge, tube
-from .bones import NewBone, add_bones, free, in_collection, limit, mush
-from .controls import add_key, add_property, follow
+from .bones import NewBone, add_bone_collection, add_bones, add_delta_mush, limit, remove_constraints
+from .controls import add_key, add_property, drive_by_property
 
 CONTROLS = "Controls"
 
 
 def ik_fk() -> None:
-    """An arm that blends from FK to IK with a custom property; deforming bones copy both chains. Delta mush."""
+    """Build an arm with delta mush whose deforming bones copy an FK and an IK chain; a custom property blends both."""
     mesh_object, armature_object = tube()
     start, joint, end = (0.0, 0.0, 0.0), (0.25, 0.0, 0.0), (0.5, 0.0, 0.0)
     add_bones(
         armature_object,
         *(
             bone
-            for way in ("fk", "ik")
+            for chain in ("fk", "ik")
             for bone in (
-                NewBone(f"{way}_upper", start, joint, is_deforming=False),
-                NewBone(f"{way}_lower", joint, end, f"{way}_upper", is_deforming=False, is_connected=True),
+                NewBone(f"{chain}_upper", start, joint, is_deforming=False),
+                NewBone(f"{chain}_lower", joint, end, f"{chain}_upper", is_deforming=False, is_connected=True),
             )
         ),
         NewBone("ik_hand", end, (0.6, 0.0, 0.0), is_deforming=False),
@@ -33,7 +33,7 @@ def ik_fk() -> None:
     bones = armature_object.pose.bones
     limit(bones["fk_upper"], "LIMIT_ROTATION", {axis: (-45.0, 45.0) for axis in range(3)})
     limit(bones["fk_lower"], "LIMIT_ROTATION", {0: (0.0, 120.0)})
-    # Nearer than the arm is long, and never straight: the pole decides where the elbow goes.
+    # The hand stays so near that the arm is never straight: a straight arm does not follow the pole.
     limit(bones["ik_hand"], "LIMIT_LOCATION", {0: (-0.12, 0.12), 1: (-0.25, -0.05), 2: (-0.12, 0.12)})
     limit(bones["ik_pole"], "LIMIT_LOCATION", {0: (-0.15, 0.15)})
     bones["ik_lower"].lock_rotation = bones["ik_upper"].lock_rotation = (False, False, False)
@@ -42,17 +42,17 @@ def ik_fk() -> None:
     ik.subtarget, ik.pole_subtarget, ik.chain_count = "ik_hand", "ik_pole", 2
     add_property(armature_object, "ik")
     for name in ("upper", "lower"):
-        free(bones[name])
-        for way in ("fk", "ik"):
+        remove_constraints(bones[name])
+        for chain in ("fk", "ik"):
             copy = bones[name].constraints.new("COPY_TRANSFORMS")
-            copy.name, copy.target, copy.subtarget = way, armature_object, f"{way}_{name}"
-        follow(bones[name].constraints["ik"], "influence", armature_object, '["ik"]')
-    in_collection(armature_object, CONTROLS, "fk_upper", "fk_lower", "ik_hand", "ik_pole")
-    mush(mesh_object)
+            copy.name, copy.target, copy.subtarget = chain, armature_object, f"{chain}_{name}"
+        drive_by_property(bones[name].constraints["ik"], "influence", armature_object, '["ik"]')
+    add_bone_collection(armature_object, CONTROLS, "fk_upper", "fk_lower", "ik_hand", "ik_pole")
+    add_delta_mush(mesh_object)
 
 
 def face_slider() -> None:
-    """A slider beside a face: a bone that moves along Z, and drives a shape key; a control bone turns the jaw."""
+    """Build a face with a slider bone that drives a shape key, and a control bone that rotates the jaw."""
     mesh_object, armature_object = tube()
     add_bones(
         armature_object,
@@ -62,19 +62,19 @@ def face_slider() -> None:
     bones = armature_object.pose.bones
     limit(bones["slider"], "LIMIT_LOCATION", {1: (0.0, 0.1)})
     limit(bones["jaw"], "LIMIT_ROTATION", {2: (0.0, 60.0)})
-    free(bones["lower"])
-    child = bones["lower"].constraints.new("ARMATURE").targets.new()
-    child.target, child.subtarget = armature_object, "jaw"
-    smile = add_key(mesh_object, "smile", bulge)
-    driver = smile.driver_add("value").driver
+    remove_constraints(bones["lower"])
+    child_target = bones["lower"].constraints.new("ARMATURE").targets.new()
+    child_target.target, child_target.subtarget = armature_object, "jaw"
+    smile_key = add_key(mesh_object, "smile", bulge)
+    driver = smile_key.driver_add("value").driver
     variable = driver.variables.new()
-    variable.name, variable.type = "place", "TRANSFORMS"
+    variable.name, variable.type = "slider_y", "TRANSFORMS"
     target = variable.targets[0]
     target.id, target.bone_target = armature_object, "slider"
     target.transform_type, target.transform_space = "LOC_Y", "LOCAL_SPACE"
-    driver.expression = "10 * place"
-    in_collection(armature_object, CONTROLS, "slider", "jaw")
-    mush(mesh_object)
+    driver.expression = "10 * slider_y"
+    add_bone_collection(armature_object, CONTROLS, "slider", "jaw")
+    add_delta_mush(mesh_object)
 
 
 CONTROL_RIGS: tuple[Callable[[], None], ...] = (ik_fk, face_slider)

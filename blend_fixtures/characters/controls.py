@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters with inputs beside their joints: one function each, which builds a tube as in `base`."""
+"""Build characters with inputs beside their joints; each function builds one from the tube of `base`."""
 
 from collections.abc import Callable
 
@@ -7,54 +7,54 @@ import bpy
 import numpy as np
 
 from .base import bulge, link, tube
-from .bones import NewBone, add_bones, mush
+from .bones import NewBone, add_bones, add_delta_mush
 
 
 def custom_property() -> None:
-    """A custom property of the armature object, which the driver of a shape key reads."""
+    """Build a tube with a custom property of the armature object that drives a shape key."""
     mesh_object, armature_object = tube()
     add_property(armature_object, "flex")
-    follow(add_key(mesh_object, "flexed", bulge), "value", armature_object, '["flex"]')
-    mush(mesh_object)
+    drive_by_property(add_key(mesh_object, "flexed", bulge), "value", armature_object, '["flex"]')
+    add_delta_mush(mesh_object)
 
 
 def free_shape_keys() -> None:
-    """Two shape keys that an animator sets by hand, and delta mush."""
+    """Build a tube with two shape keys that an animator sets by hand, and with delta mush."""
     mesh_object, _ = tube()
     add_key(mesh_object, "flexed", bulge)
     add_key(mesh_object, "thin", lambda points: points * (1.0, 0.7, 0.7)).slider_min = -0.5
-    mush(mesh_object)
+    add_delta_mush(mesh_object)
 
 
 def constraint_influence() -> None:
-    """The influence of a constraint: it turns a bone, and the driver of a shape key reads it."""
+    """Build a tube with a constraint whose influence affects the rotation of a bone and drives a shape key."""
     mesh_object, armature_object = tube()
     add_bones(armature_object, NewBone("rest", (0.25, 0.0, 0.1), (0.5, 0.0, 0.1), is_deforming=False))
     copy = armature_object.pose.bones["lower"].constraints.new("COPY_ROTATION")
     copy.name, copy.target, copy.subtarget, copy.influence = "Rest", armature_object, "rest", 0.0
     path = 'pose.bones["lower"].constraints["Rest"].influence'
-    follow(add_key(mesh_object, "flexed", bulge), "value", armature_object, path)
-    mush(mesh_object)
+    drive_by_property(add_key(mesh_object, "flexed", bulge), "value", armature_object, path)
+    add_delta_mush(mesh_object)
 
 
 def modifier_strength() -> None:
-    """A custom property of the mesh object, which drives the strength of a modifier."""
+    """Build a tube with a custom property of the mesh object that drives the strength of a modifier."""
     mesh_object, _ = tube()
     add_property(mesh_object, "softness")
     modifier = mesh_object.modifiers.new("Smooth", "SMOOTH")
     modifier.iterations = 6
-    follow(modifier, "factor", mesh_object, '["softness"]')
+    drive_by_property(modifier, "factor", mesh_object, '["softness"]')
 
 
 def undriven_strength() -> None:
-    """The strength of a modifier that an animator sets by hand."""
+    """Build a tube with a modifier whose strength an animator sets by hand."""
     mesh_object, _ = tube()
     modifier = mesh_object.modifiers.new("Cast", "CAST")
     modifier.use_radius_as_size, modifier.size, modifier.factor = False, 0.3, 0.0
 
 
 def lattice_shape_key() -> None:
-    """A shape key of a lattice that an animator sets by hand, before the skinning."""
+    """Build a tube that a lattice deforms before the skinning; an animator sets the lattice's shape key by hand."""
     mesh_object, _ = tube()
     data = bpy.data.lattices.new("lattice")
     data.points_u, data.points_v, data.points_w = 6, 3, 3
@@ -63,19 +63,19 @@ def lattice_shape_key() -> None:
     add_key(lattice_object, "thick", lambda points: points * (1.0, 1.5, 1.5))
     mesh_object.modifiers.new("Lattice", "LATTICE").object = lattice_object
     mesh_object.modifiers.move(1, 0)
-    mush(mesh_object)
+    add_delta_mush(mesh_object)
 
 
 def dial() -> None:
-    """Another object, whose place along X the driver of a shape key reads."""
+    """Build a tube with a shape key that the X location of another object drives."""
     mesh_object, _ = tube()
     dial_object = link(bpy.data.objects.new("dial", None))
     driver = add_key(mesh_object, "flexed", bulge).driver_add("value").driver
     variable = driver.variables.new()
-    variable.name, variable.type = "place", "TRANSFORMS"
+    variable.name, variable.type = "dial_x", "TRANSFORMS"
     variable.targets[0].id, variable.targets[0].transform_type = dial_object, "LOC_X"
-    driver.expression = "2 * place"
-    mush(mesh_object)
+    driver.expression = "2 * dial_x"
+    add_delta_mush(mesh_object)
 
 
 CONTROLS: tuple[Callable[[], None], ...] = (
@@ -85,10 +85,10 @@ CONTROLS: tuple[Callable[[], None], ...] = (
 
 
 def add_property(owner: bpy.types.ID, name: str) -> None:
-    """Give a datablock a custom property from 0 to 1."""
+    """Add a custom property with the range 0 to 1 to a datablock."""
     owner[name] = 0.0
     owner.id_properties_ui(name).update(min=0.0, max=1.0)
-    # Else a driver that reads it before Blender knows of it is taken for broken.
+    # Without the tag, a driver that reads the property before the next depsgraph update is marked invalid.
     owner.update_tag()
 
 
@@ -97,8 +97,8 @@ def add_key(owner: bpy.types.Object, name: str, move: Callable[[np.ndarray], np.
 
     Args:
         owner: a mesh or lattice object.
-        name: of the key.
-        move: points of the basis to those of the key, (n, 3) each, the owner's space.
+        name: name of the key.
+        move: function from the points of the basis to the points of the key, (N, 3) each, in the owner's space.
     """
     if owner.data.shape_keys is None:
         owner.shape_key_add(name="Basis", from_mix=False)
@@ -108,8 +108,8 @@ def add_key(owner: bpy.types.Object, name: str, move: Callable[[np.ndarray], np.
     return key
 
 
-def follow(owner: bpy.types.bpy_struct, attribute: str, source: bpy.types.ID, path: str) -> None:
-    """Drive a number by another one, as it is."""
+def drive_by_property(owner: bpy.types.bpy_struct, attribute: str, source: bpy.types.ID, path: str) -> None:
+    """Drive a property with the unchanged value of another property."""
     driver = owner.driver_add(attribute).driver
     variable = driver.variables.new()
     variable.name = "value"

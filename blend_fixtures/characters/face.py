@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A face: a head of 5,186 vertices with 22 bones, 22 shape keys that an animator sets, and 12 correctives.
+"""Build a face: a head of 5,186 vertices with 22 bones, 22 shape keys that an animator sets, and 12 correctives.
 
-Jaw, lips, brows, lids and cheeks are bones and shape keys both, as in production faces; correctives are shape keys that
-are driven by the product of two others, or of one and the jaw. Delta mush comes last. With an action to compare on:
-`python -m blend_fixtures.characters.face OUT.blend`.
+Both bones and shape keys move the jaw, lips, brows, lids and cheeks, as in production faces. A corrective is a shape
+key that is driven by the product of two other shape keys, or of a shape key and the opening of the jaw. Delta mush is
+the last modifier. `python -m blend_fixtures.characters.face OUT.blend` saves the face with an action for evaluations.
 """
 
 import math
@@ -21,11 +21,11 @@ from .controls import add_key
 MESH, ARMATURE, SPEECH = "face", "face_rig", "speech"
 FRAMES = 80
 RADII = np.array((0.078, 0.096, 0.118))
-"""Of the head, meters: it looks along -Y, its left is +X."""
-RINGS, AROUND = 72, 72
+"""Radii of the head along X, Y and Z, meters: it faces -Y, and its left side is at +X."""
+RINGS, RING_VERTICES = 72, 72
 
-# Where parts of the face lie: degrees to the left, and upwards.
-PLACES = {
+# Directions of the parts of the face from the center of the head: degrees to the left and upward.
+PART_ANGLES = {
     "jaw": (0, -42), "chin": (0, -55), "nose": (0, 2), "lip_top": (0, -19), "lip_bottom": (0, -29),
     **{f"{name}.{side}": (sign * left, up)
        for side, sign in (("L", 1), ("R", -1))
@@ -34,121 +34,137 @@ PLACES = {
            ("lid_bottom", 21, 12), ("brow_in", 9, 34), ("brow_out", 30, 35), ("cheek", 33, -6),
        )},
 }  # fmt: skip
-JAW_OPENS = math.radians(25)
+JAW_OPENING = math.radians(25)
 
 
-def _direction(place: tuple[float, float]) -> np.ndarray:
-    left, up = map(math.radians, place)
+def _direction(part_angles: tuple[float, float]) -> np.ndarray:
+    left, up = map(math.radians, part_angles)
     return np.array((math.sin(left) * math.cos(up), -math.cos(left) * math.cos(up), math.sin(up)))
 
 
 def _surface() -> tuple[np.ndarray, list[tuple[int, ...]]]:
-    """Points (5186, 3) of the head, and its faces: rings around Z, and two poles."""
-    up = (np.arange(RINGS) + 0.5) / RINGS * np.pi - np.pi / 2
-    around = np.arange(AROUND) / AROUND * 2 * np.pi
-    grid = np.array([(math.cos(u) * math.sin(a), -math.cos(u) * math.cos(a), math.sin(u)) for u in up for a in around])
+    """Return the points (5186, 3) and the faces of the head: rings around Z and two poles."""
+    elevations = (np.arange(RINGS) + 0.5) / RINGS * np.pi - np.pi / 2
+    azimuths = np.arange(RING_VERTICES) / RING_VERTICES * 2 * np.pi
+    grid = np.array(
+        [(math.cos(u) * math.sin(a), -math.cos(u) * math.cos(a), math.sin(u)) for u in elevations for a in azimuths]
+    )
     directions = np.concatenate([grid, [(0, 0, -1), (0, 0, 1)]])
-    nose = np.exp(-(_apart(directions, "nose") ** 2) / 0.03)
+    nose = np.exp(-(_angle_from_part(directions, "nose") ** 2) / 0.03)
     faces = [
-        (r * AROUND + a, r * AROUND + (a + 1) % AROUND, (r + 1) * AROUND + (a + 1) % AROUND, (r + 1) * AROUND + a)
+        (
+            r * RING_VERTICES + a,
+            r * RING_VERTICES + (a + 1) % RING_VERTICES,
+            (r + 1) * RING_VERTICES + (a + 1) % RING_VERTICES,
+            (r + 1) * RING_VERTICES + a,
+        )
         for r in range(RINGS - 1)
-        for a in range(AROUND)
+        for a in range(RING_VERTICES)
     ]
-    top = (RINGS - 1) * AROUND
-    faces += [((a + 1) % AROUND, a, len(grid)) for a in range(AROUND)]
-    faces += [(top + a, top + (a + 1) % AROUND, len(grid) + 1) for a in range(AROUND)]
+    last_ring = (RINGS - 1) * RING_VERTICES
+    faces += [((a + 1) % RING_VERTICES, a, len(grid)) for a in range(RING_VERTICES)]
+    faces += [(last_ring + a, last_ring + (a + 1) % RING_VERTICES, len(grid) + 1) for a in range(RING_VERTICES)]
     return directions * RADII * (1 + 0.14 * nose[:, None]), faces
 
 
-def _apart(points: np.ndarray, name: str) -> np.ndarray:
-    """(n,) angle between points, seen from the middle of the head, and a place; radians."""
+def _angle_from_part(points: np.ndarray, name: str) -> np.ndarray:
+    """Return the (N,) angles at the center of the head between points and a part of the face, radians."""
     directions = points / RADII
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.arccos(np.clip(directions @ _direction(PLACES[name]), -1, 1))
+    return np.arccos(np.clip(directions @ _direction(PART_ANGLES[name]), -1, 1))
 
 
-def _bump(name: str, offset: tuple[float, float, float], size: float = 0.16) -> Callable[[np.ndarray], np.ndarray]:
-    """Moves what is near a place, by millimeters."""
+def _move_near(name: str, offset: tuple[float, float, float], size: float = 0.16) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that moves the points near a part of the face; `offset` in millimeters, `size` in radians."""
 
     def move(points: np.ndarray) -> np.ndarray:
-        return points + np.exp(-((_apart(points, name) / size) ** 2))[:, None] * np.array(offset) / 1000
+        return points + np.exp(-((_angle_from_part(points, name) / size) ** 2))[:, None] * np.array(offset) / 1000
 
     return move
 
 
-def _together(*moves: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+def _combine(*moves: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
     return lambda points: points + sum(move(points) - points for move in moves)
 
 
-def _keys() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
-    """The 22 shapes that an animator sets."""
+def _shape_key_moves() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    """Return the 22 shape keys that an animator sets: functions that move points, by name."""
     found = {
-        "pucker": _together(
-            _bump("corner.L", (-7, -4, 0)), _bump("corner.R", (7, -4, 0)), _bump("lip_top", (0, -5, 0))
+        "pucker": _combine(
+            _move_near("corner.L", (-7, -4, 0)), _move_near("corner.R", (7, -4, 0)), _move_near("lip_top", (0, -5, 0))
         ),
-        "funnel": _together(_bump("lip_top", (0, -5, 3)), _bump("lip_bottom", (0, -5, -3))),
-        "press": _together(_bump("lip_top", (0, 1, -3)), _bump("lip_bottom", (0, 1, 3))),
-        "chin_up": _bump("chin", (0, -2, 5)),
+        "funnel": _combine(_move_near("lip_top", (0, -5, 3)), _move_near("lip_bottom", (0, -5, -3))),
+        "press": _combine(_move_near("lip_top", (0, 1, -3)), _move_near("lip_bottom", (0, 1, 3))),
+        "chin_up": _move_near("chin", (0, -2, 5)),
     }
     for side, sign in (("L", 1), ("R", -1)):
         found |= {
-            f"smile.{side}": _together(_bump(f"corner.{side}", (6 * sign, 3, 7)), _bump(f"cheek.{side}", (0, -3, 4))),
-            f"frown.{side}": _bump(f"corner.{side}", (2 * sign, 0, -7)),
-            f"wide.{side}": _bump(f"corner.{side}", (7 * sign, 3, 0)),
-            f"blink.{side}": _together(
-                _bump(f"lid_top.{side}", (0, -2, -8), 0.12), _bump(f"lid_bottom.{side}", (0, 0, 2), 0.1)
+            f"smile.{side}": _combine(
+                _move_near(f"corner.{side}", (6 * sign, 3, 7)), _move_near(f"cheek.{side}", (0, -3, 4))
             ),
-            f"squint.{side}": _bump(f"lid_bottom.{side}", (0, -2, 4), 0.12),
-            f"brow_up.{side}": _together(_bump(f"brow_in.{side}", (0, 0, 6)), _bump(f"brow_out.{side}", (0, 0, 7))),
-            f"angry.{side}": _bump(f"brow_in.{side}", (-4 * sign, -2, -6)),
-            f"sneer.{side}": _together(_bump(f"lip_top.{side}", (0, -2, 5)), _bump("nose", (0, 0, 3), 0.1)),
-            f"puff.{side}": _bump(f"cheek.{side}", (6 * sign, -5, 0), 0.2),
+            f"frown.{side}": _move_near(f"corner.{side}", (2 * sign, 0, -7)),
+            f"wide.{side}": _move_near(f"corner.{side}", (7 * sign, 3, 0)),
+            f"blink.{side}": _combine(
+                _move_near(f"lid_top.{side}", (0, -2, -8), 0.12), _move_near(f"lid_bottom.{side}", (0, 0, 2), 0.1)
+            ),
+            f"squint.{side}": _move_near(f"lid_bottom.{side}", (0, -2, 4), 0.12),
+            f"brow_up.{side}": _combine(
+                _move_near(f"brow_in.{side}", (0, 0, 6)), _move_near(f"brow_out.{side}", (0, 0, 7))
+            ),
+            f"angry.{side}": _move_near(f"brow_in.{side}", (-4 * sign, -2, -6)),
+            f"sneer.{side}": _combine(_move_near(f"lip_top.{side}", (0, -2, 5)), _move_near("nose", (0, 0, 3), 0.1)),
+            f"puff.{side}": _move_near(f"cheek.{side}", (6 * sign, -5, 0), 0.2),
         }
     return found
 
 
-def _correctives() -> dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]]:
-    """What is wrong where two of the shapes come together, or one and the open jaw."""
-    found = {("pucker", "jaw"): _bump("lip_bottom", (0, -4, 3)), ("funnel", "press"): _bump("lip_top", (0, 3, -2))}
+def _corrective_moves() -> dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]]:
+    """Return the correctives for two shape keys, or for a shape key and the open jaw: functions that move points."""
+    found = {
+        ("pucker", "jaw"): _move_near("lip_bottom", (0, -4, 3)),
+        ("funnel", "press"): _move_near("lip_top", (0, 3, -2)),
+    }
     for side, sign in (("L", 1), ("R", -1)):
         found |= {
-            (f"smile.{side}", "jaw"): _bump(f"corner.{side}", (-5 * sign, 0, -4)),
-            (f"smile.{side}", "pucker"): _bump(f"corner.{side}", (3 * sign, -4, 3)),
-            (f"blink.{side}", f"squint.{side}"): _bump(f"lid_bottom.{side}", (0, 2, -4), 0.1),
-            (f"brow_up.{side}", f"angry.{side}"): _bump(f"brow_in.{side}", (2 * sign, -4, 2)),
-            (f"sneer.{side}", f"smile.{side}"): _bump(f"lip_top.{side}", (2 * sign, -3, -3)),
+            (f"smile.{side}", "jaw"): _move_near(f"corner.{side}", (-5 * sign, 0, -4)),
+            (f"smile.{side}", "pucker"): _move_near(f"corner.{side}", (3 * sign, -4, 3)),
+            (f"blink.{side}", f"squint.{side}"): _move_near(f"lid_bottom.{side}", (0, 2, -4), 0.1),
+            (f"brow_up.{side}", f"angry.{side}"): _move_near(f"brow_in.{side}", (2 * sign, -4, 2)),
+            (f"sneer.{side}", f"smile.{side}"): _move_near(f"lip_top.{side}", (2 * sign, -3, -3)),
         }
     return found
 
 
 def face() -> None:
-    """Build it in the current scene: `face`, `face_rig`."""
+    """Build the mesh object `face` and the armature object `face_rig` in the current scene."""
     points, faces = _surface()
     mesh = bpy.data.meshes.new(MESH)
     mesh.from_pydata(points.tolist(), [], faces)
     mesh_object = link(bpy.data.objects.new(MESH, mesh))
     armature_object = link(bpy.data.objects.new(ARMATURE, bpy.data.armatures.new(ARMATURE)))
     mesh_object.parent = armature_object
-    _rig(armature_object)
-    _weigh(mesh_object, points)
+    _add_face_bones(armature_object)
+    _add_weights(mesh_object, points)
     mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
-    for name, move in _keys().items():
+    for name, move in _shape_key_moves().items():
         add_key(mesh_object, name, move)
-    for (first, second), move in _correctives().items():
-        _drive(add_key(mesh_object, f"{first}_{second}", move), mesh_object, armature_object, (first, second))
+    for (first, second), move in _corrective_moves().items():
+        _drive_by_product(
+            add_key(mesh_object, f"{first}_{second}", move), mesh_object, armature_object, (first, second)
+        )
     smooth = mesh_object.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
     smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.5, 6
     bpy.context.view_layer.update()
 
 
-def _rig(armature_object: bpy.types.Object) -> None:
+def _add_face_bones(armature_object: bpy.types.Object) -> None:
     bones = [NewBone("head", (0.0, 0.02, -0.12), (0.0, 0.02, 0.1))]
-    for name, place in PLACES.items():
-        tip = _direction(place) * RADII
-        # They turn about points inside the head, the jaw about the ears.
-        start = np.array((0.0, 0.03, 0.0)) if name == "jaw" else tip * (0.35, 0.35, 0.35)
+    for name, part_angles in PART_ANGLES.items():
+        tip = _direction(part_angles) * RADII
+        # The pivots are inside the head; the pivot of the jaw is between the ears.
+        pivot = np.array((0.0, 0.03, 0.0)) if name == "jaw" else tip * (0.35, 0.35, 0.35)
         parent = "jaw" if name.startswith(("chin", "lip_bottom")) else "head"
-        bones.append(NewBone(name, tuple(start.tolist()), tuple(tip.tolist()), parent))
+        bones.append(NewBone(name, tuple(pivot.tolist()), tuple(tip.tolist()), parent))
     add_bones(armature_object, *bones)
     pose = armature_object.pose.bones
     for bone in pose:
@@ -159,26 +175,32 @@ def _rig(armature_object: bpy.types.Object) -> None:
         limit(pose[name], "LIMIT_ROTATION", ranges)
 
 
-def _weigh(mesh_object: bpy.types.Object, points: np.ndarray) -> None:
-    """Weights that fall off around each place; the jaw has the lower part of the face, the head the rest."""
-    weights = {name: np.exp(-((_apart(points, name) / 0.2) ** 2)) for name in PLACES if name != "jaw"}
-    up = points[:, 2] / RADII[2]
-    weights["jaw"] = 0.7 / (1 + np.exp((up + 0.42) * 18)) / (1 + np.exp(points[:, 1] / RADII[1] * 12))
-    total = sum(weights.values())
-    weights = {name: own * np.minimum(1, 0.97 / np.maximum(total, 1e-9)) for name, own in weights.items()}
+def _add_weights(mesh_object: bpy.types.Object, points: np.ndarray) -> None:
+    """Add weights that fall off around each part; the jaw gets the lower face, the head gets the remaining weight."""
+    weights = {name: np.exp(-((_angle_from_part(points, name) / 0.2) ** 2)) for name in PART_ANGLES if name != "jaw"}
+    heights = points[:, 2] / RADII[2]
+    weights["jaw"] = 0.7 / (1 + np.exp((heights + 0.42) * 18)) / (1 + np.exp(points[:, 1] / RADII[1] * 12))
+    weight_sums = sum(weights.values())
+    weights = {
+        name: part_weights * np.minimum(1, 0.97 / np.maximum(weight_sums, 1e-9))
+        for name, part_weights in weights.items()
+    }
     weights["head"] = 1 - sum(weights.values())
-    for name, own in weights.items():
+    for name, part_weights in weights.items():
         group = mesh_object.vertex_groups.new(name=name)
-        for index in np.flatnonzero(own > 1e-3):
-            group.add([int(index)], float(own[index]), "REPLACE")
+        for index in np.flatnonzero(part_weights > 1e-3):
+            group.add([int(index)], float(part_weights[index]), "REPLACE")
 
 
-def _drive(
-    key: bpy.types.ShapeKey, mesh_object: bpy.types.Object, armature_object: bpy.types.Object, by: tuple[str, str]
+def _drive_by_product(
+    key: bpy.types.ShapeKey,
+    mesh_object: bpy.types.Object,
+    armature_object: bpy.types.Object,
+    driving_names: tuple[str, str],
 ) -> None:
-    """The product of two shape keys, or of one and how far the jaw is open."""
+    """Drive a shape key by the product of two shape keys, or of a shape key and the opening of the jaw."""
     driver = key.driver_add("value").driver
-    for letter, name in zip("ab", by, strict=True):
+    for letter, name in zip("ab", driving_names, strict=True):
         variable = driver.variables.new()
         variable.name = letter
         if name == "jaw":
@@ -190,43 +212,43 @@ def _drive(
             target = variable.targets[0]
             target.id_type, target.id = "KEY", mesh_object.data.shape_keys
             target.data_path = f'key_blocks["{name}"].value'
-    driver.expression = f"a * b / {-JAW_OPENS:.6f}" if "jaw" in by else "a * b"
+    driver.expression = f"a * b / {-JAW_OPENING:.6f}" if "jaw" in driving_names else "a * b"
 
 
 def add_speech() -> bpy.types.Action:
-    """The action `speech`, of bones and shape keys: each goes its own way, many at a time, none far at first."""
+    """Add the action `speech`: many bones and shape keys move at the same time, each at a different rate."""
     armature_object, keys = bpy.data.objects[ARMATURE], bpy.data.objects[MESH].data.shape_keys
     animation = armature_object.animation_data_create()
     animation.action = action = bpy.data.actions.new(SPEECH)
-    free = [block for block in keys.key_blocks[1:] if block.name in _keys()]
+    undriven_blocks = [block for block in keys.key_blocks[1:] if block.name in _shape_key_moves()]
     for frame in range(1, FRAMES + 1, 4):
-        for number, bone in enumerate(armature_object.pose.bones):
-            (held,) = bone.constraints
+        for index, bone in enumerate(armature_object.pose.bones):
+            (limit_constraint,) = bone.constraints
             for axis, letter in enumerate("xyz"):
                 if not bone.lock_rotation[axis]:
-                    low, high = getattr(held, f"min_{letter}"), getattr(held, f"max_{letter}")
-                    part = 0.5 + 0.45 * math.sin(frame * (0.11 + 0.017 * number) + 2.1 * number + axis)
-                    bone.rotation_euler[axis] = low + (high - low) * part
+                    low, high = getattr(limit_constraint, f"min_{letter}"), getattr(limit_constraint, f"max_{letter}")
+                    fraction = 0.5 + 0.45 * math.sin(frame * (0.11 + 0.017 * index) + 2.1 * index + axis)
+                    bone.rotation_euler[axis] = low + (high - low) * fraction
             bone.keyframe_insert("rotation_euler", frame=frame)
-    moved = keys.animation_data_create()
+    key_animation = keys.animation_data_create()
     action.slots.new(id_type="KEY", name=keys.name)
-    moved.action = action
+    key_animation.action = action
     for frame in range(1, FRAMES + 1, 4):
-        for number, block in enumerate(free):
-            block.value = max(0.0, math.sin(frame * (0.09 + 0.013 * number) + 1.7 * number))
+        for index, block in enumerate(undriven_blocks):
+            block.value = max(0.0, math.sin(frame * (0.09 + 0.013 * index) + 1.7 * index))
             keys.keyframe_insert(f'key_blocks["{block.name}"].value', frame=frame)
-    for block in free:
+    for block in undriven_blocks:
         block.value = 0.0
-    moved.action = None
+    key_animation.action = None
     return action
 
 
-def main(target: Path) -> None:
+def main(output_path: Path) -> None:
     """Build the face with its action, and save it."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     face()
     add_speech()
-    bpy.ops.wm.save_as_mainfile(filepath=str(target.absolute()), copy=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(output_path.absolute()), copy=True)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters in which something depends on time: one function each, which builds it in the current scene.
+"""Build characters that depend on time; each function builds one in the current scene.
 
-Of `REFUSED` the surface changes with the frame and no model could be told. Of `TOLD` what is keyed is a control. Of
-`HARMLESS` the surface follows from the pose, whatever is keyed.
+The surfaces of `REFUSED` change with the frame, and no input of a model gives the change. In `TOLD` the keyed property
+is a control. In `HARMLESS` something is keyed, but the surface depends only on the pose.
 """
 
 from collections.abc import Callable
@@ -11,14 +11,14 @@ import bpy
 
 from . import controls, stacks
 from .base import bulge, link, tube
-from .bones import free
-from .controls import add_key, add_property, follow
+from .bones import remove_constraints
+from .controls import add_key, add_property, drive_by_property
 from .skinning import two_armatures
 
 
-def key(owner: bpy.types.bpy_struct, path: str, first: object, last: object) -> None:
-    """Key a property at frames 1 and 30, and go to frame 1."""
-    for frame, value in ((1, first), (30, last)):
+def insert_keys(owner: bpy.types.bpy_struct, path: str, first_value: object, last_value: object) -> None:
+    """Insert keyframes of a property at frames 1 and 30, and go to frame 1."""
+    for frame, value in ((1, first_value), (30, last_value)):
         if path.startswith('["'):
             owner[path[2:-2]] = value
         else:
@@ -27,18 +27,18 @@ def key(owner: bpy.types.bpy_struct, path: str, first: object, last: object) -> 
     bpy.context.scene.frame_set(1)
 
 
-def smooth() -> bpy.types.Modifier:
-    """Build a tube that is smoothed after the skinning; gives the modifier."""
+def build_smoothed_tube() -> bpy.types.Modifier:
+    """Build a tube with a Smooth modifier after the skinning; return the modifier."""
     stacks.smooth()
     return bpy.data.objects["elbow"].modifiers["Smooth"]
 
 
 def keyed_strength() -> None:
-    key(smooth(), "factor", 0.0, 1.0)
+    insert_keys(build_smoothed_tube(), "factor", 0.0, 1.0)
 
 
 def strength_in_the_nla() -> None:
-    key(smooth(), "factor", 0.0, 1.0)
+    insert_keys(build_smoothed_tube(), "factor", 0.0, 1.0)
     animation = bpy.data.objects["elbow"].animation_data
     action, slot = animation.action, animation.action_slot
     animation.action = None
@@ -47,41 +47,41 @@ def strength_in_the_nla() -> None:
 
 
 def driven_by_frame() -> None:
-    smooth().driver_add("factor").driver.expression = "min(1, frame / 30)"
+    build_smoothed_tube().driver_add("factor").driver.expression = "min(1, frame / 30)"
 
 
 def driven_by_the_scene() -> None:
-    _reads_frame("SINGLE_PROP")
+    _drive_by_frame("SINGLE_PROP")
 
 
 def driven_by_the_context() -> None:
-    _reads_frame("CONTEXT_PROP")
+    _drive_by_frame("CONTEXT_PROP")
 
 
 def through_a_property() -> None:
-    """The strength follows a property of the mesh, which follows the frame."""
-    modifier, mesh_object = smooth(), bpy.data.objects["elbow"]
+    """A property of the mesh object drives the strength, and the frame drives the property."""
+    modifier, mesh_object = build_smoothed_tube(), bpy.data.objects["elbow"]
     add_property(mesh_object, "softness")
-    follow(modifier, "factor", mesh_object, '["softness"]')
+    drive_by_property(modifier, "factor", mesh_object, '["softness"]')
     mesh_object.driver_add('["softness"]').driver.expression = "min(1, frame / 30)"
 
 
 def keyed_property_without_a_range() -> None:
-    modifier, armature_object = smooth(), bpy.data.objects["elbow_rig"]
+    modifier, armature_object = build_smoothed_tube(), bpy.data.objects["elbow_rig"]
     armature_object["soft"] = 0.0
-    follow(modifier, "factor", armature_object, '["soft"]')
-    key(armature_object, '["soft"]', 0.0, 1.0)
+    drive_by_property(modifier, "factor", armature_object, '["soft"]')
+    insert_keys(armature_object, '["soft"]', 0.0, 1.0)
 
 
 def property_of_the_scene() -> None:
-    modifier, scene = smooth(), bpy.context.scene
+    modifier, scene = build_smoothed_tube(), bpy.context.scene
     scene["soft"] = 0.0
     driver = modifier.driver_add("factor").driver
     variable = driver.variables.new()
     variable.name, variable.targets[0].id_type = "soft", "SCENE"
     variable.targets[0].id, variable.targets[0].data_path = scene, '["soft"]'
     driver.expression = "soft"
-    key(scene, '["soft"]', 0.0, 1.0)
+    insert_keys(scene, '["soft"]', 0.0, 1.0)
 
 
 def shape_driven_by_frame() -> None:
@@ -93,12 +93,12 @@ def keyed_evaluation_time() -> None:
     stacks.absolute_shape_keys()
     keys = bpy.data.objects["elbow"].data.shape_keys
     keys.driver_remove("eval_time")
-    key(keys, "eval_time", 0.0, 10.0)
+    insert_keys(keys, "eval_time", 0.0, 10.0)
 
 
 def keyed_lattice() -> None:
     stacks.lattice()
-    key(bpy.data.objects["lattice"], "location", (0.25, 0.0, 0.0), (0.25, 0.0, 0.05))
+    insert_keys(bpy.data.objects["lattice"], "location", (0.25, 0.0, 0.0), (0.25, 0.0, 0.05))
 
 
 def hook_on_a_moving_parent() -> None:
@@ -106,13 +106,13 @@ def hook_on_a_moving_parent() -> None:
     parent = link(bpy.data.objects.new("mover", None))
     handle = bpy.data.objects["handle"]
     handle.parent = parent
-    key(parent, "location", (0.0, 0.0, 0.0), (0.0, 0.0, 0.05))
+    insert_keys(parent, "location", (0.0, 0.0, 0.0), (0.0, 0.0, 0.05))
 
 
 def hook_that_copies_what_moves() -> None:
     stacks.hook()
     mover, handle = link(bpy.data.objects.new("mover", None)), bpy.data.objects["handle"]
-    key(mover, "location", (0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
+    insert_keys(mover, "location", (0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
     handle.constraints.new("COPY_LOCATION").target = mover
 
 
@@ -126,14 +126,14 @@ def keyed_texture() -> None:
     stacks.displace()
     modifier = bpy.data.objects["elbow"].modifiers["Displace"]
     modifier.texture, modifier.strength = bpy.data.textures.new("clouds", "CLOUDS"), 0.05
-    key(modifier.texture, "noise_scale", 0.05, 0.5)
+    insert_keys(modifier.texture, "noise_scale", 0.05, 0.5)
 
 
 def keyed_nodes() -> None:
     stacks.geometry_nodes()
     group = bpy.data.objects["elbow"].modifiers["Ripple"].node_group
     scale = next(node for node in group.nodes if getattr(node, "operation", "") == "SCALE")
-    key(scale.inputs["Scale"], "default_value", 0.0, 0.05)
+    insert_keys(scale.inputs["Scale"], "default_value", 0.0, 0.05)
 
 
 def nodes_that_read_a_mover() -> None:
@@ -142,7 +142,7 @@ def nodes_that_read_a_mover() -> None:
     mover, info = link(bpy.data.objects.new("mover", None)), group.nodes.new("GeometryNodeObjectInfo")
     info.inputs["Object"].default_value = mover
     group.links.new(info.outputs["Location"], group.nodes["Set Position"].inputs["Offset"])
-    key(mover, "location", (0.0, 0.0, 0.0), (0.0, 0.0, 0.05))
+    insert_keys(mover, "location", (0.0, 0.0, 0.0), (0.0, 0.0, 0.05))
 
 
 def second_armature_whose_rotation_is_driven() -> None:
@@ -154,44 +154,46 @@ def second_armature_whose_rotation_is_driven() -> None:
 def keyed_shape() -> None:
     controls.free_shape_keys()
     block = bpy.data.objects["elbow"].data.shape_keys.key_blocks["flexed"]
-    key(block, "value", 0.0, 1.0)
+    insert_keys(block, "value", 0.0, 1.0)
 
 
 def keyed_shape_of_a_lattice() -> None:
     controls.lattice_shape_key()
-    key(bpy.data.objects["lattice"].data.shape_keys.key_blocks["thick"], "value", 0.0, 1.0)
+    insert_keys(bpy.data.objects["lattice"].data.shape_keys.key_blocks["thick"], "value", 0.0, 1.0)
 
 
 def keyed_property() -> None:
     controls.modifier_strength()
-    key(bpy.data.objects["elbow"], '["softness"]', 0.0, 1.0)
+    insert_keys(bpy.data.objects["elbow"], '["softness"]', 0.0, 1.0)
 
 
 def second_armature_with_an_action() -> None:
     two_armatures()
-    key(bpy.data.objects["muscle_rig"].pose.bones["muscle"], "rotation_euler", (-0.3, 0.0, 0.0), (0.3, 0.0, 0.0))
+    insert_keys(
+        bpy.data.objects["muscle_rig"].pose.bones["muscle"], "rotation_euler", (-0.3, 0.0, 0.0), (0.3, 0.0, 0.0)
+    )
 
 
 def one_value_in_all_frames() -> None:
-    key(smooth(), "factor", 0.5, 0.5)
+    insert_keys(build_smoothed_tube(), "factor", 0.5, 0.5)
 
 
 def a_hidden_modifier_with_keys() -> None:
-    modifier = smooth()
-    key(modifier, "factor", 0.0, 1.0)
+    modifier = build_smoothed_tube()
+    insert_keys(modifier, "factor", 0.0, 1.0)
     modifier.show_viewport = False
 
 
 def a_live_modifier_with_keys() -> None:
     stacks.subdivided()
-    key(bpy.data.objects["elbow"].modifiers["Thickness"], "thickness", 0.0, 0.1)
+    insert_keys(bpy.data.objects["elbow"].modifiers["Thickness"], "thickness", 0.0, 0.1)
 
 
 def what_moves_nothing() -> None:
-    modifier, mesh_object = smooth(), bpy.data.objects["elbow"]
-    key(modifier, "show_render", False, True)
-    key(mesh_object, "hide_render", False, True)
-    key(mesh_object, "pass_index", 0, 5)
+    modifier, mesh_object = build_smoothed_tube(), bpy.data.objects["elbow"]
+    insert_keys(modifier, "show_render", False, True)
+    insert_keys(mesh_object, "hide_render", False, True)
+    insert_keys(mesh_object, "pass_index", 0, 5)
     mesh_object.driver_add("color", 0).driver.expression = "frame / 30"
 
 
@@ -201,23 +203,23 @@ def a_muted_shape_with_keys() -> None:
 
 
 def a_lattice_that_is_carried() -> None:
-    """The whole character, its lattice with it, follows an empty that is animated."""
+    """The whole character and its lattice are children of an animated empty."""
     stacks.lattice()
     carrier = link(bpy.data.objects.new("carrier", None))
     for name in ("elbow_rig", "lattice"):
         bpy.data.objects[name].parent = carrier
-    key(carrier, "location", (0.0, 0.0, 0.0), (5.0, 1.0, 0.0))
+    insert_keys(carrier, "location", (0.0, 0.0, 0.0), (5.0, 1.0, 0.0))
 
 
 def bones_that_move_with_time() -> None:
-    """What depends on time in the armature itself is the pose, which a model is told."""
+    """Bones that change with time change the pose, which is an input of the model."""
     _, armature_object = tube()
     bone = armature_object.pose.bones["upper"]
-    free(bone)
+    remove_constraints(bone)
     bone.driver_add("rotation_euler", 2).driver.expression = "frame / 60"
     copy = armature_object.pose.bones["lower"].constraints.new("COPY_ROTATION")
     copy.target, copy.subtarget, copy.influence = armature_object, "upper", 0.0
-    key(copy, "influence", 0.0, 1.0)
+    insert_keys(copy, "influence", 0.0, 1.0)
 
 
 REFUSED: tuple[Callable[[], None], ...] = (
@@ -235,12 +237,12 @@ HARMLESS: tuple[Callable[[], None], ...] = (
 )  # fmt: skip
 
 
-def _reads_frame(variable_type: str) -> None:
-    driver = smooth().driver_add("factor").driver
+def _drive_by_frame(variable_type: str) -> None:
+    driver = build_smoothed_tube().driver_add("factor").driver
     variable = driver.variables.new()
-    variable.name, variable.type = "now", variable_type
+    variable.name, variable.type = "current_frame", variable_type
     if variable_type == "SINGLE_PROP":
         variable.targets[0].id_type = "SCENE"
         variable.targets[0].id = bpy.context.scene
     variable.targets[0].data_path = "frame_current"
-    driver.expression = "now / 30"
+    driver.expression = "current_frame / 30"

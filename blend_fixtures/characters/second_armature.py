@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters that bones of a second armature deform: one function each, which builds it in the current scene.
+"""Build characters that bones of a second armature deform; each function builds one in the current scene.
 
-Of `REFUSED` the second armature can move the surface by numbers that are no controls. Of `TOLD` what it does is a
-control, or follows from the first.
+In `REFUSED`, the second armature moves the surface by properties that are not controls. In `TOLD`, the motion of the
+second armature is a control, or it depends only on the first armature.
 """
 
 from collections.abc import Callable
@@ -15,42 +15,42 @@ from .bones import NewBone, add_bones, limit
 from .controls import add_key
 from .skinning import two_armatures
 
-MUSCLES, MUSCLE = "muscle_rig", "muscle"
+ARMATURE, BONE = "muscle_rig", "muscle"
 
 
-def bone() -> bpy.types.PoseBone:
-    """The bone of the second armature."""
-    return bpy.data.objects[MUSCLES].pose.bones[MUSCLE]
+def muscle_bone() -> bpy.types.PoseBone:
+    """Return the pose bone of the second armature."""
+    return bpy.data.objects[ARMATURE].pose.bones[BONE]
 
 
 def quaternion() -> None:
     two_armatures()
-    bone().rotation_mode = "QUATERNION"
+    muscle_bone().rotation_mode = "QUATERNION"
 
 
 def axis_angle() -> None:
     two_armatures()
-    bone().rotation_mode = "AXIS_ANGLE"
+    muscle_bone().rotation_mode = "AXIS_ANGLE"
 
 
 def free_location() -> None:
     two_armatures()
-    bone().lock_location[2] = False
+    muscle_bone().lock_location[2] = False
 
 
 def free_scale() -> None:
     two_armatures()
-    bone().lock_scale = (False, False, False)
+    muscle_bone().lock_scale = (False, False, False)
 
 
 def free_root() -> None:
-    """The bone that deforms follows one that does not, and is free."""
+    """The parent of the deforming bone is a non-deforming bone without limits."""
     two_armatures()
-    armature_object = bpy.data.objects[MUSCLES]
+    armature_object = bpy.data.objects[ARMATURE]
     add_bones(armature_object, NewBone("root", (0.1, 0.0, -0.1), (0.1, 0.0, 0.0), is_deforming=False))
     bpy.context.view_layer.objects.active = armature_object
     bpy.ops.object.mode_set(mode="EDIT")
-    armature_object.data.edit_bones[MUSCLE].parent = armature_object.data.edit_bones["root"]
+    armature_object.data.edit_bones[BONE].parent = armature_object.data.edit_bones["root"]
     bpy.ops.object.mode_set(mode="OBJECT")
     armature_object.pose.bones["root"].lock_rotation = (False, False, False)
     armature_object.pose.bones["root"].rotation_mode = "QUATERNION"
@@ -60,7 +60,7 @@ def hook_on_a_bone() -> None:
     stacks.hook()
     handle = bpy.data.objects["handle"]
     matrix = handle.matrix_world.copy()
-    handle.parent, handle.parent_type, handle.parent_bone = _free_bones(), "BONE", MUSCLE
+    handle.parent, handle.parent_type, handle.parent_bone = _add_unlocked_armature(), "BONE", BONE
     bpy.context.view_layer.update()
     handle.matrix_world = matrix
 
@@ -70,45 +70,45 @@ def hook_that_copies_a_bone() -> None:
     handle = bpy.data.objects["handle"]
     handle.parent = None
     copy = handle.constraints.new("COPY_TRANSFORMS")
-    copy.target, copy.subtarget = _free_bones(), MUSCLE
+    copy.target, copy.subtarget = _add_unlocked_armature(), BONE
 
 
 def lattice_on_a_bone() -> None:
     stacks.lattice()
     lattice_object = bpy.data.objects["lattice"]
-    lattice_object.vertex_groups.new(name=MUSCLE).add(range(54), 1.0, "REPLACE")
-    lattice_object.modifiers.new("Muscles", "ARMATURE").object = _free_bones()
+    lattice_object.vertex_groups.new(name=BONE).add(range(54), 1.0, "REPLACE")
+    lattice_object.modifiers.new("Muscles", "ARMATURE").object = _add_unlocked_armature()
 
 
 def driver_of_a_bone() -> None:
-    """The driver of a shape key reads how a bone is turned."""
-    _follow_transform("ROT_X")
+    """A driver of a shape key reads the rotation of a bone."""
+    _drive_by_bone_transform("ROT_X")
 
 
 def driver_of_a_channel() -> None:
-    """The driver of a shape key reads a number of a quaternion."""
+    """A driver of a shape key reads a component of a bone's quaternion."""
     mesh_object, _ = tube()
-    armature_object = _free_bones()
+    armature_object = _add_unlocked_armature()
     driver = add_key(mesh_object, "flexed", bulge).driver_add("value").driver
     variable = driver.variables.new()
     variable.name, variable.targets[0].id = "x", armature_object
-    variable.targets[0].data_path = f'pose.bones["{MUSCLE}"].rotation_quaternion[1]'
+    variable.targets[0].data_path = f'pose.bones["{BONE}"].rotation_quaternion[1]'
     driver.expression = "x"
 
 
 def limited_location() -> None:
     two_armatures()
-    limit(bone(), "LIMIT_LOCATION", {2: (-0.02, 0.02)})
+    limit(muscle_bone(), "LIMIT_LOCATION", {2: (-0.02, 0.02)})
 
 
 def copied_from_the_first() -> None:
-    """Free bones that a constraint takes to a bone of the first armature which deforms nothing."""
+    """The unlocked bone copies the transforms of a non-deforming bone of the first armature."""
     two_armatures()
     armature_object = bpy.data.objects["elbow_rig"]
     add_bones(armature_object, NewBone("handle", (0.1, 0.0, 0.0), (0.1, 0.0, 0.1), is_deforming=False))
     limit(armature_object.pose.bones["handle"], "LIMIT_ROTATION", {0: (-20.0, 20.0)})
-    _release(bone())
-    copy = bone().constraints.new("COPY_TRANSFORMS")
+    _unlock(muscle_bone())
+    copy = muscle_bone().constraints.new("COPY_TRANSFORMS")
     copy.target, copy.subtarget = armature_object, "handle"
 
 
@@ -119,25 +119,25 @@ REFUSED: tuple[Callable[[], None], ...] = (
 TOLD: tuple[Callable[[], None], ...] = (two_armatures, limited_location, copied_from_the_first)
 
 
-def _free_bones() -> bpy.types.Object:
-    """A second armature as Blender makes it: quaternions, nothing locked."""
-    found = link(bpy.data.objects.new(MUSCLES, bpy.data.armatures.new(MUSCLES)))
-    add_bones(found, NewBone(MUSCLE, (0.1, 0.0, 0.0), (0.1, 0.0, 0.1)))
-    _release(found.pose.bones[MUSCLE])
-    return found
+def _add_unlocked_armature() -> bpy.types.Object:
+    """Add a second armature with Blender's defaults: quaternion rotation and no locks."""
+    armature_object = link(bpy.data.objects.new(ARMATURE, bpy.data.armatures.new(ARMATURE)))
+    add_bones(armature_object, NewBone(BONE, (0.1, 0.0, 0.0), (0.1, 0.0, 0.1)))
+    _unlock(armature_object.pose.bones[BONE])
+    return armature_object
 
 
-def _release(free: bpy.types.PoseBone) -> None:
-    free.rotation_mode = "QUATERNION"
-    free.lock_location = free.lock_rotation = free.lock_scale = (False, False, False)
+def _unlock(pose_bone: bpy.types.PoseBone) -> None:
+    pose_bone.rotation_mode = "QUATERNION"
+    pose_bone.lock_location = pose_bone.lock_rotation = pose_bone.lock_scale = (False, False, False)
 
 
-def _follow_transform(channel: str) -> None:
+def _drive_by_bone_transform(channel: str) -> None:
     mesh_object, _ = tube()
     driver = add_key(mesh_object, "flexed", bulge).driver_add("value").driver
     variable = driver.variables.new()
-    variable.name, variable.type = "turn", "TRANSFORMS"
+    variable.name, variable.type = "transform", "TRANSFORMS"
     target = variable.targets[0]
-    target.id, target.bone_target, target.transform_type = _free_bones(), MUSCLE, channel
+    target.id, target.bone_target, target.transform_type = _add_unlocked_armature(), BONE, channel
     target.transform_space = "LOCAL_SPACE"
-    driver.expression = "turn"
+    driver.expression = "transform"

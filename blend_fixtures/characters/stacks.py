@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters whose modifiers deform them in many ways: one function each, which builds it in the current scene."""
+"""Build characters with many kinds of deforming modifiers; each function builds one in the current scene."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -11,7 +11,7 @@ from .base import add_driven_key, bulge, cage, drive, link, skin, tube
 
 
 def corrective_smooth() -> None:
-    """Delta mush that was bound to the rest pose."""
+    """Build a tube with delta mush that is bound to the rest pose."""
     mesh_object, _ = tube()
     modifier = mesh_object.modifiers.new("Mush", "CORRECTIVE_SMOOTH")
     modifier.rest_source, modifier.iterations = "BIND", 8
@@ -19,7 +19,7 @@ def corrective_smooth() -> None:
 
 
 def lattice() -> None:
-    """A lattice that bulges before the skinning, with a shape key that the bend drives."""
+    """Build a tube that a lattice deforms before the skinning; the elbow drives a shape key of the lattice."""
     mesh_object, armature_object = tube()
     data = bpy.data.lattices.new("lattice")
     data.points_u, data.points_v, data.points_w = 6, 3, 3
@@ -32,7 +32,7 @@ def lattice() -> None:
 
 
 def mesh_deform() -> None:
-    """A cage that bulges before the skinning."""
+    """Build a tube that a bulging cage deforms before the skinning."""
     mesh_object, armature_object = tube()
     target = cage("cage", 1.4)
     add_driven_key(target, armature_object, bulge)
@@ -43,7 +43,7 @@ def mesh_deform() -> None:
 
 
 def surface_deform() -> None:
-    """A mesh that sticks to another one, which is skinned and smoothed."""
+    """Build a mesh that is bound to the surface of another mesh, which is skinned and smoothed."""
     mesh_object, armature_object = tube()
     target = cage("body", 1.1)
     skin(target, armature_object)
@@ -54,7 +54,7 @@ def surface_deform() -> None:
 
 
 def shrinkwrap() -> None:
-    """A sleeve that is pulled onto a body, which is skinned and smoothed."""
+    """Build a sleeve with a Shrinkwrap onto a body that is skinned and smoothed."""
     mesh_object, armature_object = tube()
     target = cage("body", 0.9)
     skin(target, armature_object)
@@ -64,30 +64,30 @@ def shrinkwrap() -> None:
 
 
 def smooth() -> None:
-    """Plain smoothing after the skinning."""
+    """Build a tube with a Smooth modifier after the skinning."""
     _smooth(tube()[0])
 
 
 def laplacian_smooth() -> None:
-    """Laplacian smoothing after the skinning."""
+    """Build a tube with a Laplacian Smooth modifier after the skinning."""
     mesh_object, _ = tube()
     modifier = mesh_object.modifiers.new("LaplacianSmooth", "LAPLACIANSMOOTH")
     modifier.iterations, modifier.lambda_factor = 2, 0.5
 
 
 def laplacian_deform() -> None:
-    """Both ends of the tube are skinned; what is between them follows their details."""
+    """Build a tube with skinned ends; Laplacian Deform moves the surface between them."""
     mesh_object, _ = tube()
     anchors = mesh_object.vertex_groups.new(name="anchors")
-    along = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
-    anchors.add(np.flatnonzero((along < 0.18) | (along > 0.32)).tolist(), 1.0, "REPLACE")
+    x_positions = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
+    anchors.add(np.flatnonzero((x_positions < 0.18) | (x_positions > 0.32)).tolist(), 1.0, "REPLACE")
     modifier = mesh_object.modifiers.new("LaplacianDeform", "LAPLACIANDEFORM")
     modifier.vertex_group, modifier.iterations = "anchors", 2
     _bind(mesh_object, modifier, bpy.ops.object.laplaciandeform_bind)
 
 
 def hook() -> None:
-    """A hook to an empty, a child of the lower bone, that pulls at the skin before the joint."""
+    """Build a tube with a hook at the surface above the joint; the hooked empty is a child of the lower bone."""
     mesh_object, armature_object = tube()
     empty = link(bpy.data.objects.new("handle", None))
     empty.parent, empty.parent_type, empty.parent_bone = armature_object, "BONE", "lower"
@@ -97,26 +97,26 @@ def hook() -> None:
     modifier.object, modifier.falloff_radius, modifier.strength = empty, 0.15, 0.5
     modifier.center = (0.2, 0.0, 0.04)
     modifier.matrix_inverse = empty.matrix_world.inverted()
-    along = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
-    modifier.vertex_indices_set(np.flatnonzero((along > 0.1) & (along < 0.24)).tolist())
+    x_positions = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
+    modifier.vertex_indices_set(np.flatnonzero((x_positions > 0.1) & (x_positions < 0.24)).tolist())
 
 
 def cast() -> None:
-    """Drawn a little towards a sphere after the skinning."""
+    """Build a tube with a Cast modifier after the skinning."""
     mesh_object, _ = tube()
     modifier = mesh_object.modifiers.new("Cast", "CAST")
     modifier.factor, modifier.size, modifier.use_radius_as_size = 0.2, 0.3, False
 
 
 def curve() -> None:
-    """Along a curve that sags after the skinning, with a shape key that the bend drives."""
+    """Build a tube that a curve deforms before the skinning; the elbow drives a sagging shape key of the curve."""
     mesh_object, armature_object = tube()
     data = bpy.data.curves.new("path", "CURVE")
     data.dimensions = "3D"
     spline = data.splines.new("POLY")
     spline.points.add(6)
-    for number, point in enumerate(spline.points):
-        point.co = (number * 0.1, 0.0, 0.0, 1.0)
+    for index, point in enumerate(spline.points):
+        point.co = (index * 0.1, 0.0, 0.0, 1.0)
     path = link(bpy.data.objects.new("path", data))
 
     def sag(points: np.ndarray) -> np.ndarray:
@@ -129,56 +129,56 @@ def curve() -> None:
 
 
 def geometry_nodes() -> None:
-    """A node group that moves vertices by where they are after the skinning."""
+    """Build a tube with a node group that moves vertices by their position after the skinning."""
     mesh_object, _ = tube()
     mesh_object.modifiers.new("Ripple", "NODES").node_group = ripple_group()
 
 
 def shape_keys() -> None:
-    """A shape key that the bend drives, one that is muted, and Preserve Volume."""
+    """Build a tube with a shape key that the bend of the elbow drives, a muted shape key, and Preserve Volume."""
     mesh_object, armature_object = tube()
     add_driven_key(mesh_object, armature_object, bulge)
-    muted = add_driven_key(mesh_object, armature_object, lambda points: points * 3.0)
-    muted.mute = True
+    muted_key = add_driven_key(mesh_object, armature_object, lambda points: points * 3.0)
+    muted_key.mute = True
     mesh_object.modifiers["Armature"].use_deform_preserve_volume = True
 
 
 def absolute_shape_keys() -> None:
-    """Shape keys that a driven evaluation time goes through, one after the other."""
+    """Build a tube with absolute shape keys whose evaluation time is driven."""
     mesh_object, armature_object = tube()
     mesh_object.shape_key_add(name="Basis", from_mix=False)
-    thick = mesh_object.shape_key_add(name="thick", from_mix=False)
-    points = np.array([point.co for point in thick.data])
-    thick.data.foreach_set("co", bulge(points).astype(np.float32).ravel())
+    thick_key = mesh_object.shape_key_add(name="thick", from_mix=False)
+    points = np.array([point.co for point in thick_key.data])
+    thick_key.data.foreach_set("co", bulge(points).astype(np.float32).ravel())
     keys = mesh_object.data.shape_keys
     keys.use_relative = False
-    # Blender sets the keys ten frames apart.
+    # Blender spaces absolute shape keys ten frames apart.
     drive(keys, "eval_time", armature_object, "10 * bend")
 
 
 def displace() -> None:
-    """Pushed out along the normals after the skinning."""
+    """Build a tube with a Displace modifier along the normals after the skinning."""
     tube()[0].modifiers.new("Displace", "DISPLACE").strength = 0.01
 
 
 def simple_deform() -> None:
-    """Twisted after the skinning."""
+    """Build a tube that is twisted after the skinning."""
     modifier = tube()[0].modifiers.new("Twist", "SIMPLE_DEFORM")
     modifier.deform_method, modifier.deform_axis, modifier.angle = "TWIST", "X", 0.5
 
 
 def warp() -> None:
-    """Space around the joint is warped from one empty to another."""
+    """Build a tube with a Warp modifier near the joint, from one empty to another."""
     mesh_object, _ = tube()
-    ends = [link(bpy.data.objects.new(name, None)) for name in ("from", "to")]
-    for end, height in zip(ends, (0.0, 0.03), strict=True):
-        end.location = (0.3, 0.0, height)
+    empties = [link(bpy.data.objects.new(name, None)) for name in ("from", "to")]
+    for empty, height in zip(empties, (0.0, 0.03), strict=True):
+        empty.location = (0.3, 0.0, height)
     modifier = mesh_object.modifiers.new("Warp", "WARP")
-    modifier.object_from, modifier.object_to, modifier.falloff_radius = *ends, 0.2
+    modifier.object_from, modifier.object_to, modifier.falloff_radius = *empties, 0.2
 
 
 def subdivided() -> None:
-    """Delta mush, and after it modifiers that make vertices: two subdivisions and thickness."""
+    """Build a tube with delta mush, followed by modifiers that add vertices: Subdivision, Solidify and nodes."""
     corrective_smooth()
     mesh_object = bpy.data.objects["elbow"]
     mesh_object.modifiers.new("Subdivision", "SUBSURF")
@@ -193,45 +193,45 @@ STACKS: tuple[Callable[[], None], ...] = (
 
 
 def ripple_group() -> bpy.types.NodeTree:
-    """Moves each vertex by some millimeters, in a direction that depends on its place."""
-    group = chain("Ripple", "GeometryNodeSetPosition")
-    position, wave, scale = (
-        group.nodes.new(kind) for kind in ("GeometryNodeInputPosition", *["ShaderNodeVectorMath"] * 2)
+    """Build a node group that moves each vertex by some millimeters, in a direction that depends on its position."""
+    group = build_node_chain("Ripple", "GeometryNodeSetPosition")
+    position, sine, offset_scale = (
+        group.nodes.new(node_type) for node_type in ("GeometryNodeInputPosition", *["ShaderNodeVectorMath"] * 2)
     )
     position_scale = group.nodes.new("ShaderNodeVectorMath")
-    position_scale.operation, wave.operation, scale.operation = "SCALE", "SINE", "SCALE"
-    position_scale.inputs["Scale"].default_value, scale.inputs["Scale"].default_value = 30.0, 0.003
+    position_scale.operation, sine.operation, offset_scale.operation = "SCALE", "SINE", "SCALE"
+    position_scale.inputs["Scale"].default_value, offset_scale.inputs["Scale"].default_value = 30.0, 0.003
     for source, target in (
         (position.outputs[0], position_scale.inputs[0]),
-        (position_scale.outputs[0], wave.inputs[0]),
-        (wave.outputs[0], scale.inputs[0]),
-        (scale.outputs[0], group.nodes["Set Position"].inputs["Offset"]),
+        (position_scale.outputs[0], sine.inputs[0]),
+        (sine.outputs[0], offset_scale.inputs[0]),
+        (offset_scale.outputs[0], group.nodes["Set Position"].inputs["Offset"]),
     ):
         group.links.new(source, target)
     return group
 
 
 def subdividing_group() -> bpy.types.NodeTree:
-    """Makes four faces of each."""
-    return chain("Subdivide", "GeometryNodeSubdivideMesh")
+    """Build a node group that subdivides each face into four."""
+    return build_node_chain("Subdivide", "GeometryNodeSubdivideMesh")
 
 
-def chain(name: str, *kinds: str) -> bpy.types.NodeTree:
-    """A node group that sends its geometry through nodes of these kinds, one after the other."""
+def build_node_chain(name: str, *node_types: str) -> bpy.types.NodeTree:
+    """Build a node group that passes its geometry through nodes of the given types in this order."""
     group = bpy.data.node_groups.new(name, "GeometryNodeTree")
     for in_out in ("INPUT", "OUTPUT"):
         group.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
-    for kind in ("NodeGroupInput", *kinds, "NodeGroupOutput"):
-        group.nodes.new(kind)
-    link_chain(group)
+    for node_type in ("NodeGroupInput", *node_types, "NodeGroupOutput"):
+        group.nodes.new(node_type)
+    link_geometry_sockets(group)
     return group
 
 
-def link_chain(group: bpy.types.NodeTree) -> None:
-    """Send geometry through the nodes of a group in their order, as far as they have sockets for it."""
-    for before, after in pairwise(group.nodes):
-        source = next((socket for socket in before.outputs if socket.type == "GEOMETRY"), None)
-        target = next((socket for socket in after.inputs if socket.type == "GEOMETRY"), None)
+def link_geometry_sockets(group: bpy.types.NodeTree) -> None:
+    """Link the geometry sockets of each node of a group with those of the next node."""
+    for node, next_node in pairwise(group.nodes):
+        source = next((socket for socket in node.outputs if socket.type == "GEOMETRY"), None)
+        target = next((socket for socket in next_node.inputs if socket.type == "GEOMETRY"), None)
         if source and target:
             group.links.new(source, target)
 
@@ -246,7 +246,7 @@ def _move_first(mesh_object: bpy.types.Object, modifier: bpy.types.Modifier) -> 
 
 
 def _bind(mesh_object: bpy.types.Object, modifier: bpy.types.Modifier, operator: Callable) -> None:
-    """Press the button of a modifier that remembers the rest pose."""
+    """Run the operator that binds a modifier to the rest pose."""
     bpy.context.view_layer.update()
     with bpy.context.temp_override(object=mesh_object, active_object=mesh_object):
         operator(modifier=modifier.name)

@@ -45,7 +45,7 @@ class Trainings:
         Args:
             recording: folder of the recording.
             model: file to write the model to.
-            options: of `python -m trainer`.
+            options: options of `python -m trainer`.
         """
         arguments = [str(argument) for argument in (recording, model, *options)]
         self._pending.append((arguments, os.fstat(self._errors.fileno()).st_size))
@@ -56,7 +56,7 @@ class Trainings:
         """Wait until all trainings have ended.
 
         Raises:
-            RuntimeError: a training failed; the message holds what the process has written since it was added.
+            RuntimeError: a training failed; the message contains the errors of the process since then.
         """
         while self._pending:
             arguments, error_start = self._pending.pop(0)

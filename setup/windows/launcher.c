@@ -1,28 +1,28 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-/* The python.exe of a virtual environment on Windows: starts the python.exe in the folder that pyvenv.cfg names as `home`,
-   with the same arguments, tells it by __PYVENV_LAUNCHER__ who was called, waits, and passes its exit status on. As with
-   CPython's own venvlauncher.exe, which it stands for, that Python ends when this process is ended. */
+/* The python.exe of a virtual environment on Windows. It replaces CPython's venvlauncher.exe. It starts the python.exe in the
+   folder that pyvenv.cfg names as `home`, with the same arguments, waits for it, and exits with its status. The variable
+   __PYVENV_LAUNCHER__ gives that Python the path of this program. When this process is killed, that Python is killed too. */
 #include <windows.h>
 #include <stdio.h>
 #include <wchar.h>
 
-#define LONGEST 32768
+#define MAX_PATH_LENGTH 32768
 
-static wchar_t self[LONGEST], folder[LONGEST], config[LONGEST], home[LONGEST], command[2 * LONGEST];
+static wchar_t self[MAX_PATH_LENGTH], folder[MAX_PATH_LENGTH], config[MAX_PATH_LENGTH], home[MAX_PATH_LENGTH], command[2 * MAX_PATH_LENGTH];
 
-static FILE *config_in(const wchar_t *path) {
-    _snwprintf(config, LONGEST, L"%ls\\pyvenv.cfg", path);
+static FILE *open_config(const wchar_t *path) {
+    _snwprintf(config, MAX_PATH_LENGTH, L"%ls\\pyvenv.cfg", path);
     return _wfopen(config, L"rb");
 }
 
 int wmain(void) {
-    GetModuleFileNameW(NULL, self, LONGEST);
+    GetModuleFileNameW(NULL, self, MAX_PATH_LENGTH);
     wcscpy(folder, self);
     *wcsrchr(folder, L'\\') = 0;
-    FILE *file = config_in(folder);
-    if (!file) { /* in Scripts, and pyvenv.cfg above it */
+    FILE *file = open_config(folder);
+    if (!file) { /* this program is in Scripts, and pyvenv.cfg in the folder above */
         *wcsrchr(folder, L'\\') = 0;
-        file = config_in(folder);
+        file = open_config(folder);
     }
     if (!file) {
         fwprintf(stderr, L"failed to locate pyvenv.cfg\n");
@@ -34,19 +34,19 @@ int wmain(void) {
         if (value && !strncmp(line, "home", 4)) {
             for (value++; *value == ' '; value++) {}
             value[strcspn(value, "\r\n")] = 0;
-            MultiByteToWideChar(CP_UTF8, 0, value, -1, home, LONGEST);
+            MultiByteToWideChar(CP_UTF8, 0, value, -1, home, MAX_PATH_LENGTH);
         }
     }
     fclose(file);
 
-    wchar_t *arguments = GetCommandLineW(); /* all of it, but for what was called */
+    wchar_t *arguments = GetCommandLineW(); /* the command line without the program's own name */
     if (*arguments == L'"') {
         for (arguments++; *arguments && *arguments != L'"'; arguments++) {}
         if (*arguments) arguments++;
     } else {
         while (*arguments && *arguments != L' ') arguments++;
     }
-    _snwprintf(command, 2 * LONGEST, L"\"%ls\\python.exe\"%ls", home, arguments);
+    _snwprintf(command, 2 * MAX_PATH_LENGTH, L"\"%ls\\python.exe\"%ls", home, arguments);
     SetEnvironmentVariableW(L"__PYVENV_LAUNCHER__", self);
 
     HANDLE job = CreateJobObject(NULL, NULL);

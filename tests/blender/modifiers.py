@@ -61,6 +61,6 @@ def add_nodes_at(index: int, *kinds: str) -> Callable[[bpy.types.Object], None]:
     """Return a function that adds Geometry Nodes with a chain of nodes to an object, at an index of its stack."""
 
     def add(mesh_object: bpy.types.Object) -> None:
-        add_modifier_at(index, "NODES", node_group=stacks.chain("Group", *kinds))(mesh_object)
+        add_modifier_at(index, "NODES", node_group=stacks.build_node_chain("Group", *kinds))(mesh_object)
 
     return add

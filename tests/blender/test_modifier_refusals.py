@@ -19,17 +19,17 @@ from .scene_state import assert_same_state, drain, scene_state
 
 
 def simulating(mesh_object: bpy.types.Object) -> None:
-    group = stacks.chain("Group", "GeometryNodeSimulationInput", "GeometryNodeSimulationOutput")
+    group = stacks.build_node_chain("Group", "GeometryNodeSimulationInput", "GeometryNodeSimulationOutput")
     group.nodes["Simulation Input"].pair_with_output(group.nodes["Simulation Output"])
-    stacks.link_chain(group)
+    stacks.link_geometry_sockets(group)
     add_modifier_at(2, "NODES", node_group=group)(mesh_object)
 
 
 def in_a_nested_group(mesh_object: bpy.types.Object) -> None:
-    inner, outer = stacks.ripple_group(), stacks.chain("Outer", "GeometryNodeGroup")
+    inner, outer = stacks.ripple_group(), stacks.build_node_chain("Outer", "GeometryNodeGroup")
     inner.nodes.new("GeometryNodeInputSceneTime")
     outer.nodes["Group"].node_tree = inner
-    stacks.link_chain(outer)
+    stacks.link_geometry_sockets(outer)
     add_modifier_at(2, "NODES", node_group=outer)(mesh_object)
 
 

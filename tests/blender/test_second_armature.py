@@ -101,7 +101,7 @@ def test_a_bone_that_is_an_input_of_the_model_is_recorded(build, tmp_path):
     if build is second_armature.copied_from_the_first:
         bone = rig.armature_object.pose.bones["handle"]
     else:
-        bone = second_armature.bone()
+        bone = second_armature.muscle_bone()
     for axis in (0, 2):
         bone.rotation_euler[axis] = 0.3
         bone.location[axis] = 0.0 if bone.lock_location[axis] else 0.02

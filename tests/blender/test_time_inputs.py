@@ -188,7 +188,7 @@ def second_armature_on(flesh: bpy.types.Object) -> None:
     add_bones(muscles, NewBone("muscle", (0.1, 0.0, 0.0), (0.1, 0.0, 0.1)))
     flesh.vertex_groups.new(name="muscle").add(range(60), 1.0, "REPLACE")
     flesh.modifiers.new("Muscles", "ARMATURE").object = muscles
-    in_time.key(muscles.pose.bones["muscle"], "rotation_euler", (0.0, 0.0, 0.0), (0.3, 0.0, 0.0))
+    in_time.insert_keys(muscles.pose.bones["muscle"], "rotation_euler", (0.0, 0.0, 0.0), (0.3, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("build", in_time.HARMLESS, ids=lambda build: build.__name__)

@@ -36,7 +36,7 @@ posix_only = pytest.mark.skipif(WINDOWS, reason="setup/environment is a POSIX sh
 
 def write_complete_environment(folder: Path, contents: str = "blender") -> None:
     """Write the Python and the stamp of a complete environment that this Python has made."""
-    for path in (environment.program(folder, "python"), folder / environment.STAMP):
+    for path in (environment.program_path(folder, "python"), folder / environment.STAMP):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(environment.fingerprint(contents))
 
@@ -120,7 +120,7 @@ def test_a_failed_setup_leaves_no_stamp(tmp_path: Path, monkeypatch: pytest.Monk
     write_complete_environment(tmp_path)
     monkeypatch.setenv("PYTHONHOME", str(tmp_path / "nowhere"))  # lets the started Python fail at once
     monkeypatch.setattr(environment, "check_system_libraries", lambda: None)
-    with pytest.raises(environment.SetupError, match="could not be made a virtual environment"):
+    with pytest.raises(environment.SetupError, match="could not be created"):
         environment.make(tmp_path, "blender")
     assert not (tmp_path / environment.STAMP).exists()
 
@@ -139,7 +139,7 @@ def test_only_an_environment_of_this_python_is_kept(tmp_path: Path, monkeypatch:
     assert is_environment_made(folder, monkeypatch), "The folder has no environment."
     write_complete_environment(folder)
     assert not is_environment_made(folder, monkeypatch)
-    environment.program(folder, "python").unlink()
+    environment.program_path(folder, "python").unlink()
     assert is_environment_made(folder, monkeypatch), "The environment has no Python."
     write_complete_environment(folder)
     monkeypatch.setattr(sys, "version", sys.version + " of another build")
@@ -183,7 +183,7 @@ def test_a_linked_environment_is_not_changed(tmp_path: Path, monkeypatch: pytest
     (shared_environment / "bin" / "python").write_text("in use")
     (shared_environment / environment.STAMP).write_text("of other requirements")
     link.symlink_to(shared_environment)
-    monkeypatch.setattr(environment, "run", lambda *_, **__: pytest.fail("A setup step was run."))
+    monkeypatch.setattr(environment, "run_step", lambda *_, **__: pytest.fail("A setup step was run."))
     with pytest.raises(environment.SetupError, match=r"\.venv is a link to '.*shared' and is not up to date"):
         environment.make(link, "everything")
     assert (shared_environment / "bin" / "python").read_text() == "in use" and (
@@ -258,7 +258,7 @@ def test_the_staged_extension_has_the_files_that_blender_expects(tmp_path: Path,
     monkeypatch.setattr(package, "STAGE", tmp_path / "stage")
     wheel = tmp_path / "onnxruntime-1-cp311-cp311-linux.whl"
     wheel.write_bytes(b"wheel")
-    package.stage("linux-x64", [wheel])
+    package.stage_files("linux-x64", [wheel])
     manifest = tomllib.loads((tmp_path / "stage/blender_manifest.toml").read_text())
     assert manifest["version"] == PROJECT["project"]["version"]
     assert manifest["platforms"] == ["linux-x64"]
@@ -274,16 +274,24 @@ def test_the_staged_extension_has_the_files_that_blender_expects(tmp_path: Path,
 
 
 def test_platforms_of_a_package():
-    assert package.asked_platforms([]) == [package.this_platform()]
+    assert package.select_platforms([]) == [package.current_platform()]
     all_platforms = ["linux-x64", "linux-arm64", "macos-arm64", "windows-x64", "windows-arm64"]
-    assert package.asked_platforms(["all"]) == all_platforms
-    assert package.asked_platforms(["windows-x64"]) == ["windows-x64"]
+    assert package.select_platforms(["all"]) == all_platforms
+    assert package.select_platforms(["windows-x64"]) == ["windows-x64"]
 
 
 def test_linux_has_a_second_zip_for_python_3_14():
     """A zip with three wheels of 24 MB would exceed the size limit."""
-    assert package.builds("linux-x64") == package.builds("linux-arm64") == [("3.11", "3.13"), ("3.14",)]
-    assert package.builds("windows-x64") == package.builds("macos-arm64") == [("3.11", "3.13")]
+    assert (
+        package.python_versions_of_zips("linux-x64")
+        == package.python_versions_of_zips("linux-arm64")
+        == [("3.11", "3.13"), ("3.14",)]
+    )
+    assert (
+        package.python_versions_of_zips("windows-x64")
+        == package.python_versions_of_zips("macos-arm64")
+        == [("3.11", "3.13")]
+    )
 
 
 def test_a_platform_without_wheels_is_refused():
@@ -302,7 +310,7 @@ def test_a_package_that_is_too_large_is_refused(tmp_path: Path):
         file.truncate(60_000_000)
         package.check_size(zip_path)
         file.truncate(61_000_000)
-    with pytest.raises(package.PackageError, match=r"large\.zip has 61 MB and may have 60; look for"):
+    with pytest.raises(package.PackageError, match=r"large\.zip has 61 MB, more than the limit of 60 MB; look for"):
         package.check_size(zip_path)
 
 

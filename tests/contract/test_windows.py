@@ -49,5 +49,5 @@ def test_a_missing_windows_python_is_reported_with_its_setup(tmp_path: Path):
     command = [ROOT / "setup/windows/run", "3.13", "-c", "pass"]
     result = subprocess.run(command, env={**os.environ, "FDDA_WINDOWS": str(tmp_path)}, capture_output=True, text=True)
     assert result.returncode == 2 and result.stderr.count("\n") == 1
-    assert os.getuid() or "make it: setup/windows/setup 3.13" in result.stderr
+    assert os.getuid() or "create it: setup/windows/setup 3.13" in result.stderr
     assert subprocess.run([*command[:1], "3.12", "-c", "pass"], capture_output=True).returncode == 2
