@@ -21,8 +21,16 @@ import bpy
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "gui"))
 
 import sidebar
-from path_story import job_done, main_screen, part
-from window import check, over, picture, press, rest_mouse, until
+from arm import extension_module, wait_for_job
+from window import (
+    main_screen,
+    park_mouse,
+    press_keys,
+    region_override,
+    require,
+    save_screenshot,
+    wait_until,
+)
 
 RIG, OUT = (Path(argument).resolve() for argument in sys.argv[sys.argv.index("--") + 1 :][:2])
 TIME_LIMIT_S = 300
@@ -53,56 +61,58 @@ def make_first_model() -> Iterator[float]:
 
     bpy.ops.wm.open_mainfile(filepath=str(user_file), load_ui=False)
     yield 1.0
-    with over("WINDOW"):
+    with region_override("WINDOW"):
         bpy.ops.object.select_all(action="DESELECT")
         find_character().select_set(True)
         bpy.context.view_layer.objects.active = find_character()
         bpy.ops.view3d.view_selected()
-    yield from sidebar.show()
+    yield from sidebar.open_tab()
     yield 1.0
     yield from sidebar.open_section("rig")
-    yield from picture(OUT / "1_rig.png")
+    yield from save_screenshot(OUT / "1_rig.png")
     note_time("opened, rig read")
     yield from sidebar.open_section("poses")
-    yield from picture(OUT / "2_poses.png")
-    if not part("panels.poses").has_any_limits(part("scene.active_rig").cached_active_rig(bpy.context)):
-        yield from sidebar.push("fdda.human_limits(")
+    yield from save_screenshot(OUT / "2_poses.png")
+    if not extension_module("panels.poses").has_any_limits(
+        extension_module("scene.active_rig").cached_active_rig(bpy.context)
+    ):
+        yield from sidebar.press_button("fdda.human_limits(")
         yield 0.5
-    yield from sidebar.push("fdda.preview_pose", across=0.45)
+    yield from sidebar.press_button("fdda.preview_pose", across=0.45)
     yield 0.5
-    yield from picture(OUT / "3_pose.png")
-    yield from sidebar.push("fdda.rest_pose", across=0.85)
+    yield from save_screenshot(OUT / "3_pose.png")
+    yield from sidebar.press_button("fdda.rest_pose", across=0.85)
     note_time("ranges set, a pose previewed")
     yield from sidebar.open_section("recording")
-    yield from sidebar.push("fdda.record(")
-    yield from job_done("record", TIME_LIMIT_S)
-    yield from picture(OUT / "4_recorded.png")
+    yield from sidebar.press_button("fdda.record(")
+    yield from wait_for_job("record", TIME_LIMIT_S)
+    yield from save_screenshot(OUT / "4_recorded.png")
     note_time("recorded")
     yield from sidebar.open_section("training")
-    session = part("training.environment.session")
+    session = extension_module("training.environment.session")
     if session.check_result is None:
-        yield from sidebar.push("fdda.check_trainer", across=0.2)
-        yield from until(lambda: session.check_result is not None, 60, "the check of the trainer does not end")
+        yield from sidebar.press_button("fdda.check_trainer", across=0.2)
+        yield from wait_until(lambda: session.check_result is not None, 60, "the check of the trainer does not end")
     yield 0.3
-    yield from sidebar.push("fdda.train(")
-    yield from job_done("train", TIME_LIMIT_S)
-    yield from picture(OUT / "5_trained.png")
+    yield from sidebar.press_button("fdda.train(")
+    yield from wait_for_job("train", TIME_LIMIT_S)
+    yield from save_screenshot(OUT / "5_trained.png")
     note_time("trained")
     yield from sidebar.open_section("playback")
-    yield from sidebar.push("fdda.bind(")
-    yield from until(lambda: find_character().fdda.is_bound, 20, "the button does not bind the character")
-    check(not find_character().fdda.status, find_character().fdda.status)
+    yield from sidebar.press_button("fdda.bind(")
+    yield from wait_until(lambda: find_character().fdda.is_bound, 20, "the button does not bind the character")
+    require(not find_character().fdda.status, find_character().fdda.status)
     note_time("bound")
-    yield from rest_mouse()
-    yield from press("space")
-    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not start playback")
+    yield from park_mouse()
+    yield from press_keys("space")
+    yield from wait_until(lambda: main_screen().is_animation_playing, 5, "the space bar does not start playback")
     note_time("playing")
     yield 2.0
-    yield from picture(OUT / "6_playing.png")
-    yield from press("space")
-    check(find_character().fdda.mode == "FDDA" and not find_character().fdda.status, find_character().fdda.status)
+    yield from save_screenshot(OUT / "6_playing.png")
+    yield from press_keys("space")
+    require(find_character().fdda.mode == "FDDA" and not find_character().fdda.status, find_character().fdda.status)
     (OUT / "times.json").write_text(json.dumps(step_times, indent=1))
-    check(step_times["playing"] < TIME_LIMIT_S, f"the first model took {step_times['playing']:.0f} s")
+    require(step_times["playing"] < TIME_LIMIT_S, f"the first model took {step_times['playing']:.0f} s")
 
 
 def tick(steps: Iterator[float] = make_first_model()) -> float | None:  # noqa: B008
@@ -113,7 +123,7 @@ def tick(steps: Iterator[float] = make_first_model()) -> float | None:  # noqa: 
         bpy.ops.wm.quit_blender()
     except Exception:  # Blender would print the error and stay open.
         traceback.print_exc()
-        for _ in picture(OUT / "failed.png"):
+        for _ in save_screenshot(OUT / "failed.png"):
             pass
         sys.stdout.flush()
         os._exit(1)

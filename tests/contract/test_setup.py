@@ -255,7 +255,7 @@ def test_make_without_a_target_lists_all_targets():
 
 
 def test_the_staged_extension_has_the_files_that_blender_expects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(package, "STAGE", tmp_path / "stage")
+    monkeypatch.setattr(package, "STAGE_FOLDER", tmp_path / "stage")
     wheel = tmp_path / "onnxruntime-1-cp311-cp311-linux.whl"
     wheel.write_bytes(b"wheel")
     package.stage_files("linux-x64", [wheel])
