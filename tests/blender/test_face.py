@@ -54,7 +54,7 @@ def test_half_of_the_controls_are_shape_keys(face_object, face_folder):
     assert controls == {f'shape_keys/key_blocks["{name}"].value' for name in undriven_names}
 
 
-@pytest.mark.parametrize(("first", "second"), face._correctives(), ids="-".join)
+@pytest.mark.parametrize(("first", "second"), face._corrective_moves(), ids="-".join)
 def test_a_corrective_needs_both_of_its_controls(face_object, first, second):
     """The value of a corrective is 0 if one of its two controls is 0, and grows with both."""
     blocks, jaw = face_object.data.shape_keys.key_blocks, bpy.data.objects[face.ARMATURE].pose.bones["jaw"]
@@ -63,7 +63,7 @@ def test_a_corrective_needs_both_of_its_controls(face_object, first, second):
     def corrective_value(first_value: float, second_value: float) -> float:
         blocks[first].value = first_value
         if second == "jaw":
-            jaw.rotation_euler[0] = -second_value * face.JAW_OPENS
+            jaw.rotation_euler[0] = -second_value * face.JAW_OPENING
         else:
             blocks[second].value = second_value
         bpy.context.view_layer.update()
