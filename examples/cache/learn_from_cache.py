@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Learns a surface from files alone: `python learn_from_cache.py RIG.blend CACHE OUT [--object NAME] [--action NAME]`.
+"""Train a model from a cache file: `python learn_from_cache.py RIG.blend CACHE OUT --object NAME --action NAME`.
 
-RIG.blend has the rest mesh, its weights and the armature's action; nothing in it computes the surface. CACHE is an
-Alembic, USD or .pc2 file of the mesh in the frames of that action, from Houdini, Maya or a farm that simulates. Writes
-OUT/target.blend, the recording OUT/recording, the model OUT/model/NAME.onnx and OUT/errors.json. docs/simulations.md
-tells the steps.
+RIG.blend contains the rest mesh, its weights and the armature's action, but not the simulation. CACHE is an Alembic,
+USD or .pc2 file of the mesh in the frames of that action, from Houdini or Maya for example. Writes OUT/target.blend,
+the recording OUT/recording, the model OUT/model/NAME.onnx and OUT/errors.json. docs/simulations.md describes the
+steps.
 """
 
 import argparse
@@ -18,31 +18,37 @@ TARGET = "target"
 
 
 def import_cache(path: Path, mesh_object: bpy.types.Object) -> bpy.types.Object:
-    """An object that shows the cache: imported, or a bare copy of the mesh that plays a .pc2 file."""
+    """Return an object that plays the cache: an imported object, or for a .pc2 file a copy of the mesh."""
     if path.suffix == ".pc2":
-        shown = mesh_object.copy()
-        shown.data = mesh_object.data.copy()
-        shown.modifiers.clear()
-        bpy.context.scene.collection.objects.link(shown)
-        modifier = shown.modifiers.new("Cache", "MESH_CACHE")
+        cache_object = mesh_object.copy()
+        cache_object.data = mesh_object.data.copy()
+        cache_object.modifiers.clear()
+        bpy.context.scene.collection.objects.link(cache_object)
+        modifier = cache_object.modifiers.new("Cache", "MESH_CACHE")
         modifier.cache_format, modifier.filepath = "PC2", str(path)
         modifier.frame_start = bpy.context.scene.frame_start
-        return shown
-    before = set(bpy.data.objects)
+        return cache_object
+    objects_before = set(bpy.data.objects)
     importer = bpy.ops.wm.alembic_import if path.suffix == ".abc" else bpy.ops.wm.usd_import
     importer(filepath=str(path))
-    count = len(mesh_object.data.vertices)
-    found = [o for o in bpy.data.objects if o not in before and o.type == "MESH" and len(o.data.vertices) == count]
-    if len(found) != 1:
-        sys.exit(f"'{path}' holds {len(found)} meshes of {count} vertices; export the one that is to be learned.")
-    return found[0]
+    vertex_count = len(mesh_object.data.vertices)
+    candidates = [
+        o
+        for o in bpy.data.objects
+        if o not in objects_before and o.type == "MESH" and len(o.data.vertices) == vertex_count
+    ]
+    if len(candidates) != 1:
+        sys.exit(
+            f"'{path}' contains {len(candidates)} meshes of {vertex_count} vertices; export only the mesh to train on."
+        )
+    return candidates[0]
 
 
-def run(*arguments: object) -> None:
-    """A verb of the command line; ends the program where it fails, after it has said why."""
-    done = subprocess.run([sys.executable, "-m", "fdda_addon", *map(str, arguments)], check=False)
-    if done.returncode:
-        sys.exit(done.returncode)
+def run_verb(*arguments: object) -> None:
+    """Run a verb of the command line. If it fails, exit with its status; the verb prints the error."""
+    process = subprocess.run([sys.executable, "-m", "fdda_addon", *map(str, arguments)], check=False)
+    if process.returncode:
+        sys.exit(process.returncode)
 
 
 def main() -> None:
@@ -57,14 +63,14 @@ def main() -> None:
     (out / "model").mkdir(parents=True, exist_ok=True)
     bpy.ops.wm.open_mainfile(filepath=str(options.rig))
     import_cache(options.cache.resolve(), bpy.data.objects[options.object]).name = TARGET
-    with_target = out / "target.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(with_target))
-    of_target = "--object", options.object, "--target", TARGET, "--action", options.action
-    run("record", with_target, out / "recording", *of_target)
-    run("check-recording", out / "recording")
+    target_file = out / "target.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(target_file))
+    target_options = "--object", options.object, "--target", TARGET, "--action", options.action
+    run_verb("record", target_file, out / "recording", *target_options)
+    run_verb("check-recording", out / "recording")
     model = out / "model" / f"{options.object}.onnx"
-    run("train", out / "recording", model)
-    run("evaluate", with_target, model, *of_target, "--poses", 0, "--json", out / "errors.json")
+    run_verb("train", out / "recording", model)
+    run_verb("evaluate", target_file, model, *target_options, "--poses", 0, "--json", out / "errors.json")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pose a model and write the mesh, with nothing but numpy and ONNX Runtime; made to be copied.
+"""Pose a model and write the deformed mesh, with only numpy and ONNX Runtime. Copy this code into other programs.
 
 python play.py character.onnx posed.obj --turn elbow 80 0 0 --recording recording
 """
@@ -12,63 +12,65 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
-Turns = dict[str, tuple[float, ...]]
-"""Degrees about the X, Y and Z axis of a joint, by its name."""
+Rotations = dict[str, tuple[float, ...]]
+"""Rotations by name of the joint: degrees about its X, Y and Z axes."""
 
 
 def load(path: str) -> tuple[onnxruntime.InferenceSession, dict]:
-    """The model, ready to run, and what it says of itself."""
+    """Load a model; return its session and its metadata."""
     try:
         session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's exceptions have no common base but this.
-        sys.exit(f"ONNX Runtime cannot load {path}; name a model that 'train' has written. {error}")
+    except Exception as error:  # The exceptions of ONNX Runtime have no other common base class.
+        sys.exit(f"ONNX Runtime cannot load {path}; choose a model that 'train' has written. {error}")
     info = json.loads(session.get_modelmeta().custom_metadata_map.get("fdda", "{}"))
     if info.get("version") != 1:
-        sys.exit(f"{path} is no FDDA model of version 1; name one that 'train' has written.")
+        sys.exit(f"{path} is not an FDDA model of version 1; choose one that 'train' has written.")
     return session, info
 
 
 def rotation(degrees: tuple[float, ...]) -> np.ndarray:
-    """(4, 4), about X, then Y, then Z: the Euler angles XYZ of Blender."""
+    """Return the (4, 4) rotation about X, then Y, then Z: Blender's Euler order XYZ."""
     matrix = np.eye(4)
     for axis, angle in enumerate(np.radians(degrees)):
         i, j = (axis + 1) % 3, (axis + 2) % 3
-        turn = np.eye(4)
-        turn[i, i] = turn[j, j] = np.cos(angle)
-        turn[j, i], turn[i, j] = np.sin(angle), -np.sin(angle)
-        matrix = turn @ matrix
+        axis_rotation = np.eye(4)
+        axis_rotation[i, i] = axis_rotation[j, j] = np.cos(angle)
+        axis_rotation[j, i], axis_rotation[i, j] = np.sin(angle), -np.sin(angle)
+        matrix = axis_rotation @ matrix
     return matrix
 
 
-def pose_matrices(info: dict, turns: Turns) -> np.ndarray:
-    """(J, 4, 4) float32: some joints turned out of the rest pose, about their own axes, and with them all below."""
+def pose_matrices(info: dict, rotations: Rotations) -> np.ndarray:
+    """Return the (J, 4, 4) float32 pose matrices of the rest pose with some joints rotated about their local axes."""
     rest = np.reshape(info["rest_matrices"], (-1, 4, 4))
     pose = rest.copy()
-    for number, joint in enumerate(info["joints"]):  # every parent stands before its children
+    for index, joint in enumerate(info["joints"]):  # every parent comes before its children
         if joint["parent"] >= 0:
-            from_parent = np.linalg.inv(rest[joint["parent"]]) @ rest[number]
-            pose[number] = pose[joint["parent"]] @ from_parent
-        pose[number] = pose[number] @ rotation(turns.get(joint["name"], (0, 0, 0)))
+            from_parent = np.linalg.inv(rest[joint["parent"]]) @ rest[index]
+            pose[index] = pose[joint["parent"]] @ from_parent
+        pose[index] = pose[index] @ rotation(rotations.get(joint["name"], (0, 0, 0)))
     return pose.astype(np.float32)
 
 
 def control_values(controls: list[dict], values: dict[str, float]) -> np.ndarray:
-    """(C,) float32: a control that is not given is 0, or what of its range is nearest."""
-    rest = [np.clip(0.0, control["low"], control["high"]) for control in controls]
-    return np.float32([values.get(name_of(control), at) for control, at in zip(controls, rest, strict=True)])
+    """Return the (C,) float32 control values; the default of a control is the value in its range nearest to 0."""
+    defaults = [np.clip(0.0, control["low"], control["high"]) for control in controls]
+    return np.float32(
+        [values.get(control_name(control), default) for control, default in zip(controls, defaults, strict=True)]
+    )
 
 
-def name_of(control: dict) -> str:
+def control_name(control: dict) -> str:
     return f"{control['owner']}/{control['path']}"
 
 
 def read_faces(folder: Path, info: dict) -> list[np.ndarray]:
-    """The vertices of each face, from the recording that the model was trained on."""
+    """Read the vertices of each face from the recording that the model was trained on."""
     if not (folder / "face_starts.npy").is_file():
-        sys.exit(f"{folder} is no recording with faces; record the rig again, or leave --recording out.")
-    recorded = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["rig"]["fingerprint"]
-    if recorded["topology"] != info["fingerprint"]["topology"]:
-        sys.exit(f"{folder} is a recording of another mesh; name the one that the model was trained on.")
+        sys.exit(f"{folder} is not a recording with faces; record the rig again, or leave out --recording.")
+    recorded_fingerprint = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["rig"]["fingerprint"]
+    if recorded_fingerprint["topology"] != info["fingerprint"]["topology"]:
+        sys.exit(f"{folder} is a recording of a different mesh; choose the one that the model was trained on.")
     starts, vertices = (np.load(folder / f"face_{name}.npy") for name in ("starts", "vertices"))
     return np.split(vertices, starts[1:])
 
@@ -83,10 +85,10 @@ def read_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Pose a model and write the mesh.")
     parser.add_argument("model", help=".onnx file")
     parser.add_argument("out", type=Path, help=".obj file, or .npy file of an array (V, 3); mesh-object space")
-    of_turns = {"nargs": 4, "metavar": ("JOINT", "X", "Y", "Z"), "help": "degrees"}
-    of_controls = {"nargs": 2, "metavar": ("OWNER/PATH", "VALUE"), "help": "an input beside the joints"}
-    parser.add_argument("--turn", **of_turns, action="append", default=[])
-    parser.add_argument("--control", **of_controls, action="append", default=[])
+    turn_options = {"nargs": 4, "metavar": ("JOINT", "X", "Y", "Z"), "help": "rotate a joint; degrees"}
+    control_options = {"nargs": 2, "metavar": ("OWNER/PATH", "VALUE"), "help": "set a control"}
+    parser.add_argument("--turn", **turn_options, action="append", default=[])
+    parser.add_argument("--control", **control_options, action="append", default=[])
     parser.add_argument("--recording", type=Path, help="folder of the recording, for the faces of the .obj file")
     arguments = parser.parse_args()
     try:
@@ -101,13 +103,13 @@ def main() -> None:
     arguments = read_arguments()
     session, info = load(arguments.model)
     controls = info.get("controls", [])
-    joints = [joint["name"] for joint in info["joints"] if joint["name"]]  # one without a name never moves
-    for what, asked, known in (
+    joints = [joint["name"] for joint in info["joints"] if joint["name"]]  # a joint without a name never moves
+    for kind, requested_names, known_names in (
         ("joint", arguments.turn, joints),
-        ("control", arguments.control, [name_of(control) for control in controls]),
+        ("control", arguments.control, [control_name(control) for control in controls]),
     ):
-        if unknown := [name or "''" for name in asked if name not in known]:
-            sys.exit(f"The model has no {what} {', '.join(unknown)}; it has: {', '.join(known) or 'none'}.")
+        if unknown := [name or "''" for name in requested_names if name not in known_names]:
+            sys.exit(f"The model has no {kind} {', '.join(unknown)}; it has: {', '.join(known_names) or 'none'}.")
 
     inputs = {"pose_matrices": pose_matrices(info, arguments.turn)[None]}  # N = 1 pose
     if controls:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Puts a model and the faces of its mesh beside the page: prepare.py MODEL RECORDING [FOLDER]."""
+"""Copy a model and the faces of its mesh to the folder of the page: prepare.py MODEL RECORDING [FOLDER]."""
 
 import json
 import shutil
@@ -11,32 +11,40 @@ import onnxruntime
 
 
 def triangulate(starts: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """(T, 3) uint32: each face as a fan of triangles around its first corner.
+    """Split each face into a fan of triangles around its first corner.
 
     Args:
-        starts: (F,) where each face begins in `vertices`.
-        vertices: (C,) the corners of all faces.
+        starts: (F,) index of the first corner of each face in `vertices`.
+        vertices: (C,) vertex of each corner of all faces.
+
+    Returns:
+        (T, 3) uint32 vertices of the triangles.
     """
-    sizes = np.diff(starts, append=len(vertices))
-    first = np.repeat(starts, sizes - 2)
-    # Corner numbers 1 .. size - 2 of each face: where its second edge of the fan begins.
-    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
-    return vertices[np.stack([first, second, second + 1], axis=1)].astype("<u4")
+    corner_counts = np.diff(starts, append=len(vertices))
+    first_corners = np.repeat(starts, corner_counts - 2)
+    # The second corners of a face's triangles are its corners 1 to n - 2; n is its number of corners.
+    second_corners = (
+        first_corners
+        + 1
+        + np.arange(len(first_corners))
+        - np.repeat(np.cumsum(corner_counts - 2) - (corner_counts - 2), corner_counts - 2)
+    )
+    return vertices[np.stack([first_corners, second_corners, second_corners + 1], axis=1)].astype("<u4")
 
 
 def main(model: Path, recording: Path, folder: Path) -> None:
     try:
         session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's exceptions have no common base but this.
-        sys.exit(f"ONNX Runtime cannot load {model}; name a model that 'train' has written. {error}")
+    except Exception as error:  # The exceptions of ONNX Runtime have no other common base class.
+        sys.exit(f"ONNX Runtime cannot load {model}; choose a model that 'train' has written. {error}")
     info = json.loads(session.get_modelmeta().custom_metadata_map.get("fdda", "{}"))
     if info.get("version") != 1:
-        sys.exit(f"{model} is no FDDA model of version 1; name one that 'train' has written.")
+        sys.exit(f"{model} is not an FDDA model of version 1; choose one that 'train' has written.")
     if not (recording / "face_starts.npy").is_file():
-        sys.exit(f"{recording} is no recording with faces; record the rig again.")
-    recorded = json.loads((recording / "recording.json").read_text(encoding="utf-8"))["rig"]["fingerprint"]
-    if recorded["topology"] != info["fingerprint"]["topology"]:
-        sys.exit(f"{recording} is a recording of another mesh; name the one that the model was trained on.")
+        sys.exit(f"{recording} is not a recording with faces; record the rig again.")
+    recorded_fingerprint = json.loads((recording / "recording.json").read_text(encoding="utf-8"))["rig"]["fingerprint"]
+    if recorded_fingerprint["topology"] != info["fingerprint"]["topology"]:
+        sys.exit(f"{recording} is a recording of a different mesh; choose the one that the model was trained on.")
     triangles = triangulate(*(np.load(recording / f"face_{name}.npy") for name in ("starts", "vertices")))
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(model, folder / "model.onnx")

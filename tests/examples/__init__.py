@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The tests of the examples of docs/formats.md."""
+"""Tests of the examples of docs/formats.md."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Two small models for the examples, trained once; one has a control and a joint that never moves."""
+"""Fixtures: two small models for the examples, trained once; one has a control and a joint that never moves."""
 
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import bpy  # noqa: F401  mathutils comes with it
+import bpy  # noqa: F401  it includes mathutils
 import numpy as np
 import pytest
 from mathutils import Euler, Matrix
@@ -22,8 +22,8 @@ from ..trainer.chain import chain_angles, chain_residuals, chain_rig, pose_chain
 ROOT = Path(__file__).resolve().parents[2]
 JOINTS, POSES = 4, 100
 CONTROL = Control("mesh_object", '["bulge"]', 0.25, 1.0)
-Turns = dict[str, tuple[float, float, float]]
-"""Degrees about the axes X, Y, Z of a joint, by its name."""
+Rotations = dict[str, tuple[float, float, float]]
+"""Rotations by name of the joint: degrees about its X, Y and Z axes."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Character:
     recording: Path
 
 
-def trained(recording: Path) -> Character:
+def train_character(recording: Path) -> Character:
     model = recording.with_suffix(".onnx")
     assert train([str(recording), str(model), "--epochs", "20", "--hidden", "16", "16", "--batch-size", "16"]) == 0
     return Character(model, recording)
@@ -42,60 +42,60 @@ def trained(recording: Path) -> Character:
 
 @pytest.fixture(scope="session")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    """A tube on a chain of joints bone_0 to bone_3."""
+    """Return a model of a tube on a chain of joints, bone_0 to bone_3."""
     recording = tmp_path_factory.mktemp("chain") / "recording"
     write_chain(recording, POSES, joint_count=JOINTS)
-    return trained(recording)
+    return train_character(recording)
 
 
 @pytest.fixture(scope="session")
-def controlled(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    """The chain whose lowest vertices follow no bone, and that a property of its mesh object makes thicker."""
+def controlled_chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
+    """Return a model of a tube with a control that makes it thicker; its lowest vertices have no bone."""
     recording = tmp_path_factory.mktemp("controlled") / "recording"
     rig, angles = chain_rig(JOINTS), chain_angles(POSES, JOINTS, seed=1)
     values = np.random.default_rng(2).uniform(CONTROL.low, CONTROL.high, (POSES, 1)).astype(np.float32)
     poses, residuals = pose_chain(rig, angles), chain_residuals(rig, angles)
     residuals[:, :, 1] += 0.05 * values
-    lowest = rig.rest_positions[:, 2] < 0.15
-    residuals[:, lowest] = 0
+    is_static = rig.rest_positions[:, 2] < 0.15
+    residuals[:, is_static] = 0
     rig = replace(
         rig,
         joints=(*rig.joints, Joint(STATIC_JOINT, -1)),
         rest_matrices=np.concatenate([rig.rest_matrices, np.eye(4, dtype=np.float32)[None]]),
-        skin_joints=np.where(lowest[:, None], [JOINTS, 0], rig.skin_joints).astype(np.int32),
-        skin_weights=np.where(lowest[:, None], [1, 0], rig.skin_weights).astype(np.float32),
+        skin_joints=np.where(is_static[:, None], [JOINTS, 0], rig.skin_joints).astype(np.int32),
+        skin_weights=np.where(is_static[:, None], [1, 0], rig.skin_weights).astype(np.float32),
         controls=(CONTROL,),
     )
     poses = np.concatenate([poses, np.broadcast_to(np.eye(4, dtype=np.float32), (POSES, 1, 4, 4))], axis=1)
-    moving = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for joint in range(JOINTS)}
-    partitions = make_partitions(rig, moving, {joint: (0,) for joint in range(JOINTS)})
+    moving_joints = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for joint in range(JOINTS)}
+    partitions = make_partitions(rig, moving_joints, {joint: (0,) for joint in range(JOINTS)})
     info = RecordingInfo(POSES, 0, "chain.blend", "chain", "5.2.0", Sampling(1, 1.0, (), (Source("random", POSES),)))
     with RecordingWriter(recording, rig, partitions, info) as writer:
         writer.append(poses, residuals, values)
-    return trained(recording)
+    return train_character(recording)
 
 
-def blender_pose(info: dict, turns: Turns) -> np.ndarray:
-    """(1, J, 4, 4) float32, pose matrices by Blender's own mathematics.
+def blender_pose(info: dict, rotations: Rotations) -> np.ndarray:
+    """Compute pose matrices with Blender's mathutils: (1, J, 4, 4) float32.
 
     Args:
-        info: the metadata of a model.
-        turns: of the joints that are not in their rest pose.
+        info: metadata of a model.
+        rotations: rotations of the joints that are not in their rest pose.
     """
-    rest = [Matrix([row[at : at + 4] for at in (0, 4, 8, 12)]) for row in info["rest_matrices"]]
+    rest = [Matrix([row[start : start + 4] for start in (0, 4, 8, 12)]) for row in info["rest_matrices"]]
     pose: list[Matrix] = []
-    for number, joint in enumerate(info["joints"]):
-        turn = Euler(np.radians(turns.get(joint["name"], (0, 0, 0))), "XYZ").to_matrix().to_4x4()
+    for index, joint in enumerate(info["joints"]):
+        rotation = Euler(np.radians(rotations.get(joint["name"], (0, 0, 0))), "XYZ").to_matrix().to_4x4()
         parent = joint["parent"]
-        place = rest[number] if parent < 0 else pose[parent] @ rest[parent].inverted() @ rest[number]
-        pose.append(place @ turn)
+        unrotated = rest[index] if parent < 0 else pose[parent] @ rest[parent].inverted() @ rest[index]
+        pose.append(unrotated @ rotation)
     return np.array(pose, np.float32)[None]
 
 
-def expected_positions(model: Path, turns: Turns, controls: tuple[float, ...] = ()) -> np.ndarray:
-    """(V, 3), what the add-on's runtime says of a pose, meters."""
+def expected_positions(model: Path, rotations: Rotations, controls: tuple[float, ...] = ()) -> np.ndarray:
+    """Compute the vertex positions of a pose with the add-on's runtime: (V, 3), meters."""
     from fdda_addon.runtime.network import Network
 
     network = Network(model)
-    pose = blender_pose(json.loads(network.info.to_json()), turns)
+    pose = blender_pose(json.loads(network.info.to_json()), rotations)
     return network.positions(pose, np.float32([controls]) if controls else None)[0].copy()

@@ -3,9 +3,9 @@
 //
 // usage: node drive_page.mjs CHROMIUM URL PICTURE [SELECTOR=VALUE …]
 //
-// The selectors are those of selects, sliders and buttons (without a value), used in their order. Writes a picture of
-// the page and prints JSON: state and status of the page, positions, names of the joints, number of sliders, the
-// requests that were made, and what went wrong.
+// Each selector names a select, a slider, or a button (without a value); they are used in the given order. Writes a
+// screenshot of the page. Prints JSON: state and status of the page, vertex positions, names of the joints, number of
+// sliders, addresses of the requests, and errors.
 
 import { createRequire } from "node:module";
 
@@ -15,7 +15,7 @@ const { chromium } = packages("playwright-core");
 const [executablePath, url, picture, ...steps] = process.argv.slice(2);
 const args = [
   "--no-sandbox",
-  // WebGL by the processor: a machine that tests has no graphics card.
+  // Render WebGL on the CPU, because test machines have no GPU.
   "--disable-gpu",
   "--use-angle=swiftshader",
   "--enable-unsafe-swiftshader",
@@ -34,10 +34,10 @@ try {
   page.on("request", (request) => requests.push(request.url()));
   page.on("pageerror", (error) => errors.push(error.message));
   page.on("console", (message) => message.type() === "error" && errors.push(message.text()));
-  const settled = () => page.waitForSelector('body:is([data-state="ready"], [data-state="failed"])');
+  const waitForResult = () => page.waitForSelector('body:is([data-state="ready"], [data-state="failed"])');
 
   await page.goto(url);
-  await settled();
+  await waitForResult();
   for (const step of steps) {
     const [selector, value] = step.split("=");
     const element = page.locator(selector);
@@ -46,9 +46,9 @@ try {
     else if (kind === "button") await element.click();
     else await element.fill(value);
   }
-  await settled();
+  await waitForResult();
 
-  const shown = await page.evaluate(() => {
+  const pageState = await page.evaluate(() => {
     document.activeElement.blur();
     return {
       state: document.body.dataset.state,
@@ -59,7 +59,7 @@ try {
     };
   });
   await page.screenshot({ path: picture });
-  console.log(JSON.stringify({ ...shown, requests, errors }));
+  console.log(JSON.stringify({ ...pageState, requests, errors }));
 } finally {
   await browser.close();
 }

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// A model in ONNX Runtime.
+// Runs a model with ONNX Runtime.
 
 import * as ort from "onnxruntime-web/wasm";
 import wasm from "onnxruntime-web/ort-wasm-simd-threaded.wasm";
 import { readInfo } from "./metadata.js";
 
-ort.env.wasm.numThreads = 1; // more need a page that is isolated from other origins
+ort.env.wasm.numThreads = 1; // more threads need a cross-origin isolated page
 ort.env.wasm.wasmPaths = { wasm: new URL(wasm, import.meta.url).href };
 
-/** A model that is ready to play; `info` is its metadata. */
+/** A loaded model; `info` is its metadata. */
 export class Model {
   /** @param {Uint8Array} bytes the .onnx file */
   static async load(bytes) {
@@ -22,8 +22,8 @@ export class Model {
    * Deform the mesh.
    *
    * @param {Pose} pose
-   * @returns `positions`, Float32Array of V times x, y, z in mesh-object space, meters, and `confidence`, the lowest of the
-   *     partitions, 0 to 1
+   * @returns `positions`, Float32Array of x, y, z for each vertex in mesh-object space, meters, and `confidence`, the lowest
+   *     confidence of the partitions, 0 to 1
    */
   async run(pose) {
     const count = pose.joints.length;

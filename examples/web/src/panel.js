@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The panel beside the mesh: which joint, its three angles, and the controls.
+// The panel beside the mesh: a list of joints, three angle sliders, and a slider for each control.
 
 import { MathUtils } from "three";
 
@@ -10,19 +10,19 @@ const element = (id) => document.getElementById(id);
  * Fill the panel.
  *
  * @param info the metadata of the model
- * @param {Pose} pose what the sliders set
- * @param {(joint: number) => void} changed called after each change, with the joint in hand
+ * @param {Pose} pose the pose that the sliders change
+ * @param {(joint: number) => void} onChange called after each change with the index of the chosen joint
  */
-export function fillPanel(info, pose, changed) {
+export function fillPanel(info, pose, onChange) {
   const select = element("joint");
   info.joints.forEach(({ name }, joint) => {
-    if (name) select.append(new Option(name, joint)); // one without a name never moves
+    if (name) select.append(new Option(name, joint)); // a joint without a name never moves
   });
-  const joint = () => Number(select.value);
+  const chosenJoint = () => Number(select.value);
   const angles = AXES.map((axis, number) => {
     const slider = new Slider(axis.toUpperCase(), `angle-${axis}`, -180, 180, 1, "°", (value) => {
-      pose.degrees[joint()][number] = value;
-      changed(joint());
+      pose.degrees[chosenJoint()][number] = value;
+      onChange(chosenJoint());
     });
     element("angles").append(slider.row);
     return slider;
@@ -30,7 +30,7 @@ export function fillPanel(info, pose, changed) {
   const controls = pose.controls.map(({ path, low, high }, number) => {
     const slider = new Slider(path, `control-${number}`, low, high, "any", "", (value) => {
       pose.values[number] = value;
-      changed(joint());
+      onChange(chosenJoint());
     });
     element("controls").append(slider.row);
     return slider;
@@ -38,15 +38,15 @@ export function fillPanel(info, pose, changed) {
   element("controls").hidden = !controls.length;
 
   const refresh = () => {
-    const trained = (info.training?.limits ?? []).filter(
-      ({ bone, kind }) => kind === "rotation" && bone === info.joints[joint()].name,
+    const trainedLimits = (info.training?.limits ?? []).filter(
+      ({ bone, kind }) => kind === "rotation" && bone === info.joints[chosenJoint()].name,
     );
     angles.forEach((slider, axis) => {
-      slider.set(pose.degrees[joint()][axis]);
-      slider.mark(trained.find((limit) => limit.axis === axis));
+      slider.set(pose.degrees[chosenJoint()][axis]);
+      slider.markRange(trainedLimits.find((limit) => limit.axis === axis));
     });
     controls.forEach((slider, control) => slider.set(pose.values[control]));
-    changed(joint());
+    onChange(chosenJoint());
   };
   select.addEventListener("change", refresh);
   element("rest").addEventListener("click", () => {
@@ -58,9 +58,9 @@ export function fillPanel(info, pose, changed) {
   refresh();
 }
 
-/** A labeled slider; `row` is its element. */
+/** A labeled slider; `row` is its HTML element. */
 class Slider {
-  constructor(label, id, low, high, step, unit, changed) {
+  constructor(label, id, low, high, step, unit, onChange) {
     this.unit = unit;
     this.row = element("slider").content.firstElementChild.cloneNode(true);
     this.row.firstElementChild.textContent = label;
@@ -69,7 +69,7 @@ class Slider {
     Object.assign(this.input, { id, min: low, max: high, step });
     this.input.addEventListener("input", () => {
       this.show();
-      changed(this.input.valueAsNumber);
+      onChange(this.input.valueAsNumber);
     });
   }
 
@@ -82,11 +82,11 @@ class Slider {
     this.output.textContent = this.unit ? `${this.input.value}${this.unit}` : this.input.valueAsNumber.toFixed(2);
   }
 
-  /** Mark the range, in radians, in which the training drew random poses; none without `limit`. */
-  mark(limit) {
-    const place = (angle) =>
+  /** Mark the range of the random training poses, radians; without `limit`, remove the mark. */
+  markRange(limit) {
+    const positionOf = (angle) =>
       `${((MathUtils.radToDeg(angle) - this.input.min) / (this.input.max - this.input.min)) * 100}%`;
-    this.input.style.setProperty("--low", limit ? place(limit.low) : "0%");
-    this.input.style.setProperty("--high", limit ? place(limit.high) : "0%");
+    this.input.style.setProperty("--low", limit ? positionOf(limit.low) : "0%");
+    this.input.style.setProperty("--high", limit ? positionOf(limit.high) : "0%");
   }
 }

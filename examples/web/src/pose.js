@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Forward kinematics: from the angles of the joints to what the model takes.
+// Forward kinematics: computes the inputs of the model from the angles of the joints.
 
 import { Euler, MathUtils, Matrix4 } from "three";
 
-const ORDER = "ZYX"; // three.js names the axes outermost first: about X, then Y, then Z, Blender's XYZ
+const ORDER = "ZYX"; // three.js names the last rotation first: this is Blender's order XYZ
 
 /** A pose of the joints of a model. */
 export class Pose {
@@ -16,29 +16,29 @@ export class Pose {
       parent < 0 ? this.rest[joint] : this.rest[parent].clone().invert().multiply(this.rest[joint]),
     );
     this.controls = info.controls ?? [];
-    this.values = this.controls.map(atRest);
+    this.values = this.controls.map(defaultValue);
   }
 
-  /** Back to the rest pose. */
+  /** Reset to the rest pose. */
   reset() {
     this.degrees.forEach((angles) => angles.fill(0));
-    this.values = this.controls.map(atRest);
+    this.values = this.controls.map(defaultValue);
   }
 
-  /** Pose matrices of the joints, mesh-object space, meters; every parent stands before its children. */
+  /** Return the pose matrices of the joints, mesh-object space, meters. Every parent comes before its children. */
   matrices() {
     const posed = [];
     this.joints.forEach(({ parent }, joint) => {
       const angles = this.degrees[joint].map(MathUtils.degToRad);
-      const turn = new Matrix4().makeRotationFromEuler(new Euler(...angles, ORDER));
-      const place = parent < 0 ? new Matrix4() : posed[parent].clone();
-      posed.push(place.multiply(this.fromParent[joint]).multiply(turn));
+      const rotation = new Matrix4().makeRotationFromEuler(new Euler(...angles, ORDER));
+      const matrix = parent < 0 ? new Matrix4() : posed[parent].clone();
+      posed.push(matrix.multiply(this.fromParent[joint]).multiply(rotation));
     });
     return posed;
   }
 }
 
-/** Where a control stands that nobody has set: 0, or what of its range is nearest. */
-function atRest({ low, high }) {
+/** Return the default of a control: the value in its range nearest to 0. */
+function defaultValue({ low, high }) {
   return MathUtils.clamp(0, low, high);
 }

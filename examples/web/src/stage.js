@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// What is seen: the mesh, a floor, the axes of the joint in hand, and a camera that turns around them.
+// The 3D view: the mesh, a floor, the axes of the chosen joint, and a camera that orbits around them.
 
 import {
   AxesHelper,
@@ -24,18 +24,18 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const BACKGROUND = 0x24272c;
-const AXES = [0xff7a6b, 0x7ed77e, 0x7fb0ff]; // as in the panel
+const AXIS_COLORS = [0xff7a6b, 0x7ed77e, 0x7fb0ff]; // the colors of the panel
 const LIGHTS = [
-  [2.4, -0.8, 1, 0.5], // strength and where it comes from, as the camera sees it: from the left and above
-  [0.8, 1, 0.2, -0.6], // along the edge on the right
+  [2.4, -0.8, 1, 0.5], // strength and direction in camera space: from the left and above
+  [0.8, 1, 0.2, -0.6], // rim light from the right
 ];
-const VIEW = { Z: [0.55, -1, 0.4], Y: [0.55, 0.4, 1] }; // from the front, the left and above
+const VIEW_DIRECTIONS = { Z: [0.55, -1, 0.4], Y: [0.55, 0.4, 1] }; // from the front, the left and above
 
 export class Stage {
   /**
    * @param {HTMLCanvasElement} canvas fills its parent
    * @param {Uint32Array} triangles three vertices each
-   * @param {Float32Array} positions the rest pose, meters
+   * @param {Float32Array} positions vertex positions in the rest pose, meters
    */
   constructor(canvas, triangles, positions) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true });
@@ -44,9 +44,9 @@ export class Stage {
     this.scene.background = new Color(BACKGROUND);
     this.camera = new PerspectiveCamera(35);
     this.scene.add(this.camera, new HemisphereLight(0xdfe8f5, 0x3c3a38, 0.9));
-    for (const [strength, ...place] of LIGHTS) {
+    for (const [strength, ...direction] of LIGHTS) {
       const light = new DirectionalLight(0xffffff, strength);
-      light.position.set(...place);
+      light.position.set(...direction);
       this.camera.add(light);
     }
 
@@ -56,12 +56,12 @@ export class Stage {
     this.geometry.computeVertexNormals();
     const gray = new MeshStandardMaterial({ color: 0xc4c4c4, roughness: 0.55, side: DoubleSide });
     const mesh = new Mesh(this.geometry, gray);
-    mesh.frustumCulled = false; // its bounds would have to follow each pose
+    mesh.frustumCulled = false; // frustum culling would need new bounds for each pose
     this.box = new Box3().setFromBufferAttribute(this.geometry.getAttribute("position"));
     this.sphere = this.box.getBoundingSphere(new Sphere());
 
     this.axes = new AxesHelper(this.sphere.radius * 0.18);
-    this.axes.setColors(...AXES.map((color) => new Color(color)));
+    this.axes.setColors(...AXIS_COLORS.map((color) => new Color(color)));
     this.axes.matrixAutoUpdate = false;
     this.axes.material.depthTest = false;
     this.axes.renderOrder = 1;
@@ -73,30 +73,30 @@ export class Stage {
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
   }
 
-  /** Show the mesh, and the axes of a joint at its pose matrix. */
+  /** Show the mesh, and axes at the pose matrix of a joint. */
   show(positions, joint) {
     const attribute = this.geometry.getAttribute("position");
     attribute.array.set(positions);
     attribute.needsUpdate = true;
     this.geometry.computeVertexNormals();
-    // The joint may be scaled, as in a rig that was built in centimeters; its axes keep their length.
+    // Normalize the axes, because a joint may be scaled, for example in a rig that was built in centimeters.
     const columns = [new Vector3(), new Vector3(), new Vector3()];
     joint.extractBasis(...columns);
     this.axes.matrix.makeBasis(...columns.map((column) => column.normalize())).copyPosition(joint);
     this.draw();
   }
 
-  /** Look at the whole mesh; `up` is the axis of the mesh that points upwards, "Z" or "Y". */
+  /** Frame the whole mesh in the view; `up` is the axis of the mesh that points up, "Z" or "Y". */
   frame(up) {
     const { center, radius } = this.sphere;
     this.camera.up.set(0, up === "Y" ? 1 : 0, up === "Z" ? 1 : 0);
     this.floor.rotation.x = up === "Z" ? Math.PI / 2 : 0;
     this.floor.position.copy(center);
     this.floor.position[up.toLowerCase()] = this.box.min[up.toLowerCase()];
-    const half = Math.tan(MathUtils.degToRad(this.camera.fov / 2)) * Math.min(1, this.camera.aspect);
-    const distance = radius / Math.sin(Math.atan(half));
+    const halfExtent = Math.tan(MathUtils.degToRad(this.camera.fov / 2)) * Math.min(1, this.camera.aspect);
+    const distance = radius / Math.sin(Math.atan(halfExtent));
     this.camera.position
-      .set(...VIEW[up])
+      .set(...VIEW_DIRECTIONS[up])
       .setLength(distance)
       .add(center);
     this.camera.near = distance / 100;
