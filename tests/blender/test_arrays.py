@@ -92,7 +92,7 @@ def test_a_reader_refuses_data_of_another_size(mesh):
     mesh.vertices.add(1)
     with pytest.raises(ValueError, match=r"'vector' of .*\[4\], FloatVectorAttribute.* the array is \(3, 3\) float32"):
         reader.read(mesh.attributes["position"].data)
-    with pytest.raises(ValueError, match=r"'vector' of the memory to read into is .* the array is \(3, 3\) float64"):
+    with pytest.raises(ValueError, match=r"'vector' of the array to read into is .* the array is \(3, 3\) float64"):
         PropertyReader(VECTOR_ELEMENT, np.empty((3, 3)))
 
 
