@@ -2,8 +2,8 @@
 """Limit a human with a Mixamo-style rig to the range of motion of a person: `human_limits.py IN.blend OUT.blend`.
 
 Writes the limits as Limit Rotation constraints in local space. A person's ranges are defined about directions of the
-body, and each bone has different axes. Each range applies to the axis of the bone that is nearest to the direction; the
-range is mirrored if that axis points the opposite way.
+body, and each bone has different axes. Each range applies to the bone's axis that is
+nearest to its direction, and is mirrored if that axis points the opposite way.
 """
 
 import math

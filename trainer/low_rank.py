@@ -69,7 +69,7 @@ def factorize(
     inputs = _inputs(regression.design_of(fit.joints)[training], coefficients[training], weights)
     eigenvalues, eigenvectors = np.linalg.eigh(inputs.T @ inputs)
     root = (np.sqrt(np.maximum(eigenvalues, 0)) * eigenvectors).T
-    weighted = root @ _parameters(fit, basis, regression.center)
+    weighted = root @ _stacked_factors(fit, basis, regression.center)
     squares, eigenvectors = np.linalg.eigh(weighted @ weighted.T)
     squares, eigenvectors = np.maximum(squares[::-1], 0), eigenvectors[:, ::-1]
     errors = np.sqrt(np.append(np.cumsum(squares[::-1])[::-1], 0) / (weights.sum() * vertex_count))
@@ -95,7 +95,7 @@ def _inputs(design: np.ndarray, coefficients: np.ndarray, weights: np.ndarray) -
     return (rows * np.sqrt(weights)[:, None, None]).reshape(3 * len(rows), -1)
 
 
-def _parameters(fit: JointFit, basis: Basis, center: np.ndarray) -> np.ndarray:
+def _stacked_factors(fit: JointFit, basis: Basis, center: np.ndarray) -> np.ndarray:
     """Return (4 Jf + 3 K, Vp) float64 parameters of the vertices; the mean is part of the main joint's parameters."""
     vertex_count, component_count = fit.factors.shape[1], len(basis.components)
     factors = fit.factors.reshape(-1, 4, vertex_count).astype(np.float64)

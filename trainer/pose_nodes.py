@@ -29,8 +29,8 @@ VECTOR_SIZE = 3
 MATRIX_COLUMNS, ZERO_ROW, MATRIX_ROW, TRANSPOSE_ROW = 4, 4, 5, 6
 """Number of columns of an affine matrix, and the rows of the table for a space.
 
-The first four rows have one column of the matrix each, repeated three times. `ZERO_ROW` is zero. `MATRIX_ROW` has the
-matrix, column by column. `TRANSPOSE_ROW` has its transpose; it does not exist if a bone is sheared."""
+Each of the first four rows has one column of the matrix, three times in succession. `ZERO_ROW` is zero. `MATRIX_ROW`
+has the matrix, column by column. `TRANSPOSE_ROW` has its transpose; it does not exist if a bone is sheared."""
 
 
 @dataclass(frozen=True)

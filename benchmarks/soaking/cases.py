@@ -93,7 +93,7 @@ def memory_mb() -> float:
 
 
 def _reset_peak() -> float:
-    """Reset the peak of the memory; return the memory of this process, MB."""
+    """Reset the peak memory use of this process, and return its present use, MB."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return _read_process_status("VmRSS")

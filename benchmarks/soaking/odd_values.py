@@ -66,7 +66,7 @@ def mutate_json(random: np.random.Generator, value: object) -> object:
 
 
 def to_json_text(value: object) -> str:
-    """Convert a value to JSON text; Python writes NaN and infinity by name, although JSON has neither."""
+    """Convert a value to JSON text. NaN and infinity become names that Python reads and JSON does not allow."""
     return json.dumps(value)
 
 

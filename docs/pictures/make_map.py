@@ -38,7 +38,7 @@ LAYER_SPACING = 2.45
 """Vertical distance from one layer to the next."""
 TEXT_COLOR, BACKGROUND_COLOR = "#222222", "#ffffff"
 MAX_FILE_NAMES = 6
-SENTENCE_WIDTH, FILE_NAMES_WIDTH = 48, 44
+SENTENCE_WIDTH, FILE_NAMES_WIDTH = 48, 38
 """Maximum numbers of letters in a line of the sentence, and in the line of file names."""
 LAYOUT_STEPS = 200
 

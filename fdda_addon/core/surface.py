@@ -138,14 +138,14 @@ class SurfaceErrors:
         return {**mean_errors, "ratio": mean_errors["across"] / mean_errors["inside"] if has_ratio else None}
 
 
-def surface_json(fdda: SurfaceErrors | None, linear: SurfaceErrors | None) -> dict:
+def surface_json(fdda_errors: SurfaceErrors | None, linear_errors: SurfaceErrors | None) -> dict:
     """Return the errors `normals` (degrees) and `edges` (relative) of the model and of linear skinning.
 
     Both are None where the mesh has no faces.
     """
-    if fdda is None or linear is None:
+    if fdda_errors is None or linear_errors is None:
         return {"normals": None, "edges": None}
-    methods = {"fdda": fdda, "linear": linear}
+    methods = {"fdda": fdda_errors, "linear": linear_errors}
     return {
         "normals": {method: errors.normals_json() for method, errors in methods.items()},
         "edges": {method: errors.edges_json() for method, errors in methods.items()},

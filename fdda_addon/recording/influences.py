@@ -105,7 +105,7 @@ class _MoveBatch:
         self._moves: list[tuple[str, int]] = []
         self._evaluated_poses: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def set_base(self) -> None:
+    def set_base_pose(self) -> None:
         """Use the current pose as base pose."""
         self._base_residuals = self._residuals([self._evaluator.evaluate()[:2]])
 
@@ -189,7 +189,7 @@ def _move_channels(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, moves
     total_steps = poses_per_input * (len(moved_inputs) + 1)
     for base_index, base_values in enumerate(base_poses):
         poser.set(base_values)
-        moves.set_base()
+        moves.set_base_pose()
         for step, ((kind, index), moved_channels) in enumerate(
             moved_inputs.items(), base_index * (len(moved_inputs) + 1) + 1
         ):
@@ -232,7 +232,7 @@ def _override_each_joint(
         base_states = [rest_state] * (poses_per_input - poses_per_input // 2) + states[: poses_per_input // 2]
         for base_index, (base_state, other_state) in enumerate(zip(base_states, states[poses_per_input:], strict=True)):
             show_pose(base_state)
-            moves.set_base()
+            moves.set_base_pose()
             for step, (kind, index) in enumerate(moved_inputs, base_index * (len(moved_inputs) + 1) + 1):
                 yield Progress("influences", step, poses_per_input * (len(moved_inputs) + 1))
                 show_pose(base_state.with_input_of(other_state, kind, index))

@@ -106,10 +106,10 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     deforming_indices = [
         i for i, effect in enumerate(effects) if effect in {_ModifierEffect.DEFORMS, _ModifierEffect.UNKNOWN}
     ]
-    original_mesh_indices = [i for i, m in enumerate(modifiers) if m.type in ORIGINAL_MESH_TYPES]
+    original_mesh_modifier_indices = [i for i, m in enumerate(modifiers) if m.type in ORIGINAL_MESH_TYPES]
     # If all deforming modifiers are off, all of them count, because the user may switch them on later.
     effective_indices = [i for i in deforming_indices if modifiers[i].show_viewport] or deforming_indices
-    last_replaced_index = max(effective_indices + original_mesh_indices, default=-1)
+    last_replaced_index = max(effective_indices + original_mesh_modifier_indices, default=-1)
     fdda_index = _fdda_modifier_index(mesh_object)
     if fdda_index is not None and any(i < fdda_index for i in deforming_indices):
         last_replaced_index = fdda_index - 1
@@ -121,7 +121,7 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
         replaced=tuple(
             m.name
             for i, m in enumerate(modifiers[: last_replaced_index + 1])
-            if i in deforming_indices + original_mesh_indices
+            if i in deforming_indices + original_mesh_modifier_indices
         ),
         misplaced=tuple(modifiers[i].name for i in generating_indices if i <= last_replaced_index),
         downstream=tuple(

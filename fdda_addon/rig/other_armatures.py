@@ -142,7 +142,7 @@ def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, AxisRan
 
 
 def _is_overridden(bone: bpy.types.PoseBone, kind: str) -> bool:
-    """Return whether a constraint overrides the channels of a kind."""
+    """Return whether a constraint overrides the channels of `kind`: location, rotation or scale."""
     return any(
         constraint.type == "COPY_TRANSFORMS"
         or (_COPY_CONSTRAINTS.get(constraint.type) == kind and _copies_all_axes(constraint))

@@ -68,9 +68,9 @@ def loaded_commands() -> list[str]:
     ]
 
 
-def user_files(user: Path) -> list[str]:
+def user_files(user_folder: Path) -> list[str]:
     """Return the paths of all files in the user's folder, without caches."""
-    paths = (path.relative_to(user).as_posix() for path in user.rglob("*") if path.is_file())
+    paths = (path.relative_to(user_folder).as_posix() for path in user_folder.rglob("*") if path.is_file())
     return sorted(path for path in paths if "__pycache__" not in path and "/.cache/" not in path)
 
 
@@ -101,8 +101,8 @@ def enable_at_startup() -> dict:
 
 def installed_onnxruntime() -> ModuleType:
     """Import the ONNX Runtime that the zip has installed, although the environment may contain another one."""
-    user = Path(os.environ["BLENDER_USER_RESOURCES"])
-    sys.path.insert(0, str(next(user.glob("extensions/.local/lib/*/site-packages"))))
+    user_folder = Path(os.environ["BLENDER_USER_RESOURCES"])
+    sys.path.insert(0, str(next(user_folder.glob("extensions/.local/lib/*/site-packages"))))
     import onnxruntime
 
     return onnxruntime
@@ -125,11 +125,11 @@ def play_bound_file(package: str, bound_elbow: str) -> dict:
 
 def run_life_cycle(package: str) -> dict[str, dict]:
     """Install, enable, disable, update and uninstall the extension; return what is registered after each step."""
-    user = Path(os.environ["BLENDER_USER_RESOURCES"])
+    user_folder = Path(os.environ["BLENDER_USER_RESOURCES"])
     states: dict[str, dict] = {}
 
     def add_state(name: str, **values: object) -> None:
-        states[name] = {**registered_items(), "files": user_files(user), **values}
+        states[name] = {**registered_items(), "files": user_files(user_folder), **values}
 
     add_state("before")
     add_state("installed", result=install_zip(package, False))

@@ -44,7 +44,7 @@ def test_a_deforming_stack_is_recorded_and_played(build, loose_model, tmp_path):
     pose(angle=1.0)
     true = evaluated_positions(rig.mesh_object)
     bind(rig, loose_model)
-    live = [m for m in rig.mesh_object.modifiers if m.name in read_live(rig)]
+    live = [m for m in rig.mesh_object.modifiers if m.name in read_downstream_names(rig)]
     assert len(evaluated_positions(rig.mesh_object)) == len(true)
     for modifier in live:
         modifier.show_viewport = False
@@ -60,8 +60,8 @@ def test_a_deforming_stack_is_recorded_and_played(build, loose_model, tmp_path):
     np.testing.assert_allclose(evaluated_positions(rig.mesh_object), true, atol=1e-6)
 
 
-def read_live(rig: SceneRig) -> tuple[str, ...]:
-    """The live modifiers of a bound object."""
+def read_downstream_names(rig: SceneRig) -> tuple[str, ...]:
+    """Return the names of the modifiers that stay on after the modifier FDDA of a bound object."""
     with_rig, rig.mesh_object.fdda.mode = rig.mesh_object.fdda.mode, "RIG"
     live = read_stack(rig.mesh_object).downstream
     rig.mesh_object.fdda.mode = with_rig

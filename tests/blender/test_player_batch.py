@@ -85,16 +85,16 @@ def test_posing_one_character_of_a_crowd_is_one_network_call(bound_elbow, elbow_
     animate(crowd)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
-    still = {mesh_object: assert_plays(mesh_object, elbow_files.model) for mesh_object in crowd}
+    positions_before = {mesh_object: assert_plays(mesh_object, elbow_files.model) for mesh_object in crowd}
     for angle in (0.2, 0.4):
         calls.clear()
         armature_modifier(crowd[7]).object.pose.bones["lower"].rotation_euler[0] = angle
         bpy.context.view_layer.update()
         assert calls == [1]
         moved = assert_plays(crowd[7], elbow_files.model)
-        assert np.abs(moved - still[crowd[7]]).max() > 1e-3
+        assert np.abs(moved - positions_before[crowd[7]]).max() > 1e-3
         for mesh_object in crowd[:7] + crowd[8:]:
-            assert np.array_equal(assert_plays(mesh_object, elbow_files.model), still[mesh_object])
+            assert np.array_equal(assert_plays(mesh_object, elbow_files.model), positions_before[mesh_object])
     for frame in (3, 4, 5):
         bpy.context.scene.frame_set(frame)
         for mesh_object in crowd:

@@ -137,7 +137,7 @@ def test_vertices_without_weights_follow_the_static_joint(smooth: bpy.types.Obje
     assert rig.skin_weights[rig.skin_joints == unmoved].sum() > 1
 
 
-def test_a_rig_reads_the_same_with_the_joints_of_a_model(smooth: bpy.types.Object):
+def test_a_rig_read_with_its_own_joints_is_the_same(smooth: bpy.types.Object):
     missing(smooth)
     first = read_rig(find_rig())
     again = read_rig(find_rig(), first.joint_names)

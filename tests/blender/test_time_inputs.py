@@ -83,7 +83,7 @@ HELD = {
     in_time.through_a_property,
     in_time.second_armature_whose_rotation_is_driven,
 }
-"""Characters whose changing property is keyed in the armature's action, which is not played, or is a control."""
+"""Characters with a property that changes over time. It is a control, or the action that keys it is not played."""
 
 
 def shown_in_frames(rig: SceneRig) -> list[np.ndarray]:

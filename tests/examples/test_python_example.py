@@ -81,10 +81,10 @@ def test_a_control_that_is_not_set_has_its_value_nearest_to_zero(
 
 
 def test_vertices_without_a_bone_do_not_move(controlled_chain: Character, tmp_path: Path):
-    is_static = np.load(controlled_chain.recording / "rest_positions.npy")[:, 2] < 0.15
+    is_static_vertex = np.load(controlled_chain.recording / "rest_positions.npy")[:, 2] < 0.15
     posed_positions = run_and_load(tmp_path, controlled_chain.model, "--turn", "bone_0", 30, 0, 0)
     moved_distances = np.linalg.norm(posed_positions - run_and_load(tmp_path, controlled_chain.model), axis=1)
-    assert moved_distances[is_static].max() < 1e-5 and np.median(moved_distances[~is_static]) > 0.05
+    assert moved_distances[is_static_vertex].max() < 1e-5 and np.median(moved_distances[~is_static_vertex]) > 0.05
 
 
 def test_unknown_joints_and_controls_are_reported_in_one_sentence(

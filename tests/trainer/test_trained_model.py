@@ -125,16 +125,18 @@ def test_a_joint_scaled_to_zero_gives_finite_positions(session, rig):
 
 
 def test_metadata_describes_rig_and_training(trained, recording, report):
-    info, source = read_model_info(trained / "model.onnx"), read_recording(recording)
-    check_rig(trained / "model.onnx", info, source.rig)
-    assert info.joints == source.rig.joints and info.fingerprint == source.rig.fingerprint
-    assert [p.joint for p in info.partitions] == [p.joint for p in source.partitions]
+    info, source_recording = read_model_info(trained / "model.onnx"), read_recording(recording)
+    check_rig(trained / "model.onnx", info, source_recording.rig)
+    assert info.joints == source_recording.rig.joints and info.fingerprint == source_recording.rig.fingerprint
+    assert [p.joint for p in info.partitions] == [p.joint for p in source_recording.partitions]
     assert [p.basis for p in info.partitions] == [p["basis"] for p in report["partitions"]]
-    assert info.limits == source.info.sampling.channels
+    assert info.limits == source_recording.info.sampling.channels
     assert info.training["hidden"] == [24, 24] and info.training["seed"] == 0 and info.training["torch"]
     assert info.held_out_mm == report["fdda"]["held_out"]
     assert 0 < info.parity_mm < 1e-2
-    features = joint_features(source.pose_matrices, source.rig.rest_matrices, source.rig.parents)
+    features = joint_features(
+        source_recording.pose_matrices, source_recording.rig.rest_matrices, source_recording.rig.parents
+    )
     assert (info.feature_low <= features.min(axis=0)).mean() > 0.95
     assert info.feature_low.shape == info.feature_high.shape == (3, 12)
 
@@ -147,8 +149,8 @@ def test_the_graph_has_standard_operators_of_an_early_opset(trained):
 
 
 def test_the_report_has_the_errors_of_the_model(report, trained, recording, session):
-    source = read_recording(recording)
-    assert sum(p["vertices"] for p in report["partitions"]) == source.rig.vertex_count
+    source_recording = read_recording(recording)
+    assert sum(p["vertices"] for p in report["partitions"]) == source_recording.rig.vertex_count
     assert report["model_bytes"] == (trained / "model.onnx").stat().st_size
     held_out, linear = report["fdda"]["held_out"], report["linear"]["held_out"]
     assert held_out["mean"] < 0.1 * linear["mean"]
@@ -156,7 +158,7 @@ def test_the_report_has_the_errors_of_the_model(report, trained, recording, sess
     weights = [p["vertices"] for p in report["partitions"]]
     by_partition = np.average([p["held_out"]["mean"] for p in report["partitions"]], weights=weights)
     assert by_partition == pytest.approx(held_out["mean"], rel=1e-4)
-    assert sum(report["histogram"]["fdda"]) == source.rig.vertex_count * report["training"]["held_out_poses"]
+    assert sum(report["histogram"]["fdda"]) == source_recording.rig.vertex_count * report["training"]["held_out_poses"]
     for p in report["partitions"]:
         assert len(p["curve"]["validation"]) == (40 if p["basis"] else 0)
 
@@ -180,20 +182,20 @@ def test_a_rig_of_one_joint_is_exported(tmp_path):
 
 
 def test_the_report_has_the_surface_errors(report, recording, session, trained):
-    source = read_recording(recording)
+    source_recording = read_recording(recording)
     normals, edges = report["normals"], report["edges"]
     assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
     assert edges["fdda"]["across"] < edges["linear"]["across"]
-    skinning, split = LinearSkinning(source.rig), split_recording(source, TrainingConfig())
-    triangles = source.rig.face_vertices.reshape(-1, 3)
+    skinning, split = LinearSkinning(source_recording.rig), split_recording(source_recording, TrainingConfig())
+    triangles = source_recording.rig.face_vertices.reshape(-1, 3)
     edge_vertices = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    partition_of_vertex = partition_indices(read_model_info(trained / "model.onnx").partitions_of(source.rig))
+    partition_of_vertex = partition_indices(read_model_info(trained / "model.onnx").partitions_of(source_recording.rig))
     is_across = partition_of_vertex[edge_vertices[:, 0]] != partition_of_vertex[edge_vertices[:, 1]]
-    rest_lengths = np.linalg.norm(np.subtract(*source.rig.rest_positions[edge_vertices.T]), axis=1)
+    rest_lengths = np.linalg.norm(np.subtract(*source_recording.rig.rest_positions[edge_vertices.T]), axis=1)
     errors = []
     for pose in split.held_out:
-        matrices = np.array(source.pose_matrices[pose : pose + 1])
-        truth = skinning.complex_positions(matrices, np.array(source.residuals[pose : pose + 1]))[0]
+        matrices = np.array(source_recording.pose_matrices[pose : pose + 1])
+        truth = skinning.complex_positions(matrices, np.array(source_recording.residuals[pose : pose + 1]))[0]
         predicted = run_model(session, matrices)[0][0]
         lengths = [np.linalg.norm(np.subtract(*positions[edge_vertices.T]), axis=1) for positions in (predicted, truth)]
         errors.append(np.abs(lengths[0] - lengths[1]) / rest_lengths)

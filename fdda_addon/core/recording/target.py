@@ -97,7 +97,7 @@ class Repeatability:
         return repeatability
 
     def sentence(self) -> str:
-        """Describe the repeatability for the user."""
+        """Return a text about how closely a repeated pose gives the same surface."""
         count = "1 pose" if len(self.poses) == 1 else f"{len(self.poses)} poses"
         return (
             f"The same pose from two directions: {self.distance_mm['mean']:.3g} mm apart on average, "
