@@ -114,7 +114,7 @@ class TestSmallPartitions:
         assert line in capsys.readouterr().out
         assert self.partitions(tmp_path / "all")["lower"] == (144, ["tip", "nail"])
 
-    def test_no_partitions_are_merged_with_a_minimum_of_zero(self, rig, tmp_path, capsys):
+    def test_a_minimum_of_zero_keeps_small_partitions(self, rig, tmp_path, capsys):
         assert run("record", rig, tmp_path / "apart", "--poses", 30, "--min-partition-vertices", 0) == 0
         assert "merged" not in capsys.readouterr().out
         assert self.partitions(tmp_path / "apart")["nail"] == (3, [])
