@@ -31,7 +31,7 @@ from .joint_override import JointOverride, override_joints
 MIN_TRANSFORM_CHANGE = 1e-5
 """Smallest change of a joint's relative transform between poses that counts as motion (no unit, or meters)."""
 MAX_BATCH_MOVES, BATCH_BYTES = 50, 6 << 20
-"""Largest number of moves, and size in bytes, of a batch whose residuals are computed together."""
+"""Limits of a batch whose residuals are computed together: moves of single joints, and bytes of their positions."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, make_recording_margin
 
 REPEATABILITY_INDEX_OFFSET = 1 << 36
-"""Offset of the indices of intermediate random poses, larger than any pose index of a recording or an evaluation."""
+"""First index of the random poses from which a pose is approached again to measure the repeatability.
+
+No recording or evaluation has as many poses."""
 
 
 class PosePlan:

@@ -211,7 +211,7 @@ def _have_same_faces(first_mesh: bpy.types.Mesh, second_mesh: bpy.types.Mesh) ->
 
 
 def _faces_by_corner_count(starts: np.ndarray, vertices: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the vertices (n, corners) of the faces, in a sorted order, by their number of corners."""
+    """Return the sorted vertex indices of the faces, (n, corners), by number of corners; the faces are sorted, too."""
     corner_counts = np.diff(np.append(starts, len(vertices)))
     faces = {}
     for corner_count in np.unique(corner_counts).tolist():
