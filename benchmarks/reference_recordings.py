@@ -25,12 +25,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fdda_addon.core.partition import Partition
 from trainer.config import TrainingConfig, add_options, config_from_arguments
-from trainer.data import PartitionData, PreparedPartition, prepare_partition
-from trainer.inputs import NetworkInputs, make_inputs
-from trainer.joint_fit import make_joint_regression
-from trainer.loop import train
-from trainer.networks import Network
-from trainer.splitting import split_poses
+from trainer.data.split import split_poses
+from trainer.fits.joint_fit import make_joint_regression
+from trainer.fits.preparation import PartitionData, PreparedPartition, prepare_partition
+from trainer.inputs.network_inputs import NetworkInputs, make_inputs
+from trainer.networks.loop import train
+from trainer.networks.networks import Network
 
 DATA_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
 TRAINING_POSES = 700

@@ -16,16 +16,16 @@ from fdda_addon.core.output import atomic_write, write_json
 from fdda_addon.core.recording.reader import Recording, partitions_to_json, read_partitions, read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
-from trainer.confidence import measure_training_range
 from trainer.config import TrainingConfig
-from trainer.curves import Curves
-from trainer.data import partition_data, prepare_partition
-from trainer.export import PositionErrors, build_model, measure, write_model
-from trainer.inputs import NetworkInputs, inputs_of_rig, partition_centers
-from trainer.loop import train
-from trainer.splitting import split_poses
-from trainer.surface_frame_fit import select_surface_frames
-from trainer.trained_model import TrainedModel, is_sheared
+from trainer.data.split import split_poses
+from trainer.export.export import PositionErrors, build_model, measure, write_model
+from trainer.fits.preparation import partition_data, prepare_partition
+from trainer.fits.surface_frame_fit import select_surface_frames
+from trainer.inputs.network_inputs import NetworkInputs, inputs_of_rig, partition_centers
+from trainer.model import TrainedModel, is_sheared
+from trainer.networks.confidence import measure_training_range
+from trainer.networks.curves import Curves
+from trainer.networks.loop import train
 
 
 @dataclass(frozen=True)

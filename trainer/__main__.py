@@ -50,7 +50,7 @@ def _train(options: argparse.Namespace, sink: MessageSink, stop_request: StopReq
         else:
             check_training_outputs(options.model, options.overwrite)
         with stop_request.exit_immediately(sink):
-            from .training import train_model
+            from .train import train_model
     except ModuleNotFoundError as error:
         raise missing_package_error("Training", error) from error
     settings = (config, sink, stop_request, options.warm_start, options.strict, options.overwrite)

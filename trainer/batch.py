@@ -86,7 +86,7 @@ def train_models(
         Cancelled: `should_stop` returned True.
         FDDAError: as in `check_batch` and `train_model`.
     """
-    from .training import train_model
+    from .train import train_model
 
     started = time.perf_counter()
     check_batch(recordings, folder, overwrite)

@@ -12,7 +12,7 @@ from fdda_addon.core.recording.arrays import NPY_HEADER_ERRORS
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
-from trainer.training import train_model
+from trainer.train import train_model
 
 from .cases import CaseFailedError, print_case, run_case
 from .odd_values import mutate_bytes, mutate_json, to_json_text

@@ -85,7 +85,7 @@ class Trainings:
 def main() -> None:
     """Run the trainings whose arguments stdin lists."""
     # This import takes seconds. It runs while the caller records the first character.
-    import trainer.training  # noqa: F401
+    import trainer.train  # noqa: F401
     from trainer.__main__ import main as train
 
     status_output = sys.stdout

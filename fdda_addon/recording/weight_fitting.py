@@ -28,9 +28,9 @@ WAIT_SECONDS = 0.02
 
 
 class SkinFitting(TrainerProcess):
-    """Process that fits skin weights; its arguments are those of `trainer.skin_fit`."""
+    """Process that fits skin weights; its arguments are those of `trainer.skin`."""
 
-    module = "trainer.skin_fit"
+    module = "trainer.skin"
     failure_message = "The skin weights could not be fitted."
     loss_advice = "no skin weights were fitted, record again"
 

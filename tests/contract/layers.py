@@ -28,6 +28,22 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 """From the top down. A file imports from its own package and lower layers, not from other packages of its layer."""
 
 
+TRAINER_LAYERS: tuple[tuple[str, ...], ...] = (
+    ("__main__",),
+    ("batch",),
+    ("train",),
+    ("report",),
+    ("export",),
+    ("model",),
+    ("networks",),
+    ("fits",),
+    ("data", "inputs", "skin"),
+    ("config", "goal", "graph_builder", "outputs", "process"),
+    ("blocks", "progress"),
+)
+"""The folders and root files of trainer/ from the top down. Each imports from its own folder and lower layers."""
+
+
 def package_of(module_name: str) -> str:
     """Return the package of a module: "core.recording" for "core.recording.index", "__init__" for ""."""
     layer_packages = [package for layer in LAYERS for package in layer]

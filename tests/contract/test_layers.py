@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from .. import systems
-from .layers import ADDON, LAYERS, ROOT, import_graph, imported_names, module_of, package_graph
+from .layers import ADDON, LAYERS, ROOT, TRAINER_LAYERS, import_graph, imported_names, module_of, package_graph
 
 STANDARD_LIBRARY = sys.stdlib_module_names
 BLENDER_MODULES = {"bpy", "bpy_extras", "mathutils", "bmesh", "gpu", "gpu_extras", "blf", "idprop", "pxr"}
@@ -56,6 +56,19 @@ def test_the_trainer_uses_only_the_core_of_the_addon():
     assert [
         pair for pair in names if f"{pair[1]}.".startswith("fdda_addon.") and "fdda_addon.core." not in pair[1]
     ] == []
+
+
+def test_imports_of_the_trainer_point_down_its_layers():
+    layer_of = {unit: index for index, layer in enumerate(TRAINER_LAYERS) for unit in layer}
+    upward_imports, units = [], set()
+    for module, imported in import_graph("trainer").items():
+        for name in imported - {"trainer"}:
+            unit, imported_unit = (dotted.split(".")[1] for dotted in (module, name))
+            units |= {unit, imported_unit}
+            if unit != imported_unit and layer_of[unit] >= layer_of[imported_unit]:
+                upward_imports.append(f"{module} imports {name}")
+    assert upward_imports == []
+    assert units == set(layer_of), "TRAINER_LAYERS names folders that do not exist, or lacks some."
 
 
 def test_the_farm_does_not_import_blender_and_only_the_cluster_imports_dask():

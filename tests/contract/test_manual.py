@@ -21,7 +21,7 @@ INTERFACE_FILES = [
     *(ADDON / "panels").glob("*.py"),
     *(ADDON / "operators").glob("*.py"),
     *sorted((ADDON / "properties").glob("*.py")),
-    ROOT / "trainer" / "report_page.py",
+    ROOT / "trainer" / "report" / "page.py",
 ]
 MESSAGE_FILES = list(ADDON.rglob("*.py"))
 EXAMPLES_OF_BOLD_TEXT = {"bold"}

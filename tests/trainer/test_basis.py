@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from trainer import basis as basis_module
-from trainer.basis import allocate_components, make_basis
+from trainer.fits import basis as basis_module
+from trainer.fits.basis import allocate_components, make_basis
 
 
 def random_residuals(poses: int, vertices: int, rank: int, seed: int = 0) -> np.ndarray:

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from trainer.config import TrainingConfig
-from trainer.data import PartitionData, prepare_partition
-from trainer.loop import _Loop, train
-from trainer.networks import ACTIVATION_FUNCTIONS, PartitionNetworks
+from trainer.data.split import split_poses
+from trainer.fits.preparation import PartitionData, prepare_partition
+from trainer.networks.loop import _Loop, train
+from trainer.networks.networks import ACTIVATION_FUNCTIONS, PartitionNetworks
 from trainer.process import Cancelled
-from trainer.splitting import split_poses
 
 from .chain import chain_angles
 
@@ -131,7 +131,7 @@ def test_irrelevant_inputs_are_suppressed(monkeypatch):
         return min(train_partitions([with_noise], config)[1].curves[0].validation_mm)
 
     rescaled_error = validation_error()
-    monkeypatch.setattr("trainer.loop.RELEVANCE_EPOCH_FRACTIONS", ())
+    monkeypatch.setattr("trainer.networks.loop.RELEVANCE_EPOCH_FRACTIONS", ())
     assert rescaled_error < 0.7 * validation_error()
 
 

@@ -21,10 +21,10 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
-from trainer.confidence import measure_training_range
 from trainer.config import TrainingConfig
-from trainer.inputs import inputs_of_rig, partition_centers
-from trainer.splitting import split_recording
+from trainer.data.split import split_recording
+from trainer.inputs.network_inputs import inputs_of_rig, partition_centers
+from trainer.networks.confidence import measure_training_range
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS, run_page_code

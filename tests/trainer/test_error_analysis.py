@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from trainer.__main__ import main
-from trainer.error_analysis import _cause
-from trainer.error_causes import (
+from trainer.report.error_analysis import _cause
+from trainer.report.error_causes import (
     EXTREME_POSES,
     HIGH_TRAINING_ERRORS,
     NO_CLEAR_CAUSE,
@@ -16,7 +16,7 @@ from trainer.error_causes import (
     TOO_FEW_COMPONENTS,
     TOO_FEW_POSES,
 )
-from trainer.report_page import render_html
+from trainer.report.page import render_html
 
 from .chain import write_chain
 

@@ -8,16 +8,16 @@ import numpy as np
 import onnx
 import pytest
 
-import trainer.training
+import trainer.train
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.skinning import LinearSkinning
-from trainer import network_nodes, skinning_nodes
 from trainer.__main__ import main
-from trainer.export import open_session, reference_positions
-from trainer.graph import build_graph
-from trainer.trained_model import TrainedModel, is_sheared
+from trainer.export import network_nodes, skinning_nodes
+from trainer.export.export import open_session, reference_positions
+from trainer.export.graph import build_graph
+from trainer.model import TrainedModel, is_sheared
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain, rotation
 from .conftest import QUICK_OPTIONS
@@ -28,7 +28,7 @@ SHEAR[0, 1] = 0.3
 
 def collect_trained_models(monkeypatch) -> list[TrainedModel]:
     """Return a list to which every later training adds its model."""
-    trained_models, make_trained_model = [], trainer.training._make_trained_model
+    trained_models, make_trained_model = [], trainer.train._make_trained_model
     monkeypatch.setattr(
         trainer.training,
         "_make_trained_model",

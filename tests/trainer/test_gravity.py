@@ -10,8 +10,8 @@ from fdda_addon.core.partition import assume_nearby_influences, make_partitions
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
-from trainer.gravity import drop_gravity_input
-from trainer.splitting import Split
+from trainer.data.split import Split
+from trainer.fits.gravity import drop_gravity_input
 
 from .chain import MAX_ANGLE, chain_residuals, chain_rig, pose_chain
 

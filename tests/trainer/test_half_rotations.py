@@ -18,15 +18,15 @@ from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
-from trainer import skinning_nodes
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
-from trainer.graph import build_graph
-from trainer.half_rotations import half_rotation_matrices, half_rotations_help, regression_matrices
-from trainer.joint_fit import JointFit, joint_regression
+from trainer.data.split import split_recording
+from trainer.export import skinning_nodes
+from trainer.export.graph import build_graph
+from trainer.fits.half_rotations import half_rotation_matrices, half_rotations_help, regression_matrices
+from trainer.fits.joint_fit import JointFit, joint_regression
+from trainer.model import TrainedModel
 from trainer.process import Cancelled
-from trainer.splitting import split_recording
-from trainer.trained_model import TrainedModel
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, rotation, write_chain
 from .conftest import QUICK_OPTIONS

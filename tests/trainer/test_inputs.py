@@ -7,7 +7,7 @@ import pytest
 from fdda_addon.core.features import joint_features
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.skinning import skin_matrices
-from trainer.inputs import make_inputs, partition_centers
+from trainer.inputs.network_inputs import make_inputs, partition_centers
 
 from .chain import chain_angles, chain_rig, pose_chain
 

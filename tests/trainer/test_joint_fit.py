@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.rig import Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
-from trainer.joint_fit import joint_regression
+from trainer.fits.joint_fit import joint_regression
 
 from .chain import chain_angles, chain_rig, pose_chain, rotation
 

@@ -15,9 +15,9 @@ from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import report_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
-from trainer.data import partition_data, prepare_partition
-from trainer.inputs import inputs_of_rig, partition_centers
-from trainer.splitting import split_recording
+from trainer.data.split import split_recording
+from trainer.fits.preparation import partition_data, prepare_partition
+from trainer.inputs.network_inputs import inputs_of_rig, partition_centers
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS

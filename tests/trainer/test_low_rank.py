@@ -11,13 +11,13 @@ from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
-from trainer import low_rank
 from trainer.__main__ import main
-from trainer.basis import make_basis
-from trainer.graph import build_graph
-from trainer.joint_fit import JointFit, JointRegression, joint_regression
-from trainer.low_rank import TOLERANCE_RATIO, LowRankFactors, may_factorize
-from trainer.trained_model import TrainedModel
+from trainer.export.graph import build_graph
+from trainer.fits import low_rank
+from trainer.fits.basis import make_basis
+from trainer.fits.joint_fit import JointFit, JointRegression, joint_regression
+from trainer.fits.low_rank import TOLERANCE_RATIO, LowRankFactors, may_factorize
+from trainer.model import TrainedModel
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS

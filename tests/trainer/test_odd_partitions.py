@@ -16,8 +16,8 @@ from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
-from trainer.inputs import inputs_of_rig, joints_on_path, partition_centers
-from trainer.joint_fit import joint_regression
+from trainer.fits.joint_fit import joint_regression
+from trainer.inputs.network_inputs import inputs_of_rig, joints_on_path, partition_centers
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS, run_page_code

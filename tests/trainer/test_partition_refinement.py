@@ -15,14 +15,15 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.skinning import LinearSkinning
-from trainer import partition_refinement, training
+from trainer import train
 from trainer.__main__ import main
-from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
-from trainer.data import residuals_of
-from trainer.partition_refinement import partition_indices, reassign_vertices, refine_partitions
+from trainer.data.residuals import residuals_of
+from trainer.data.split import split_recording
+from trainer.fits import partition_refinement
+from trainer.fits.partition_refinement import partition_indices, reassign_vertices, refine_partitions
+from trainer.networks.checkpoint import read_checkpoint
 from trainer.process import Cancelled
-from trainer.splitting import split_recording
 
 from .chain import chain_angles, chain_info, pose_chain
 from .conftest import QUICK_OPTIONS
@@ -201,7 +202,7 @@ def test_a_warm_start_keeps_the_partitions(odd_recording, model_path, tmp_path, 
     error_before = json.loads((model_path.parent / "report.json").read_text())["fdda"]["held_out"]["mean"]
     model = tmp_path / "tube.onnx"
     checkpoint_path(model).write_bytes(checkpoint_path(model_path).read_bytes())
-    monkeypatch.setattr(training, "refine_partitions", None)
+    monkeypatch.setattr(train, "refine_partitions", None)
     assert (
         main(
             [

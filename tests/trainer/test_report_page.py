@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from trainer.report import main
+from trainer.report.__main__ import main
 
 from .. import systems
 from .conftest import REPOSITORY
@@ -166,5 +166,5 @@ def test_a_file_that_is_not_a_report_is_refused(tmp_path, capsys):
 
 
 def test_the_page_needs_no_torch(trained):
-    code = "import sys; sys.modules['torch'] = None; import trainer.report"
+    code = "import sys; sys.modules['torch'] = None; import trainer.report.__main__"
     subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, check=True)

@@ -19,9 +19,9 @@ from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skin_fit import SkinFit
 from fdda_addon.core.skinning import LinearSkinning
 from trainer.process import Cancelled
-from trainer.skin_fit import main
-from trainer.skin_fit_job import fit_folder, measure
-from trainer.skin_solver import SkinSolver, simplex_weights
+from trainer.skin.__main__ import main
+from trainer.skin.job import fit_folder, measure
+from trainer.skin.solver import SkinSolver, simplex_weights
 
 from .. import systems
 from .chain import rotation
@@ -222,7 +222,9 @@ def test_a_stopped_fit_writes_nothing(tmp_path):
 
 
 def test_a_missing_scipy_is_named(tmp_path):
-    code = "import sys; sys.modules['scipy'] = None; from trainer.skin_fit import main; sys.exit(main(sys.argv[1:]))"
+    code = (
+        "import sys; sys.modules['scipy'] = None; from trainer.skin.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    )
     command = [sys.executable, "-c", code, str(write_fit_folder(tmp_path, make_fit_poses(random_rig(2)))), "smooth"]
     process = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert process.returncode == 1

@@ -12,8 +12,8 @@ from fdda_addon.core.poses import Margin
 from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording, read_recording
 from trainer.config import TrainingConfig
-from trainer.data import PartitionData, prepare_partition
-from trainer.splitting import BLOCK_FRAMES, Split, split_recording
+from trainer.data.split import BLOCK_FRAMES, Split, split_recording
+from trainer.fits.preparation import PartitionData, prepare_partition
 
 from .chain import write_chain
 

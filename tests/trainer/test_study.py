@@ -16,9 +16,9 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
-from trainer.inputs import inputs_of_rig, partition_centers
-from trainer.splitting import split_poses
-from trainer.surface_frame_fit import select_surface_frames
+from trainer.data.split import split_poses
+from trainer.fits.surface_frame_fit import select_surface_frames
+from trainer.inputs.network_inputs import inputs_of_rig, partition_centers
 
 from .chain import write_chain
 from .tube import write_tube

@@ -12,15 +12,15 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.skinning import LinearSkinning
-from trainer import surface_frame_fit
 from trainer.__main__ import main
-from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
-from trainer.inputs import inputs_with_surface_frames
+from trainer.data.split import split_recording
+from trainer.fits import surface_frame_fit
+from trainer.fits.surface_frame_fit import MIN_EXPLAINED_VARIANCE, select_surface_frames
+from trainer.inputs.network_inputs import inputs_with_surface_frames
+from trainer.inputs.surface_frames import NO_SURFACE_FRAMES, SurfaceFrameFeatures
+from trainer.networks.checkpoint import read_checkpoint
 from trainer.process import Cancelled
-from trainer.splitting import split_recording
-from trainer.surface_frame_fit import MIN_EXPLAINED_VARIANCE, select_surface_frames
-from trainer.surface_frames import NO_SURFACE_FRAMES, SurfaceFrameFeatures
 
 from .chain import rotation, write_chain
 from .conftest import QUICK_OPTIONS

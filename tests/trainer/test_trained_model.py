@@ -16,8 +16,8 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.config import ACTIVATIONS, TrainingConfig
-from trainer.partition_refinement import partition_indices
-from trainer.splitting import split_recording
+from trainer.data.split import split_recording
+from trainer.fits.partition_refinement import partition_indices
 
 from .chain import MAX_ANGLE, chain_angles, chain_residuals, pose_chain, write_chain
 

@@ -7,8 +7,8 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
+from trainer.export.vertex_order import VertexOrder, vertex_order
 from trainer.graph_builder import GraphBuilder
-from trainer.vertex_order import VertexOrder, vertex_order
 
 
 def assign_strips(vertex_count: int, strip_length: int, partition_count: int) -> list[np.ndarray]:

@@ -13,12 +13,12 @@ from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.report import checkpoint_path
 from trainer.__main__ import main
-from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
-from trainer.data import partition_data, prepare_partition
-from trainer.inputs import inputs_with_surface_frames
-from trainer.splitting import split_recording
-from trainer.warm_start import initial_networks
+from trainer.data.split import split_recording
+from trainer.fits.preparation import partition_data, prepare_partition
+from trainer.inputs.network_inputs import inputs_with_surface_frames
+from trainer.networks.checkpoint import read_checkpoint
+from trainer.networks.warm_start import initial_networks
 
 from .. import systems
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain

@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Builds the ONNX model, checks it against the trained networks, and measures its errors."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.features import FEATURES_PER_JOINT, FLOAT32_ROUNDING_RATIO
+from fdda_addon.core.metrics import distances, error_statistics
+from fdda_addon.core.model import (
+    CHECKSUM_KEY,
+    CONTROLS_INPUT,
+    LIMITS_KEY,
+    METADATA_KEY,
+    OBJECT_KEY,
+    POSE_INPUT,
+    POSITIONS_OUTPUT,
+    SKIN_KEY,
+    ModelInfo,
+    ModelPartition,
+    read_model_info,
+)
+from fdda_addon.core.onnx_file import read_onnx
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.skin_fit import skin_to_text
+from fdda_addon.core.skinning import LinearSkinning
+from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
+
+from ..fits.half_rotations import regression_matrices
+from ..model import TrainedModel
+from .graph import build_graph
+
+MAX_DIFFERENCE_METRES = 1e-5
+"""Maximum difference of a position from the reference, meters. For rigs larger than a meter it is scaled by their size,
+and the rounding error of float32 far from the origin is added."""
+MAX_CONFIDENCE_DIFFERENCE = 1e-3
+MAX_SURFACE_POSES = 50
+"""Maximum number of poses in which normals are compared. At 50,000 vertices a pose takes a tenth of a second."""
+BLOCK_ELEMENTS = 1 << 24
+"""Poses are evaluated in blocks of at most this many coordinates."""
+
+
+@dataclass(frozen=True)
+class PositionErrors:
+    """Distances to the recorded positions, meters, with the vertices in mesh order.
+
+    Attributes:
+        fdda, linear: (n, V) float32, errors of the model and of linear skinning alone.
+    """
+
+    fdda: np.ndarray
+    linear: np.ndarray
+
+
+def reference_positions(
+    trained_model: TrainedModel, pose_matrices: np.ndarray, controls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the positions with the features and linear skinning of `core`, and with the networks in PyTorch.
+
+    Args:
+        trained_model: model with J joints, V vertices and P partitions.
+        pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
+        controls: (N, C) values of the controls.
+
+    Returns:
+        (N, V, 3) float32 positions, mesh-object space, mesh units, and (N, P) float32 confidence.
+    """
+    rig, training_range = trained_model.rig, trained_model.training_range
+    features = trained_model.inputs.compute_features(pose_matrices, rig.rest_matrices, controls)
+    confidence = training_range.compute_confidence(features)
+    mean, scale = trained_model.feature_statistics()
+    clamped = np.clip(features, training_range.low, training_range.high)
+    inputs = ((clamped - mean) / scale).astype(np.float32)
+    matrices = regression_matrices(pose_matrices, rig, len(trained_model.half_rotation_joints()) > 0)
+    local, offsets = (np.zeros((len(features), rig.vertex_count, 3), np.float32) for _ in range(2))
+    for index, (partition, prepared, network) in enumerate(
+        zip(trained_model.partitions, trained_model.prepared, trained_model.networks, strict=True)
+    ):
+        coefficients = network.evaluate(inputs[:, trained_model.feature_columns(index)], trained_model.activation)
+        residuals = prepared.basis.reconstruct(coefficients) * confidence[:, index, None]
+        local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
+        offsets[:, partition.vertices] = prepared.fit.compute_offsets(matrices) * confidence[:, index, None, None]
+    return LinearSkinning(rig, trained_model.partitions).complex_positions(pose_matrices, local) + offsets, confidence
+
+
+def open_session(model: bytes) -> onnxruntime.InferenceSession:
+    """Create an ONNX Runtime session on the CPU.
+
+    Raises:
+        TrainingError: ONNX Runtime does not load the model.
+    """
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's exceptions have no narrower common base class.
+        raise TrainingError(f"ONNX Runtime {onnxruntime.__version__} refuses the exported model: {error}") from error
+
+
+def _inputs(recording: Recording, poses: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the inputs of a session for poses of a recording."""
+    inputs = {POSE_INPUT: np.array(recording.pose_matrices[poses])}
+    if recording.rig.controls:
+        inputs[CONTROLS_INPUT] = np.array(recording.controls[poses])
+    return inputs
+
+
+def measure(
+    session: onnxruntime.InferenceSession, recording: Recording, trained_model: TrainedModel, poses: np.ndarray
+) -> PositionErrors:
+    """Measure the errors of the exported model and of linear skinning on poses of the recording."""
+    vertices = recording.rig.vertex_count
+    fdda, linear = (np.empty((len(poses), vertices), np.float32) for _ in range(2))
+    skinning = LinearSkinning(recording.rig, recording.partitions)
+    for block in _blocks(len(poses), vertices):
+        inputs = _inputs(recording, poses[block])
+        matrices = inputs[POSE_INPUT]
+        truth = skinning.complex_positions(matrices, np.array(recording.residuals[poses[block]]))
+        (positions,) = session.run([POSITIONS_OUTPUT], inputs)
+        fdda[block] = distances(positions, truth, recording.rig.metres_per_unit)
+        linear[block] = distances(skinning.positions(matrices), truth, recording.rig.metres_per_unit)
+    return PositionErrors(fdda, linear)
+
+
+def measure_surface(
+    session: onnxruntime.InferenceSession, recording: Recording, trained_model: TrainedModel, poses: np.ndarray
+) -> dict:
+    """Measure normals and edge lengths on at most `MAX_SURFACE_POSES` poses; returns the JSON of `surface_json`."""
+    rig, rows = recording.rig, []
+    if not len(rig.face_starts):
+        return surface_json(None, None)
+    skinning = LinearSkinning(rig, recording.partitions)
+    comparison = SurfaceComparison(
+        Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, trained_model.partitions
+    )
+    for pose in poses[:: -(-len(poses) // MAX_SURFACE_POSES)]:
+        inputs = _inputs(recording, np.array([pose]))
+        matrices = inputs[POSE_INPUT]
+        truth = skinning.complex_positions(matrices, np.array(recording.residuals[pose, None]))
+        (positions,) = session.run([POSITIONS_OUTPUT], inputs)
+        rows.append(comparison.compare(truth[0], (positions[0], skinning.positions(matrices)[0])))
+    return surface_json(*(surface_errors(method_rows) for method_rows in zip(*rows, strict=True)))
+
+
+def check_parity(
+    session: onnxruntime.InferenceSession, recording: Recording, trained_model: TrainedModel, poses: np.ndarray
+) -> float:
+    """Compare the exported model with `reference_positions`.
+
+    Returns:
+        The largest difference of a position, meters.
+
+    Raises:
+        TrainingError: the difference is too large, or the outputs are not finite.
+    """
+    max_difference, metres_per_unit = 0.0, recording.rig.metres_per_unit
+    for block in _blocks(len(poses), recording.rig.vertex_count):
+        inputs = _inputs(recording, poses[block])
+        positions, confidence = session.run(None, inputs)
+        controls = np.array(recording.controls[poses[block]])
+        expected, expected_confidence = reference_positions(trained_model, inputs[POSE_INPUT], controls)
+        difference = max(float(distances(positions, expected, metres_per_unit).max()), 0.0)
+        if not np.isfinite(positions).all() or not np.isfinite(confidence).all():
+            raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
+        if np.abs(confidence - expected_confidence).max(initial=0) > MAX_CONFIDENCE_DIFFERENCE:
+            raise TrainingError(
+                "The confidence of the exported model differs from PyTorch; this is a defect, report it."
+            )
+        max_difference = max(max_difference, difference)
+    max_coordinate = float(
+        np.abs(recording.rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max()
+    )
+    allowed = (
+        MAX_DIFFERENCE_METRES * max(1.0, recording.rig.size * metres_per_unit)
+        + 2 * FLOAT32_ROUNDING_RATIO * max_coordinate * metres_per_unit
+    )
+    if max_difference > allowed:
+        raise TrainingError(
+            f"The exported model differs from PyTorch by {max_difference * 1000:.3g} mm, more than the allowed "
+            f"{allowed * 1000:.3g} mm; train with a larger weight decay or a smaller learning rate."
+        )
+    return max_difference
+
+
+def model_info(
+    recording: Recording, trained_model: TrainedModel, held_out_errors: np.ndarray, training_info: dict
+) -> ModelInfo:
+    """Create the metadata of a model; the parity is 0 until it is measured.
+
+    Args:
+        recording: recording of the training.
+        trained_model: the result of the training.
+        held_out_errors: (n, V) errors of the held-out poses, meters.
+        training_info: settings and versions.
+    """
+    rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
+    partitions = zip(trained_model.partitions, recording.partitions, trained_model.component_counts(), strict=True)
+    return ModelInfo(
+        rig.joints,
+        rig.rest_matrices,
+        rig.vertex_count,
+        rig.fingerprint,
+        tuple(
+            ModelPartition(
+                *(p.joint, p.influencing, len(p.vertices), count, p.controls, p.merged),
+                tuple(np.setdiff1d(p.vertices, recorded.vertices).tolist()),
+            )
+            for p, recorded, count in partitions
+        ),
+        *(bound[: trained_model.inputs.control_start].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
+        trained_model.training_range.controls,
+        error_statistics(held_out_errors).to_json(),
+        0.0,
+        {
+            **training_info,
+            OBJECT_KEY: recording.info.object_name,
+            LIMITS_KEY: recording.info.sampling.to_json()["limits"],
+        },
+        rig.metres_per_unit,
+    )
+
+
+@dataclass(frozen=True)
+class ExportedModel:
+    """A model that has passed its checks.
+
+    Attributes:
+        content: bytes of the model file.
+        info: metadata of the model.
+        held_out: errors on the held-out poses.
+        session: ONNX Runtime session with the model.
+    """
+
+    content: bytes
+    info: ModelInfo
+    held_out: PositionErrors
+    session: onnxruntime.InferenceSession
+
+
+def build_model(
+    recording: Recording, trained_model: TrainedModel, held_out_poses: np.ndarray, training_info: dict
+) -> ExportedModel:
+    """Build the model, check it against the trained networks, and measure its errors; nothing is written.
+
+    Args:
+        recording: recording of the training.
+        trained_model: the result of the training.
+        held_out_poses: indices of the held-out poses.
+        training_info: settings and versions for the metadata.
+
+    Raises:
+        TrainingError: the model differs from the trained networks.
+    """
+    model = build_graph(trained_model)
+    onnx.checker.check_model(model)
+    session = open_session(model.SerializeToString())
+    parity = check_parity(session, recording, trained_model, held_out_poses)
+    held_out_errors = measure(session, recording, trained_model, held_out_poses)
+    info = replace(
+        model_info(recording, trained_model, held_out_errors.fdda, training_info),
+        parity_mm=parity * 1000,
+        constant_bytes=sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer),
+    )
+    # The checksum comes first, so that a truncated file still has it.
+    model.metadata_props.add(key=CHECKSUM_KEY, value=read_onnx(model.SerializeToString()).checksum)
+    model.metadata_props.add(key=METADATA_KEY, value=info.to_json())
+    if recording.info.fit:
+        skin = skin_to_text(recording.rig.skin_joints, recording.rig.skin_weights)
+        model.metadata_props.add(key=SKIN_KEY, value=skin)
+    return ExportedModel(model.SerializeToString(), info, held_out_errors, session)
+
+
+def write_model(path: Path, content: bytes) -> None:
+    """Write the model file, and check that the add-on can read its metadata.
+
+    Raises:
+        OSError: the file cannot be written.
+        ModelError: the metadata cannot be read.
+    """
+    path.write_bytes(content)
+    read_model_info(path)
+
+
+def _blocks(pose_count: int, vertex_count: int) -> list[slice]:
+    block_size = max(1, BLOCK_ELEMENTS // (3 * vertex_count))
+    return [slice(start, start + block_size) for start in range(0, pose_count, block_size)]

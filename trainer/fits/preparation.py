@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Training data of the networks: features and coefficients of each partition."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdda_addon.core.features import float32_rounding
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
+
+from ..blocks import BLOCK_ELEMENTS
+from ..data.residuals import residuals_of
+from ..data.split import Split
+from ..inputs.network_inputs import NetworkInputs
+from .basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
+from .half_rotations import regression_matrices
+from .joint_fit import JointFit, JointRegression, joint_regression
+from .low_rank import factorize, may_factorize
+
+MARGIN_POSE_WEIGHT = 0.1
+"""Weight of a margin pose in the basis; other poses have weight 1. Margin poses have residuals many times as large, but
+the components are meant for the range of motion."""
+MIN_FEATURE_SPREAD = 1e-5
+"""A feature is constant if its standard deviation over the training poses is smaller: meters, or no unit."""
+
+
+@dataclass(frozen=True)
+class PartitionData:
+    """Features and residuals of one partition, from a recording or another source.
+
+    Attributes:
+        name: name of the main joint.
+        features: (N, F) float32, the features that are offered to the network; F may be 0.
+        read_residuals: returns the (N, Vp, 3) float32 local residuals, mesh units. It is called once, so that only one
+            partition's residuals are in memory at a time.
+        vertex_count: Vp.
+        read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
+        min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
+    """
+
+    name: str
+    features: np.ndarray
+    read_residuals: Callable[[], np.ndarray]
+    vertex_count: int
+    read_regression: Callable[[], JointRegression] | None = None
+    min_spread: np.ndarray | float = MIN_FEATURE_SPREAD
+
+
+@dataclass(frozen=True)
+class PreparedPartition:
+    """A partition that is ready to train.
+
+    Attributes:
+        name: name of the main joint.
+        vertex_count: Vp.
+        columns: (F',) int32, the offered features that vary over the training poses: the inputs of the network.
+        feature_mean, feature_scale: (F',) float32, mean and standard deviation over the training poses.
+        inputs: (N, F') float32, standardized features of all poses.
+        fit: linear part of the residuals.
+        basis: components of the training residuals that remain after the fit.
+        coefficients: (N, K) float32, coefficients of all poses, mesh units.
+        residual_rms: rms distance from the mean over training poses and vertices, after the fit, mesh units.
+        validation_truncation: (n,) rms distance over the vertices between the residuals of each validation pose and
+            their approximation by the basis, mesh units.
+        validation: (n,) indices of the validation poses.
+        mm_per_unit: millimeters per mesh unit.
+        vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
+    """
+
+    name: str
+    vertex_count: int
+    columns: np.ndarray
+    feature_mean: np.ndarray
+    feature_scale: np.ndarray
+    inputs: np.ndarray
+    fit: JointFit
+    basis: Basis
+    coefficients: np.ndarray
+    residual_rms: float
+    validation_truncation: np.ndarray
+    validation: np.ndarray
+    mm_per_unit: float = 1000.0
+    vertex_factors: np.ndarray | None = None
+
+    def with_components(self, count: int) -> "PreparedPartition":
+        """Return the partition with only the first `count` components."""
+        removed = self.coefficients[self.validation, count:].astype(np.float64)
+        squared = self.validation_truncation**2 + (removed**2).sum(axis=1) / self.vertex_count
+        return replace(
+            self,
+            basis=self.basis.truncate(count),
+            coefficients=np.ascontiguousarray(self.coefficients[:, :count]),
+            validation_truncation=np.sqrt(squared),
+        )
+
+
+def partition_data(
+    recording: Recording, partitions: Sequence[Partition], inputs: NetworkInputs, use_half_rotations: bool = False
+) -> list[PartitionData]:
+    """Create the data of a recording's partitions.
+
+    Args:
+        recording: recording with the poses.
+        partitions: partitions of the recording, possibly refined.
+        inputs: input features of the networks.
+        use_half_rotations: whether residuals are also regressed on half-rotation matrices.
+    """
+    rig = recording.rig
+    features = inputs.compute_features(recording.pose_matrices, rig.rest_matrices, recording.controls)
+    matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations)
+    min_length_spread = max(MIN_FEATURE_SPREAD / rig.metres_per_unit, float32_rounding(recording.pose_matrices))
+    min_spread = np.where(inputs.length_mask(), min_length_spread, MIN_FEATURE_SPREAD)
+    return [
+        PartitionData(
+            rig.joints[partition.joint].name,
+            features[:, columns],
+            lambda partition=partition: residuals_of(recording, partition),
+            len(partition.vertices),
+            lambda partition=partition: joint_regression(rig, partition, matrices),
+            min_spread[columns],
+        )
+        for partition, columns in zip(partitions, inputs.columns, strict=True)
+    ]
+
+
+def prepare_partition(
+    partition: PartitionData, split: Split, tolerance_mm: float, seed: int, metres_per_unit: float = 1.0
+) -> PreparedPartition:
+    """Standardize the features of a partition, fit its linear part, and convert the remainder to coefficients.
+
+    Only training poses determine the statistics, the fit and the basis. A partition without varying features has no
+    components, because its mean is its best approximation.
+
+    Args:
+        partition: data of all poses.
+        split: split of the poses.
+        tolerance_mm: rms error that the components may leave, mm.
+        seed: seed of the sample of poses from which the basis is computed.
+        metres_per_unit: as in `Rig`.
+    """
+    features = partition.features
+    training = features[split.training].astype(np.float64)
+    scale = training.std(axis=0)
+    columns = np.flatnonzero(scale > partition.min_spread).astype(np.int32)
+    mean = training[:, columns].mean(axis=0).astype(np.float32)
+    scale = scale[columns].astype(np.float32)
+    residuals = np.asarray(partition.read_residuals(), np.float32)
+    fit = JointFit(np.zeros(0, np.int64), np.zeros((0, partition.vertex_count), np.float32))
+    if partition.read_regression:
+        regression = partition.read_regression()
+        regression = regression if len(columns) else regression.main_joint_only()
+        fit, residuals = regression.fit(residuals, split.training)
+    residuals = residuals.reshape(len(features), -1)
+    mm_per_unit = 1000 * metres_per_unit
+    tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
+    rng, weights = np.random.default_rng([seed, 2]), split.weights(MARGIN_POSE_WEIGHT)
+    basis = make_basis(residuals[split.training], tolerance, rng, weights)
+    coefficients = basis.project(residuals)
+    truncated = residuals[split.validation] - basis.reconstruct(coefficients[split.validation])
+    return PreparedPartition(
+        partition.name,
+        partition.vertex_count,
+        columns,
+        mean,
+        scale,
+        (features[:, columns] - mean) / scale,
+        fit,
+        basis,
+        coefficients,
+        float(np.sqrt(_mean_square(residuals, basis.mean, split.training) / partition.vertex_count)),
+        np.sqrt((truncated**2).sum(axis=1) / partition.vertex_count),
+        split.validation,
+        mm_per_unit,
+    )
+
+
+def prepare_partitions(
+    partitions: Sequence[PartitionData],
+    split: Split,
+    tolerance_mm: float,
+    seed: int,
+    metres_per_unit: float = 1.0,
+    last_hidden_units: int = 0,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> list[PreparedPartition]:
+    """Prepare partitions that share one tolerance (`allocate_components`), and factorize large partitions.
+
+    Args:
+        partitions, split, tolerance_mm, seed, metres_per_unit: as in `prepare_partition`.
+        last_hidden_units: number of units in the last hidden layer.
+        on_progress: called after each partition with the number of partitions that are prepared.
+    """
+    prepared = []
+    for partition in partitions:
+        fine_tolerance_mm = tolerance_mm / FINE_TOLERANCE_FACTOR
+        prepared.append(prepare_partition(partition, split, fine_tolerance_mm, seed, metres_per_unit))
+        on_progress(len(prepared))
+    errors, vertex_counts = [p.basis.error_by_count for p in prepared], [p.vertex_count for p in prepared]
+    tolerance = tolerance_mm / (1000 * metres_per_unit)
+    counts = allocate_components(errors, vertex_counts, tolerance, last_hidden_units + 1)
+    return [
+        _factorized(partition_with_all_components.with_components(count), partition.read_regression, split, tolerance)
+        for partition_with_all_components, count, partition in zip(prepared, counts, partitions, strict=True)
+    ]
+
+
+def _factorized(
+    prepared: PreparedPartition, read_regression: Callable[[], JointRegression] | None, split: Split, tolerance: float
+) -> PreparedPartition:
+    """Factorize a partition if that saves parameters; otherwise return it unchanged."""
+    if not may_factorize(prepared.fit, prepared.basis):
+        return prepared
+    fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
+    weights, regression = split.weights(MARGIN_POSE_WEIGHT), read_regression()
+    factors = factorize(fit, basis, coefficients, regression, split.training, weights, tolerance)
+    if factors is None:
+        return prepared
+    return replace(
+        prepared,
+        fit=factors.fit,
+        basis=factors.basis,
+        coefficients=factors.coefficients,
+        validation_truncation=np.hypot(prepared.validation_truncation, factors.error_rms),
+        vertex_factors=factors.vertex_factors,
+    )
+
+
+def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:
+    """Return the mean over poses of the squared distance between (N, W) residuals and their mean (W,)."""
+    total, step = 0.0, max(1, BLOCK_ELEMENTS // residuals.shape[1])
+    for start in range(0, len(poses), step):
+        errors = residuals[poses[start : start + step]].astype(np.float64) - mean
+        total += float(np.einsum("nw,nw->", errors, errors))
+    return total / len(poses)

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The result of a training, which is exported and evaluated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.rig import Rig
+
+from .fits.partition_refinement import partition_indices
+from .fits.preparation import PreparedPartition
+from .inputs.network_inputs import NetworkInputs
+from .networks.checkpoint import Checkpoint, PartitionCheckpoint
+from .networks.confidence import TrainingRange
+from .networks.networks import Network
+
+MAX_COLUMN_COSINE = 1e-5
+"""A pose matrix is sheared if two of its columns have a larger cosine. Rounding to float32 causes a tenth of it.
+A cosine of 3e-5 already lowers the confidence of nearly locked joints if their bones are treated as orthogonal."""
+BLOCK_POSES = 256
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A trained character.
+
+    Attributes:
+        rig: rig with J joints and V vertices.
+        partitions: P partitions.
+        inputs: input features of the networks.
+        prepared: data of each partition.
+        networks: network of each partition.
+        training_range: range of the training poses.
+        activation: activation of the networks.
+        sheared: whether the columns of some recorded pose matrix are not orthogonal.
+    """
+
+    rig: Rig
+    partitions: tuple[Partition, ...]
+    inputs: NetworkInputs
+    prepared: tuple[PreparedPartition, ...]
+    networks: tuple[Network, ...]
+    training_range: TrainingRange
+    activation: str
+    sheared: bool
+
+    def feature_statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (F,) float64 mean and scale of each feature; 0 and 1 where no network takes it."""
+        size = len(self.training_range.low)
+        mean, scale = np.zeros(size), np.ones(size)
+        for index, prepared in enumerate(self.prepared):
+            columns = self.feature_columns(index)
+            mean[columns], scale[columns] = prepared.feature_mean, prepared.feature_scale
+        return mean, scale
+
+    def feature_columns(self, partition: int) -> np.ndarray:
+        """Return (F',) indices of the features that a partition's network takes, in its order."""
+        return self.inputs.columns[partition][self.prepared[partition].columns]
+
+    def half_rotation_joints(self) -> np.ndarray:
+        """Return (H,) int64, ascending, the joints whose half-rotation matrices some partition is fitted to."""
+        fitted = np.unique(np.concatenate([prepared.fit.joints for prepared in self.prepared]))
+        return fitted[fitted >= len(self.rig.parents)] - len(self.rig.parents)
+
+    def checkpoint(self, holdout: str, hidden: tuple[int, ...], history: list[dict]) -> Checkpoint:
+        """Return the state from which the training can be continued; arguments as in `Checkpoint`."""
+        partitions = [
+            PartitionCheckpoint(
+                self.feature_columns(index),
+                prepared.feature_mean,
+                prepared.feature_scale,
+                prepared.basis.mean,
+                prepared.basis.components,
+                network,
+            )
+            for index, (prepared, network) in enumerate(zip(self.prepared, self.networks, strict=True))
+        ]
+        return Checkpoint(
+            self.rig.fingerprint,
+            tuple(control.name for control in self.rig.controls),
+            holdout,
+            hidden,
+            self.activation,
+            tuple(history),
+            tuple(partitions),
+            self.inputs.surface_frames,
+            partition_indices(self.partitions),
+        )
+
+    def component_counts(self) -> list[int]:
+        """Return K, the number of components, of each partition."""
+        return [len(prepared.basis.components) for prepared in self.prepared]
+
+
+def is_sheared(pose_matrices: np.ndarray) -> bool:
+    """Return whether some matrix has columns that are not orthogonal; scale alone is no shear.
+
+    Args:
+        pose_matrices: (N, J, 4, 4).
+    """
+    for start in range(0, len(pose_matrices), BLOCK_POSES):
+        axes = np.asarray(pose_matrices[start : start + BLOCK_POSES], np.float64)[:, :, :3, :3]
+        lengths = np.linalg.norm(axes, axis=2)
+        products = np.abs(axes.transpose(0, 1, 3, 2) @ axes)[:, :, [0, 0, 1], [1, 2, 2]]
+        if (products > MAX_COLUMN_COSINE * lengths[:, :, [0, 0, 1]] * lengths[:, :, [1, 2, 2]]).any():
+            return True
+    return False

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The checkpoint of a training, a file beside the model: reading, writing and validation."""
+
+import json
+import os
+import zipfile
+import zlib
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.input_file import open_input
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.arrays import MAX_VALUE, NPY_HEADER_ERRORS
+from fdda_addon.core.rig import Fingerprint
+
+from ..fits.partition_refinement import reassign_vertices
+from ..inputs.surface_frames import SurfaceFrameFeatures
+from .networks import Network
+
+VERSION = 1
+READ_ERRORS = (
+    *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
+    *(RuntimeError, IndexError, *NPY_HEADER_ERRORS),
+)
+"""Errors that numpy and zipfile raise for a damaged file. RuntimeError is for an encrypted archive."""
+OTHER_PARTITIONS_SENTENCE = "The checkpoint is of other partitions; train without --warm-start."
+CONTRADICTION_CLAUSE = "its arrays contradict each other"
+NOT_FINITE_CLAUSE = "its arrays hold values that are not numbers"
+
+
+@dataclass(frozen=True)
+class PartitionCheckpoint:
+    """The network of one partition, with the feature statistics and the basis that it was trained with.
+
+    Attributes:
+        columns: (F',) int64, indices of the network's inputs among all features of `NetworkInputs`.
+        feature_mean, feature_scale: (F',) float32, statistics of these features over the training poses.
+        basis_mean: (3 Vp,) float32, mesh units.
+        basis_components: (K, 3 Vp) float32, orthonormal rows, no unit.
+        network: maps standardized features to coefficients in mesh units.
+    """
+
+    columns: np.ndarray
+    feature_mean: np.ndarray
+    feature_scale: np.ndarray
+    basis_mean: np.ndarray
+    basis_components: np.ndarray
+    network: Network
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The state from which a training can be continued.
+
+    Attributes:
+        fingerprint: fingerprint of the rig.
+        controls: names of the rig's controls.
+        holdout: fingerprint of the held-out and validation poses (`splitting.holdout_fingerprint`).
+        hidden, activation: layers and activation of the networks, as in `TrainingConfig`.
+        history: pose count and held-out error of this training and its predecessors, oldest first:
+            `{"poses", "p999"}`, mm.
+        partitions: state of each partition, in the order of the recording.
+        surface_frames: surface frames that are inputs of the networks.
+        partition_indices: (V,) int64, index of the partition of each vertex.
+    """
+
+    fingerprint: Fingerprint
+    controls: tuple[str, ...]
+    holdout: str
+    hidden: tuple[int, ...]
+    activation: str
+    history: tuple[dict, ...]
+    partitions: tuple[PartitionCheckpoint, ...]
+    surface_frames: SurfaceFrameFeatures
+    partition_indices: np.ndarray
+
+    def reassign(self, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
+        """Assign the vertices of a recording to its partitions as in the checkpoint.
+
+        Raises:
+            TrainingError: the recording has other partitions.
+        """
+        vertex_count = sum(len(partition.vertices) for partition in partitions)
+        if (len(self.partitions), len(self.partition_indices)) != (len(partitions), vertex_count):
+            raise TrainingError(OTHER_PARTITIONS_SENTENCE)
+        return reassign_vertices(partitions, self.partition_indices)
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    metadata = {
+        "version": VERSION,
+        "fingerprint": vars(checkpoint.fingerprint),
+        "controls": checkpoint.controls,
+        "holdout": checkpoint.holdout,
+        "hidden": checkpoint.hidden,
+        "activation": checkpoint.activation,
+        "history": checkpoint.history,
+        "partitions": len(checkpoint.partitions),
+    }
+    arrays = {"about": np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
+    arrays |= {f"surface_frames/{name}": array for name, array in vars(checkpoint.surface_frames).items()}
+    arrays["partition_indices"] = checkpoint.partition_indices
+    for index, partition in enumerate(checkpoint.partitions):
+        partition_arrays = {name: array for name, array in vars(partition).items() if name != "network"}
+        partition_arrays |= {f"weight_{layer}": weight for layer, weight in enumerate(partition.network.weights)}
+        partition_arrays |= {f"bias_{layer}": bias for layer, bias in enumerate(partition.network.biases)}
+        arrays |= {f"{index}/{name}": array for name, array in partition_arrays.items()}
+    with open(path, "wb") as file:
+        np.savez(file, **arrays)
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        TrainingError: there is no checkpoint, or it is damaged.
+    """
+    try:
+        with open_input(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            with zipfile.ZipFile(file) as archive:
+                # An array that is larger than the file is refused before memory is allocated for it.
+                if any(member.file_size > size for member in archive.infolist()):
+                    raise ValueError("it is packed")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as arrays:
+                return _read_arrays(arrays)
+    except FileNotFoundError as error:
+        raise TrainingError(
+            f"There is no checkpoint '{path}' to start from; train without --warm-start first."
+        ) from error
+    except READ_ERRORS as error:
+        raise TrainingError(f"The checkpoint '{path}' cannot be used ({error}); train without --warm-start.") from error
+
+
+def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
+    metadata = json.loads(arrays["about"].tobytes())
+    if metadata["version"] != VERSION:
+        raise ValueError(f"version {metadata['version']!r}")
+    hidden = tuple(int(units) for units in metadata["hidden"])
+    partitions = []
+    for index in range(int(metadata["partitions"])):
+        names = ("columns", "feature_mean", "feature_scale", "basis_mean", "basis_components")
+        values = {name: arrays[f"{index}/{name}"] for name in names}
+        layers = range(1 if not len(values["basis_components"]) else len(hidden) + 1)
+        weights, biases = (tuple(arrays[f"{index}/{kind}_{layer}"] for layer in layers) for kind in ("weight", "bias"))
+        partition = PartitionCheckpoint(**values, network=Network(weights, biases))
+        _check_partition(partition, hidden)
+        partitions.append(partition)
+    return Checkpoint(
+        Fingerprint.from_json(metadata["fingerprint"]),
+        tuple(str(name) for name in metadata["controls"]),
+        str(metadata["holdout"]),
+        hidden,
+        str(metadata["activation"]),
+        tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in metadata["history"]),
+        tuple(partitions),
+        _read_surface_frames(arrays),
+        _read_partition_indices(arrays["partition_indices"], partitions),
+    )
+
+
+def _read_partition_indices(partition_indices: np.ndarray, partitions: list[PartitionCheckpoint]) -> np.ndarray:
+    if partition_indices.dtype != np.int64 or partition_indices.ndim != 1 or partition_indices.min(initial=0) < 0:
+        raise ValueError(CONTRADICTION_CLAUSE)
+    sizes = [len(partition.basis_mean) for partition in partitions]
+    if (3 * np.bincount(partition_indices, minlength=len(sizes))).tolist() != sizes:
+        raise ValueError(CONTRADICTION_CLAUSE)
+    return partition_indices
+
+
+def _read_surface_frames(arrays: np.lib.npyio.NpzFile) -> SurfaceFrameFeatures:
+    surface_frames = SurfaceFrameFeatures(
+        **{field.name: arrays[f"surface_frames/{field.name}"] for field in fields(SurfaceFrameFeatures)}
+    )
+    _, count, corners = surface_frames.lengths.shape
+    shapes = {
+        "vertices": (count,),
+        "main_joints": (count,),
+        "tangents": (2, count, corners, *surface_frames.tangents.shape[3:4]),
+    }
+    for name, array in vars(surface_frames).items():
+        is_index = name in ("vertices", "main_joints")
+        if array.dtype != (np.int64 if is_index else np.float64) or array.shape != shapes.get(
+            name, (3, count, corners)
+        ):
+            raise ValueError(CONTRADICTION_CLAUSE)
+        if not (np.abs(array) <= MAX_VALUE).all() or (is_index and array.min(initial=0) < 0):
+            raise ValueError(NOT_FINITE_CLAUSE)
+    if surface_frames.tangents.ndim != 4 or not (surface_frames.epsilons > 0).all():
+        raise ValueError(CONTRADICTION_CLAUSE)
+    return surface_frames
+
+
+def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) -> None:
+    """Check the dtypes, shapes and values of a partition's arrays.
+
+    Raises:
+        ValueError: arrays contradict each other, or hold values that are not numbers.
+    """
+    network = partition.network
+    arrays = [partition.feature_mean, partition.feature_scale, partition.basis_mean, partition.basis_components]
+    for array in (*arrays, *network.weights, *network.biases):
+        if array.dtype != np.float32 or not (np.abs(array) <= MAX_VALUE).all():
+            raise ValueError(NOT_FINITE_CLAUSE)
+    if partition.columns.dtype != np.int64 or partition.columns.ndim != 1:
+        raise ValueError(CONTRADICTION_CLAUSE)
+    feature_count, component_count = len(partition.columns), len(partition.basis_components)
+    sizes = (feature_count, *hidden, component_count) if component_count else (feature_count, 0)
+    if (
+        [weight.shape for weight in network.weights] != list(pairwise(sizes))
+        or [bias.shape for bias in network.biases] != [(size,) for size in sizes[1:]]
+        or partition.basis_components.shape != (component_count, len(partition.basis_mean))
+        or not (partition.feature_mean.shape == partition.feature_scale.shape == (feature_count,))
+        or not (partition.feature_scale > 0).all()
+    ):
+        raise ValueError(CONTRADICTION_CLAUSE)

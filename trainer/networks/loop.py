@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The training loop, which trains the networks of all partitions together."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.func import functional_call
+
+from fdda_addon.core.errors import TrainingError
+
+from ..config import TrainingConfig
+from ..data.split import Split
+from ..fits.preparation import PreparedPartition
+from ..process import Cancelled
+from .curves import Curves, Progress
+from .networks import Network, PartitionNetworks
+from .optimizer import OneCycleAdamW
+
+WARM_UP_FRACTION = 0.15
+"""Part of the steps in which the learning rate rises."""
+RELEVANCE_EPOCH_FRACTIONS = (0.1, 0.2)
+"""Inputs are rescaled by relevance after these parts of the epochs (`_Loop.rescale_inputs_by_relevance`)."""
+RELEVANCE_POSES = 1000
+"""Approximate number of training poses on which relevance is measured."""
+MIN_RELEVANCE = 1e-3
+"""Minimum factor of an input. The root mean square of the factors of a partition's inputs is 1."""
+LOSS_EPSILON = 1e-6
+"""Added to squared relative errors, so that the loss, a distance, is smooth at zero."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """Network and learning curves of each partition. The network of a constant partition has no outputs."""
+
+    networks: tuple[Network, ...]
+    curves: tuple[Curves, ...]
+
+
+def choose_device() -> torch.device:
+    """Return the GPU where torch finds one, else the CPU."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def train(
+    partitions: Sequence[PreparedPartition],
+    split: Split,
+    config: TrainingConfig,
+    device: torch.device | None = None,
+    on_epoch: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    initial: Sequence[Network | None] | None = None,
+) -> TrainingResult:
+    """Train the networks of all partitions together.
+
+    Args:
+        partitions: partitions with the inputs and coefficients of all poses.
+        split: split of the poses.
+        config: settings of the training. Equal settings and data give equal weights on one machine.
+        device: device to train on; None for `choose_device()`.
+        on_epoch: called after every epoch.
+        should_stop: called before every step.
+        initial: for each partition the network to start from, or None for random weights.
+
+    Raises:
+        Cancelled: `should_stop` returned True.
+        TrainingError: the training diverged.
+    """
+    device = device or choose_device()
+    # Inactive units lead to denormal numbers in the optimizer, which take twice the time.
+    torch.set_flush_denormal(True)
+    learning_indices = [index for index, partition in enumerate(partitions) if len(partition.basis.components)]
+    curves = tuple(Curves() for _ in partitions)
+    networks = [Network((np.zeros((len(p.columns), 0), np.float32),), (np.zeros(0, np.float32),)) for p in partitions]
+    if learning_indices:
+        loop = _Loop([partitions[index] for index in learning_indices], split, config, device)
+        if initial is not None:
+            loop.start_from([initial[index] for index in learning_indices])
+        loop.run([curves[index] for index in learning_indices], on_epoch, should_stop, partitions)
+        for index, network in zip(learning_indices, loop.best_networks(), strict=True):
+            networks[index] = network
+    return TrainingResult(tuple(networks), curves)
+
+
+class _Loop:
+    """The state of a training of P partitions."""
+
+    def __init__(self, partitions: list[PreparedPartition], split: Split, config: TrainingConfig, device: torch.device):
+        self.partitions, self.config, self.device = partitions, config, device
+        # Coefficients are divided by the residual of their partition, so that one loss and one learning rate suit all.
+        self.target_scales = [partition.residual_rms * np.sqrt(partition.vertex_count) for partition in partitions]
+        inputs = [p.inputs for p in partitions]
+        targets = [p.coefficients / scale for p, scale in zip(partitions, self.target_scales, strict=True)]
+        self.inputs, self.targets = (_padded(arrays, split.training, device) for arrays in (inputs, targets))
+        self.validation_inputs, self.validation_targets = (
+            _padded(arrays, split.validation, device) for arrays in (inputs, targets)
+        )
+        self.to_mm = torch.tensor([p.residual_rms * p.mm_per_unit for p in partitions], device=device)[:, None]
+        self.validation_truncation_mm = torch.tensor(
+            np.stack([p.validation_truncation * p.mm_per_unit for p in partitions]),
+            dtype=torch.float32,
+            device=device,
+        )
+        truncation_rms_mm = [p.basis.truncation_rms * p.mm_per_unit for p in partitions]
+        self.truncation_mm = torch.tensor(truncation_rms_mm, device=device)[:, None]
+        self.model = PartitionNetworks(
+            [array.shape[1] for array in inputs],
+            [array.shape[1] for array in targets],
+            config.hidden,
+            config.activation,
+            config.dropout,
+            torch.Generator().manual_seed(config.seed),
+        ).to(device)
+        self._start_average()
+        self.best_parameters = [parameter.clone() for parameter in self.averaged_parameters]
+        self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
+        # (P, F) product of all factors by which the standardized features were rescaled.
+        self.input_scales = torch.ones_like(self.inputs[:, 0])
+
+    @torch.enable_grad()
+    def rescale_inputs_by_relevance(self) -> torch.Tensor:
+        """Multiply each input by its relevance, the root mean square gradient of the outputs with respect to it.
+
+        Inputs with little effect become small, so that the networks do not fit chance correlations with them. Automatic
+        relevance determination finds such factors for a kernel (MacKay, 1994).
+
+        Returns:
+            (P, 1, F) factors of the inputs.
+        """
+        generator = torch.Generator().manual_seed(self.config.seed + 3)
+        inputs = self.inputs[:, :: -(-self.inputs.shape[1] // RELEVANCE_POSES)].clone().requires_grad_(True)
+        outputs = self._averaged_outputs(inputs)
+        # Along random directions the mean square over poses estimates the sum over all outputs.
+        directions = torch.randn(outputs.shape, generator=generator).to(self.device)
+        (gradients,) = torch.autograd.grad(outputs, inputs, directions)
+        mean_squares = gradients.square().mean(dim=1, keepdim=True)
+        input_counts = torch.tensor([p.inputs.shape[1] for p in self.partitions], device=self.device)[:, None, None]
+        mean_over_inputs = mean_squares.sum(dim=2, keepdim=True) / input_counts
+        factors = torch.where(mean_over_inputs > 0, (mean_squares / mean_over_inputs).sqrt(), 1.0).clamp(
+            min=MIN_RELEVANCE
+        )
+        self.inputs *= factors
+        self.validation_inputs *= factors
+        self.input_scales *= factors[:, 0]
+        # The best weights are divided by the factors, so that their outputs stay the same.
+        self.best_parameters[0] /= factors.transpose(1, 2)
+        return factors
+
+    @torch.no_grad()
+    def start_from(self, networks: list[Network | None]) -> None:
+        """Replace the random weights with the weights of trained networks. None keeps random weights.
+
+        Inputs are rescaled once, and the first layer inversely, so that the outputs stay the same.
+        """
+        for index, (network, scale) in enumerate(zip(networks, self.target_scales, strict=True)):
+            if network is None:
+                continue
+            last_layer = len(network.weights) - 1
+            for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+                factor = np.float32(1 / scale) if layer == last_layer else np.float32(1)
+                rows, columns = weight.shape
+                self.model.weights[layer][index, :rows, :columns] = torch.from_numpy(weight * factor)
+                self.model.biases[layer][index, 0, :columns] = torch.from_numpy(bias * factor)
+        self._start_average()
+        factors = self.rescale_inputs_by_relevance()
+        for first_layer in (self.model.weights[0], self.averaged_parameters[0]):
+            first_layer /= factors.transpose(1, 2)
+
+    def _start_average(self) -> None:
+        self.averaged_parameters = [parameter.detach().clone() for parameter in self.model.parameters()]
+
+    def run(
+        self,
+        curves: list[Curves],
+        on_epoch: Callable[[Progress], None] | None,
+        should_stop: Callable[[], bool],
+        all_partitions: Sequence[PreparedPartition],
+    ) -> None:
+        """Train for all epochs.
+
+        Args:
+            curves: learning curves of the P partitions; each epoch adds its errors.
+            on_epoch, should_stop: as in `train`.
+            all_partitions: the P partitions and the partitions without components. The reported progress is a mean
+                over all of them.
+        """
+        config, pose_count = self.config, self.inputs.shape[1]
+        step_count = -(-pose_count // config.batch_size)
+        optimizer = OneCycleAdamW(
+            self.model.parameters(),
+            config.learning_rate,
+            config.weight_decay,
+            config.epochs * step_count,
+            WARM_UP_FRACTION,
+        )
+        order_generator = torch.Generator().manual_seed(config.seed + 1)
+        dropout_generator = torch.Generator(self.device).manual_seed(config.seed + 2)
+        vertex_counts = np.array([p.vertex_count for p in all_partitions])
+        constant_partitions = [p for p in all_partitions if not len(p.basis.components)]
+        constant_mm = sum(
+            float(p.validation_truncation.mean()) * p.mm_per_unit * p.vertex_count for p in constant_partitions
+        )
+        learning_vertex_counts = np.array([p.vertex_count for p in self.partitions])
+        rescaling_epochs = {round(fraction * config.epochs) for fraction in RELEVANCE_EPOCH_FRACTIONS} - {0}
+        for epoch in range(1, config.epochs + 1):
+            if epoch - 1 in rescaling_epochs:
+                self.rescale_inputs_by_relevance()
+            pose_order = torch.randperm(pose_count, generator=order_generator).to(self.device)
+            training_mm = torch.zeros(len(self.partitions), device=self.device)
+            for step in range(step_count):
+                if should_stop():
+                    raise Cancelled
+                batch_poses = pose_order[step * config.batch_size : (step + 1) * config.batch_size]
+                errors = self._step(optimizer, batch_poses, dropout_generator)
+                self._update_average((epoch - 1) * step_count + step)
+                training_mm += (errors * self.to_mm.square() + self.truncation_mm.square()).sqrt().sum(dim=1)
+            validation_mm, worst_mm = self._validate()
+            self._update_best(validation_mm, epoch, curves)
+            validation = validation_mm.cpu().numpy()
+            if not np.isfinite(validation).all():
+                raise TrainingError(
+                    f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
+                    f"{config.learning_rate:g}."
+                )
+            training = (training_mm / pose_count).tolist()
+            errors_mm = zip(curves, training, validation.tolist(), worst_mm.tolist(), strict=True)
+            for curve, training_error, validation_error, worst_error in errors_mm:
+                curve.training_mm.append(training_error)
+                curve.validation_mm.append(validation_error)
+                curve.worst_mm.append(worst_error)
+            if on_epoch:
+                means = [
+                    (float(errors @ learning_vertex_counts) + constant_mm) / vertex_counts.sum()
+                    for errors in (np.array(training), validation)
+                ]
+                on_epoch(Progress(epoch, config.epochs, *means))
+            if config.patience and epoch - max(curve.best_epoch for curve in curves) >= config.patience:
+                break
+
+    def _step(self, optimizer: OneCycleAdamW, poses: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Take one optimization step; returns (P, n) squared errors in units of each partition's residual."""
+        optimizer.zero_grad()
+        differences = self.model(self.inputs[:, poses], generator) - self.targets[:, poses]
+        squared_errors = differences.square().sum(dim=2)
+        # The loss is a mean distance, like the reported error. Unlike a mean square, it is robust to outliers.
+        # The sum over partitions gives each network the same gradient as if it were trained alone.
+        loss = (squared_errors + LOSS_EPSILON).sqrt().mean(dim=1).sum()
+        if self.config.l1:
+            loss = loss + self.config.l1 * sum(weight.abs().sum() for weight in self.model.weights)
+        if self.config.l2:
+            loss = loss + self.config.l2 * sum(weight.square().sum() for weight in self.model.weights)
+        loss.backward()
+        optimizer.step()
+        return squared_errors.detach()
+
+    @torch.no_grad()
+    def _update_average(self, step: int) -> None:
+        """Update the running average of the weights, faster in the first steps, where they change most."""
+        decay = min(self.config.averaging, (1 + step) / (10 + step)) if self.config.averaging else 0.0
+        torch._foreach_lerp_(self.averaged_parameters, list(self.model.parameters()), 1 - decay)
+
+    def _averaged_outputs(self, inputs: torch.Tensor) -> torch.Tensor:
+        names = [name for name, _ in self.model.named_parameters()]
+        return functional_call(self.model, dict(zip(names, self.averaged_parameters, strict=True)), (inputs,))
+
+    @torch.no_grad()
+    def _validate(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (P,) mean and (P,) maximum error of the validation poses with the averaged weights, mm."""
+        differences = self._averaged_outputs(self.validation_inputs) - self.validation_targets
+        squared = differences.square().sum(dim=2) * self.to_mm.square()
+        errors = (squared + self.validation_truncation_mm.square()).sqrt()
+        return errors.mean(dim=1), errors.max(dim=1).values
+
+    def _update_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
+        is_better = validation_mm < self.best_mm
+        self.best_mm = torch.where(is_better, validation_mm, self.best_mm)
+        for best_parameter, averaged_parameter in zip(self.best_parameters, self.averaged_parameters, strict=True):
+            best_parameter[is_better] = averaged_parameter[is_better]
+        for index in torch.nonzero(is_better).flatten().tolist():
+            curves[index].best_epoch = epoch
+
+    def best_networks(self) -> list[Network]:
+        """Return the best weights of each partition without padding, for coefficients in mesh units."""
+        layer_count = len(self.model.weights)
+        all_weights, all_biases = (
+            [tensor.cpu().numpy() for tensor in self.best_parameters[half * layer_count : (half + 1) * layer_count]]
+            for half in range(2)
+        )
+        input_scales = self.input_scales.cpu().numpy()
+        networks = []
+        for index, (partition, scale) in enumerate(zip(self.partitions, self.target_scales, strict=True)):
+            weights, biases = ([array[index].copy() for array in arrays] for arrays in (all_weights, all_biases))
+            output_count, input_count = len(partition.basis.components), partition.inputs.shape[1]
+            weights[0] = weights[0][:input_count] * input_scales[index, :input_count, None]
+            weights[-1] = weights[-1][:, :output_count] * np.float32(scale)
+            biases[-1] = biases[-1][:, :output_count] * np.float32(scale)
+            networks.append(Network(tuple(weights), tuple(bias[0] for bias in biases)))
+        return networks
+
+
+def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: torch.device) -> torch.Tensor:
+    """Stack (n, width) arrays of the selected poses into one (P, n, max width) float32 tensor, padded with 0."""
+    padded = np.zeros((len(arrays), len(poses), max(array.shape[1] for array in arrays)), np.float32)
+    for index, array in enumerate(arrays):
+        padded[index, :, : array.shape[1]] = array[poses]
+    return torch.from_numpy(padded).to(device)

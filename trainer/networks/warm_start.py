@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A warm start: continues a training from its checkpoint, on a recording that may have grown.
+
+Linear fits, feature statistics and bases are computed from the current poses. The first and the last layer of each
+network absorb the differences in statistics and basis, so the network starts with nearly its former outputs.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.report import checkpoint_path
+
+from ..config import TrainingConfig
+from ..fits.preparation import PreparedPartition
+from .checkpoint import OTHER_PARTITIONS_SENTENCE, Checkpoint, PartitionCheckpoint, read_checkpoint
+from .networks import Network
+
+WARM_START_EPOCHS_RATIO, WARM_START_RATE_RATIO = 0.5, 0.3
+"""Epochs and learning rate of a warm start, as parts of the settings."""
+
+
+def read_initial_checkpoint(model_path: Path, recording: Recording, holdout: str, config: TrainingConfig) -> Checkpoint:
+    """Read the checkpoint to start from, and check that it fits.
+
+    Args:
+        model_path: path of the model; the checkpoint is beside it.
+        recording: recording to train on.
+        holdout: fingerprint of its held-out and validation poses.
+        config: settings of the training.
+
+    Raises:
+        TrainingError: there is no checkpoint, or its rig, controls, networks or split differ.
+    """
+    path = checkpoint_path(model_path)
+    checkpoint = read_checkpoint(path)
+    if checkpoint.fingerprint != recording.rig.fingerprint:
+        raise TrainingError(f"The checkpoint '{path}' is of another rig; train without --warm-start.")
+    if checkpoint.controls != tuple(control.name for control in recording.rig.controls):
+        raise TrainingError(f"The checkpoint '{path}' is of other controls; train without --warm-start.")
+    if not checkpoint.surface_frames.fits(recording.rig):
+        raise TrainingError(f"The checkpoint '{path}' is damaged; train without --warm-start.")
+    if checkpoint.holdout != holdout:
+        raise TrainingError(
+            f"The checkpoint '{path}' is of another recording or seed, and may have been trained on poses that are "
+            "held out now; train with the same, or without --warm-start."
+        )
+    if (checkpoint.hidden, checkpoint.activation) != (config.hidden, config.activation):
+        raise TrainingError(
+            f"The checkpoint '{path}' is of networks --hidden {' '.join(map(str, checkpoint.hidden))} --activation "
+            f"{checkpoint.activation}; train with the same, or without --warm-start."
+        )
+    return checkpoint
+
+
+def warm_start_config(config: TrainingConfig) -> TrainingConfig:
+    """Return the settings of a warm start: fewer epochs at a lower learning rate."""
+    return replace(
+        config,
+        epochs=max(1, round(config.epochs * WARM_START_EPOCHS_RATIO)),
+        learning_rate=config.learning_rate * WARM_START_RATE_RATIO,
+    )
+
+
+def initial_networks(
+    checkpoint: Checkpoint, prepared: list[PreparedPartition], columns: list[np.ndarray]
+) -> list[Network | None]:
+    """Convert the networks of a checkpoint to the features and bases of the current training.
+
+    Args:
+        checkpoint: checkpoint of the same rig, controls, hidden layers and activation.
+        prepared: the partitions of the current training.
+        columns: for each partition, (F',) indices of its features among all features of `NetworkInputs`.
+
+    Returns:
+        For each partition a network with nearly the former outputs; None where the partition has no network now or had
+        none before.
+
+    Raises:
+        TrainingError: the checkpoint is of other partitions.
+    """
+    sizes = [3 * partition.vertex_count for partition in prepared]
+    if sizes != [len(partition.basis_mean) for partition in checkpoint.partitions]:
+        raise TrainingError(OTHER_PARTITIONS_SENTENCE)
+    return [_convert_network(*arguments) for arguments in zip(checkpoint.partitions, prepared, columns, strict=True)]
+
+
+def _convert_network(former: PartitionCheckpoint, prepared: PreparedPartition, columns: np.ndarray) -> Network | None:
+    """Convert the network of one partition; arguments and result as in `initial_networks`."""
+    if not len(former.basis_components) or not len(prepared.basis.components):
+        return None
+    weights, biases = (
+        [array.astype(np.float64) for array in arrays] for arrays in (former.network.weights, former.network.biases)
+    )
+    # A feature that was constant before gets weight 0. A feature that is constant now stays at its mean.
+    first_weights = np.zeros((len(columns), weights[0].shape[1]))
+    _, new_rows, former_rows = np.intersect1d(columns, former.columns, return_indices=True)
+    unscaled = weights[0][former_rows] / former.feature_scale[former_rows, None]
+    first_weights[new_rows] = unscaled * prepared.feature_scale[new_rows, None]
+    biases[0] = biases[0] + (prepared.feature_mean[new_rows] - former.feature_mean[former_rows]) @ unscaled
+    weights[0] = first_weights
+    components = prepared.basis.components.T.astype(np.float64)
+    change_of_basis = former.basis_components @ components
+    weights[-1] = weights[-1] @ change_of_basis
+    biases[-1] = biases[-1] @ change_of_basis + (former.basis_mean - prepared.basis.mean) @ components
+    return Network(*(tuple(array.astype(np.float32) for array in arrays) for arrays in (weights, biases)))

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Analysis of the largest errors of each partition. The report shows what is likely to lower them."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.refinement import nearest_recorded_distances
+
+from ..data.residuals import residuals_of
+from ..data.split import Split
+from ..fits.half_rotations import regression_matrices
+from ..fits.preparation import PreparedPartition
+from ..model import TrainedModel
+from .error_causes import EXTREME_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE, TOO_FEW_COMPONENTS, TOO_FEW_POSES
+
+ANALYZED_FRACTION = 5e-3
+"""Part of a partition's held-out errors that is analyzed. They are the largest errors, and at least one."""
+MAX_TRAINING_POSES = 2000
+"""Maximum number of training poses among which the nearest pose is searched."""
+MIN_TRUNCATION_FRACTION = 0.5
+"""Too few components are the cause if they leave at least this part of the squared error."""
+MIN_GENERALIZATION_RATIO = 1.5
+"""Too few poses are the cause if the held-out errors are at least this many times the training errors."""
+MIN_DISTANCE_RATIO = 1.5
+"""Poses are extreme if the nearest training pose is at least this many times as far as the median."""
+MIN_SPREAD_RATIO = 1e-3
+"""Features are ignored if their standard deviation is below this part of the largest one."""
+
+
+@dataclass(frozen=True)
+class ErrorAnalysis:
+    """The largest held-out errors of one partition.
+
+    Attributes:
+        poses, vertices: numbers of different poses and vertices with these errors.
+        truncation: part of the squared errors that the components do not represent.
+        boundary: ratio between the frequency of boundary vertices among these errors and among all vertices. A boundary
+            vertex has an edge to another partition. None if there is no boundary vertex.
+        joint: name of the influencing joint or control that is furthest from its mean in these poses; empty if nothing
+            influences the partition.
+        extreme: ratio between the distance of this joint from its mean in these poses and in all held-out poses.
+        distance: ratio between the distance of these poses to the nearest training pose and the median distance of all
+            held-out poses.
+        generalization: ratio between the 99.9th percentiles of the held-out errors and of the training errors.
+        cause: key of `error_causes.REMEDY_BY_CAUSE`.
+    """
+
+    poses: int
+    vertices: int
+    truncation: float
+    boundary: float | None
+    joint: str
+    extreme: float
+    distance: float
+    generalization: float
+    cause: str
+
+    def to_json(self) -> dict:
+        """Convert to JSON."""
+        return asdict(self)
+
+
+def analyze_errors(
+    recording: Recording,
+    trained_model: TrainedModel,
+    split: Split,
+    held_out_errors: np.ndarray,
+    training_errors: np.ndarray,
+) -> list[ErrorAnalysis]:
+    """Analyze the largest errors of each partition.
+
+    Args:
+        recording: recording of the training.
+        trained_model: the result of the training.
+        split: split of the poses.
+        held_out_errors: (n, V) float32 errors of the held-out poses, meters.
+        training_errors: (m, V) float32 errors of some training poses, meters.
+    """
+    rig = recording.rig
+    training = split.training[:: max(1, len(split.training) // MAX_TRAINING_POSES)]
+    held_out_features, training_features = (
+        joint_features(np.array(recording.pose_matrices[poses]), rig.rest_matrices, rig.parents)
+        for poses in (split.held_out, training)
+    )
+    is_boundary = _boundary_mask(recording, trained_model)
+    analyses = []
+    for partition, prepared in zip(trained_model.partitions, trained_model.prepared, strict=True):
+        errors = held_out_errors[:, partition.vertices].astype(np.float64)
+        count = max(1, round(errors.size * ANALYZED_FRACTION))
+        largest = np.argpartition(errors.ravel(), -count)[-count:]
+        poses, vertices = np.unravel_index(largest, errors.shape)
+        held_out_values, training_values = (
+            _influencing_values(recording, partition, features, rows)
+            for features, rows in ((held_out_features, split.held_out), (training_features, training))
+        )
+        nearest_distances = (
+            nearest_recorded_distances(held_out_values, training_values)
+            if held_out_values.shape[1]
+            else np.zeros(len(held_out_values))
+        )
+        distance = _ratio(float(nearest_distances[poses].mean()), float(np.median(nearest_distances)))
+        joint, extreme = _most_extreme_joint(recording, partition, held_out_values, training_values, poses)
+        truncation = _truncation_fraction(recording, partition, prepared, split.held_out, poses, vertices, errors)
+        percentiles = (float(np.percentile(e, 99.9)) for e in (errors, training_errors[:, partition.vertices]))
+        generalization = _ratio(*percentiles)
+        boundary = None
+        if is_boundary is not None and is_boundary[partition.vertices].any():
+            is_at_boundary = is_boundary[partition.vertices]
+            boundary = _ratio(float(is_at_boundary[vertices].mean()), float(is_at_boundary.mean()))
+        cause = _cause(truncation, distance, generalization)
+        counts = len(np.unique(poses)), len(np.unique(vertices))
+        analyses.append(ErrorAnalysis(*counts, truncation, boundary, joint, extreme, distance, generalization, cause))
+    return analyses
+
+
+def _influencing_values(
+    recording: Recording, partition: Partition, features: np.ndarray, poses: np.ndarray
+) -> np.ndarray:
+    """Return (n, f) features of the joints and controls that influence a partition; `features` (n, J, 12)."""
+    joints = features[:, list(partition.influencing)].reshape(len(features), -1)
+    return np.concatenate([joints, np.array(recording.controls[poses])[:, list(partition.controls)]], axis=1)
+
+
+def _cause(truncation: float, distance: float, generalization: float) -> str:
+    if truncation >= MIN_TRUNCATION_FRACTION:
+        return TOO_FEW_COMPONENTS
+    is_extreme = distance >= MIN_DISTANCE_RATIO
+    if generalization >= MIN_GENERALIZATION_RATIO:
+        return EXTREME_POSES if is_extreme else TOO_FEW_POSES
+    if is_extreme:
+        return EXTREME_POSES
+    return HIGH_TRAINING_ERRORS if truncation < MIN_TRUNCATION_FRACTION / 2 else NO_CLEAR_CAUSE
+
+
+def _ratio(value: float, reference: float) -> float:
+    return value / reference if reference > 0 else 1.0
+
+
+def _boundary_mask(recording: Recording, trained_model: TrainedModel) -> np.ndarray | None:
+    """Return (V,) bool, the vertices with an edge to another partition; None without faces."""
+    starts, corners = recording.rig.face_starts, recording.rig.face_vertices
+    if not len(starts):
+        return None
+    partition_index_of_vertex = np.zeros(recording.rig.vertex_count, np.int64)
+    for index, partition in enumerate(trained_model.partitions):
+        partition_index_of_vertex[partition.vertices] = index
+    ends = np.append(starts[1:], len(corners))
+    next_corner = np.arange(len(corners)) + 1
+    next_corner[ends - 1] = starts
+    crosses_boundary = partition_index_of_vertex[corners] != partition_index_of_vertex[corners[next_corner]]
+    is_boundary = np.zeros(len(partition_index_of_vertex), bool)
+    is_boundary[corners[crosses_boundary]] = is_boundary[corners[next_corner][crosses_boundary]] = True
+    return is_boundary
+
+
+def _most_extreme_joint(
+    recording: Recording,
+    partition: Partition,
+    held_out_values: np.ndarray,
+    training_values: np.ndarray,
+    poses: np.ndarray,
+) -> tuple[str, float]:
+    """Find the joint or control that is furthest from its mean in the analyzed poses.
+
+    Args:
+        recording, partition: recording and partition of the values.
+        held_out_values: (n, f) values of the held-out poses from `_influencing_values`.
+        training_values: (m, f) values of training poses.
+        poses: indices of the analyzed poses among the n.
+
+    Returns:
+        The name, and the ratio between its distance from the mean in the analyzed poses and in all n poses.
+    """
+    names = [recording.rig.joint_names[joint] for joint in partition.influencing]
+    column_counts = [FEATURES_PER_JOINT] * len(names) + [1] * len(partition.controls)
+    names += [recording.rig.controls[control].name for control in partition.controls]
+    spread = training_values.std(axis=0, dtype=np.float64)
+    is_used = spread > spread.max(initial=0) * MIN_SPREAD_RATIO
+    squares = np.zeros(held_out_values.shape)
+    offsets = (held_out_values - training_values.mean(axis=0, dtype=np.float64))[:, is_used]
+    squares[:, is_used] = (offsets / spread[is_used]) ** 2
+    most_extreme, squares_by_name = ("", 1.0), np.split(squares, np.cumsum(column_counts), axis=1)
+    for name, columns in zip(names, squares_by_name[:-1], strict=True):
+        distances = np.sqrt(columns.sum(axis=1))
+        distance_ratio = _ratio(float(distances[poses].mean()), float(distances.mean()))
+        most_extreme = max(most_extreme, (name, distance_ratio), key=lambda pair: pair[1])
+    return most_extreme
+
+
+def _truncation_fraction(
+    recording: Recording,
+    partition: Partition,
+    prepared: PreparedPartition,
+    held_out_poses: np.ndarray,
+    poses: np.ndarray,
+    vertices: np.ndarray,
+    errors: np.ndarray,
+) -> float:
+    """Return the part of the squared errors that fit and components do not represent.
+
+    Args:
+        recording, partition, prepared: recording, and the partition with its data.
+        held_out_poses: indices of the n held-out poses.
+        poses, vertices: indices of the analyzed errors.
+        errors: (n, Vp) distances, meters.
+    """
+    unique_poses, rows = np.unique(poses, return_inverse=True)
+    pose_indices = held_out_poses[unique_poses]
+    remaining_residuals = residuals_of(recording, partition, pose_indices).astype(np.float64)
+    if len(prepared.fit.joints):
+        use_half_rotations = prepared.fit.joints.max() >= len(recording.rig.joints)
+        pose_matrices = np.array(recording.pose_matrices[pose_indices])
+        matrices = regression_matrices(pose_matrices, recording.rig, use_half_rotations)
+        to_local = np.linalg.inv(matrices[:, prepared.fit.joints[0], :, :3].astype(np.float64))
+        remaining_residuals -= prepared.fit.compute_offsets(matrices) @ to_local.transpose(0, 2, 1)
+    remaining_residuals -= prepared.basis.reconstruct(prepared.coefficients[pose_indices]).reshape(
+        remaining_residuals.shape
+    )
+    distances = np.linalg.norm(remaining_residuals, axis=2)[rows, vertices] * recording.rig.metres_per_unit
+    return min(1.0, _ratio(float((distances**2).sum()), float((errors[poses, vertices] ** 2).sum())))

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fits skin weights to poses that `record` has evaluated: `python -m trainer.skin FOLDER hard|smooth`.
+
+`core.recording.fit_folder` writes FOLDER, and this command writes the fitted weights into it. It has the same messages
+and exit statuses as `python -m trainer`.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fdda_addon.core.skin_fit import FIT_KINDS
+from fdda_addon.core.terminal import escape_unencodable_output
+
+from ..process import StopRequest, missing_package_error, run_with_messages
+from ..progress import JsonMessageSink, MessageSink
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    escape_unencodable_output()
+    parser = argparse.ArgumentParser("trainer.skin", description="Fit skin weights to the poses in a folder.")
+    parser.add_argument("folder", type=Path, help="folder that record made")
+    parser.add_argument("kind", choices=FIT_KINDS, help="one joint per vertex, or at most four")
+    parser.add_argument("--metres-per-unit", type=float, default=1.0, help="length of a mesh unit in meters")
+    options = parser.parse_args(arguments)
+    sink, stop_request = JsonMessageSink(), StopRequest()
+    return run_with_messages(lambda: _fit(options, sink, stop_request), sink)
+
+
+def _fit(options: argparse.Namespace, sink: MessageSink, stop_request: StopRequest) -> None:
+    try:
+        with stop_request.exit_immediately(sink):
+            from .job import fit_folder
+    except ModuleNotFoundError as error:
+        raise missing_package_error("Fitting skin weights", error) from error
+    fit_folder(options.folder, options.kind, sink, stop_request, options.metres_per_unit)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fits skin weights to a folder of poses, and measures the improvement."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fdda_addon.core.messages import MessageType
+from fdda_addon.core.metrics import distances
+from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted_weights
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.skin_fit import INFLUENCES, FitReport, SkinFit
+from fdda_addon.core.skinning import LinearSkinning
+
+from ..blocks import BLOCK_ELEMENTS
+from ..process import Cancelled
+from ..progress import MessageSink
+from .solver import SkinSolver
+
+
+def fit_folder(
+    folder: Path, kind: str, sink: MessageSink, should_stop: Callable[[], bool], metres_per_unit: float = 1.0
+) -> SkinFit:
+    """Fit skin weights to a folder of poses, and write them into it. Every other pose is held out to measure the error.
+
+    Args:
+        folder: written by `FitPosesWriter`.
+        kind: one of `core.skin_fit.FIT_KINDS`.
+        sink: receives progress, and last the result.
+        should_stop: called often; nothing has been written when it stops the fit.
+        metres_per_unit: as in `Rig`.
+
+    Raises:
+        Cancelled: `should_stop` returned True.
+        FDDAError: the folder is damaged or cannot be written.
+    """
+    started = time.perf_counter()
+    poses = read_fit_poses(folder)
+    vertex_count = poses.rig.vertex_count
+    training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
+    joints, weights = (np.zeros((vertex_count, INFLUENCES), dtype) for dtype in (np.int32, np.float32))
+    for block, *fitted in SkinSolver(training).fit(kind):
+        if should_stop():
+            raise Cancelled
+        joints[block], weights[block] = fitted
+        sink.send(MessageType.PROGRESS, done=block.stop, total=vertex_count)
+    skinned = replace(poses.rig, skin_joints=joints, skin_weights=weights, metres_per_unit=metres_per_unit)
+    result = SkinFit(kind, len(poses.positions), measure(held_out, skinned), measure(training, skinned))
+    write_fitted_weights(folder, joints, weights)
+    sink.send(MessageType.FINISHED, seconds=time.perf_counter() - started, fit=result.to_json())
+    return result
+
+
+def measure(poses: FitPoses, fitted: Rig) -> FitReport:
+    """Measure the errors of linear skinning with the rig's own and with the fitted weights."""
+    step, metres_per_unit = max(1, BLOCK_ELEMENTS // (3 * fitted.vertex_count)), fitted.metres_per_unit
+    rms, maxima = {}, {}
+    for name, rig in (("rig", poses.rig), ("fitted", fitted)):
+        skinning, squares, maximum = LinearSkinning(rig), 0.0, 0.0
+        for start in range(0, len(poses.positions), step):
+            block = slice(start, start + step)
+            positions = skinning.positions(poses.pose_matrices[block])
+            errors = distances(positions, poses.positions[block], metres_per_unit).astype(np.float64)
+            squares, maximum = squares + float((errors**2).sum()), max(maximum, float(errors.max()))
+        rms[name] = 1000 * (squares / (len(poses.positions) * fitted.vertex_count)) ** 0.5
+        maxima[name] = 1000 * maximum
+    return FitReport(rms, maxima)
