@@ -30,7 +30,7 @@ def collect_trained_models(monkeypatch) -> list[TrainedModel]:
     """Return a list to which every later training adds its model."""
     trained_models, make_trained_model = [], trainer.train._make_trained_model
     monkeypatch.setattr(
-        trainer.training,
+        trainer.train,
         "_make_trained_model",
         lambda *args: trained_models.append(make_trained_model(*args)) or trained_models[-1],
     )
