@@ -26,7 +26,7 @@ TARGET = "flesh"
 def target_copy() -> bpy.types.Object:
     """Build a tube, and a copy of it with delta mush after its Armature modifier; return the copy."""
     mesh_object, _ = tube()
-    flesh = _add_target_copy(mesh_object)
+    flesh = add_target_copy(mesh_object)
     modifier = flesh.modifiers.new("Mush", "CORRECTIVE_SMOOTH")
     modifier.rest_source, modifier.factor, modifier.iterations = "ORCO", 0.6, 8
     return flesh
@@ -74,7 +74,7 @@ def target_mdd() -> None:
 def target_shape_keys() -> None:
     """Build the target as a copy with a shape key whose value is keyed in every frame of the action."""
     mesh_object, armature_object = tube()
-    flesh = _add_target_copy(mesh_object)
+    flesh = add_target_copy(mesh_object)
     flesh.shape_key_add(name="Basis", from_mix=False)
     key = flesh.shape_key_add(name="flexed", from_mix=False)
     points = np.array([point.co for point in key.data])
@@ -89,7 +89,7 @@ def target_shape_keys() -> None:
 
 def target_soft_body() -> bpy.types.Object:
     """Build the target as a copy with a soft body whose goal is the skinned surface; return the copy."""
-    flesh = _add_target_copy(tube()[0])
+    flesh = add_target_copy(tube()[0])
     flesh.modifiers.new("Softbody", "SOFT_BODY")
     soft_body = flesh.soft_body
     soft_body.use_goal, soft_body.goal_default, soft_body.goal_spring, soft_body.goal_friction = True, 0.7, 0.5, 20.0
@@ -100,7 +100,7 @@ def target_soft_body() -> bpy.types.Object:
 
 def target_cloth() -> bpy.types.Object:
     """Build the target as a copy with cloth that has a pin weight of one half; return the copy."""
-    flesh = _add_target_copy(tube()[0])
+    flesh = add_target_copy(tube()[0])
     pin_group = flesh.vertex_groups.new(name="pin")
     pin_group.add(range(len(flesh.data.vertices)), 0.5, "REPLACE")
     settings = flesh.modifiers.new("Cloth", "CLOTH").settings
@@ -113,7 +113,7 @@ def target_geometry_nodes() -> bpy.types.Object:
 
     A simulation zone of Geometry Nodes computes the lag.
     """
-    flesh = _add_target_copy(tube()[0])
+    flesh = add_target_copy(tube()[0])
     flesh.modifiers.new("Lag", "NODES").node_group = lagging_group()
     delta_mush = flesh.modifiers.new("Mush", "CORRECTIVE_SMOOTH")
     delta_mush.rest_source, delta_mush.factor, delta_mush.iterations = "ORCO", 0.6, 8
@@ -172,7 +172,7 @@ def _temporary_directory() -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix="fdda_targets_")
 
 
-def _add_target_copy(mesh_object: bpy.types.Object) -> bpy.types.Object:
+def add_target_copy(mesh_object: bpy.types.Object) -> bpy.types.Object:
     """Copy an object and its mesh; return the copy."""
     flesh = mesh_object.copy()
     flesh.data, flesh.name = mesh_object.data.copy(), TARGET

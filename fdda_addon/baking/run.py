@@ -25,7 +25,7 @@ from ..runtime.network import Network
 from ..runtime.opened_model import OpenedModel, open_model
 from ..scene.armature import clear_pose
 from ..scene.blend_file import save_copy
-from ..scene.controls import ControlReader
+from ..scene.control_reader import ControlReader
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose, temporary_visibility

@@ -87,8 +87,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME[=LOW:HIGH]",
-        help="extra input of the model besides bones: the name of a shape key, shape_keys for all shape keys, or "
-        "OWNER/PATH; inputs that drivers of the mesh read are detected automatically; repeatable",
+        help="extra input of the model besides bones: the name of a shape key, shape_keys for all shape keys, "
+        "OWNER/PATH, or control bones, collection:NAME or bone:NAME: their unlocked channels and custom properties; "
+        "inputs that drivers of the mesh read are detected automatically; repeatable",
     )
     parser.add_argument(
         "--fit-linear",
@@ -191,6 +192,8 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError("--overwrite makes a new recording; leave --resume and --refine out.")
     open_file(options.rig)
     rigs = _find_rigs(options)
+    if not options.refine:
+        _print_control_bones(rigs[0][0], options)
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:
         for scene_rig, _ in rigs:
@@ -228,6 +231,18 @@ def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
     if len(names) > 1:
         return mesh_folders([find_rig(name) for name in names], options.recording)
     return [(find_rig(*names), options.recording)]
+
+
+def _print_control_bones(scene_rig: "SceneRig", options: argparse.Namespace) -> None:
+    """Print how many inputs the control bones are, and which locations have no range."""
+    from ..poses.control_bones import describe_control_bones, split_control_bones
+    from ..recording.plan import RecordingSettings, listed_controls
+
+    texts = [text for text in options.control if text.startswith(("collection:", "bone:"))]
+    if texts:
+        names, _ = split_control_bones(scene_rig, texts)
+        settings = RecordingSettings(controls=tuple(texts), sample=tuple(options.sample), actions=tuple(options.action))
+        print(describe_control_bones(scene_rig.armature_object, names, listed_controls(scene_rig, settings)))
 
 
 def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":

@@ -48,12 +48,12 @@ class FDDA_OT_rest_pose(PoseOperator, bpy.types.Operator):
     def apply(self, context: bpy.types.Context) -> str:
         from ..scene.armature import clear_pose
         from ..scene.control_names import control_default
-        from ..scene.controls import is_driven, owner_of, set_control
+        from ..scene.controls import can_be_set, is_driven, owner_of, set_control
 
         rig = self.rig(context)
         clear_pose(rig.armature_object)
         for control in _sampled_controls(rig):
-            if not is_driven(owner_of(rig, control.owner), control.path):
+            if can_be_set(control.name) and not is_driven(owner_of(rig, control.owner), control.path):
                 set_control(rig, control.name, control_default(rig, control.name))
         return f"'{rig.armature_object.name}' is in its rest pose."
 

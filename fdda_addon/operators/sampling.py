@@ -6,7 +6,7 @@ from dataclasses import replace
 import bpy
 
 from ..core.errors import RigError
-from ..properties.recording_options import recording_settings
+from ..properties.recording_options import recorded_actions, recording_settings
 from .pose_operator import PoseOperator
 
 
@@ -66,6 +66,36 @@ class FDDA_OT_add_control(PoseOperator, bpy.types.Operator):
         return f"Added {name or 'an input'}."
 
 
+class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
+    bl_idname = "fdda.add_control_bones"
+    bl_label = "Add Bones as Controls"
+    bl_description = (
+        "Make the unlocked channels and custom properties of the selected bones inputs of the model, for control bones "
+        "that deform the mesh other than through its deforming bones. Random poses move them too"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    def apply(self, context: bpy.types.Context) -> str:
+        from ..recording.plan import RecordingSettings, listed_controls
+        from ..scene.compatibility import is_selected
+
+        rig = self.rig(context)
+        settings = rig.mesh_object.fdda.settings
+        names = [f"bone:{bone.name}" for bone in rig.armature_object.pose.bones if is_selected(bone)]
+        if not names:
+            raise RigError(f"No bone of '{rig.armature_object.name}' is selected; select control bones in Pose Mode.")
+        new_names = [name for name in names if name not in settings.controls]
+        if not new_names:
+            raise RigError("The selected bones are already in the list.")
+        actions = recorded_actions(rig.armature_object)
+        controls = listed_controls(rig, RecordingSettings(controls=tuple(new_names), actions=actions))
+        for name in new_names:
+            settings.controls.add().name = name
+        settings.control_index = len(settings.controls) - 1
+        bone_text = "1 bone" if len(new_names) == 1 else f"{len(new_names)} bones"
+        return f"Added {bone_text} with {len(controls)} inputs."
+
+
 class FDDA_OT_remove_control(PoseOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_control"
     bl_label = "Remove Extra Input"
@@ -83,4 +113,4 @@ class FDDA_OT_remove_control(PoseOperator, bpy.types.Operator):
         return f"Removed {name or 'the input'}."
 
 
-CLASSES = (FDDA_OT_use_selected_bones, FDDA_OT_add_control, FDDA_OT_remove_control)
+CLASSES = (FDDA_OT_use_selected_bones, FDDA_OT_add_control, FDDA_OT_add_control_bones, FDDA_OT_remove_control)

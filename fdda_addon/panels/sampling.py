@@ -18,12 +18,19 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 MAX_SHOWN_CONTROLS = 8
 """Largest number of detected extra inputs that the panel lists."""
 
+BONE_ICONS = {"bone:": "BONE_DATA", "collection:": "GROUP_BONE"}
+"""Icons of the extra inputs that are control bones, by the prefix of their names (`poses.sample_selection`)."""
+
 
 class FDDA_UL_controls(bpy.types.UIList):
     """List of the extra inputs that the user has added, with their ranges."""
 
     def draw_item(self, _context: bpy.types.Context, layout: bpy.types.UILayout, _data, control, _icon, _active, _name):
         row = layout.row()
+        if control.name.startswith(tuple(BONE_ICONS)):
+            kind, _, name = control.name.partition(":")
+            row.label(text=name, icon=BONE_ICONS[f"{kind}:"])
+            return
         text = "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name.rpartition("/")[2] or "(unnamed)"
         row.label(text=text, icon="SHAPEKEY_DATA" if "/" not in control.name else "DRIVER")
         right_part = row.row()
@@ -104,12 +111,15 @@ def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
         control = settings.controls[settings.control_index]
         column = body.column(align=True)
         column.prop(control, "name", text="", placeholder="Shape key or data path")
-        row = column.row(align=True)
-        row.prop(control, "has_range", text="Override Range")
-        fields = row.row(align=True)
-        fields.active = control.has_range
-        fields.prop(control, "low", text="")
-        fields.prop(control, "high", text="")
+        # Each channel of a control bone has the range of the bone.
+        if not control.name.startswith(tuple(BONE_ICONS)):
+            row = column.row(align=True)
+            row.prop(control, "has_range", text="Override Range")
+            fields = row.row(align=True)
+            fields.active = control.has_range
+            fields.prop(control, "low", text="")
+            fields.prop(control, "high", text="")
+    body.operator("fdda.add_control_bones", icon="BONE_DATA").object = rig.mesh_object.name
     if rig.mesh_object.data.shape_keys and ALL_SHAPE_KEYS not in settings.controls:
         properties = body.operator("fdda.add_control", text="All Shape Keys", icon="SHAPEKEY_DATA")
         properties.object, properties.name = rig.mesh_object.name, ALL_SHAPE_KEYS

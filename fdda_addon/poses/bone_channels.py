@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Relates channels of bones to controls: both may set the same number of the armature object."""
+"""Relates channels of bones to controls and constraints, which may set the same numbers of the armature object."""
 
 from collections.abc import Iterable
 
@@ -8,6 +8,7 @@ import bpy
 from ..core.controls import ARMATURE_OBJECT
 from ..core.poses import LOCATION, ROTATION, SCALE, Channel
 
+LIMIT_CONSTRAINTS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
 _PROPERTY_NAMES = {ROTATION: "rotation_euler", LOCATION: "location", SCALE: "scale"}
 
 
@@ -27,3 +28,8 @@ def ranges_by_control(armature_object: bpy.types.Object, channels: Iterable[Chan
     ranges = {control_name(armature_object, channel): (channel.low, channel.high) for channel in channels}
     ranges.pop("", None)
     return ranges
+
+
+def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
+    """Return whether a constraint other than a limit moves a bone."""
+    return any(c.type not in LIMIT_CONSTRAINTS and not c.mute and c.influence > 0 for c in bone.constraints)

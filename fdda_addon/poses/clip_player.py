@@ -12,7 +12,7 @@ from ..core.recording.index import ACTION
 from ..scene.armature import clear_pose
 from ..scene.arrays import POSE_CHANNELS, read, write
 from ..scene.compatibility import curves_of
-from ..scene.controls import owner_of, set_control
+from ..scene.controls import can_be_set, owner_of, set_control
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_values, assign_action, driving_actions, read_value, set_value
 from .clip import Clip
@@ -73,7 +73,7 @@ class ClipPlayer:
         self._numbers: PropertyValues = animated_numbers
         self._controls: list[tuple[SceneRig, str, float]] = []
         for scene_rig, names in rigs:
-            for name in names:
+            for name in filter(can_be_set, names):
                 owner, _, path = name.partition("/")
                 self._controls.append((scene_rig, name, owner_of(scene_rig, owner).path_resolve(path)))
 

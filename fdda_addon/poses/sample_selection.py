@@ -2,7 +2,9 @@
 """Parses the user's selection of bones and controls for random poses."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
@@ -27,6 +29,8 @@ class SampleSelection:
         action_bones: names of the bones that are selected by actions alone.
         controls: the controls, listed by the user or keyed by the actions.
         constant_channels: numbers that the actions key at a single value which differs from the current one.
+        control_bones: names of the bones whose channels are controls; they are sampled besides the default bones. They
+            are among the selected bones, if there are any.
     """
 
     bones: frozenset[str] | None = None
@@ -34,45 +38,61 @@ class SampleSelection:
     action_bones: frozenset[str] = frozenset()
     controls: tuple[Control, ...] = ()
     constant_channels: tuple[Channel, ...] = ()
+    control_bones: frozenset[str] = frozenset()
 
 
 DEFAULT_SELECTION = SampleSelection()
 """The user selected nothing, so the default bones are sampled."""
 
 
-def select_bones(scene_rig: SceneRig, texts: Iterable[str]) -> SampleSelection:
+def select_bones(
+    scene_rig: SceneRig,
+    texts: Iterable[str],
+    control_bones: frozenset[str] = frozenset(),
+    recorded_actions: Iterable[bpy.types.Action] = (),
+) -> SampleSelection:
     """Parse a selection, which may be empty.
 
     Args:
         scene_rig: the rig.
         texts: as for `sampling.parse_sample_selection`.
+        control_bones: names of the bones whose channels are controls.
+        recorded_actions: actions whose frames are recorded; control bones without a range move in their ranges.
 
     Raises:
         RigError: there is no such collection, action or bone.
     """
     texts = list(texts)
+    measured = keyed_ranges(scene_rig.armature_object, recorded_actions if control_bones else ())
+    control_ranges = {key: bounds for key, bounds in measured.items() if key[0] in control_bones}
     if not texts:
-        return DEFAULT_SELECTION
-    selected_bones: set[str] = set()
+        return replace(DEFAULT_SELECTION, measured=tuple(control_ranges.items()), control_bones=control_bones)
+    selected_bones = set(control_bones)
     actions = []
     for text in texts:
         if text.startswith(ACTION_PREFIX):
             actions.append(find_action(text.removeprefix(ACTION_PREFIX)))
         else:
-            selected_bones |= _parse_bones(scene_rig, text)
+            selected_bones |= parse_bones(scene_rig, text)
     keyed_channel_ranges = keyed_ranges(scene_rig.armature_object, actions)
     keyed_bones = {bone for bone, _, _ in keyed_channel_ranges}
     controls, constant_channels = measured_controls(scene_rig, actions), constant_controls(scene_rig, actions)
     return SampleSelection(
         frozenset(selected_bones | keyed_bones),
-        tuple(keyed_channel_ranges.items()),
+        tuple((control_ranges | keyed_channel_ranges).items()),
         frozenset(keyed_bones - selected_bones),
         controls,
         constant_channels,
+        control_bones,
     )
 
 
-def _parse_bones(scene_rig: SceneRig, text: str) -> set[str]:
+def parse_bones(scene_rig: SceneRig, text: str) -> set[str]:
+    """Return the names of the bones that a text chooses: `selected`, `collection:NAME` or `bone:NAME`.
+
+    Raises:
+        RigError: there is no such collection or bone.
+    """
     armature_object = scene_rig.armature_object
     bones, armature = armature_object.pose.bones, armature_object.data
     if text == SELECTED_BONES:

@@ -11,20 +11,24 @@ from ..core.errors import RigError
 from ..core.model import ModelInfo
 from ..core.poses import CHANNEL_KINDS, CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import Rig
-from ..scene.controls import is_driven, is_number, owner_of
+from ..scene.controls import can_be_set, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_range import ChannelRanges, has_width
-from .bone_channels import control_name, ranges_by_control
+from .bone_channels import control_name, is_moved_by_constraints, ranges_by_control
+from .control_bones import bone_controls
 from .motion_range import DEFAULT, RotationRange, location_ranges, rotation_ranges, scale_ranges
 from .sample_selection import DEFAULT_SELECTION, SampleSelection, select_bones
 
-LIMIT_CONSTRAINTS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
 ControlRanges = dict[str, tuple[float, float]]
 """Ranges by the names of controls."""
 
 
 def parse_sample_selection(
-    scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[ControlRanges], Iterable[Control]]
+    scene_rig: SceneRig,
+    texts: Iterable[str],
+    find_controls: Callable[[ControlRanges], Iterable[Control]],
+    control_bones: frozenset[str] = frozenset(),
+    recorded_actions: Iterable[bpy.types.Action] = (),
 ) -> SampleSelection:
     """Parse the user's selection of bones and controls.
 
@@ -34,19 +38,31 @@ def parse_sample_selection(
             `action:NAME` for all bones and controls that an action keys, or `bone:NAME`; empty for the default bones.
         find_controls: returns further controls, given the ranges of the sampled numbers of bones (`ranges_by_control`),
             which may be controls too.
+        control_bones, recorded_actions: as for `select_bones`.
 
     Raises:
         RigError: there is no such collection, action or bone, or the selection is empty.
     """
     texts = list(texts)
-    selection = select_bones(scene_rig, texts)
+    selection = select_bones(scene_rig, texts, control_bones, recorded_actions)
     controls = {control.name: control for control in selection.controls}
+    controls |= {control.name: control for control in controls_of_bones(scene_rig, selection)}
     controls |= {control.name: control for control in find_controls(sampled_numbers(scene_rig, selection))}
     selection = replace(selection, controls=tuple(controls.values()))
     has_bones = selection.bones is None or selection.bones - selection.action_bones
     if not controls and not has_bones and not any(has_width(bounds) for _, bounds in selection.measured):
         raise RigError(f"Nothing is chosen to sample by {', '.join(texts)}; choose bones that an animator poses.")
     return selection
+
+
+def controls_of_bones(scene_rig: SceneRig, selection: SampleSelection) -> tuple[Control, ...]:
+    """Return the controls of the control bones of a selection.
+
+    Raises:
+        RigError: as `bone_controls`.
+    """
+    channels = _bone_channels(scene_rig.armature_object, selection, set())
+    return bone_controls(scene_rig, selection.control_bones, channels)
 
 
 def sampled_numbers(scene_rig: SceneRig, selection: SampleSelection) -> ControlRanges:
@@ -76,7 +92,9 @@ def sampled_channels(
     channels += [
         Channel(control.name, CONTROL, 0, control.low, control.high)
         for control in selection.controls
-        if control.name in controls and not is_driven(owner_of(scene_rig, control.owner), control.path)
+        if control.name in controls
+        and can_be_set(control.name)
+        and not is_driven(owner_of(scene_rig, control.owner), control.path)
     ]
     control_names = {control.name for control in selection.controls}
     channels += [channel for channel in selection.constant_channels if channel.name not in control_names]
@@ -93,9 +111,13 @@ def _bone_channels(
     armature_object: bpy.types.Object, selection: SampleSelection, names: set[str]
 ) -> tuple[Channel, ...]:
     """Return the channels of the bones of a selection; `names` is passed to `default_channels`."""
-    if selection.bones is None:
-        return default_channels(armature_object, names)
-    return selected_channels(armature_object, selection)
+    if selection.bones is not None:
+        return selected_channels(armature_object, selection)
+    channels = default_channels(armature_object, names)
+    if not selection.control_bones:
+        return channels
+    control_channels = selected_channels(armature_object, replace(selection, bones=selection.control_bones))
+    return (*(channel for channel in channels if channel.name not in selection.control_bones), *control_channels)
 
 
 def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Channel, ...]:
@@ -273,8 +295,3 @@ def _location_and_scale_ranges(bone: bpy.types.PoseBone) -> dict[tuple[str, int]
     """Return the ranges of locations and scales of a bone, by kind and axis."""
     kinds = ((LOCATION, location_ranges(bone)), (SCALE, scale_ranges(bone)))
     return {(kind, axis): bounds for kind, ranges in kinds for axis, bounds in ranges.items()}
-
-
-def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
-    """Return whether a constraint other than a limit moves a bone."""
-    return any(c.type not in LIMIT_CONSTRAINTS and not c.mute and c.influence > 0 for c in bone.constraints)

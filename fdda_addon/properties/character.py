@@ -53,7 +53,7 @@ def _shorten_data_path(control: "FDDA_PG_control", _context: bpy.types.Context) 
 
 @not_animatable
 class FDDA_PG_control(bpy.types.PropertyGroup):
-    """An extra input of the model, in the syntax of `scene.controls.parse_controls`."""
+    """Extra inputs of the model, in the syntax of `split_control_bones` and `parse_controls`."""
 
     name: StringProperty(
         name="Extra Input",

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ..core.defaults import INFLUENCE_POSES
 from ..core.features import FLOAT32_ROUNDING_RATIO
@@ -19,12 +20,13 @@ from ..core.poses import CONTROL, Channel
 from ..core.progress import Progress
 from ..core.rig import STATIC_JOINT, Rig
 from ..core.skinning import LinearSkinning
-from ..poses.bone_channels import control_name
 from ..poses.sampling import is_moved_by_constraints
 from ..rig.reading import PoseEvaluator
 from ..rig.sources import split_bone_path
 from ..scene.armature import Poser, clear_pose
-from ..scene.controls import ControlReader, is_driven, owner_of, set_control
+from ..scene.bone_transform import controls_by_bone
+from ..scene.control_reader import ControlReader
+from ..scene.controls import is_driven, owner_of, set_control
 from ..scene.scene_rig import SceneRig
 from .joint_override import JointOverride, override_joints
 
@@ -69,14 +71,19 @@ class _InfluenceCollector:
         self.partitions = partitions
         self._influencing_joints: dict[int, set[int]] = {p.joint: set() for p in partitions}
         self._influencing_controls: dict[int, set[int]] = {p.joint: set() for p in partitions}
+        self._controls_of_bone = {indices[0]: indices for indices in controls_by_bone(rig.controls).values()}
 
     def add(self, moves: list[tuple[str, int]], moved_residuals: np.ndarray, base_residuals: np.ndarray) -> None:
-        """Compare (n, V, 3) residuals of n moves with the (1, V, 3) residuals of the base pose."""
+        """Compare (n, V, 3) residuals of n moves with the (1, V, 3) residuals of the base pose.
+
+        The first control of a bone stands for all controls of its transform.
+        """
         changes = max_residual_changes(self.partitions, moved_residuals, base_residuals)
         for (kind, index), is_influenced in zip(moves, changes > self._threshold, strict=True):
             influences = self._influencing_controls if kind == CONTROL else self._influencing_joints
             for partition_index in np.flatnonzero(is_influenced):
-                influences[self.partitions[partition_index].joint].add(index)
+                indices = self._controls_of_bone.get(index, (index,)) if kind == CONTROL else (index,)
+                influences[self.partitions[partition_index].joint].update(indices)
 
     def add_to_all(self, control: int) -> None:
         """Add a control to all partitions."""
@@ -170,6 +177,7 @@ def _move_channels(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, moves
     poser = Poser(scene_rig, channels)
     joints = {name: index for index, name in enumerate(rig.joint_names)}
     controls = {control.name: index for index, control in enumerate(rig.controls)}
+    moved_bones = controls_by_bone(rig.controls)
     channel_indices: dict[tuple[str, int], list[int]] = {}
     for channel_index, channel in enumerate(channels):
         index = (controls if channel.kind == CONTROL else joints).get(channel.name)
@@ -177,9 +185,9 @@ def _move_channels(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, moves
             channel_indices.setdefault((CONTROL if channel.kind == CONTROL else "joint", index), []).append(
                 channel_index
             )
-        # A control may be the property that a channel of a bone sets.
-        if (control := controls.get(control_name(scene_rig.armature_object, channel))) is not None:
-            channel_indices[CONTROL, control] = [channel_index]
+        # Controls may be numbers of the transform that the channels of a bone set; they change together.
+        if channel.kind != CONTROL and channel.name in moved_bones:
+            channel_indices.setdefault((CONTROL, moved_bones[channel.name][0]), []).append(channel_index)
     moved_inputs = dict(sorted(channel_indices.items(), key=lambda item: (item[0][0] == CONTROL, item[0][1])))
     rest_values = np.array([channel.rest for channel in channels])
     # All joints share the base poses: the rest pose for half of the moves, random poses for the others.
@@ -216,26 +224,36 @@ def _override_each_joint(
     changes = np.abs(joint_transforms - joint_transforms[0])
     changes[..., :3, 3] *= rig.metres_per_unit
     moving_joints = np.flatnonzero(changes.max(axis=(0, 2, 3)) > MIN_TRANSFORM_CHANGE).tolist()
-    movable_controls = [n for n, c in enumerate(rig.controls) if not is_driven(owner_of(scene_rig, c.owner), c.path)]
+    bones, joint_names = controls_by_bone(rig.controls), set(rig.joint_names)
+    driven_controls = {n for n, c in enumerate(rig.controls) if is_driven(owner_of(scene_rig, c.owner), c.path)}
+    # The transform of a joint is set with the joint.
+    movable_bones = {n: c for n, c in bones.items() if n not in joint_names and driven_controls.isdisjoint(c)}
+    bone_controls = {index for indices in bones.values() for index in indices}
+    movable_controls = sorted(set(range(len(rig.controls))) - bone_controls - driven_controls)
+    bone_of_control = {indices[0]: name for name, indices in movable_bones.items()}
+    first_controls = sorted([*movable_controls, *bone_of_control])
     for control in set(range(len(rig.controls))) - set(movable_controls):
-        # A driven property cannot be moved alone, so it may influence all partitions.
-        collector.add_to_all(control)
-    moved_inputs = [("joint", index) for index in moving_joints] + [(CONTROL, index) for index in movable_controls]
+        # A control that cannot be moved alone, such as a driven property, may influence all partitions.
+        if not any(control in indices for indices in movable_bones.values()):
+            collector.add_to_all(control)
+    moved_inputs = [("joint", index) for index in moving_joints] + [(CONTROL, index) for index in first_controls]
     with override_joints(scene_rig, rig.joints, search.has_target) as override:
 
         def show_pose(state: _PoseState) -> None:
             override.set(state.joints)
             for index in movable_controls:
                 set_control(scene_rig, rig.controls[index].name, float(state.controls[index]))
+            for name in movable_bones:
+                scene_rig.armature_object.pose.bones[name].matrix_basis = state.bones[name]
 
-        rest_state = _PoseState(override.rest, states[0].controls)
+        rest_state = _PoseState(override.rest, states[0].controls, dict.fromkeys(bones, Matrix()))
         base_states = [rest_state] * (poses_per_input - poses_per_input // 2) + states[: poses_per_input // 2]
         for base_index, (base_state, other_state) in enumerate(zip(base_states, states[poses_per_input:], strict=True)):
             show_pose(base_state)
             moves.set_base_pose()
             for step, (kind, index) in enumerate(moved_inputs, base_index * (len(moved_inputs) + 1) + 1):
                 yield Progress("influences", step, poses_per_input * (len(moved_inputs) + 1))
-                show_pose(base_state.with_input_of(other_state, kind, index))
+                show_pose(base_state.with_input_of(other_state, kind, index, bone_of_control.get(index, "")))
                 moves.add(kind, index)
             moves.flush()
             yield Progress(
@@ -245,19 +263,28 @@ def _override_each_joint(
 
 @dataclass(frozen=True)
 class _PoseState:
-    """State of joints and controls in a pose: (J, 4, 4) matrices relative to parent joints, and (C,) control values."""
+    """State of joints and controls in a pose.
+
+    Attributes:
+        joints: (J, 4, 4) matrices relative to parent joints.
+        controls: (C,) control values.
+        bones: the transform of each control bone relative to its rest pose, by name.
+    """
 
     joints: np.ndarray
     controls: np.ndarray
+    bones: dict[str, Matrix]
 
-    def with_input_of(self, other: "_PoseState", kind: str, index: int) -> "_PoseState":
-        """Return a copy in which one joint or control has its value in another state."""
-        joints, controls = self.joints.copy(), self.controls.copy()
-        if kind == CONTROL:
-            controls[index] = other.controls[index]
-        else:
+    def with_input_of(self, other: "_PoseState", kind: str, index: int, bone: str) -> "_PoseState":
+        """Return a copy in which one joint, control or control bone, if it is named, has its value in another state."""
+        joints, controls, bones = self.joints.copy(), self.controls.copy(), dict(self.bones)
+        if kind != CONTROL:
             joints[index] = other.joints[index]
-        return _PoseState(joints, controls)
+        elif bone:
+            bones[bone] = other.bones[bone]
+        else:
+            controls[index] = other.controls[index]
+        return _PoseState(joints, controls, bones)
 
 
 def _sample_states(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, count: int) -> list[_PoseState]:
@@ -271,6 +298,9 @@ def _sample_states(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, count
             poser.set(search.draw_values(index))
         else:
             search.show_pose(index)
-        states.append(_PoseState(override.read(), reader.read(scene_rig, bpy.context.evaluated_depsgraph_get())))
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        bones = scene_rig.armature_object.evaluated_get(depsgraph).pose.bones
+        transforms = {name: bones[name].matrix_basis.copy() for name in controls_by_bone(rig.controls)}
+        states.append(_PoseState(override.read(), reader.read(scene_rig, depsgraph), transforms))
     search.stop_playback()
     return states

@@ -15,9 +15,11 @@ from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
 from ..core.rig import Rig
 from ..poses.clip import find_clips
+from ..poses.control_bones import split_control_bones
 from ..poses.sample_selection import SampleSelection, select_bones
 from ..poses.sampling import (
     ControlRanges,
+    controls_of_bones,
     locked_channels,
     parse_sample_selection,
     sampled_channels,
@@ -50,7 +52,7 @@ class RecordingSettings:
         sample: control bones that the random poses move, in the syntax of `sampling.parse_sample_selection`; empty for
             the default bones.
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.FIT_KINDS`); empty for those of the rig.
-        controls: properties that are inputs besides the automatic controls, in the syntax of `parse_controls`.
+        controls: inputs besides the automatic controls, in the syntax of `split_control_bones` and `parse_controls`.
         min_partition_vertices: partitions with fewer vertices are merged into others; 0 to merge no partitions.
         shard: number of the shard to record, from 1, and count of all shards; None to record all poses.
         detect_influences: detect the influences of all shards, and record no poses.
@@ -113,13 +115,15 @@ def read_sample_selection(
         RigError: the rig lacks a bone, control, collection or action of the settings.
     """
     dependencies = read_dependencies(scene_rig, find_actions(settings))
+    control_bones, number_texts = split_control_bones(scene_rig, settings.controls)
 
     def find_controls(sampled_ranges: ControlRanges) -> Iterator[Control]:
         yield from dependencies.controls
-        yield from parse_controls(scene_rig, settings.controls, sampled_ranges)
+        yield from parse_controls(scene_rig, number_texts, sampled_ranges)
 
-    selection = parse_sample_selection(scene_rig, settings.sample, find_controls)
-    return selection, None if selection.bones is None else dependencies.bones
+    selection = parse_sample_selection(scene_rig, settings.sample, find_controls, control_bones, find_actions(settings))
+    has_control_bones = selection.bones is not None or selection.control_bones
+    return selection, dependencies.bones if has_control_bones else None
 
 
 def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Control, ...]:
@@ -128,8 +132,12 @@ def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[C
     Raises:
         RigError: the rig lacks a control, or its range is unknown.
     """
-    sampled_ranges = sampled_numbers(scene_rig, select_bones(scene_rig, settings.sample)) if settings.controls else {}
-    return parse_controls(scene_rig, settings.controls, sampled_ranges)
+    if not settings.controls:
+        return ()
+    control_bones, number_texts = split_control_bones(scene_rig, settings.controls)
+    selection = select_bones(scene_rig, settings.sample, control_bones, find_actions(settings))
+    number_controls = parse_controls(scene_rig, number_texts, sampled_numbers(scene_rig, selection))
+    return (*controls_of_bones(scene_rig, selection), *number_controls)
 
 
 def find_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:

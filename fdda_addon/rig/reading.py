@@ -15,7 +15,7 @@ from ..core.rig import STATIC_JOINT, Fingerprint, Rig
 from ..poses.sampling import model_channels, sampled_channels
 from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
-from ..scene.controls import ControlReader
+from ..scene.control_reader import ControlReader
 from ..scene.scene_rig import (
     MIN_VOLUME,
     MODIFIER_NAME,

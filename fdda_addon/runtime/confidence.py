@@ -6,7 +6,7 @@ import bpy
 from ..core.errors import FDDAError
 from ..core.rig import STATIC_JOINT
 from ..rig.reading import PoseReader
-from ..scene.controls import ControlReader
+from ..scene.control_reader import ControlReader
 from ..scene.scene_rig import SceneRig, armature_of
 from . import model_files
 

@@ -31,7 +31,7 @@ def pose_inputs(buffer: bpy.types.Object, scene_rig: SceneRig, controls: Iterabl
     Args:
         buffer: the position buffer.
         scene_rig: the rig whose pose is read.
-        controls: the controls of the model.
+        controls: controls on which all controls of the model depend (`ControlReader.sources`).
     """
     return [
         # Evaluating the geometry of the buffer resets its positions to the stored ones, so it has to come first.

@@ -15,7 +15,7 @@ from ..core.mask import SkinningBlend
 from ..core.rig import STATIC_JOINT
 from ..rig.reading import PoseReader, read_model_rig
 from ..scene.arrays import MUTE_ELEMENT, write
-from ..scene.controls import ControlReader
+from ..scene.control_reader import ControlReader
 from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
@@ -109,11 +109,11 @@ class Player:
     @property
     def pose_input_count(self) -> int:
         """Return the number of `pose_inputs`."""
-        return 3 + len(self.network.info.controls)
+        return 3 + len(self._control_reader.sources)
 
     def pose_inputs(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> list[driver.DriverInput]:
         """Return the driver variables whose datablocks `play` reads."""
-        return driver.pose_inputs(buffer, self.scene_rig(mesh_object), self.network.info.controls)
+        return driver.pose_inputs(buffer, self.scene_rig(mesh_object), self._control_reader.sources)
 
     def dependency_inputs(self, mesh_object: bpy.types.Object) -> list[driver.DriverInput]:
         """Return the driver variables that only add dependencies."""
@@ -237,7 +237,7 @@ class Player:
         Args:
             mesh_object: the bound object.
             armature_object: its armature object.
-            owners: the datablocks that own the controls of the model, in their order.
+            owners: the datablocks that own `ControlReader.sources`, in their order.
 
         Returns:
             Whether there are positions to write.

@@ -6,7 +6,9 @@ import re
 import bpy
 
 from ..core.controls import ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS
+from .bone_transform import bone_transform
 from .controls import (
+    custom_properties,
     custom_property_key,
     fcurve_target,
     is_custom_property,
@@ -49,7 +51,7 @@ def control_at(scene_rig: SceneRig, full_data_path: str) -> str:
 
 
 def suggested_controls(scene_rig: SceneRig) -> list[str]:
-    """Suggest the shape keys and custom properties that no driver sets, in the form that `parse_controls` reads."""
+    """Suggest the shape keys and custom properties that no driver sets, and bone collections, as users list them."""
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     names = []
     if shape_keys := mesh_object.data.shape_keys:
@@ -57,22 +59,18 @@ def suggested_controls(scene_rig: SceneRig) -> list[str]:
         undriven_names = [block.name for block in key_blocks if not is_driven(shape_keys, block.path_from_id("value"))]
         names += [SHAPE_KEYS, *undriven_names] if undriven_names else []
     for owner, datablock in ((ARMATURE_OBJECT, armature_object), (MESH_OBJECT, mesh_object)):
-        names += [f"{owner}/{path}" for path in _custom_properties(datablock, "")]
+        names += [f"{owner}/{path}" for path in custom_properties(datablock, "")]
     for bone in armature_object.pose.bones:
-        names += [f"{ARMATURE_OBJECT}/{path}" for path in _custom_properties(armature_object, bone.path_from_id())]
-    return names
-
-
-def _custom_properties(datablock: bpy.types.ID, owner_path: str) -> list[str]:
-    """Return the paths of the undriven numeric custom properties of a datablock, or of a struct in it."""
-    struct = datablock.path_resolve(owner_path) if owner_path else datablock
-    paths = [f'{owner_path}["{bpy.utils.escape_identifier(name)}"]' for name, _ in struct.items()]
-    return [path for path in paths if is_number(datablock, path) and not is_driven(datablock, path)]
+        names += [f"{ARMATURE_OBJECT}/{path}" for path in custom_properties(armature_object, bone.path_from_id())]
+    return [*names, *(f"collection:{collection.name}" for collection in armature_object.data.collections_all)]
 
 
 def control_default(scene_rig: SceneRig, name: str) -> float:
     """Return the default value of a control; 0 for a shape key."""
     owner, _, path = name.partition("/")
+    transform = bone_transform(path)
+    if transform is not None and transform.is_matrix:
+        return float(transform.element[0] == transform.element[1])
     struct, attribute, index = parent_and_name(owner_of(scene_rig, owner), path)
     if isinstance(struct, bpy.types.ShapeKey):
         return 0.0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds, reads and sets controls: numbers of a rig that are inputs of a model besides its joints."""
+"""Finds and sets controls: numbers of a rig that are inputs of a model besides its joints."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, OTHER_OBJECT, OWNERS, SHAPE_KEYS, Control
 from ..core.errors import RigError
+from .bone_transform import MATRIX_ELEMENT_RANGE, bone_transform
 from .scene_rig import SceneRig
 
 MAX_RANGE_WIDTH = 1e4
@@ -118,6 +119,12 @@ def _resolve_name(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
     return [(owner, path)]
 
 
+def can_be_set(name: str) -> bool:
+    """Return whether `set_control` can set a control, given its name: not an element of `MATRIX`."""
+    transform = bone_transform(name.partition("/")[2])
+    return transform is None or not transform.is_matrix
+
+
 def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     """Return whether a driver sets a number."""
     owner, array_path, index = fcurve_target(datablock, path)
@@ -127,9 +134,16 @@ def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     )
 
 
+def custom_properties(datablock: bpy.types.ID, owner_path: str) -> list[str]:
+    """Return the paths of the undriven numeric custom properties of a datablock, or of a struct in it."""
+    struct = datablock.path_resolve(owner_path) if owner_path else datablock
+    paths = [f'{owner_path}["{bpy.utils.escape_identifier(name)}"]' for name, _ in struct.items()]
+    return [path for path in paths if is_number(datablock, path) and not is_driven(datablock, path)]
+
+
 def is_number(datablock: bpy.types.ID | None, path: str) -> bool:
     """Return whether a path of a datablock leads to a number."""
-    return datablock is not None and _value(datablock, path) is not None
+    return datablock is not None and number_at(datablock, path) is not None
 
 
 def _split_index(path: str) -> tuple[str, int | None]:
@@ -186,7 +200,7 @@ def write_value(datablock: bpy.types.ID, path: str, value: object) -> None:
         setattr(struct, name, value)
 
 
-def _value(datablock: bpy.types.ID, path: str) -> float | None:
+def number_at(datablock: bpy.types.ID, path: str) -> float | None:
     """Return the number at a path; None if there is none."""
     try:
         value = datablock.path_resolve(path)
@@ -196,6 +210,10 @@ def _value(datablock: bpy.types.ID, path: str) -> float | None:
 
 
 def _property_range(datablock: bpy.types.ID, path: str) -> tuple[float, float]:
+    transform = bone_transform(path)
+    if transform is not None and transform.is_matrix:
+        # The last column is the location, which has no range.
+        return MATRIX_ELEMENT_RANGE if transform.element[0] < 3 else (0.0, 0.0)
     struct, name, _ = parent_and_name(datablock, path)
     if is_custom_property(name):
         key = custom_property_key(name)
@@ -215,50 +233,8 @@ def _narrower_range(soft_range: tuple[float, float], hard_range: tuple[float, fl
     return soft_range if soft_range[1] - soft_range[0] <= hard_range[1] - hard_range[0] else hard_range
 
 
-class ControlReader:
-    """Reads the values of controls of a rig."""
-
-    def __init__(self, scene_rig: SceneRig, controls: tuple[Control, ...]):
-        """Prepare to read controls.
-
-        Args:
-            scene_rig: the rig.
-            controls: C controls.
-
-        Raises:
-            RigError: the rig lacks a control.
-        """
-        self._controls, self._mesh_name = controls, scene_rig.mesh_object.name
-        self.values([owner_of(scene_rig, control.owner) for control in controls])
-
-    def read(self, scene_rig: SceneRig, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-        """Read the evaluated values of the controls.
-
-        Returns:
-            (C,) float32, each in the unit of its property.
-
-        Raises:
-            RigError: a control was removed or renamed.
-        """
-        owners = [owner_of(scene_rig, control.owner) for control in self._controls]
-        return self.values([owner and owner.evaluated_get(depsgraph) for owner in owners])
-
-    def values(self, owners: Sequence[bpy.types.ID | None]) -> np.ndarray:
-        """Read the values as `read` does, given the owner of each control, which may be an evaluated datablock."""
-        values = np.zeros(len(self._controls), np.float32)
-        for index, (owner, control) in enumerate(zip(owners, self._controls, strict=True)):
-            value = None if owner is None else _value(owner, control.path)
-            if value is None:
-                raise RigError(
-                    f"'{self._mesh_name}' lacks the control '{control.name}', or it is not a number; name it as "
-                    "before, or record and train this rig."
-                )
-            values[index] = value
-        return values
-
-
 def set_control(scene_rig: SceneRig, name: str, value: float) -> None:
-    """Set a control by its name without evaluating it; integers and booleans are rounded."""
+    """Set a control by its name without evaluating it (`can_be_set`); integers and booleans are rounded."""
     owner, _, path = name.partition("/")
     datablock = owner_of(scene_rig, owner)
     current = datablock.path_resolve(path)
@@ -271,9 +247,9 @@ def set_control(scene_rig: SceneRig, name: str, value: float) -> None:
 def temporary_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[None]:
     """Remove the animation of controls, given by name; restore it and their values afterwards.
 
-    `temporary_state.temporary_pose` does the same for the animation of the armature object.
+    `temporary_state.temporary_pose` does the same for the animation of the armature object and for transforms of bones.
     """
-    names = list(names)
+    names = [name for name in names if can_be_set(name)]
     owners_and_paths = [
         (owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)
     ]

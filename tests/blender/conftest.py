@@ -19,7 +19,7 @@ from fdda_addon.cli.main import main
 from fdda_addon.core.model import METADATA_KEY
 from fdda_addon.rig.reading import PoseReader
 from fdda_addon.runtime.network import Network
-from fdda_addon.scene.controls import ControlReader
+from fdda_addon.scene.control_reader import ControlReader
 from fdda_addon.scene.scene_rig import SceneRig, armature_of, find_rig
 
 ELBOW = "elbow"

@@ -6,7 +6,8 @@ import pytest
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.scene.control_names import control_default
-from fdda_addon.scene.controls import ControlReader, is_driven, parse_controls, set_control
+from fdda_addon.scene.control_reader import ControlReader
+from fdda_addon.scene.controls import is_driven, parse_controls, set_control
 
 from .conftest import ELBOW_RIG
 

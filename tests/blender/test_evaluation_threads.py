@@ -10,7 +10,7 @@ import pytest
 
 from fdda_addon.runtime import evaluation_threads, playback
 from fdda_addon.runtime.player import Player
-from fdda_addon.scene.controls import ControlReader
+from fdda_addon.scene.control_reader import ControlReader
 
 from .conftest import ELBOW_RIG, assert_plays, pose
 

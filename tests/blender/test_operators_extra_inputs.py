@@ -130,7 +130,7 @@ def test_shape_keys_are_suggested_and_driven_ones_are_not(face):
 def test_properties_are_suggested(arm):
     arm.armature_object.pose.bones["fk_upper"]["follow"] = 1.0
     names = suggested_controls(arm)
-    assert names == [IK, 'armature_object/pose.bones["fk_upper"]["follow"]']
+    assert names == [IK, 'armature_object/pose.bones["fk_upper"]["follow"]', "collection:Controls"]
 
 
 def test_the_default_values_of_controls_are_read(arm):

@@ -15,7 +15,7 @@ from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.rig import time_inputs
 from fdda_addon.rig.pose_setter import TargetSettings
-from fdda_addon.scene.controls import ControlReader
+from fdda_addon.scene.control_reader import ControlReader
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import ELBOW, evaluated_positions

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Control bones: their channels are inputs of a model, which learns what they move besides its joints."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.characters import control_face
+from blend_fixtures.characters.targets import TARGET
+from fdda_addon.core.errors import RigError
+from fdda_addon.core.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.poses.control_bones import bones_without_location_range, rotation_elements
+from fdda_addon.recording.plan import RecordingSettings, listed_controls, read_sampled_rig
+from fdda_addon.runtime import driver
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.control_reader import ControlReader
+from fdda_addon.scene.controls import parse_controls
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+
+from .conftest import assert_plays, run, train
+
+FACE = f"collection:{control_face.COLLECTION}"
+MAX_ERROR_RATIO = 0.15
+"""Largest mean error with the controls, as a ratio of the mean error without them."""
+EYE_ELEMENTS = [f'pose.bones["eye"].matrix_basis[{column}][{row}]' for column in (0, 1) for row in (0, 1, 2)]
+PATHS = {
+    'pose.bones["brow"].location[0]', 'pose.bones["brow"].location[2]', *EYE_ELEMENTS,
+    'pose.bones["lid"].matrix_basis[2][2]', 'pose.bones["lid"].matrix_basis[2][0]',
+    'pose.bones["mouth"].scale[2]', 'pose.bones["mouth"]["smile"]',
+}  # fmt: skip
+
+
+@pytest.fixture
+def face() -> SceneRig:
+    control_face.control_face()
+    return find_rig("elbow")
+
+
+@pytest.fixture(scope="module")
+def face_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record and train the face with and without its control bones; return the folder of the files."""
+    folder = tmp_path_factory.mktemp("control_face")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    control_face.control_face()
+    save_copy(folder / "face.blend")
+    control_face.add_speech()
+    save_copy(folder / "speech.blend")
+    bones = ("--sample", FACE, "--sample", "bone:lower", "--target", TARGET)
+    for name, options in (("with", ("--control", FACE)), ("without", ())):
+        recording = folder / f"{name}_recording"
+        options = ("--object", "elbow", "--poses", 300, "--spread", 10, *bones, *options)
+        assert run("record", folder / "face.blend", recording, *options) == 0
+        train(recording, folder / f"{name}.onnx", "--epochs", 80)
+    return folder
+
+
+def test_a_face_is_learned_only_with_its_control_bones(face_folder, tmp_path):
+    means = {}
+    for name in ("with", "without"):
+        report = tmp_path / f"{name}.json"
+        options = ("--object", "elbow", "--target", TARGET, "--poses", 0, "--action", control_face.SPEECH)
+        files = (face_folder / "speech.blend", face_folder / f"{name}.onnx", "--json", report)
+        assert run("evaluate", *files, *options) == 0
+        (errors,) = json.loads(report.read_text())["actions"]
+        means[name], linear = errors["fdda"]["mean"], errors["linear"]["mean"]
+    assert linear > 1 and means["with"] < MAX_ERROR_RATIO * means["without"]
+
+
+def test_the_recording_has_the_controls_and_their_influences(face_folder):
+    recording = read_recording(face_folder / "with_recording")
+    assert {control.path for control in recording.rig.controls} == PATHS
+    assert list(recording.rig.joint_names) == ["upper", "lower"]
+    partition = next(p for p in recording.partitions if recording.rig.joint_names[p.joint] == "lower")
+    assert set(partition.controls) == set(range(len(PATHS)))
+    values = np.array(recording.controls)
+    assert (np.ptp(values, axis=0) > 0.02).all()
+    # The columns of a rotation have the length 1; the bone `lid` rotates about one axis.
+    paths = [control.path for control in recording.rig.controls]
+    for elements in (EYE_ELEMENTS[:3], EYE_ELEMENTS[3:], [path for path in paths if '"lid"' in path]):
+        columns = values[:, [paths.index(path) for path in elements]]
+        assert np.linalg.norm(columns, axis=1) == pytest.approx(1, abs=1e-5)
+
+
+@pytest.fixture
+def bound_face(face_folder, tmp_path) -> bpy.types.Object:
+    """Bind the model with control bones, and return the mesh object."""
+    path = tmp_path / "bound.blend"
+    assert run("bind", face_folder / "speech.blend", face_folder / "with.onnx", path, "--object", "elbow") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    return bpy.data.objects["elbow"]
+
+
+def test_playback_follows_the_control_bones(bound_face, face_folder):
+    """Every kind of channel is followed, keyed and set by hand; a full turn of a bone does not jump."""
+    armature_object = bpy.data.objects[control_face.ARMATURE]
+    bones, shapes = armature_object.pose.bones, []
+    for frame in (1, 9, 20):
+        bpy.context.scene.frame_set(frame)
+        shapes.append(assert_plays(bound_face, face_folder / "with.onnx"))
+    assert all(np.abs(shapes[n] - shapes[n - 1]).max() > 0.002 for n in range(3))
+    armature_object.animation_data.action = None
+    for bone, attribute, value in (
+        ("brow", "location", (0.02, 0, 0.03)),
+        ("eye", "rotation_quaternion", (0.9, 0.4, 0, 0)),
+        ("lid", "rotation_euler", (0, 1, 0)),
+        ("mouth", "scale", (1, 1, 1.5)),
+    ):
+        setattr(bones[bone], attribute, value)
+        bpy.context.view_layer.update()
+        shapes.append(assert_plays(bound_face, face_folder / "with.onnx"))
+        assert np.abs(shapes[-1] - shapes[-2]).max() > 1e-4, bone
+    bones["mouth"]["smile"] = 1.0
+    armature_object.update_tag()
+    bpy.context.view_layer.update()
+    assert np.abs(assert_plays(bound_face, face_folder / "with.onnx") - shapes[-1]).max() > 1e-4
+    before = assert_plays(bound_face, face_folder / "with.onnx")
+    bones["eye"].rotation_quaternion = -np.array(bones["eye"].rotation_quaternion)
+    bones["lid"].rotation_euler[1] += 2 * np.pi
+    bpy.context.view_layer.update()
+    assert np.abs(assert_plays(bound_face, face_folder / "with.onnx") - before).max() < 1e-5
+
+
+@pytest.mark.parametrize("change", ["rename", "remove"])
+def test_a_missing_control_bone_is_named(bound_face, change):
+    armature_object = bpy.data.objects[control_face.ARMATURE]
+    if change == "rename":
+        armature_object.data.bones["eye"].name = "eye.L"
+    else:
+        bpy.context.view_layer.objects.active = armature_object
+        bpy.ops.object.mode_set(mode="EDIT")
+        armature_object.data.edit_bones.remove(armature_object.data.edit_bones["eye"])
+        bpy.ops.object.mode_set(mode="OBJECT")
+    bpy.context.view_layer.update()
+    bpy.context.scene.frame_set(3)
+    assert "'elbow' lacks the control bone 'eye'; name it as before" in bound_face.fdda.status
+
+
+def test_a_model_of_another_rig_names_the_missing_control_bone(face_folder, tmp_path, capfd):
+    bpy.ops.wm.open_mainfile(filepath=str(face_folder / "face.blend"))
+    bpy.data.objects[control_face.ARMATURE].data.bones["lid"].name = "eyelid"
+    save_copy(tmp_path / "renamed.blend")
+    options = ("bind", tmp_path / "renamed.blend", face_folder / "with.onnx", tmp_path / "out.blend")
+    assert run(*options, "--object", "elbow") == 1
+    assert "'elbow' lacks the control bone 'lid'" in capfd.readouterr().err
+
+
+def test_locked_and_driven_channels_are_left_out(face):
+    bones = face.armature_object.pose.bones
+    settings = RecordingSettings(controls=(FACE,))
+    assert {control.path for control in listed_controls(face, settings)} == PATHS
+    bones["brow"].lock_location[0] = True
+    bones["mouth"].driver_add("scale", 2)
+    bones["lid"].driver_add("rotation_euler", 1)
+    paths = {control.path for control in listed_controls(face, settings)}
+    assert paths == PATHS - {path for path in PATHS if "location[0]" in path or "lid" in path or "scale" in path}
+    with pytest.raises(RigError, match="No channel of the 1 control bones of 'elbow_rig', such as 'still', may move"):
+        listed_controls(face, RecordingSettings(controls=("bone:still",)))
+    with pytest.raises(RigError, match="'elbow_rig' has no bone collection 'Mouth'; its collections: 'Face'"):
+        listed_controls(face, RecordingSettings(controls=("collection:Mouth",)))
+
+
+def test_control_bones_are_posed_besides_the_default_bones(face):
+    """Their locations without limits take the ranges of recorded actions; without any they are reported."""
+    rig, channels = read_sampled_rig(face, RecordingSettings(controls=("bone:brow",)))
+    assert {channel.name for channel in channels} == {"upper", "lower", "brow", "lid", "mouth"}
+    assert set(rig.joint_names) == {"upper", "lower"}, "bones that are posed and have no weights are no joints"
+    brow = face.armature_object.pose.bones["brow"]
+    brow.constraints.remove(brow.constraints[0])
+    brow.lock_rotation[0] = False
+    controls = listed_controls(face, RecordingSettings(controls=("bone:brow",)))
+    assert len(controls) == 2 and bones_without_location_range(face.armature_object, ["brow"], controls) == ["brow"]
+    control_face.add_speech()
+    settings = RecordingSettings(controls=("bone:brow",), actions=(control_face.SPEECH,))
+    controls = listed_controls(face, settings)
+    assert {control.path[-11:] for control in controls if "location" in control.path} == {"location[0]", "location[2]"}
+    assert bones_without_location_range(face.armature_object, ["brow"], controls) == []
+
+
+@pytest.mark.parametrize(
+    ("channels", "elements"),
+    [
+        ([], []),
+        ([(LOCATION, 0)], []),
+        ([(ROTATION, 0)], [(1, 1), (1, 2)]),
+        ([(ROTATION, 1)], [(2, 2), (2, 0)]),
+        ([(ROTATION, 2)], [(0, 0), (0, 1)]),
+        ([(ROTATION, 0), (ROTATION, 2)], [(c, r) for c in (0, 1) for r in (0, 1, 2)]),
+        ([(ROTATION_VECTOR, 0)], [(c, r) for c in (0, 1) for r in (0, 1, 2)]),
+    ],
+)
+def test_a_rotation_becomes_two_columns_or_cosine_and_sine(channels, elements):
+    assert rotation_elements([Channel("bone", kind, axis, -1.0, 1.0) for kind, axis in channels]) == elements
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_cosine_and_sine_are_read_from_the_matrix(face, axis):
+    lid = face.armature_object.pose.bones["lid"]
+    lid.rotation_euler = (0, 0, 0)
+    lid.rotation_euler[axis] = 0.7
+    names = [
+        f'armature_object/pose.bones["lid"].matrix_basis[{column}][{row}]'
+        for column, row in rotation_elements([Channel("lid", ROTATION, axis, -1.0, 1.0)])
+    ]
+    reader = ControlReader(face, parse_controls(face, names))
+    bpy.context.view_layer.update()
+    values = reader.read(face, bpy.context.evaluated_depsgraph_get())
+    assert values == pytest.approx([np.cos(0.7), np.sin(0.7)], abs=1e-6)
+
+
+def test_sixty_control_bones_are_read_through_sixty_dependencies():
+    control_face.many_control_bones(60)
+    rig = find_rig("elbow")
+    controls = listed_controls(rig, RecordingSettings(controls=(FACE,)))
+    reader = ControlReader(rig, controls)
+    assert len(controls) == 60 * 9 and len(reader.sources) == 60
+    buffer = rig.mesh_object
+    assert len(driver.pose_inputs(buffer, rig, reader.sources)) == 63
+    names = [bone.name for bone in rig.armature_object.pose.bones if bone.name.startswith("control")]
+    for index, name in enumerate(names):
+        rig.armature_object.pose.bones[name].location[1] = index / 1000
+    bpy.context.view_layer.update()
+    values = reader.read(rig, bpy.context.evaluated_depsgraph_get())
+    locations = [value for control, value in zip(controls, values, strict=True) if control.path.endswith("location[1]")]
+    assert locations == pytest.approx(np.arange(60) / 1000)
+
+
+def test_a_collection_takes_no_range(face):
+    with pytest.raises(RigError, match="has no bone collection 'Face=0:1'"):
+        listed_controls(face, RecordingSettings(controls=(f"{FACE}=0:1",)))
