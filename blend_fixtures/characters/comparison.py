@@ -18,7 +18,7 @@ from fdda_addon.rig.reading import PoseReader, read_model_rig
 from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.blend_file import save_copy
-from fdda_addon.scene.controls import ControlReader
+from fdda_addon.scene.control_reader import ControlReader
 from fdda_addon.scene.mesh import evaluated_positions, rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, armature_of, find_rig
 from fdda_addon.scene.unit import metres_per_unit
