@@ -70,8 +70,8 @@ def _visible_bone_flags(rig: SceneRig, search_text: str, flag: int) -> tuple[int
 @draw_cached
 def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
     """Return icon, name and limits of a bone for the list, and whether limits are set for the bone."""
+    from ..poses.bone_channels import is_moved_by_constraints
     from ..poses.motion_range import DEFAULT, rotation_ranges
-    from ..poses.sampling import is_moved_by_constraints
 
     name = short_bone_name(rig.armature_object, bone.name)
     channels = sampled_channels_by_bone(rig)

@@ -20,7 +20,7 @@ from ..core.poses import CONTROL, Channel
 from ..core.progress import Progress
 from ..core.rig import STATIC_JOINT, Rig
 from ..core.skinning import LinearSkinning
-from ..poses.sampling import is_moved_by_constraints
+from ..poses.bone_channels import is_moved_by_constraints
 from ..rig.reading import PoseEvaluator
 from ..rig.sources import split_bone_path
 from ..scene.armature import Poser, clear_pose
