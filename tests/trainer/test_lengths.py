@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.checks.recording import check_recording
+from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import read_recording
@@ -85,6 +86,19 @@ def test_networks_have_the_same_inputs(results_by_unit, name):
         assert partition.columns.tolist() == reference.columns.tolist()
         assert partition.fit.joints.tolist() == reference.fit.joints.tolist()
         assert abs(len(partition.basis.components) - len(reference.basis.components)) <= 1
+
+
+def test_features_that_vary_like_rounded_keys_are_no_inputs(results_by_unit):
+    """Standardization would amplify a rotation by 2e-5 so that rounding errors of the model become visible."""
+    recording = results_by_unit[METER][0]
+    matrices = np.array(recording.pose_matrices)
+    angles = 2e-5 * np.random.default_rng(0).choice([-1.0, 1.0], len(matrices))
+    matrices[:, 0, 0, 1], matrices[:, 0, 1, 0] = matrices[:, 0, 0, 1] - angles, matrices[:, 0, 1, 0] + angles
+    partitions = tuple(
+        replace(partition, influencing=(0, *partition.influencing)) for partition in recording.partitions
+    )
+    for partition in prepared(replace(recording, pose_matrices=matrices, partitions=partitions)):
+        assert len(partition.columns) == 0 or partition.columns.min() >= FEATURES_PER_JOINT, partition.name
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)

@@ -22,8 +22,10 @@ from .low_rank import factorize, may_factorize
 MARGIN_POSE_WEIGHT = 0.1
 """Weight of a margin pose in the basis; other poses have weight 1. Margin poses have residuals many times as large, but
 the components are meant for the range of motion."""
-MIN_FEATURE_SPREAD = 1e-5
-"""A feature is constant if its standard deviation over the training poses is smaller: meters, or no unit."""
+MIN_FEATURE_SPREAD = 5e-5
+"""A feature is constant if its standard deviation over the training poses is smaller: no unit, or part of the
+character's size for a length. Features that vary less express rounding in imported animation, and standardization
+amplifies it."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def partition_data(
     rig = recording.rig
     features = inputs.compute_features(recording.pose_matrices, rig.rest_matrices, recording.controls)
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations)
-    min_length_spread = max(MIN_FEATURE_SPREAD / rig.metres_per_unit, float32_rounding(recording.pose_matrices))
+    min_length_spread = max(MIN_FEATURE_SPREAD * rig.size, float32_rounding(recording.pose_matrices))
     min_spread = np.where(inputs.length_mask(), min_length_spread, MIN_FEATURE_SPREAD)
     return [
         PartitionData(
