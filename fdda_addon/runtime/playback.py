@@ -12,7 +12,6 @@ import bpy
 
 from . import modifier_switch, playback_modifier, registry, rig_signature
 from .depsgraph_changes import DepsgraphChanges, changed_meshes, has_edited_armature
-from .evaluation_threads import keep_thread_state
 from .mode_override import overriding_mode
 from .model_files import network_of
 from .player import VIEWPORT_KEY, Player
@@ -23,7 +22,6 @@ _is_switching = False
 
 def on_evaluate(driven_object: bpy.types.Object) -> None:
     """Play the models of an evaluated position buffer or batch driver. Raises nothing."""
-    keep_thread_state()
     driven_uid = driven_object.original.session_uid
     player_or_batch = registry.players.get(driven_uid) or registry.batches.by_driver.get(driven_uid)
     if player_or_batch is not None:
