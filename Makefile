@@ -115,6 +115,9 @@ lint: .venv  ## check the code with ruff, and code and documents for retired wor
 package: .venv  ## build dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: all platforms)
 	.venv/bin/python setup/package.py $(PLATFORM)
 
+release: .venv  ## build the zips of VERSION for all platforms, and a repository that any web server can offer, into dist/repository (WEBSITE=https://…)
+	.venv/bin/python setup/release.py $(or $(VERSION),$(error VERSION=0.2.0 names the version, as in blender_manifest.toml)) $(if $(WEBSITE),--website '$(WEBSITE)')
+
 requirements: .venv  ## pin the packages that pyproject.toml names, and their dependencies, in requirements/
 	for version in 3.11 3.13 3.14; do .venv/bin/uv pip compile --quiet --no-annotate \
 		--python-version $$version --python-platform x86_64-manylinux_2_28 --custom-compile-command 'make requirements' \
@@ -124,4 +127,4 @@ requirements: .venv  ## pin the packages that pyproject.toml names, and their de
 clean:  ## remove all built files and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures map fixtures lint package requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures map fixtures lint package release requirements clean

@@ -6,8 +6,7 @@ the system's Python, and one zip for all Python versions would be too large.
 
 Blender expects the manifest of an extension beside its `__init__.py`. Here the manifest is at the root and the code is
 in `fdda_addon/`, so the files are first copied to dist/stage. The copy includes the trainer, its pinned requirements,
-and the wheels of onnxruntime for the Python versions. Blender's extension tool then builds and validates the zip. The
-tool is part of the bpy wheel and does not import bpy.
+and the wheels of onnxruntime for the Python versions. Blender's extension tool then builds and validates the zip.
 """
 
 import argparse
@@ -100,8 +99,14 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
     return wheels
 
 
-def stage_files(name: str, wheels: list[Path]) -> None:
-    """Copy the files of the extension for a platform to dist/stage."""
+def stage_files(name: str, wheels: list[Path], website: str = "") -> None:
+    """Copy the files of the extension for a platform to dist/stage.
+
+    Args:
+        name: Blender's name of the platform.
+        wheels: paths of the wheels.
+        website: address that Blender opens with *Visit Website*; empty for none.
+    """
     shutil.rmtree(STAGE_FOLDER, ignore_errors=True)
     for folder in ("fdda_addon", "trainer", "requirements"):
         shutil.copytree(ROOT / folder, STAGE_FOLDER / folder, ignore=shutil.ignore_patterns("__pycache__"))
@@ -115,23 +120,32 @@ def stage_files(name: str, wheels: list[Path]) -> None:
         shutil.copy(wheel, STAGE_FOLDER / "wheels")
     manifest = (ROOT / "blender_manifest.toml").read_text()
     built_tables = f"platforms = {json.dumps([name])}\nwheels = {json.dumps([f'./wheels/{w.name}' for w in wheels])}\n"
+    built_tables += f"website = {json.dumps(website)}\n" if website else ""
     (STAGE_FOLDER / "blender_manifest.toml").write_text(
         manifest.replace("\n[permissions]", f"\n{built_tables}\n[permissions]")
     )
 
 
-def build(package: Path) -> None:
-    """Build and validate the zip from dist/stage with the extension tool of the bpy wheel.
+def run_extension_tool(*arguments: object) -> None:
+    """Run Blender's extension tool, which is part of the bpy wheel and does not import bpy.
 
     Raises:
-        PackageError: the zip is too large.
+        CalledProcessError: the tool failed; it has printed the reason.
     """
     bpy_folder = Path(sysconfig.get_path("platlib")) / "bpy"
     (tool,) = bpy_folder.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py")
-    subprocess.run(
-        [sys.executable, tool, "build", "--source-dir", STAGE_FOLDER, "--output-filepath", package], check=True
-    )
-    subprocess.run([sys.executable, tool, "validate", package], check=True)
+    subprocess.run([sys.executable, tool, *arguments], check=True)
+
+
+def build(package: Path) -> None:
+    """Build and validate the zip from dist/stage.
+
+    Raises:
+        PackageError: the zip is too large.
+        CalledProcessError: the zip cannot be built, or is not valid.
+    """
+    run_extension_tool("build", "--source-dir", STAGE_FOLDER, "--output-filepath", package)
+    run_extension_tool("validate", package)
     check_size(package)
 
 
@@ -149,25 +163,48 @@ def check_size(package: Path) -> None:
         )
 
 
+def read_version() -> str:
+    """Return the version of the extension. The manifest at the root is the only place that has it."""
+    return tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
+
+
+def build_packages(names: list[str], website: str = "") -> list[Path]:
+    """Build and validate the zips for platforms, and print their sizes.
+
+    Args:
+        names: as for `select_platforms`.
+        website: as for `stage_files`.
+
+    Returns:
+        The paths of the zips.
+
+    Raises:
+        PackageError: there are no wheels for a platform, or a zip is too large.
+        CalledProcessError: pip or the extension tool failed.
+    """
+    packages = []
+    for name in select_platforms(names):
+        for pythons in python_versions_of_zips(name):
+            # Several zips are named as Blender's option `--split-platforms` names them.
+            suffix = f"-{name.replace('-', '_')}" if names else ""
+            suffix += "" if pythons == PYTHON_VERSIONS else f"-python{pythons[0]}"
+            package = DIST_FOLDER / f"fdda_addon-{read_version()}{suffix}.zip"
+            stage_files(name, fetch_wheels(name, pythons), website)
+            build(package)
+            size = package.stat().st_size / 1e6
+            print(f"{package.relative_to(ROOT)} ({size:.0f} MB) for {name}, Python {' and '.join(pythons)}")
+            packages.append(package)
+    return packages
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     platform_names = ", ".join(PLATFORMS)
     parser.add_argument(
         "platforms", nargs="*", help=f"{ALL_PLATFORMS}, or some of {platform_names}; by default the current platform"
     )
-    names = parser.parse_args().platforms
-    version = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
     try:
-        for name in select_platforms(names):
-            for pythons in python_versions_of_zips(name):
-                # Several zips are named as Blender's option `--split-platforms` names them.
-                suffix = f"-{name.replace('-', '_')}" if names else ""
-                suffix += "" if pythons == PYTHON_VERSIONS else f"-python{pythons[0]}"
-                package = DIST_FOLDER / f"fdda_addon-{version}{suffix}.zip"
-                stage_files(name, fetch_wheels(name, pythons))
-                build(package)
-                size = package.stat().st_size / 1e6
-                print(f"{package.relative_to(ROOT)} ({size:.0f} MB) for {name}, Python {' and '.join(pythons)}")
+        build_packages(parser.parse_args().platforms)
     except PackageError as error:
         print(error, file=sys.stderr)
         return 1

@@ -260,7 +260,7 @@ def test_the_staged_extension_has_the_files_that_blender_expects(tmp_path: Path,
     wheel.write_bytes(b"wheel")
     package.stage_files("linux-x64", [wheel])
     manifest = tomllib.loads((tmp_path / "stage/blender_manifest.toml").read_text())
-    assert manifest["version"] == PROJECT["project"]["version"]
+    assert manifest["version"] == package.read_version() and "website" not in manifest
     assert manifest["platforms"] == ["linux-x64"]
     assert [(tmp_path / "stage" / path).read_bytes() for path in manifest["wheels"]] == [b"wheel"]
     assert set(manifest["permissions"]) == {"files", "network"}
