@@ -27,10 +27,12 @@ from fdda_addon.core.partition import Partition
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import split_poses
 from trainer.fits.joint_fit import make_joint_regression
-from trainer.fits.preparation import PartitionData, PreparedPartition, prepare_partition
-from trainer.inputs.network_inputs import NetworkInputs, make_inputs
+from trainer.inputs.joints import JointFeatures
+from trainer.inputs.neighbor_positions import NeighborPositions
+from trainer.inputs.network_inputs import NetworkInputs
 from trainer.networks.loop import train
 from trainer.networks.networks import Network
+from trainer.preparation import PartitionData, PreparedPartition, prepare_partition
 
 DATA_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
 TRAINING_POSES = 700
@@ -121,10 +123,9 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
     for index in range(1, len(names)):
         poses[:, index] = poses[:, parents[index]] @ poses[:, index]
     partition = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
-    inputs: NetworkInputs = make_inputs(parents, points, [partition])
-    features = inputs.compute_features(
-        poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1))
-    )
+    joints = JointFeatures(parents, np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
+    inputs = NetworkInputs.of([joints, NeighborPositions.between(parents, points, [partition])], [partition])
+    features = inputs.compute_features(poses.astype(np.float32), np.zeros((len(poses), 0)))
     residuals = residuals * np.float32(METERS_PER_CM)
     data = PartitionData(
         name,

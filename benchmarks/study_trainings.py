@@ -19,13 +19,18 @@ from fdda_addon.core.skinning import skin_matrices
 from trainer.config import TrainingConfig
 from trainer.data.split import split_poses
 from trainer.export.export import PositionErrors, build_model, measure, write_model
-from trainer.fits.preparation import partition_data, prepare_partition
-from trainer.fits.surface_frame_fit import select_surface_frames
-from trainer.inputs.network_inputs import NetworkInputs, inputs_of_rig, partition_centers
+from trainer.fits.joint_paths import static_joints
+from trainer.inputs.block import State
+from trainer.inputs.controls import ControlFeatures
+from trainer.inputs.joints import JointFeatures
+from trainer.inputs.neighbor_positions import NeighborPositions, partition_centers
+from trainer.inputs.network_inputs import NetworkInputs, fit_inputs
+from trainer.inputs.surface_frames import SurfaceFrameFeatures
 from trainer.model import TrainedModel, is_sheared
 from trainer.networks.confidence import measure_training_range
 from trainer.networks.curves import Curves
 from trainer.networks.loop import train
+from trainer.preparation import partition_data, prepare_partition
 
 
 @dataclass(frozen=True)
@@ -35,13 +40,11 @@ class StudyData:
     Attributes:
         whole_training: the training recording with all partitions.
         training, held_out: both recordings with only the partitions of the study.
-        inputs: inputs of the networks without surface frames, which depend on the split.
     """
 
     whole_training: Recording
     training: Recording
     held_out: Recording
-    inputs: NetworkInputs
 
 
 def select_partitions(recording: Recording, names: tuple[str, ...]) -> Recording:
@@ -95,11 +98,22 @@ def read_study_data(training: Path, held_out: Path, names: tuple[str, ...]) -> S
             "record it with another --seed."
         )
     training_data = select_partitions(whole_training, names)
-    # Compute the centers from all partitions, as in a training of the whole character.
-    inputs = inputs_of_rig(
-        whole_training.rig, partition_centers(whole_training.rig, whole_training.partitions), training_data.partitions
+    return StudyData(whole_training, training_data, select_partitions(whole_held_out, names))
+
+
+def make_study_inputs(study_data: StudyData, states: dict[str, State]) -> NetworkInputs:
+    """Make the inputs of the partitions as in a training of the whole character."""
+    whole, partitions = study_data.whole_training, study_data.training.partitions
+    centers = partition_centers(whole.rig, whole.partitions)
+    surface_frames = SurfaceFrameFeatures.make(whole.rig, whole.partitions, states.get(SurfaceFrameFeatures.name, {}))
+    is_selected = np.isin(surface_frames.main_joints, [partition.joint for partition in partitions])
+    blocks = (
+        JointFeatures.make(whole.rig, partitions, {}),
+        ControlFeatures.make(whole.rig, partitions, {}),
+        NeighborPositions.between(whole.rig.parents, centers, partitions, static_joints(whole.rig)),
+        surface_frames.subset(is_selected),
     )
-    return StudyData(whole_training, training_data, select_partitions(whole_held_out, names), inputs)
+    return NetworkInputs.of(blocks, partitions)
 
 
 def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) -> dict:
@@ -107,16 +121,13 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
     recording = study_data.training
     wall_start, processor_start = time.perf_counter(), time.process_time()
     split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
-    # Select among the surface frames of all partitions, as in a training of the whole character.
-    surface_frames = select_surface_frames(study_data.whole_training, split, config.tolerance_mm)
-    is_selected = np.isin(surface_frames.main_joints, [partition.joint for partition in recording.partitions])
-    inputs = study_data.inputs.with_surface_frames(surface_frames.subset(is_selected), recording.partitions)
+    inputs = make_study_inputs(study_data, fit_inputs(study_data.whole_training, split, config))
     data = partition_data(recording, recording.partitions, inputs)
     prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor_start, "wall": time.perf_counter() - wall_start}
     poses, controls = (np.array(a[split.training]) for a in (recording.pose_matrices, recording.controls))
-    training_features = inputs.compute_features(poses, recording.rig.rest_matrices, controls)
+    training_features = inputs.compute_features(poses, controls)
     training_range = measure_training_range(training_features, recording.rig, recording.partitions)
     trained_model = TrainedModel(
         recording.rig,

@@ -9,11 +9,11 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
 from .fits.partition_refinement import partition_indices
-from .fits.preparation import PreparedPartition
 from .inputs.network_inputs import NetworkInputs
 from .networks.checkpoint import Checkpoint, PartitionCheckpoint
 from .networks.confidence import TrainingRange
 from .networks.networks import Network
+from .preparation import PreparedPartition
 
 MAX_COLUMN_COSINE = 1e-5
 """A pose matrix is sheared if two of its columns have a larger cosine. Rounding to float32 causes a tenth of it.
@@ -84,7 +84,7 @@ class TrainedModel:
             self.activation,
             tuple(history),
             tuple(partitions),
-            self.inputs.surface_frames,
+            self.inputs.states,
             partition_indices(self.partitions),
         )
 

@@ -25,16 +25,16 @@ from .export.export import build_model, measure, measure_surface, write_model
 from .fits.gravity import drop_gravity_input
 from .fits.half_rotations import half_rotations_help
 from .fits.partition_refinement import partition_indices, refine_partitions
-from .fits.preparation import PreparedPartition, partition_data, prepare_partitions
-from .fits.surface_frame_fit import select_surface_frames
 from .goal import GoalResult, evaluate_goal
-from .inputs.network_inputs import NetworkInputs, inputs_with_surface_frames
+from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
+from .inputs.surface_frames import SurfaceFrameFeatures
 from .model import TrainedModel, is_sheared
 from .networks.checkpoint import write_checkpoint
 from .networks.confidence import measure_training_range
 from .networks.loop import TrainingResult, choose_device, train
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import check_training_outputs, training_outputs
+from .preparation import PreparedPartition, partition_data, prepare_partitions
 from .process import Cancelled
 from .progress import MessageSink
 from .report.contents import make_report
@@ -87,18 +87,13 @@ def train_model(
     _raise_if_stopped(should_stop)
     recording = drop_gravity_input(recording, split)
     # A warm start keeps the inputs of the checkpoint.
-    surface_frames = (
-        checkpoint.surface_frames
-        if checkpoint
-        else select_surface_frames(recording, split, config.tolerance_mm, should_stop)
-    )
-    if len(surface_frames):
-        sink.send(
-            MessageType.LOG,
-            text=f"The rig smooths: networks take surface frames of {len(surface_frames)} vertices as inputs.",
-        )
+    input_states = checkpoint.input_states if checkpoint else fit_inputs(recording, split, config, should_stop)
+    for block in make_inputs(recording.rig, recording.partitions, input_states).blocks:
+        if block.log_text:
+            sink.send(MessageType.LOG, text=block.log_text)
     # Surface frames make half-rotation features unnecessary.
-    use_half_rotations = not len(surface_frames) and half_rotations_help(recording, split.training, should_stop)
+    has_surface_frames = bool(input_states.get(SurfaceFrameFeatures.name))
+    use_half_rotations = not has_surface_frames and half_rotations_help(recording, split.training, should_stop)
     if use_half_rotations:
         sink.send(
             MessageType.LOG, text="The rig blends rotations: residuals are fitted to half-rotation features, too."
@@ -113,7 +108,7 @@ def train_model(
         sink.send(
             MessageType.LOG, text=f"Partitions refined: {reassigned} vertices are reassigned to a neighbor partition."
         )
-    inputs = inputs_with_surface_frames(recording.rig, partitions, surface_frames)
+    inputs = make_inputs(recording.rig, partitions, input_states)
     prepared = _prepare_partitions(recording, partitions, inputs, use_half_rotations, split, config, sink, should_stop)
     columns = [
         offered_columns[partition.columns] for offered_columns, partition in zip(inputs.columns, prepared, strict=True)
@@ -252,7 +247,7 @@ def _make_trained_model(
 ) -> TrainedModel:
     rig = recording.rig
     matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
-    features = inputs.compute_features(matrices, rig.rest_matrices, controls)
+    features = inputs.compute_features(matrices, controls)
     return TrainedModel(
         rig,
         partitions,

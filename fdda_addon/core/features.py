@@ -8,6 +8,10 @@ from .rig import Rig
 FEATURES_PER_JOINT = 12
 FLOAT32_ROUNDING_RATIO = 2.0**-21
 """Largest rounding error of float32, a few units in the last place, as a ratio of the largest coordinate."""
+MIN_FEATURE_SPREAD = 5e-5
+"""A feature is constant if its standard deviation over the training poses is smaller: no unit, or part of the
+character's size for a length. Features that vary less express rounding in imported animation, and standardization
+amplifies it."""
 
 
 def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:

@@ -36,8 +36,10 @@ TRAINER_LAYERS: tuple[tuple[str, ...], ...] = (
     ("export",),
     ("model",),
     ("networks",),
-    ("fits",),
-    ("data", "inputs", "skin"),
+    ("preparation",),
+    ("inputs",),
+    ("fits", "skin"),
+    ("data",),
     ("config", "goal", "graph_builder", "outputs", "process"),
     ("blocks", "progress"),
 )

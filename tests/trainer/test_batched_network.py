@@ -9,9 +9,9 @@ import torch
 
 from trainer.config import TrainingConfig
 from trainer.data.split import split_poses
-from trainer.fits.preparation import PartitionData, prepare_partition
 from trainer.networks.loop import _Loop, train
 from trainer.networks.networks import ACTIVATION_FUNCTIONS, PartitionNetworks
+from trainer.preparation import PartitionData, prepare_partition
 from trainer.process import Cancelled
 
 from .chain import chain_angles

@@ -23,7 +23,7 @@ from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
-from trainer.inputs.network_inputs import inputs_of_rig, partition_centers
+from trainer.inputs.network_inputs import make_inputs
 from trainer.networks.confidence import measure_training_range
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
@@ -159,15 +159,11 @@ def test_a_control_that_never_moved_lowers_confidence_only_when_it_moves(network
 def test_a_constant_control_with_a_range_counts_where_it_influences():
     rig = controlled_rig(BULGE)
     partitions = make_partitions(rig, INFLUENCING, {1: (0,)})
-    inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
+    inputs = make_inputs(rig, partitions)
     poses, constant_values = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
-    training_range = measure_training_range(
-        inputs.compute_features(poses, rig.rest_matrices, constant_values), rig, partitions
-    )
+    training_range = measure_training_range(inputs.compute_features(poses, constant_values), rig, partitions)
     assert training_range.controls == (replace(BULGE, low=0.25, high=0.25),)
-    confidence = training_range.compute_confidence(
-        inputs.compute_features(poses[:3], rig.rest_matrices, np.array([[0.25], [1], [6]]))
-    )
+    confidence = training_range.compute_confidence(inputs.compute_features(poses[:3], np.array([[0.25], [1], [6]])))
     assert (
         (confidence[:, [0, 2]] == 1).all() and confidence[0, 1] == 1 > confidence[1, 1] > 0.8 and confidence[2, 1] == 0
     )

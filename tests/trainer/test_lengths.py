@@ -17,8 +17,8 @@ from fdda_addon.core.report import report_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
-from trainer.fits.preparation import partition_data, prepare_partition
-from trainer.inputs.network_inputs import inputs_of_rig, partition_centers
+from trainer.inputs.network_inputs import make_inputs
+from trainer.preparation import partition_data, prepare_partition
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
@@ -74,7 +74,7 @@ def results_by_unit(tmp_path_factory) -> dict:
 def prepared(recording) -> list:
     config = TrainingConfig(seed=0)
     rig, split = recording.rig, split_recording(recording, config)
-    inputs = inputs_of_rig(rig, partition_centers(rig, recording.partitions), recording.partitions)
+    inputs = make_inputs(rig, recording.partitions)
     partitions = partition_data(recording, recording.partitions, inputs)
     return [prepare_partition(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
 

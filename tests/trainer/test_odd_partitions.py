@@ -17,7 +17,8 @@ from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.fits.joint_fit import joint_regression
-from trainer.inputs.network_inputs import inputs_of_rig, joints_on_path, partition_centers
+from trainer.fits.joint_paths import joints_on_path
+from trainer.inputs.neighbor_positions import NeighborPositions
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS, run_page_code
@@ -110,8 +111,8 @@ def test_confidence_is_one_where_only_recorded_joints_move(model):
 def test_vertices_without_a_bone_have_inputs_of_influencing_joints():
     rig = odd_rig()
     partitions = odd_partitions(rig)
-    inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
-    pairs = [(a, b) for a, b in zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True)]
+    neighbors = NeighborPositions.make(rig, partitions, {})
+    pairs = list(zip(neighbors.main_joints.tolist(), neighbors.pair_points.tolist(), strict=True))
     assert (STATIC_JOINT_INDEX, 1) in pairs, "two joints move the second bone relative to vertices without a bone"
     assert (1, STATIC_JOINT_INDEX) in pairs and (2, STATIC_JOINT_INDEX) not in pairs, (
         "the root does not influence the third partition"

@@ -13,7 +13,7 @@ from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, S
 from fdda_addon.core.recording.reader import Recording, read_recording
 from trainer.config import TrainingConfig
 from trainer.data.split import BLOCK_FRAMES, Split, split_recording
-from trainer.fits.preparation import PartitionData, prepare_partition
+from trainer.preparation import PartitionData, prepare_partition
 
 from .chain import write_chain
 
@@ -98,7 +98,7 @@ def test_all_margin_poses_are_training_poses(recording):
     assert np.isin(result.margin, result.training).all()
     split_alone = split(recording, Source(RANDOM, 150))
     assert np.array_equal(result.held_out[result.held_out < 200], split_alone.held_out)
-    weights = result.weights(0.1)
+    weights = result.weights()
     assert np.array_equal(result.training[weights == 0.1], result.margin) and set(weights) == {0.1, 1.0}
 
 

@@ -9,7 +9,14 @@ import pytest
 
 from benchmarks.study import Plan, main, study
 from benchmarks.study_tables import format_tables
-from benchmarks.study_trainings import StudyData, Trainings, read_study_data, select_partitions, train_once
+from benchmarks.study_trainings import (
+    StudyData,
+    Trainings,
+    make_study_inputs,
+    read_study_data,
+    select_partitions,
+    train_once,
+)
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.recording.reader import read_recording
@@ -17,8 +24,8 @@ from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
 from trainer.data.split import split_poses
-from trainer.fits.surface_frame_fit import select_surface_frames
-from trainer.inputs.network_inputs import inputs_of_rig, partition_centers
+from trainer.inputs.network_inputs import make_inputs
+from trainer.inputs.surface_frame_fit import select_surface_frames
 
 from .chain import write_chain
 from .tube import write_tube
@@ -79,13 +86,8 @@ def test_networks_of_a_rig_that_smooths_take_surface_frames(tmp_path):
     tube_recording = write_tube(tmp_path / "tube")
     names = ("bone_1",)
     cut_recording = select_partitions(tube_recording, names)
-    inputs = inputs_of_rig(
-        tube_recording.rig, partition_centers(tube_recording.rig, tube_recording.partitions), cut_recording.partitions
-    )
     model = tmp_path / "tube.onnx"
-    train_once(
-        StudyData(tube_recording, cut_recording, cut_recording, inputs), TrainingConfig(epochs=1, hidden=(8, 8)), model
-    )
+    train_once(StudyData(tube_recording, cut_recording, cut_recording), TrainingConfig(epochs=1, hidden=(8, 8)), model)
     network_frames_shape = next(
         info for info in onnx.load(model).graph.initializer if info.name == "main_joint_axes"
     ).dims
@@ -118,17 +120,12 @@ def test_the_study_reports_the_errors_of_the_models_on_held_out_poses(study_fold
 
 def test_a_studied_partition_has_the_inputs_of_a_whole_training(recording, held_out):
     whole_recording = read_recording(recording)
-    inputs = inputs_of_rig(
-        whole_recording.rig,
-        partition_centers(whole_recording.rig, whole_recording.partitions),
-        whole_recording.partitions,
-    )
-    all_features = inputs.compute_features(whole_recording.pose_matrices, whole_recording.rig.rest_matrices)
+    inputs = make_inputs(whole_recording.rig, whole_recording.partitions)
+    all_features = inputs.compute_features(whole_recording.pose_matrices, whole_recording.controls)
     study_data = read_study_data(recording, held_out, PARTITION_NAMES)
-    features = study_data.inputs.compute_features(
-        study_data.training.pose_matrices, study_data.training.rig.rest_matrices
-    )
-    for columns, all_columns in zip(study_data.inputs.columns, inputs.columns[1:], strict=True):
+    study_inputs = make_study_inputs(study_data, {})
+    features = study_inputs.compute_features(study_data.training.pose_matrices, study_data.training.controls)
+    for columns, all_columns in zip(study_inputs.columns, inputs.columns[1:], strict=True):
         assert np.array_equal(features[:, columns], all_features[:, all_columns])
 
 

@@ -15,10 +15,11 @@ from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
-from trainer.fits import surface_frame_fit
-from trainer.fits.surface_frame_fit import MIN_EXPLAINED_VARIANCE, select_surface_frames
-from trainer.inputs.network_inputs import inputs_with_surface_frames
-from trainer.inputs.surface_frames import NO_SURFACE_FRAMES, SurfaceFrameFeatures
+from trainer.inputs import surface_frame_fit
+from trainer.inputs.network_inputs import make_inputs
+from trainer.inputs.surface_frame_fit import MIN_EXPLAINED_VARIANCE, select_surface_frames
+from trainer.inputs.surface_frame_vectors import NO_SURFACE_FRAMES, SurfaceFrames
+from trainer.inputs.surface_frames import SurfaceFrameFeatures
 from trainer.networks.checkpoint import read_checkpoint
 from trainer.process import Cancelled
 
@@ -27,7 +28,7 @@ from .conftest import QUICK_OPTIONS
 from .tube import INFLUENCING, JOINTS, POSES, smoothed, write_tube
 
 
-def select_frames(recording: Recording) -> SurfaceFrameFeatures:
+def select_frames(recording: Recording) -> SurfaceFrames:
     return select_surface_frames(recording, split_recording(recording, TrainingConfig()), tolerance_mm=0.04)
 
 
@@ -38,7 +39,7 @@ def recording(tmp_path_factory) -> Recording:
 
 @pytest.fixture(scope="module")
 def surface_frames(recording) -> SurfaceFrameFeatures:
-    return select_frames(recording)
+    return SurfaceFrameFeatures(**vars(select_frames(recording)))
 
 
 def test_a_rig_that_smooths_has_surface_frames_in_every_partition(recording, surface_frames):
@@ -96,7 +97,7 @@ def test_selection_does_not_depend_on_unit_and_position(
     selected = select_frames(moved_recording)
     assert selected.vertices.tolist() == surface_frames.vertices.tolist()
     features, reference_features = (
-        selected.evaluate(moved_recording.pose_matrices) / units_per_metre,
+        SurfaceFrameFeatures(**vars(selected)).evaluate(moved_recording.pose_matrices) / units_per_metre,
         surface_frames.evaluate(recording.pose_matrices),
     )
     # At 100 m from the origin, positions have steps of 0.008 mm.
@@ -219,10 +220,10 @@ def test_the_graph_agrees_with_pytorch_in_other_rigs(tmp_path, tube_options):
 def test_a_warm_start_keeps_the_surface_frames(recording, surface_frames, model_path, tmp_path, capsys):
     for file in (model_path, checkpoint_path(model_path)):
         shutil.copy(file, tmp_path)
-    frames_of_checkpoint = read_checkpoint(checkpoint_path(model_path)).surface_frames
+    states = read_checkpoint(checkpoint_path(model_path)).input_states
     for name, array in vars(surface_frames).items():
-        assert np.array_equal(getattr(frames_of_checkpoint, name), array), name
-    offered_columns = inputs_with_surface_frames(recording.rig, recording.partitions, frames_of_checkpoint).columns
+        assert np.array_equal(states["surface_frames"][name], array), name
+    offered_columns = make_inputs(recording.rig, recording.partitions, states).columns
     assert [len(columns) % 3 for columns in offered_columns] == [0] * JOINTS
     assert main([str(recording.path), str(tmp_path / model_path.name), *QUICK_OPTIONS, "--warm-start"]) == 0
     assert (
@@ -247,7 +248,7 @@ DAMAGED_ARRAYS = {
 def test_damaged_surface_frames_are_refused(recording, model_path, tmp_path, capsys, damage_name):
     name, change = DAMAGED_ARRAYS[damage_name]
     with np.load(checkpoint_path(model_path)) as arrays:
-        changed_arrays = {**arrays, f"surface_frames/{name}": change(arrays[f"surface_frames/{name}"])}
+        changed_arrays = {**arrays, f"inputs/surface_frames/{name}": change(arrays[f"inputs/surface_frames/{name}"])}
     model = tmp_path / "tube.onnx"
     with open(checkpoint_path(model), "wb") as file:
         np.savez(file, **changed_arrays)

@@ -15,10 +15,10 @@ from fdda_addon.core.report import checkpoint_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
-from trainer.fits.preparation import partition_data, prepare_partition
-from trainer.inputs.network_inputs import inputs_with_surface_frames
+from trainer.inputs.network_inputs import make_inputs
 from trainer.networks.checkpoint import read_checkpoint
 from trainer.networks.warm_start import initial_networks
+from trainer.preparation import partition_data, prepare_partition
 
 from .. import systems
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain
@@ -52,7 +52,7 @@ def prepare_recording(path, config, checkpoint):
     recording = read_recording(path)
     split = split_recording(recording, config)
     partitions = checkpoint.reassign(recording.partitions)
-    inputs = inputs_with_surface_frames(recording.rig, partitions, checkpoint.surface_frames)
+    inputs = make_inputs(recording.rig, partitions, checkpoint.input_states)
     data = partition_data(recording, partitions, inputs)
     prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     return (
@@ -163,7 +163,7 @@ def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage_kind):
     elif damage_kind == "version":
         with np.load(path) as arrays:
             content = dict(arrays)
-        about = json.loads(content["about"].tobytes()) | {"version": 2}
+        about = json.loads(content["about"].tobytes()) | {"version": 1}
         content["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
         np.savez(path, **content)
     elif damage_kind == "pipe":
@@ -186,7 +186,7 @@ def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage_kind):
     elif damage_kind == "text":
         assert "another file is there, which is not the checkpoint of a training" in text
     elif damage_kind == "version":
-        assert "cannot be used (version 2); train without --warm-start" in text
+        assert "cannot be used (version 1); train without --warm-start" in text
     else:
         assert "cannot be used" in text and "train without --warm-start" in text
     assert model.read_bytes() == model_before

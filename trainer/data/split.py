@@ -13,6 +13,9 @@ from fdda_addon.core.rig import Fingerprint
 from ..config import TrainingConfig
 
 MIN_POSES = 10
+MARGIN_POSE_WEIGHT = 0.1
+"""Weight of a margin pose in the basis; other poses have weight 1. Margin poses have residuals many times as large, but
+the components are meant for the range of motion."""
 BLOCK_FRAMES = 10
 """Number of consecutive frames that stay in one part of a split, because adjacent frames are nearly the same pose."""
 
@@ -33,9 +36,9 @@ class Split:
     held_out: np.ndarray
     margin: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
-    def weights(self, margin_weight: float) -> np.ndarray:
-        """Return (n,) float64 weights of the training poses: 1, and `margin_weight` for poses of the margin."""
-        return np.where(np.isin(self.training, self.margin), margin_weight, 1.0)
+    def weights(self) -> np.ndarray:
+        """Return (n,) float64 weights of the training poses: 1, and `MARGIN_POSE_WEIGHT` for poses of the margin."""
+        return np.where(np.isin(self.training, self.margin), MARGIN_POSE_WEIGHT, 1.0)
 
 
 def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float = 0.0) -> Split:

@@ -70,7 +70,7 @@ def reference_positions(
         (N, V, 3) float32 positions, mesh-object space, mesh units, and (N, P) float32 confidence.
     """
     rig, training_range = trained_model.rig, trained_model.training_range
-    features = trained_model.inputs.compute_features(pose_matrices, rig.rest_matrices, controls)
+    features = trained_model.inputs.compute_features(pose_matrices, controls)
     confidence = training_range.compute_confidence(features)
     mean, scale = trained_model.feature_statistics()
     clamped = np.clip(features, training_range.low, training_range.high)
@@ -211,7 +211,7 @@ def model_info(
             )
             for p, recorded, count in partitions
         ),
-        *(bound[: trained_model.inputs.control_start].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
+        *(bound[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         trained_model.training_range.controls,
         error_statistics(held_out_errors).to_json(),
         0.0,

@@ -33,7 +33,7 @@ def build_graph(trained_model: TrainedModel) -> onnx.ModelProto:
     coefficients = add_networks(graph, features, clamped, trained_model)
     add_skinning(graph, features, coefficients, outside, trained_model)
     inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(trained_model.rig.joints), 4, 4])]
-    if count := trained_model.inputs.control_count:
+    if count := len(trained_model.rig.controls):
         inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))
     outputs = [
         helper.make_tensor_value_info(POSITIONS_OUTPUT, TensorProto.FLOAT, ["N", trained_model.rig.vertex_count, 3]),

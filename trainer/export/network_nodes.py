@@ -15,8 +15,9 @@ import numpy as np
 from fdda_addon.core.model import CONFIDENCE_OUTPUT
 
 from ..graph_builder import GraphBuilder
+from ..inputs.block import VECTOR_SIZE
 from ..model import TrainedModel
-from .pose_nodes import VECTOR_SIZE, Features
+from .pose_nodes import Features
 
 CHUNK_COST, SPLIT_COST = 800, 15_000
 """Time of one chunk, and time of the nodes that combine chunks, as numbers of constants that are read in that time."""

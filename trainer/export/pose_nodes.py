@@ -8,7 +8,7 @@ spaces, two gathers of points, and one product.
 
 If no recorded bone is sheared, the columns of R are orthogonal. R^-1 is then the transpose of R with each row divided
 by its squared length, which takes a third of the nodes of an inverse. The features of surface frames
-(`surface_frame_nodes`) come after the vectors. Half-rotation matrices are computed from the same vectors.
+come after the vectors. Half-rotation matrices are computed from the same vectors.
 """
 
 from dataclasses import dataclass
@@ -16,21 +16,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdda_addon.core.features import FEATURES_PER_JOINT
-from fdda_addon.core.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSE_INPUT
+from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSE_INPUT
 
+from ..fits.half_rotations import add_half_rotations
 from ..graph_builder import GraphBuilder
-from ..inputs.surface_frames import MIN_SQUARED_LENGTH
+from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, LocalVectors
+from ..inputs.joints import needed_joints
 from ..model import TrainedModel
-from .half_rotation_nodes import add_half_rotations
-from .surface_frame_nodes import add_surface_frames
 
-VECTOR_SIZE = 3
-"""Number of elements of a vector. The graph gathers three features at a time, as one vector."""
-MATRIX_COLUMNS, ZERO_ROW, MATRIX_ROW, TRANSPOSE_ROW = 4, 4, 5, 6
-"""Number of columns of an affine matrix, and the rows of the table for a space.
+MATRIX_ROW, TRANSPOSE_ROW = 5, 6
+"""Rows of the table for a space, after the rows of its columns.
 
-Each of the first four rows has one column of the matrix, three times in succession. `ZERO_ROW` is zero. `MATRIX_ROW`
-has the matrix, column by column. `TRANSPOSE_ROW` has its transpose; it does not exist if a bone is sheared."""
+Each of the first four rows has one column of the matrix, three times in succession. Row `ZERO_COLUMN` is zero.
+`MATRIX_ROW` has the matrix, column by column. `TRANSPOSE_ROW` has its transpose; it does not exist if a bone is
+sheared."""
+MIN_SQUARED_LENGTH = 1e-18
+"""Added to squared lengths before a division, so that a joint that is scaled to zero gives finite values."""
 
 
 @dataclass(frozen=True)
@@ -70,40 +71,69 @@ class Features:
         return reordered
 
 
-@dataclass(frozen=True)
-class _SpaceLayout:
-    """The order of the spaces in the stacked matrices: carried joints, then points, then joints.
-
-    Attributes:
-        joints: (Ju,) joints whose features are needed. The first Ju spaces are these joints as their parents carry them
-            along.
-        points: (M,) indices of the points that are needed. They are the origins of the next M spaces.
-        joint_start: index of the first of the last J spaces, which are the spaces of all joints.
-    """
-
-    joints: np.ndarray
-    points: np.ndarray
-    joint_start: int
-
-
 def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
     """Add the nodes that compute the features of the networks and of the confidence."""
-    inputs, joints = trained_model.inputs, _needed_joints(trained_model)
-    points = np.unique(inputs.pair_points)
-    space_layout = _SpaceLayout(joints, points, len(joints) + len(points))
-    space_matrices = _add_spaces(graph, trained_model, space_layout)
-    vector_spaces, end_rows, origin_rows = _vector_indices(trained_model, space_layout)
+    inputs, is_needed = trained_model.inputs, _needed_features(trained_model)
+    parts: dict[tuple[bool, bool], list] = {(is_direct, is_local): [] for is_direct, is_local in np.ndindex(2, 2)}
+    for block, columns in zip(inputs.blocks, inputs.block_slices, strict=True):
+        if columns.stop > columns.start:
+            vectors, position = block.add_nodes(graph, is_needed[columns])
+            parts[block.is_direct, isinstance(vectors, LocalVectors)].append((columns, vectors, position))
+    direct_locals, derived_locals = (
+        [vectors for _, vectors, _ in parts[is_direct, True]] for is_direct in (True, False)
+    )
+    local_vectors = _join([*direct_locals, ZERO_VECTOR, *derived_locals])
+    name, table = _add_local_vectors(graph, trained_model, local_vectors)
+    table, pose_rows = _add_half_rotations(graph, trained_model, len(local_vectors.joints), is_needed, name, table)
+    values = [vectors.name for _, vectors, _ in parts[True, False]]
+    values += [name, *(vectors.name for _, vectors, _ in parts[False, False])]
+    # The zero vector is the last one of the direct vectors.
+    order = [*parts[True, False], *parts[True, True], (slice(0), ZERO_VECTOR, np.zeros(0, np.int64))]
+    direct_count = sum(vectors.count for _, vectors, _ in order)
+    start, all_positions = 0, np.full(len(is_needed), -1, np.int64)
+    for columns, vectors, position in [*order, *parts[False, True], *parts[False, False]]:
+        all_positions[columns] = np.where(position < 0, -1, position + VECTOR_SIZE * start)
+        start += vectors.count
+    name = graph.join(values, "features", axis=1)
+    return Features(name, direct_count, VECTOR_SIZE * start, all_positions, table, pose_rows)
+
+
+ZERO_VECTOR = LocalVectors(
+    np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(1, np.int64), *2 * [np.array([[0, ZERO_COLUMN]])]
+)
+
+
+def _join(parts: list[LocalVectors]) -> LocalVectors:
+    """Join vectors: the added spaces of all parts come first, then the spaces of the joints."""
+    space_count, start, joined = sum(len(part.joints) for part in parts), 0, []
+    for part in parts:
+
+        def shift(spaces: np.ndarray, start: int = start, count: int = len(part.joints)) -> np.ndarray:
+            return np.where(spaces < count, start + spaces, space_count + spaces - count)
+
+        ends, origins = (
+            np.stack([np.where(columns == ZERO_COLUMN, 0, shift(spaces)), columns], axis=1)
+            for spaces, columns in (part.ends.T, part.origins.T)
+        )
+        # R of a zero vector may be any space.
+        spaces = part.spaces if part is ZERO_VECTOR else shift(part.spaces)
+        joined.append((part.joints, part.offsets, spaces, ends, origins))
+        start += len(part.joints)
+    return LocalVectors(*(np.concatenate(arrays) for arrays in zip(*joined, strict=True)))
+
+
+def _add_local_vectors(graph: GraphBuilder, trained_model: TrainedModel, vectors: LocalVectors) -> tuple[str, str]:
+    """Add the nodes of joined vectors; returns the names of the (N, ., 3) vectors and of the (N, ., 12) table."""
     rows_per_space = _rows_per_space(trained_model)
-    flat_matrices = graph.reshape(
-        space_matrices, [0, space_layout.joint_start + len(inputs.parents), 16], "flat_spaces"
-    )
-    table = graph.add(
-        "MatMul", [flat_matrices, graph.floats("table_picks", _table_selection(rows_per_space))], "table_rows"
-    )
-    table = graph.reshape(table, [0, -1, 12], "table")
+    space_count = len(vectors.joints) + len(trained_model.rig.joints)
+    flat_matrices = graph.reshape(_add_spaces(graph, vectors), [0, space_count, 16], "flat_spaces")
+    selection = graph.floats("table_picks", _table_selection(rows_per_space))
+    table = graph.reshape(graph.add("MatMul", [flat_matrices, selection], "table_rows"), [0, -1, 12], "table")
     inverse_source = _add_inverses(graph, flat_matrices) if trained_model.sheared else table
+    inverse_rows = vectors.spaces if trained_model.sheared else rows_per_space * vectors.spaces + TRANSPOSE_ROW
+    end_rows, origin_rows = (indices @ [rows_per_space, 1] for indices in (vectors.ends, vectors.origins))
     inverses = graph.add(
-        "Gather", [inverse_source, graph.integers("vector_spaces", vector_spaces)], "vector_inverses", axis=1
+        "Gather", [inverse_source, graph.integers("vector_spaces", inverse_rows)], "vector_inverses", axis=1
     )
     end_points = [graph.add("Gather", [table, graph.integers("vector_ends", end_rows)], "ends", axis=1)]
     end_points.append(graph.add("Gather", [table, graph.integers("vector_origins", origin_rows)], "origins", axis=1))
@@ -113,58 +143,35 @@ def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
     if not trained_model.sheared:
         squared_inverses = graph.add("Mul", [inverses, inverses], "inverses_squared")
         name = graph.add("Div", [name, graph.add("MatMul", [squared_inverses, row_sums], "lengths")], "local_vectors")
-    table, pose_rows = _add_half_rotations(graph, trained_model, space_layout, name, table)
-    position, control_values = np.full(inputs.feature_count, -1, np.int64), []
-    if control_count := inputs.control_count:
-        # A control is repeated to fill a vector. Only the first element is used.
-        repeated = graph.add("Concat", [CONTROLS_INPUT] * VECTOR_SIZE, "controls_repeated", axis=1)
-        control_values.append(graph.reshape(repeated, [0, control_count, VECTOR_SIZE], "control_vectors"))
-        position[inputs.control_start : inputs.pair_start] = np.arange(control_count)
-    surface_frame_values = [add_surface_frames(graph, inputs.surface_frames)] if len(inputs.surface_frames) else []
-    name = graph.join([*control_values, name, *surface_frame_values], "features", axis=1)
-    direct_count = control_count + MATRIX_COLUMNS * len(joints) + 1
-    by_column = np.arange(FEATURES_PER_JOINT).reshape(VECTOR_SIZE, MATRIX_COLUMNS).T.ravel()
-    joint_positions = np.arange(VECTOR_SIZE * control_count, VECTOR_SIZE * (direct_count - 1))
-    position[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = joint_positions
-    element_count = VECTOR_SIZE * direct_count + inputs.feature_count - inputs.pair_start
-    position[inputs.pair_start :] = np.arange(VECTOR_SIZE * direct_count, element_count)
-    return Features(name, direct_count, element_count, position, table, pose_rows)
+    return name, table
 
 
 def _rows_per_space(trained_model: TrainedModel) -> int:
     return TRANSPOSE_ROW + (not trained_model.sheared)
 
 
-def _needed_joints(trained_model: TrainedModel) -> np.ndarray:
-    """Return (Ju,) joints that a network, a partition's confidence or a half-rotation matrix depends on."""
-    inputs = trained_model.inputs
-    is_needed = trained_model.training_range.counts[:, : inputs.control_start].any(axis=0)
+def _needed_features(trained_model: TrainedModel) -> np.ndarray:
+    """Return (F,) bool, the features that a network, a partition's confidence or a half-rotation matrix depends on."""
+    is_needed = np.zeros(len(trained_model.training_range.low), bool)
+    counts = trained_model.training_range.counts
+    is_needed[: counts.shape[1]] = counts.any(axis=0)
     for index in range(len(trained_model.partitions)):
-        columns = trained_model.feature_columns(index)
-        is_needed[columns[columns < inputs.control_start]] = True
-    is_needed.reshape(-1, FEATURES_PER_JOINT)[trained_model.half_rotation_joints()] = True
-    joints = np.flatnonzero(is_needed.reshape(-1, FEATURES_PER_JOINT).any(axis=1))
-    # An empty gather is not possible.
-    return joints if len(joints) else np.zeros(1, np.int64)
+        is_needed[trained_model.feature_columns(index)] = True
+    by_joint = is_needed[: FEATURES_PER_JOINT * len(trained_model.rig.joints)].reshape(-1, FEATURES_PER_JOINT)
+    by_joint[trained_model.half_rotation_joints()] = True
+    return is_needed
 
 
-def _add_spaces(graph: GraphBuilder, trained_model: TrainedModel, space_layout: _SpaceLayout) -> str:
-    """Add the (N, Ju + M + J, 4, 4) matrices of all spaces. The matrix of a carried joint is Q_j = P_p B_p^-1 B_j."""
-    rig, inputs = trained_model.rig, trained_model.inputs
-    parents, rest_matrices = rig.parents[space_layout.joints], rig.rest_matrices.astype(np.float64)
-    safe_parents, is_root = np.maximum(parents, 0), (parents < 0)[:, None, None]
-    to_child = np.where(is_root, 0, np.linalg.inv(rest_matrices[safe_parents]) @ rest_matrices[space_layout.joints])
-    to_points = np.tile(np.eye(4), (len(space_layout.points), 1, 1))
-    to_points[:, :3, 3] = inputs.points[space_layout.points]
-    source_joints = np.concatenate([safe_parents, inputs.point_joints[space_layout.points]]).astype(np.int64)
-    space_matrices = graph.add(
-        "Gather", [POSE_INPUT, graph.integers("space_joints", source_joints)], "space_poses", axis=1
-    )
-    offset_matrices = graph.floats("space_offsets", np.concatenate([to_child, to_points]))
-    space_matrices = graph.add("MatMul", [space_matrices, offset_matrices], "moved")
-    if is_root.any():
-        root_matrices = np.concatenate([np.where(is_root, rest_matrices[space_layout.joints], 0), 0 * to_points])
-        space_matrices = graph.add("Add", [space_matrices, graph.floats("root_spaces", root_matrices)], "carried")
+def _add_spaces(graph: GraphBuilder, vectors: LocalVectors) -> str:
+    """Add the (N, S + J, 4, 4) matrices of all spaces."""
+    is_fixed = (vectors.joints < 0)[:, None, None]
+    source_joints = graph.integers("space_joints", np.maximum(vectors.joints, 0))
+    space_matrices = graph.add("Gather", [POSE_INPUT, source_joints], "space_poses", axis=1)
+    offsets = graph.floats("space_offsets", np.where(is_fixed, 0, vectors.offsets))
+    space_matrices = graph.add("MatMul", [space_matrices, offsets], "moved")
+    if is_fixed.any():
+        fixed_matrices = graph.floats("root_spaces", np.where(is_fixed, vectors.offsets, 0))
+        space_matrices = graph.add("Add", [space_matrices, fixed_matrices], "carried")
     return graph.add("Concat", [space_matrices, POSE_INPUT], "spaces", axis=1)
 
 
@@ -183,52 +190,28 @@ def _table_selection(rows: int) -> np.ndarray:
     return selection.reshape(16, -1)
 
 
-def _vector_indices(
-    trained_model: TrainedModel, space_layout: _SpaceLayout
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices that each vector is computed from.
-
-    Returns:
-        Index of the inverse of its space: a row of the table, or an index of an inverse if bones are sheared. Then the
-        row of its end d in the table, and the row of its origin t.
-    """
-    inputs, rows_per_space = trained_model.inputs, _rows_per_space(trained_model)
-    carried_spaces, joint_spaces = np.arange(len(space_layout.joints)), space_layout.joint_start + space_layout.joints
-    columns = np.arange(MATRIX_COLUMNS)
-    # The axes of a joint have no origin. Its translation is relative to the carried joint.
-    origin_rows = np.where(
-        columns == MATRIX_COLUMNS - 1, rows_per_space * carried_spaces[:, None] + MATRIX_COLUMNS - 1, ZERO_ROW
-    ).ravel()
-    reference_spaces = space_layout.joint_start + inputs.pair_references
-    point_spaces = len(space_layout.joints) + np.searchsorted(space_layout.points, inputs.pair_points)
-    # The zero vector after the joints may be in any space.
-    vector_spaces = np.concatenate([np.repeat(carried_spaces, MATRIX_COLUMNS), carried_spaces[:1], reference_spaces])
-    return (
-        vector_spaces if trained_model.sheared else rows_per_space * vector_spaces + TRANSPOSE_ROW,
-        np.concatenate(
-            [
-                (rows_per_space * joint_spaces[:, None] + columns).ravel(),
-                [ZERO_ROW],
-                rows_per_space * point_spaces + MATRIX_COLUMNS - 1,
-            ]
-        ),
-        np.concatenate([origin_rows, [ZERO_ROW], rows_per_space * reference_spaces + MATRIX_COLUMNS - 1]),
-    )
-
-
 def _add_half_rotations(
-    graph: GraphBuilder, trained_model: TrainedModel, space_layout: _SpaceLayout, vectors: str, table: str
+    graph: GraphBuilder,
+    trained_model: TrainedModel,
+    added_space_count: int,
+    is_needed: np.ndarray,
+    vectors: str,
+    table: str,
 ) -> tuple[str, np.ndarray]:
-    """Append the needed half-rotation matrices to the table; returns the name of the table and `Features.pose_rows`."""
+    """Append the needed half-rotation matrices to the table; returns the name of the table and `Features.pose_rows`.
+
+    The first of the added spaces are those of `JointFeatures`, and so are the first vectors.
+    """
     joint_count, half_rotation_joints = len(trained_model.rig.joints), trained_model.half_rotation_joints()
     rows_per_space = _rows_per_space(trained_model)
-    matrix_rows = rows_per_space * (space_layout.joint_start + np.arange(joint_count)) + MATRIX_ROW
+    matrix_rows = rows_per_space * (added_space_count + np.arange(joint_count)) + MATRIX_ROW
     pose_rows = np.append(matrix_rows, np.full(joint_count, -1))
     if len(half_rotation_joints):
-        appended_rows = rows_per_space * (space_layout.joint_start + joint_count) + np.arange(len(half_rotation_joints))
+        appended_rows = rows_per_space * (added_space_count + joint_count) + np.arange(len(half_rotation_joints))
         pose_rows[joint_count + half_rotation_joints] = appended_rows
-        carried_spaces = np.searchsorted(space_layout.joints, half_rotation_joints)[:, None]
-        zero_vector = np.full_like(carried_spaces, MATRIX_COLUMNS * len(space_layout.joints))
+        joints = needed_joints(is_needed[: FEATURES_PER_JOINT * joint_count])
+        carried_spaces = np.searchsorted(joints, half_rotation_joints)[:, None]
+        zero_vector = np.full_like(carried_spaces, MATRIX_COLUMNS * len(joints))
         rotation_columns = np.append(MATRIX_COLUMNS * carried_spaces + np.arange(3), zero_vector, axis=1)
         carried_columns = MATRIX_COLUMNS * (rows_per_space * carried_spaces + MATRIX_ROW) + np.arange(3)
         table = add_half_rotations(graph, vectors, rotation_columns, table, carried_columns)

@@ -9,9 +9,10 @@ from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSITIONS_OUTPUT
 from fdda_addon.core.skinning import SkinBlock
 
 from ..graph_builder import GraphBuilder
+from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE
 from ..model import TrainedModel
 from .network_nodes import Coefficients
-from .pose_nodes import MATRIX_COLUMNS, VECTOR_SIZE, Features
+from .pose_nodes import Features
 from .vertex_order import vertex_order
 
 MAX_PADDING_ELEMENTS = 6_000

@@ -11,13 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdda_addon.core.features import joint_features_in_metres
+from fdda_addon.core.features import MIN_FEATURE_SPREAD, joint_features_in_metres
 from fdda_addon.core.partition import Partition, assume_nearby_influences
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import POSE
 
 from ..data.split import Split
-from .preparation import MIN_FEATURE_SPREAD
 
 MAX_POSES, MAX_COMPONENTS = 300, 16
 """Maximum numbers of poses, and of principal components of each partition's residuals."""

@@ -15,7 +15,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
 from ..blocks import BLOCK_ELEMENTS
-from ..inputs.network_inputs import joints_on_path, static_joints
+from .joint_paths import joints_on_path, static_joints
 
 RIDGE = 1e-6
 """Ridge, as a part of the number of poses. It makes joints that move alike share the fit, and keeps factors small."""

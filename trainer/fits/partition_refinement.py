@@ -25,7 +25,6 @@ from ..process import Cancelled
 from .basis import FINE_TOLERANCE_FACTOR, allocate_components, make_basis
 from .half_rotations import regression_matrices
 from .joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
-from .preparation import MARGIN_POSE_WEIGHT
 
 MAX_POSES = 300
 """Maximum number of training poses that are evaluated."""
@@ -86,7 +85,7 @@ class _Refinement:
         rig, self._recording, self._partitions = recording.rig, recording, recording.partitions
         max_poses = min(MAX_POSES, MAX_ELEMENTS // (3 * rig.vertex_count))
         sampled_rows = np.unique(np.linspace(0, len(split.training) - 1, max_poses).astype(np.int64))
-        self._poses, self._pose_weights = split.training[sampled_rows], split.weights(MARGIN_POSE_WEIGHT)[sampled_rows]
+        self._poses, self._pose_weights = split.training[sampled_rows], split.weights()[sampled_rows]
         self._tolerance, self._parameters_per_component = tolerance, parameters_per_component
         matrices = regression_matrices(np.array(recording.pose_matrices[self._poses]), rig, use_half_rotations)
         self._column_spaces = {}

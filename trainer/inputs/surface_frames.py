@@ -9,73 +9,86 @@ surface frame is a weighted sum of tangents and normals of the face corners at a
 weights to the recording. docs/experiments.md compares the errors with and without them.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
+from fdda_addon.core.model import POSE_INPUT
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 
 from ..blocks import BLOCK_ELEMENTS
+from ..config import TrainingConfig
+from ..data.split import Split
+from ..graph_builder import GraphBuilder
+from .block import VECTOR_SIZE, FeatureBlock, State, Vectors
+from .surface_frame_fit import select_surface_frames
+from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
-FEATURES_PER_SURFACE_FRAME = 3
+MATRIX_ROWS = 4
+"""Number of rows of a pose matrix. The last row has no effect; removing it would take longer than computing with it."""
 MIN_SQUARED_LENGTH = 1e-18
 """Added to squared lengths before a division, so that a joint that is scaled to zero gives finite values."""
-MAX_JOINT_ENTRIES = 1 << 12
-"""Maximum of joints times surface frames. Each evaluation reads one value of each joint for each tangent."""
 
 
 @dataclass(frozen=True)
-class SurfaceFrameFeatures:
-    """D surface frames at vertices with up to K face corners.
+class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
+    """Three features for each of D surface frames: their sum in the space of the main joint, mesh units."""
 
-    With a and b the edges of the smoothed surface from a vertex to its predecessor and successor in a face, the corner
-    has the tangents a + b and b - a; their cross product is along the normal. Each vector v enters as
-    v / sqrt(|v|^2 + epsilon^2), of length 1 unless the corner has degenerated.
+    name = "surface_frames"
 
-    Attributes:
-        vertices: (D,) int64.
-        main_joints: (D,) int64, main joint of each vertex's partition; the features are in its space.
-        tangents: (2, D, K, 4 J) float64, mesh units. Their product with the columns of all pose matrices, stacked to
-            (4 J, 3), is the tangents in mesh-object space. Padded with 0.
-        epsilons: (3, D, K) float64, above 0: of the tangents in mesh units, of the normal in square mesh units.
-        lengths: (3, D, K) float64, mesh units, weights of the tangents and of the normal in the sum. Padded with 0.
-    """
+    @classmethod
+    def fit(cls, recording: Recording, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]) -> State:
+        surface_frames = select_surface_frames(recording, split, config.tolerance_mm, should_stop)
+        return dict(vars(surface_frames)) if len(surface_frames) else {}
 
-    vertices: np.ndarray
-    main_joints: np.ndarray
-    tangents: np.ndarray
-    epsilons: np.ndarray
-    lengths: np.ndarray
+    @classmethod
+    def check_state(cls, state: State, rig: Rig) -> None:
+        if not state:
+            return
+        joint_count, (count, corner_count) = len(rig.joints), state["lengths"].shape[1:]
+        shapes = {
+            "vertices": (count,),
+            "main_joints": (count,),
+            "tangents": (2, count, corner_count, 4 * joint_count),
+            "epsilons": (3, count, corner_count),
+            "lengths": (3, count, corner_count),
+        }
+        dtypes = {name: np.float64 if len(shape) > 1 else np.int64 for name, shape in shapes.items()}
+        if {name: (array.shape, array.dtype.type) for name, array in state.items()} != {
+            name: (shape, dtypes[name]) for name, shape in shapes.items()
+        } or count * joint_count > MAX_JOINT_ENTRIES:
+            raise ValueError("arrays of surface frames contradict each other")
+        for indices, limit in ((state["vertices"], rig.vertex_count), (state["main_joints"], joint_count)):
+            if indices.min(initial=0) < 0 or indices.max(initial=0) >= limit:
+                raise ValueError("surface frames are of another rig")
+        if not (state["epsilons"] > 0).all():
+            raise ValueError("surface frames have epsilons of 0")
 
-    def __len__(self) -> int:
-        return len(self.vertices)
+    @classmethod
+    def make(cls, rig: Rig, partitions: Sequence[Partition], state: State) -> Self:
+        return cls(**(state or vars(NO_SURFACE_FRAMES)))
 
-    def fits(self, rig: Rig) -> bool:
-        """Return whether indices and sizes are possible for a rig."""
-        joint_count, vertex_count = len(rig.joints), rig.vertex_count
-        has_valid_indices = (
-            self.main_joints.max(initial=0) < joint_count and self.vertices.max(initial=0) < vertex_count
-        )
-        has_valid_size = len(self) * joint_count <= MAX_JOINT_ENTRIES
-        return has_valid_indices and has_valid_size and (not len(self) or self.tangents.shape[3] == 4 * joint_count)
+    @property
+    def length_mask(self) -> np.ndarray:
+        return np.ones(VECTOR_SIZE * len(self), bool)
 
-    def subset(self, mask: np.ndarray) -> "SurfaceFrameFeatures":
-        """Return the surface frames of a (D,) bool mask, without the corners that none of them uses."""
-        is_used = (self.lengths[:, mask] != 0).any(axis=(0, 1))
-        corner_arrays = (array[:, mask][:, :, is_used] for array in (self.tangents, self.epsilons, self.lengths))
-        return SurfaceFrameFeatures(self.vertices[mask], self.main_joints[mask], *corner_arrays)
+    def offered(self, partition: Partition) -> np.ndarray:
+        frames = np.flatnonzero(self.main_joints == partition.joint)
+        return (VECTOR_SIZE * frames[:, None] + np.arange(VECTOR_SIZE)).ravel()
 
-    def evaluate(self, pose_matrices: np.ndarray) -> np.ndarray:
-        """Compute the features along the axes of the main joints; a uniform scale of the character cancels out.
+    @property
+    def log_text(self) -> str:
+        count = len(self)
+        return f"The rig smooths: networks take surface frames of {count} vertices as inputs." if count else ""
 
-        Args:
-            pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-
-        Returns:
-            (N, 3 D) float32, mesh units.
-        """
+    def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray:
+        """Compute the features along the axes of the main joints; a uniform scale of the character cancels out."""
         frame_count = len(self)
-        features = np.empty((len(pose_matrices), FEATURES_PER_SURFACE_FRAME * frame_count), np.float32)
+        features = np.empty((len(pose_matrices), VECTOR_SIZE * frame_count), np.float32)
         step = max(1, BLOCK_ELEMENTS // max(1, 3 * self.lengths.size))
         for start in range(0, len(features) if frame_count else 0, step):
             poses = pose_matrices[start : start + step].astype(np.float64)
@@ -85,24 +98,63 @@ class SurfaceFrameFeatures:
             features[start : start + step] = np.einsum("ndab,nda->ndb", axes, frame_sums).reshape(len(poses), -1)
         return features
 
-    def compute_corner_vectors(self, pose_matrices: np.ndarray) -> np.ndarray:
-        """Compute the tangents and normals of all corners.
-
-        Args:
-            pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-
-        Returns:
-            (N, 3, D, K, 3) float64, mesh-object space, no unit.
-        """
-        columns = pose_matrices[:, :, :3].astype(np.float64).swapaxes(2, 3).reshape(len(pose_matrices), -1, 3)
-        size = self.tangents.shape
-        tangents = (self.tangents.reshape(-1, size[3]) @ columns).reshape(len(columns), *size[:3], 3)
-        vectors = np.append(tangents, np.cross(tangents[:, :1], tangents[:, 1:]), axis=1)
-        return vectors / np.sqrt((vectors**2).sum(axis=4) + self.epsilons**2)[..., None]
-
-
-NO_SURFACE_FRAMES = SurfaceFrameFeatures(
-    *(np.zeros(0, np.int64) for _ in range(2)),
-    np.zeros((2, 0, 1, 0)),
-    *(np.zeros((3, 0, 1)) for _ in range(2)),
-)
+    def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[Vectors, np.ndarray]:
+        (frame_count, corner_count), column_count = self.lengths.shape[1:], self.tangents.shape[3]
+        # The corners come before the frames, so that a sum over the corners adds contiguous rows.
+        tangent_weights, epsilons, lengths = (
+            array.swapaxes(1, 2) for array in (self.tangents, self.epsilons, self.lengths)
+        )
+        poses_by_row = graph.add("Transpose", [POSE_INPUT], "poses_by_row", perm=[0, 2, 1, 3])
+        pose_columns = graph.reshape(poses_by_row, [0, MATRIX_ROWS, column_count], "pose_columns")
+        tangents = [
+            graph.add(
+                "MatMul",
+                [pose_columns, graph.floats(f"{tangent_name}_of_poses", weights.reshape(-1, column_count).T)],
+                f"{tangent_name}_tangents",
+            )
+            for tangent_name, weights in zip(("first", "second"), tangent_weights, strict=True)
+        ]
+        # a x b = (a_y b_z, a_z b_x, a_x b_y) - (a_z b_y, a_x b_z, a_y b_x)
+        permuted_tangents = [
+            graph.add("Gather", [tangent, graph.integers(f"{tangent}_axes", axes)], f"{tangent}_permuted", axis=1)
+            for tangent, axes in zip(tangents, ([1, 2, 0, 2, 0, 1], [2, 0, 1, 1, 2, 0]), strict=True)
+        ]
+        cross_signs = graph.floats(
+            "cross_signs", np.pad(np.hstack([np.eye(3), -np.eye(3)]), ((0, MATRIX_ROWS - 3), (0, 0)))
+        )
+        normals = graph.add("MatMul", [cross_signs, graph.add("Mul", permuted_tangents, "cross_terms")], "crossed")
+        # The same nodes normalize the corner vectors and the axes of the joints.
+        vectors = graph.add("Concat", [*tangents, normals, pose_columns], "corner_vectors", axis=2)
+        squared_epsilons = np.append(epsilons.ravel() ** 2, np.full(column_count, MIN_SQUARED_LENGTH))
+        squared_lengths = graph.add("Mul", [vectors, vectors], "vectors_squared")
+        # The last row of a tangent is masked: it is not exactly 0, because skin weights sum to 1 up to rounding.
+        row_mask = graph.floats("rows_in_space", [[1, 1, 1, 0]])
+        squared_lengths = graph.add("MatMul", [row_mask, squared_lengths], "vector_sums")
+        safe_squared_lengths = graph.add(
+            "Add", [squared_lengths, graph.floats("least_squares", squared_epsilons)], "vectors_safe"
+        )
+        target_lengths = graph.floats("vector_lengths", np.append(lengths.ravel(), np.ones(column_count)))
+        scale_factors = graph.add(
+            "Div", [target_lengths, graph.add("Sqrt", [safe_squared_lengths], "lengths_of_vectors")], "vector_factors"
+        )
+        vectors = graph.add("Mul", [vectors, scale_factors], "scaled_vectors")
+        frame_terms, axes = graph.split(vectors, [lengths.size, column_count], ["surface_frame_terms", "axes"], axis=2)
+        frame_terms = graph.reshape(
+            frame_terms, [0, MATRIX_ROWS, len(lengths) * corner_count, frame_count], "terms_by_surface_frame"
+        )
+        frame_sums = graph.add(
+            "ReduceSum", [frame_terms, graph.integers("kinds_and_corners", [2])], "surface_frames", keepdims=0
+        )
+        # Gathering the main joint's products last is faster than gathering its axes before the product.
+        axes = graph.add("Transpose", [axes], "axes_by_row", perm=[0, 2, 1])
+        projected_sums = graph.reshape(
+            graph.add("MatMul", [axes, frame_sums], "along_axes"), [0, column_count * frame_count], "along_axes_in_row"
+        )
+        main_joint_rows = frame_count * (4 * self.main_joints[:, None] + np.arange(3)) + np.arange(frame_count)[:, None]
+        name = graph.add(
+            "Gather",
+            [projected_sums, graph.integers("main_joint_axes", main_joint_rows)],
+            "surface_frame_features",
+            axis=1,
+        )
+        return Vectors(name, frame_count), np.arange(len(is_needed))

@@ -5,7 +5,7 @@ import json
 import os
 import zipfile
 import zlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,10 +18,12 @@ from fdda_addon.core.recording.arrays import MAX_VALUE, NPY_HEADER_ERRORS
 from fdda_addon.core.rig import Fingerprint
 
 from ..fits.partition_refinement import reassign_vertices
-from ..inputs.surface_frames import SurfaceFrameFeatures
+from ..inputs.block import State
 from .networks import Network
 
-VERSION = 1
+VERSION = 2
+INPUTS_PREFIX = "inputs/"
+"""Prefix of the arrays of input states: inputs/BLOCK/ARRAY."""
 READ_ERRORS = (
     *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
     *(RuntimeError, IndexError, *NPY_HEADER_ERRORS),
@@ -64,7 +66,7 @@ class Checkpoint:
         history: pose count and held-out error of this training and its predecessors, oldest first:
             `{"poses", "p999"}`, mm.
         partitions: state of each partition, in the order of the recording.
-        surface_frames: surface frames that are inputs of the networks.
+        input_states: state of each block of the inputs, by its name (`inputs.block`).
         partition_indices: (V,) int64, index of the partition of each vertex.
     """
 
@@ -75,7 +77,7 @@ class Checkpoint:
     activation: str
     history: tuple[dict, ...]
     partitions: tuple[PartitionCheckpoint, ...]
-    surface_frames: SurfaceFrameFeatures
+    input_states: dict[str, State]
     partition_indices: np.ndarray
 
     def reassign(self, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
@@ -107,7 +109,8 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "partitions": len(checkpoint.partitions),
     }
     arrays = {"about": np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
-    arrays |= {f"surface_frames/{name}": array for name, array in vars(checkpoint.surface_frames).items()}
+    for block, state in checkpoint.input_states.items():
+        arrays |= {f"{INPUTS_PREFIX}{block}/{name}": array for name, array in state.items()}
     arrays["partition_indices"] = checkpoint.partition_indices
     for index, partition in enumerate(checkpoint.partitions):
         partition_arrays = {name: array for name, array in vars(partition).items() if name != "network"}
@@ -164,7 +167,7 @@ def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
         str(metadata["activation"]),
         tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in metadata["history"]),
         tuple(partitions),
-        _read_surface_frames(arrays),
+        _read_input_states(arrays),
         _read_partition_indices(arrays["partition_indices"], partitions),
     )
 
@@ -178,27 +181,14 @@ def _read_partition_indices(partition_indices: np.ndarray, partitions: list[Part
     return partition_indices
 
 
-def _read_surface_frames(arrays: np.lib.npyio.NpzFile) -> SurfaceFrameFeatures:
-    surface_frames = SurfaceFrameFeatures(
-        **{field.name: arrays[f"surface_frames/{field.name}"] for field in fields(SurfaceFrameFeatures)}
-    )
-    _, count, corners = surface_frames.lengths.shape
-    shapes = {
-        "vertices": (count,),
-        "main_joints": (count,),
-        "tangents": (2, count, corners, *surface_frames.tangents.shape[3:4]),
-    }
-    for name, array in vars(surface_frames).items():
-        is_index = name in ("vertices", "main_joints")
-        if array.dtype != (np.int64 if is_index else np.float64) or array.shape != shapes.get(
-            name, (3, count, corners)
-        ):
-            raise ValueError(CONTRADICTION_CLAUSE)
-        if not (np.abs(array) <= MAX_VALUE).all() or (is_index and array.min(initial=0) < 0):
+def _read_input_states(arrays: np.lib.npyio.NpzFile) -> dict[str, State]:
+    states: dict[str, State] = {}
+    for path in (path for path in arrays.files if path.startswith(INPUTS_PREFIX)):
+        _, block, name = path.split("/")
+        states.setdefault(block, {})[name] = array = arrays[path]
+        if array.dtype not in (np.int64, np.float32, np.float64) or not (np.abs(array) <= MAX_VALUE).all():
             raise ValueError(NOT_FINITE_CLAUSE)
-    if surface_frames.tangents.ndim != 4 or not (surface_frames.epsilons > 0).all():
-        raise ValueError(CONTRADICTION_CLAUSE)
-    return surface_frames
+    return states
 
 
 def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) -> None:

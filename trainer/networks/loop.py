@@ -12,7 +12,7 @@ from fdda_addon.core.errors import TrainingError
 
 from ..config import TrainingConfig
 from ..data.split import Split
-from ..fits.preparation import PreparedPartition
+from ..preparation import PreparedPartition
 from ..process import Cancelled
 from .curves import Curves, Progress
 from .networks import Network, PartitionNetworks

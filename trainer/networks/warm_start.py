@@ -15,7 +15,8 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.report import checkpoint_path
 
 from ..config import TrainingConfig
-from ..fits.preparation import PreparedPartition
+from ..inputs.network_inputs import check_states
+from ..preparation import PreparedPartition
 from .checkpoint import OTHER_PARTITIONS_SENTENCE, Checkpoint, PartitionCheckpoint, read_checkpoint
 from .networks import Network
 
@@ -41,8 +42,10 @@ def read_initial_checkpoint(model_path: Path, recording: Recording, holdout: str
         raise TrainingError(f"The checkpoint '{path}' is of another rig; train without --warm-start.")
     if checkpoint.controls != tuple(control.name for control in recording.rig.controls):
         raise TrainingError(f"The checkpoint '{path}' is of other controls; train without --warm-start.")
-    if not checkpoint.surface_frames.fits(recording.rig):
-        raise TrainingError(f"The checkpoint '{path}' is damaged; train without --warm-start.")
+    try:
+        check_states(checkpoint.input_states, recording.rig)
+    except (ValueError, KeyError) as error:
+        raise TrainingError(f"The checkpoint '{path}' is damaged ({error}); train without --warm-start.") from error
     if checkpoint.holdout != holdout:
         raise TrainingError(
             f"The checkpoint '{path}' is of another recording or seed, and may have been trained on poses that are "

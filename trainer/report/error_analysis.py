@@ -13,8 +13,8 @@ from fdda_addon.core.refinement import nearest_recorded_distances
 from ..data.residuals import residuals_of
 from ..data.split import Split
 from ..fits.half_rotations import regression_matrices
-from ..fits.preparation import PreparedPartition
 from ..model import TrainedModel
+from ..preparation import PreparedPartition
 from .error_causes import EXTREME_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE, TOO_FEW_COMPONENTS, TOO_FEW_POSES
 
 ANALYZED_FRACTION = 5e-3

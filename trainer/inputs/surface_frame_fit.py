@@ -19,9 +19,9 @@ from fdda_addon.core.skinning import skin_matrices
 from fdda_addon.core.surface import adjacent_corners
 
 from ..data.split import Split
-from ..inputs.surface_frames import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrameFeatures
+from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
 from ..process import Cancelled
-from .joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
+from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
 MAX_POSES = 400
 """Maximum number of training poses that are evaluated."""
@@ -37,7 +37,7 @@ MIN_EXPLAINED_VARIANCE, MIN_BEST_EXPLAINED_VARIANCE = 0.8, 0.95
 each selected vertex and to the median candidate, the second to the best candidate. Bulges that follow joint angles
 reach 0.94 by chance."""
 EPSILON_RATIO = 0.01
-"""Ratio of `SurfaceFrameFeatures.epsilons` to the length of the corner's longer tangent in the rest pose. For the
+"""Ratio of `SurfaceFrames.epsilons` to the length of the corner's longer tangent in the rest pose. For the
 normal it is the ratio to the square of this length. Vectors whose direction is mostly a rounding error fade out."""
 MAX_PROBED_CANDIDATES = 24
 """Maximum number of candidates that determine the number of smoothing iterations."""
@@ -97,7 +97,7 @@ class _EvaluatedPoses:
 
 def select_surface_frames(
     recording: Recording, split: Split, tolerance_mm: float, should_stop: Callable[[], bool] = lambda: False
-) -> SurfaceFrameFeatures:
+) -> SurfaceFrames:
     """Select the vertices of each partition that explain most of its residuals, and fit their surface frames.
 
     Args:
@@ -235,7 +235,7 @@ class _SmoothedSurface:
         ).tocsr()
         self._inverse_rest = np.linalg.inv(rig.rest_matrices.astype(np.float64))
 
-    def surface_frames(self, candidates: Sequence[_Candidate]) -> Iterator[tuple[int, SurfaceFrameFeatures]]:
+    def surface_frames(self, candidates: Sequence[_Candidate]) -> Iterator[tuple[int, SurfaceFrames]]:
         """Compute the surface frames of the candidates for each of `SMOOTHING_ITERATIONS`, with all lengths 1.
 
         Yields:
@@ -274,7 +274,7 @@ class _SmoothedSurface:
             epsilons = np.maximum(EPSILON_RATIO * np.stack([extents, extents, extents**2]), MIN_EPSILON)
             posed_tangents = np.einsum("jab,fdkjb->fdkja", self._inverse_rest, by_joint).reshape(tangents.shape)
             lengths = np.tile(is_corner, (3, 1, 1)).astype(np.float64)
-            yield iterations, SurfaceFrameFeatures(vertices, joints, posed_tangents, epsilons, lengths)
+            yield iterations, SurfaceFrames(vertices, joints, posed_tangents, epsilons, lengths)
 
 
 def _best_iteration_count(
@@ -292,7 +292,7 @@ def _best_iteration_count(
 
 
 def _fit_lengths(
-    surface_frames: SurfaceFrameFeatures, candidates: Sequence[_Candidate], poses: _EvaluatedPoses
+    surface_frames: SurfaceFrames, candidates: Sequence[_Candidate], poses: _EvaluatedPoses
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit the lengths of tangents and normals to the candidates' residuals.
 

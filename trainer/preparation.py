@@ -6,26 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdda_addon.core.features import float32_rounding
+from fdda_addon.core.features import MIN_FEATURE_SPREAD, float32_rounding
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 
-from ..blocks import BLOCK_ELEMENTS
-from ..data.residuals import residuals_of
-from ..data.split import Split
-from ..inputs.network_inputs import NetworkInputs
-from .basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
-from .half_rotations import regression_matrices
-from .joint_fit import JointFit, JointRegression, joint_regression
-from .low_rank import factorize, may_factorize
-
-MARGIN_POSE_WEIGHT = 0.1
-"""Weight of a margin pose in the basis; other poses have weight 1. Margin poses have residuals many times as large, but
-the components are meant for the range of motion."""
-MIN_FEATURE_SPREAD = 5e-5
-"""A feature is constant if its standard deviation over the training poses is smaller: no unit, or part of the
-character's size for a length. Features that vary less express rounding in imported animation, and standardization
-amplifies it."""
+from .blocks import BLOCK_ELEMENTS
+from .data.residuals import residuals_of
+from .data.split import Split
+from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
+from .fits.half_rotations import regression_matrices
+from .fits.joint_fit import JointFit, JointRegression, joint_regression
+from .fits.low_rank import factorize, may_factorize
+from .inputs.network_inputs import NetworkInputs
 
 
 @dataclass(frozen=True)
@@ -110,7 +102,7 @@ def partition_data(
         use_half_rotations: whether residuals are also regressed on half-rotation matrices.
     """
     rig = recording.rig
-    features = inputs.compute_features(recording.pose_matrices, rig.rest_matrices, recording.controls)
+    features = inputs.compute_features(recording.pose_matrices, recording.controls)
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations)
     min_length_spread = max(MIN_FEATURE_SPREAD * rig.size, float32_rounding(recording.pose_matrices))
     min_spread = np.where(inputs.length_mask(), min_length_spread, MIN_FEATURE_SPREAD)
@@ -157,7 +149,7 @@ def prepare_partition(
     residuals = residuals.reshape(len(features), -1)
     mm_per_unit = 1000 * metres_per_unit
     tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
-    rng, weights = np.random.default_rng([seed, 2]), split.weights(MARGIN_POSE_WEIGHT)
+    rng, weights = np.random.default_rng([seed, 2]), split.weights()
     basis = make_basis(residuals[split.training], tolerance, rng, weights)
     coefficients = basis.project(residuals)
     truncated = residuals[split.validation] - basis.reconstruct(coefficients[split.validation])
@@ -215,7 +207,7 @@ def _factorized(
     if not may_factorize(prepared.fit, prepared.basis):
         return prepared
     fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
-    weights, regression = split.weights(MARGIN_POSE_WEIGHT), read_regression()
+    weights, regression = split.weights(), read_regression()
     factors = factorize(fit, basis, coefficients, regression, split.training, weights, tolerance)
     if factors is None:
         return prepared

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The protocol of input features. docs/development.md, A new input, explains how to add a block."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.rig import Rig
+
+from ..config import TrainingConfig
+from ..data.split import Split
+from ..graph_builder import GraphBuilder
+
+State = dict[str, np.ndarray]
+VECTOR_SIZE = 3
+"""Number of elements of a vector. The graph gathers three features at a time, as one vector."""
+MATRIX_COLUMNS, ZERO_COLUMN = 4, 4
+"""Number of columns of an affine matrix, and the index that stands for a zero vector in `LocalVectors`."""
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """B vectors in the graph: the name of a value (N, B, 3), and B."""
+
+    name: str
+    count: int
+
+
+@dataclass(frozen=True)
+class LocalVectors:
+    """B vectors R^-1 (d - t), where R and t are the axes and the translation of a space.
+
+    The graph computes the vectors of all blocks in the same few nodes. The spaces are S spaces that the block adds,
+    then the spaces of the J joints: index S + j is the pose matrix of joint j.
+
+    Attributes:
+        joints: (S,) int64, joint that carries an added space; -1 for a space that does not move.
+        offsets: (S, 4, 4) float64, the matrix of the space is the pose matrix of its joint times this offset.
+        spaces: (B,) int64, index of the space of R.
+        ends, origins: (B, 2) int64, d and t: index of a space, and column of its matrix. Column 3 is the translation,
+            `ZERO_COLUMN` a zero vector.
+    """
+
+    joints: np.ndarray
+    offsets: np.ndarray
+    spaces: np.ndarray
+    ends: np.ndarray
+    origins: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """B, the number of vectors."""
+        return len(self.spaces)
+
+
+class FeatureBlock(ABC):
+    """A group of F input features, computed from the pose matrices and the controls of a pose.
+
+    Attributes:
+        name: name of the block in checkpoints.
+        is_direct: whether the confidence depends on the features. Features of other blocks are functions of these.
+    """
+
+    name: ClassVar[str]
+    is_direct: ClassVar[bool] = False
+
+    @classmethod
+    def fit(cls, recording: Recording, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]) -> State:
+        """Fit the block to a recording; returns its state, arrays that a checkpoint stores.
+
+        Raises:
+            Cancelled: `should_stop` returned True.
+        """
+        return {}
+
+    @classmethod
+    def check_state(cls, state: State, rig: Rig) -> None:
+        """Check a state that was read from a file; its values are finite.
+
+        Raises:
+            ValueError: the block cannot be made from it.
+        """
+        if state:
+            raise ValueError(f"{cls.name} have no state")
+
+    @classmethod
+    @abstractmethod
+    def make(cls, rig: Rig, partitions: Sequence[Partition], state: State) -> Self:
+        """Make the block of a rig with partitions, from a state that `fit` returned."""
+
+    @property
+    @abstractmethod
+    def length_mask(self) -> np.ndarray:
+        """(F,) bool, which features are lengths in mesh units. Other features have no unit."""
+
+    @abstractmethod
+    def offered(self, partition: Partition) -> np.ndarray:
+        """Return indices of the features that are offered to the network of a partition."""
+
+    @abstractmethod
+    def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """Compute the features: the reference, with which the nodes of the graph are compared.
+
+        Args:
+            pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
+            controls: (N, C) values.
+
+        Returns:
+            (N, F) float32.
+        """
+
+    @abstractmethod
+    def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[Vectors | LocalVectors, np.ndarray]:
+        """Add the nodes that compute the features; not called for a block without features.
+
+        Args:
+            graph: graph with the inputs `POSE_INPUT`, (N, J, 4, 4), and `CONTROLS_INPUT`, (N, C).
+            is_needed: (F,) bool, the features that a network, or another part of the graph, reads.
+
+        Returns:
+            Vectors of the added nodes, or vectors that share nodes with other blocks. Then (F,) int64, the index of
+            each feature among their 3 B elements, -1 for a feature that is not computed.
+        """
+
+    @property
+    def log_text(self) -> str:
+        """A sentence for the log about what was fitted; empty for nothing to tell."""
+        return ""
+
+
+def add_scalar_vectors(graph: GraphBuilder, scalars: str, count: int) -> Vectors:
+    """Add vectors whose first `count` elements are (N, count) scalars."""
+    repeated = graph.add("Concat", [scalars] * VECTOR_SIZE, f"{scalars}_repeated", axis=1)
+    return Vectors(graph.reshape(repeated, [0, count, VECTOR_SIZE], f"{scalars}_vectors"), count)

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The transforms of joints relative to their parents and to the rest pose, as inputs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.rig import Rig
+
+from ..graph_builder import GraphBuilder
+from .block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, FeatureBlock, LocalVectors, State
+
+
+@dataclass(frozen=True)
+class JointFeatures(FeatureBlock):
+    """Twelve features for each of J joints (`core.features`). Every fourth feature is a length in mesh units.
+
+    Attributes:
+        parents: (J,) parent of each joint, -1 for a root.
+        rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
+    """
+
+    name, is_direct = "joints", True
+    parents: np.ndarray
+    rest_matrices: np.ndarray
+
+    @classmethod
+    def make(cls, rig: Rig, partitions: Sequence[Partition], state: State) -> Self:
+        return cls(rig.parents, rig.rest_matrices)
+
+    @property
+    def length_mask(self) -> np.ndarray:
+        return np.arange(FEATURES_PER_JOINT * len(self.parents)) % MATRIX_COLUMNS == MATRIX_COLUMNS - 1
+
+    def offered(self, partition: Partition) -> np.ndarray:
+        joints = np.array(partition.influencing, np.int64)
+        return (FEATURES_PER_JOINT * joints[:, None] + np.arange(FEATURES_PER_JOINT)).ravel()
+
+    def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        return joint_features(pose_matrices, self.rest_matrices, self.parents).reshape(len(pose_matrices), -1)
+
+    def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[LocalVectors, np.ndarray]:
+        """Request the columns of each needed joint in the space Q_j of the joint as its parent carries it along.
+
+        Q_j = P_p B_p^-1 B_j with the parent p. The axes of a joint have no origin. Its translation is relative to Q_j.
+        """
+        joints = needed_joints(is_needed)
+        parents, rest_matrices = self.parents[joints], self.rest_matrices.astype(np.float64)
+        to_child = np.linalg.inv(rest_matrices[np.maximum(parents, 0)]) @ rest_matrices[joints]
+        offsets = np.where((parents < 0)[:, None, None], rest_matrices[joints], to_child)
+        carried, columns = np.indices((len(joints), MATRIX_COLUMNS))
+        is_translation = columns == MATRIX_COLUMNS - 1
+        vectors = LocalVectors(
+            parents.astype(np.int64),
+            offsets,
+            carried.ravel(),
+            np.stack([len(joints) + joints[carried], columns], axis=2).reshape(-1, 2),
+            np.stack([carried * is_translation, np.where(is_translation, columns, ZERO_COLUMN)], axis=2).reshape(-1, 2),
+        )
+        position = np.full(len(is_needed), -1, np.int64)
+        by_column = np.arange(FEATURES_PER_JOINT).reshape(VECTOR_SIZE, MATRIX_COLUMNS).T.ravel()
+        position[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(
+            FEATURES_PER_JOINT * len(joints)
+        )
+        return vectors, position
+
+
+def needed_joints(is_needed: np.ndarray) -> np.ndarray:
+    """Return the joints of which a feature is needed, ascending; at least one, because no gather may be empty."""
+    joints = np.flatnonzero(is_needed.reshape(-1, FEATURES_PER_JOINT).any(axis=1))
+    return joints if len(joints) else np.zeros(1, np.int64)
