@@ -6,6 +6,7 @@ MODULES: tuple[str, ...] = (
     "trainer_environment",
     "trusted_folders",
     "rig",
+    "frame_profile",
     "sampling",
     "poses",
     "limits",

@@ -13,10 +13,10 @@ from .rig_operator import RigOperator
 
 MENU_OPERATORS = (
     ("fdda.add_sample_arm", "fdda.build_model"),
-    ("fdda.measure",),
+    ("fdda.measure", "fdda.profile_frame"),
     ("fdda.preview_pose", "fdda.rest_pose", "fdda.use_selected_bones", "fdda.limits_from_actions"),
     ("fdda.human_limits", "fdda.copy_limits", "fdda.mirror_limits", "fdda.set_limits", "fdda.clear_limits"),
-    ("fdda.add_control", "fdda.remove_control"),
+    ("fdda.add_control", "fdda.add_control_bones", "fdda.remove_control"),
     ("fdda.record", "fdda.delete_recording"),
     ("fdda.check_trainer", "fdda.train", "fdda.refine", "fdda.create_trainer_environment"),
     ("fdda.bind", "fdda.set_mode", "fdda.measure_model", "fdda.bake", "fdda.relink", "fdda.unbind"),

@@ -8,6 +8,7 @@ from ..operators.rig import measured_cost
 from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
 from . import checks, curves
+from .frame_profile import draw_profile
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
 
 MAX_MESHES = 8
@@ -20,7 +21,7 @@ MODIFIER_ICONS = {
 class FDDA_PT_rig(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_rig"
     bl_label = "Rig"
-    verbs = ("measure", "build_model")
+    verbs = ("measure", "build_model", "profile_frame")
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -48,6 +49,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         if check:
             _draw_replaced(layout, rig.mesh_object, check.replaced_modifiers)
         _draw_cost(layout, context, rig)
+        draw_profile(layout, context, rig)
 
 
 def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

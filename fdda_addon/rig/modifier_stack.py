@@ -213,12 +213,12 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     return stack
 
 
-def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
-    """Sort the modifiers of a rig, and check that its evaluated mesh can be compared with a model.
+def check_posable(scene_rig: SceneRig) -> None:
+    """Check that animation moves a rig.
 
     Raises:
-        RigError: the rig is in edit mode or in the NLA's tweak mode, the object is hidden, the Armature modifier is
-            off, or a model cannot replace a modifier.
+        RigError: the rig is in edit mode, in the NLA's tweak mode or in its rest position, or its Armature modifier is
+            off.
     """
     mesh_object = scene_rig.mesh_object
     if mesh_object.mode == "EDIT" or scene_rig.armature_object.mode == "EDIT":
@@ -231,6 +231,16 @@ def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
         raise RigError(f"The Armature modifier of '{mesh_object.name}' is switched off in the viewport; switch it on.")
     if scene_rig.armature_object.data.pose_position == "REST":
         raise RigError(f"The armature '{scene_rig.armature_object.name}' shows its rest position; set it to pose.")
+
+
+def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
+    """Sort the modifiers of a rig, and check that its evaluated mesh can be compared with a model.
+
+    Raises:
+        RigError: as `check_posable`, the object is hidden, or a model cannot replace a modifier.
+    """
+    check_posable(scene_rig)
+    mesh_object = scene_rig.mesh_object
     _evaluated_object(mesh_object)
     stack = check_stack(mesh_object)
     if not stack.downstream:
