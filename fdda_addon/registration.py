@@ -63,7 +63,7 @@ def unregister() -> None:
 
 def handler_table() -> list[tuple[str, Callable[..., None]]]:
     """Return all handlers in calling order, each with the name of its list in `bpy.app.handlers`."""
-    from .evaluation import side_by_side
+    from .evaluation import reopening, side_by_side
     from .jobs import job
     from .operators import training
     from .panels import checks
@@ -71,7 +71,7 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
     from .scene import stored_paths, undo
 
     # Paths must be restored before models are loaded, so `stored_paths` is the first module.
-    modules = (stored_paths, undo, job, checks, handlers, side_by_side, training)
+    modules = (stored_paths, undo, job, checks, handlers, reopening, side_by_side, training)
     return [entry for module in modules for entry in module.HANDLERS.items()]
 
 

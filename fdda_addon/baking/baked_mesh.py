@@ -2,7 +2,7 @@
 """Makes a mesh object play baked positions, without its rig and without the add-on."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import bpy
@@ -52,8 +52,9 @@ def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
     # Local, because modifiers of a library override cannot be removed.
     object_copy = mesh_object.copy().make_local()
     unbind(object_copy)
+    object_copy.fdda.models.clear()
     # With a fake user the original object would be saved too.
-    with temporary_attributes(mesh_object, use_fake_user=False):
+    with temporary_attributes(mesh_object, use_fake_user=False), _packed_models_unused(mesh_object):
         mesh_object.user_remap(object_copy)
         try:
             mesh_object.name, object_copy.name = f"{name} rig", name
@@ -62,6 +63,16 @@ def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
             object_copy.user_remap(mesh_object)
             _remove_object(object_copy)
             mesh_object.name = name
+
+
+@contextmanager
+def _packed_models_unused(mesh_object: bpy.types.Object) -> Iterator[None]:
+    """Remove the pointers of an object to packed models in the block, so that a saved file does not contain them."""
+    binding = mesh_object.fdda
+    with ExitStack() as exit_stack:
+        for owner in (binding, *binding.models):
+            exit_stack.enter_context(temporary_attributes(owner, packed=None))
+        yield
 
 
 def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: Path, first_frame: int) -> None:

@@ -3,7 +3,7 @@
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -110,13 +110,13 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
         elif settings.shape_keys:
             with _temporary_point_cache(out) as cache:
                 yield from _write_frames(cache, reader, frames)
-                with temporary_copy(scene_rig.mesh_object) as mesh_object:
+                with temporary_copy(scene_rig.mesh_object) as mesh_object, _scene_range(frames):
                     play_shape_keys(mesh_object, stack, read_point_cache(cache).positions, frames.start)
                     save_copy(out)
         else:
             with atomic_write_all(*files) as (blend, cache):
                 yield from _write_frames(cache, reader, frames)
-                with temporary_copy(scene_rig.mesh_object) as mesh_object:
+                with temporary_copy(scene_rig.mesh_object) as mesh_object, _scene_range(frames):
                     play_point_cache(mesh_object, stack, files[1], frames.start)
                     save_copy(blend)
     yield Bake(frames, files)
@@ -159,6 +159,14 @@ def _select_frames(action: bpy.types.Action | None, frames: tuple[int, int] | No
     if max(abs(first), abs(last)) > MAX_FRAME:
         raise WrongUsageError(f"Blender has frames up to {MAX_FRAME}, not from {first} to {last}; give fewer.")
     return range(first, last + 1)
+
+
+def _scene_range(frames: range) -> AbstractContextManager[None]:
+    """Limit the scene to the baked frames in a block; the saved copy then plays only these."""
+    # Blender's frame range begins at 0.
+    first, last = max(0, frames.start), max(0, frames[-1])
+    scene = bpy.context.scene
+    return temporary_attributes(scene, frame_start=first, frame_end=last, use_preview_range=False)
 
 
 class FrameReader:

@@ -10,6 +10,14 @@ NO_ERROR_METRES = 1e-6
 HEAT_MAP_STOPS = ((NO_ERROR_METRES, (0.10, 0.25, 0.95)), (0.005, (0.60, 0.10, 0.80)), (0.01, (0.95, 0.05, 0.05)))
 """Error in meters and sRGB color: blue just above no error, violet at 0.5 cm, red at 1 cm and above."""
 NO_ERROR_COLOR = (0.10, 0.70, 0.20)
+VIEWPORT_STOPS = (
+    (0.0, (0.00, 0.00, 1.00)),
+    (0.25, (0.00, 1.00, 1.00)),
+    (0.5, (0.00, 1.00, 0.00)),
+    (0.75, (1.00, 1.00, 0.00)),
+    (1.0, (1.00, 0.00, 0.00)),
+)
+"""Ratio of the largest shown error and sRGB color in the viewport: the colors of Blender's Weight Paint mode."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,7 @@ def error_statistics(errors: np.ndarray) -> ErrorStatistics:
 
 
 def heat_colors(errors: np.ndarray, max_error: float = HEAT_MAP_STOPS[-1][0]) -> np.ndarray:
-    """Compute the heat map colors of errors.
+    """Compute the heat map colors of errors in pictures.
 
     Args:
         errors: (V,) meters.
@@ -71,6 +79,21 @@ def heat_colors(errors: np.ndarray, max_error: float = HEAT_MAP_STOPS[-1][0]) ->
     vertex_colors = np.stack([np.interp(errors, stops, colors[:, channel]) for channel in range(3)], axis=-1)
     vertex_colors[np.asarray(errors) < NO_ERROR_METRES] = NO_ERROR_COLOR
     return vertex_colors.astype(np.float32)
+
+
+def viewport_colors(errors: np.ndarray, max_error: float) -> np.ndarray:
+    """Compute the colors of errors in the viewport.
+
+    Args:
+        errors: (V,) meters.
+        max_error: meters; this error and larger ones are red.
+
+    Returns:
+        (V, 3) float32 sRGB, 0 to 1: blue without error, then cyan, green, yellow and red (`VIEWPORT_STOPS`).
+    """
+    ratios = np.asarray(errors) / max_error
+    stops, colors = [stop for stop, _ in VIEWPORT_STOPS], np.array([color for _, color in VIEWPORT_STOPS])
+    return np.stack([np.interp(ratios, stops, colors[:, channel]) for channel in range(3)], axis=-1).astype(np.float32)
 
 
 def worst_poses(errors: np.ndarray, count: int, min_index_distance: int) -> list[int]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.defaults import MIN_PARTITION_VERTICES
 from ..core.errors import ModelError
-from ..core.metrics import heat_colors
+from ..core.metrics import viewport_colors
 from ..core.partition import make_merged_partitions, partition_colors
 from ..rig.reading import read_rig
 from ..runtime.model_files import network_of
@@ -112,7 +112,7 @@ def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
     if paint.kind == PARTITIONS:
         return paint.partition_colors
     errors = errors_of(mesh_object)
-    return None if errors is None else heat_colors(errors, bpy.context.window_manager.fdda_view.range_mm / 1000)
+    return None if errors is None else viewport_colors(errors, bpy.context.window_manager.fdda_view.range_mm / 1000)
 
 
 def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:

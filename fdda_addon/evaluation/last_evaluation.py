@@ -150,11 +150,16 @@ def store(
         tuple(partitions),
         evaluation.channels,
     )
+    restore(mesh_object, stored_evaluation)
+    return stored_evaluation
+
+
+def restore(mesh_object: bpy.types.Object, evaluation: LastEvaluation) -> None:
+    """Store an evaluation as the last of an object."""
     _evaluations.pop(mesh_object.session_uid, None)
     while len(_evaluations) >= MAX_STORED_EVALUATIONS:
         del _evaluations[next(iter(_evaluations))]
-    _evaluations[mesh_object.session_uid] = stored_evaluation
-    return stored_evaluation
+    _evaluations[mesh_object.session_uid] = evaluation
 
 
 def get(mesh_object: bpy.types.Object) -> LastEvaluation | None:

@@ -10,7 +10,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..core.metrics import NO_ERROR_COLOR, NO_ERROR_METRES, heat_colors
+from ..core.metrics import viewport_colors
 from ..scene.arrays import TRIANGLE_ELEMENT, VECTOR_ELEMENT, read
 from ..scene.mesh import mesh_positions
 
@@ -231,14 +231,10 @@ def _draw_legend(get_legend: Callable[[bpy.types.Context], tuple[list[str], floa
 def _draw_color_scale(left: float, bottom: float, ui_scale: float, range_mm: float) -> None:
     height, width = 14 * ui_scale, 240 * ui_scale
     strip_bottom = bottom + 18 * ui_scale
-    _draw_strip(left, strip_bottom, height, height, np.tile(np.float32(NO_ERROR_COLOR), (2, 1)))
-    _draw_text("none", left - 2 * ui_scale, bottom)
-    scale_left = left + 44 * ui_scale
-    strip_colors = heat_colors(np.linspace(NO_ERROR_METRES, range_mm / 1000, 64), range_mm / 1000)
-    _draw_strip(scale_left, strip_bottom, width, height, strip_colors)
+    _draw_strip(left, strip_bottom, width, height, viewport_colors(np.linspace(0, 1, 65), 1.0))
     for fraction, text in ((0, "0"), (0.5, f"{range_mm / 2:.4g}"), (1, f"{range_mm:.4g} mm and more")):
         half_width = blf.dimensions(0, text.split(" ")[0])[0] / 2
-        _draw_text(text, scale_left + fraction * width - half_width, bottom)
+        _draw_text(text, left + fraction * width - half_width, bottom)
 
 
 def _draw_strip(left: float, bottom: float, width: float, height: float, colors: np.ndarray) -> None:

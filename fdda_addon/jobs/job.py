@@ -281,7 +281,15 @@ def _on_undo(*_: object) -> None:
         _stop("the scene was undone")
 
 
-HANDLERS = {"load_pre": _on_load, "undo_pre": _on_undo, "redo_pre": _on_undo}
+@persistent
+def _on_save(*_: object) -> None:
+    # The error may be that the file was not saved.
+    for verb in [verb for verb, state in _states.items() if not state.is_running and state.outcome_level == "ERROR"]:
+        del _states[verb]
+    redraw()
+
+
+HANDLERS = {"load_pre": _on_load, "save_post": _on_save, "undo_pre": _on_undo, "redo_pre": _on_undo}
 
 
 def unregister() -> None:

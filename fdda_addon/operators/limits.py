@@ -7,7 +7,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..scene.compatibility import is_selected
-from .pose_operator import PoseOperator
+from .pose_operator import LimitsOperator
 
 AXES = "XYZ"
 
@@ -17,7 +17,7 @@ def _count_bones(count: int) -> str:
     return "1 bone" if count == 1 else f"{count} bones"
 
 
-class _SelectedBonesOperator(PoseOperator):
+class _SelectedBonesOperator(LimitsOperator):
     """Mixin for an operator on the limits of the selected bones."""
 
     def selected_bones(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
@@ -146,7 +146,7 @@ class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
         return f"Mirrored the limits of {_count_bones(len(pairs))}."
 
 
-class FDDA_OT_human_limits(PoseOperator, bpy.types.Operator):
+class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
     bl_idname = "fdda.human_limits"
     bl_label = "Human Limits"
     bl_description = (

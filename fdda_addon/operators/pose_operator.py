@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Base class of operators that change the pose, the limits or the recorded inputs of a rig."""
 
+from contextlib import suppress
+
 import bpy
 
 from ..core.errors import FDDAError
 from ..jobs.job import current
+from ..properties.recording_options import recording_settings
 from .rig_operator import RigOperator
 
 
@@ -30,3 +33,22 @@ class PoseOperator(RigOperator):
             return {"CANCELLED"}
         self.report({"INFO"}, message)
         return {"FINISHED"}
+
+
+class LimitsOperator(PoseOperator):
+    """Mixin for an operator that changes limits. A random pose that the rig shows is then posed within the new ones."""
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        from ..recording.preview import show_random_pose, shows_random_pose
+
+        try:
+            rig = self.rig(context)
+            is_preview = shows_random_pose(rig)
+        except FDDAError:
+            is_preview = False
+        result = super().execute(context)
+        if is_preview and result == {"FINISHED"}:
+            # If all axes are locked now, there is no random pose.
+            with suppress(FDDAError):
+                show_random_pose(rig, recording_settings(rig), context.window_manager.fdda.pose_index)
+        return result

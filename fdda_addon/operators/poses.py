@@ -2,17 +2,12 @@
 """Operators on poses and limits: preview random poses, reset the pose, set the limits of a bone."""
 
 import math
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import RigError
-from ..properties.recording_options import recorded_actions, recording_settings
-from ..scene.scene_rig import SceneRig
-from .pose_operator import PoseOperator
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..core.controls import Control
+from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
+from .pose_operator import LimitsOperator, PoseOperator
 
 
 class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
@@ -34,7 +29,7 @@ class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
         from ..recording.preview import show_random_pose
 
         rig, session = self.rig(context), context.window_manager.fdda
-        start = self.number if self.number >= 0 else session.pose_index
+        start = self.number if self.number >= 0 else max(session.pose_index, 0 if self.step <= 0 else -1)
         session.pose_index = show_random_pose(rig, recording_settings(rig), max(0, start + self.step))
         return f"Random pose {session.pose_index + 1}."
 
@@ -46,29 +41,15 @@ class FDDA_OT_rest_pose(PoseOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..scene.armature import clear_pose
-        from ..scene.control_names import control_default
-        from ..scene.controls import can_be_set, is_driven, owner_of, set_control
+        from ..recording.preview import show_rest_pose
 
         rig = self.rig(context)
-        clear_pose(rig.armature_object)
-        for control in _sampled_controls(rig):
-            if can_be_set(control.name) and not is_driven(owner_of(rig, control.owner), control.path):
-                set_control(rig, control.name, control_default(rig, control.name))
+        show_rest_pose(rig, complete_settings(rig))
+        context.window_manager.fdda.pose_index = -1
         return f"'{rig.armature_object.name}' is in its rest pose."
 
 
-def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
-    """Return the extra inputs that random poses change; none while the settings are incomplete."""
-    from ..recording.plan import read_sample_selection
-
-    try:
-        return read_sample_selection(rig, recording_settings(rig))[0].controls
-    except RigError:
-        return ()
-
-
-class _LimitOperator(PoseOperator):
+class _LimitOperator(LimitsOperator):
     """Mixin for an operator on the rotation limit of a bone about one axis."""
 
     bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
@@ -129,7 +110,7 @@ class FDDA_OT_clear_limit(_LimitOperator, bpy.types.Operator):
         return f"Removed the limit of '{bone.name}' about {self.axis}."
 
 
-class FDDA_OT_limits_from_actions(PoseOperator, bpy.types.Operator):
+class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
     bl_idname = "fdda.limits_from_actions"
     bl_label = "Set Limits from Actions"
     bl_description = "Set each bone's limits to the motion in the checked actions. Bones can still be posed freely"

@@ -63,13 +63,12 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             column.prop(view, "poses")
             column.prop(view, "seed")
         else:
-            if animation is not None:
-                layout.prop_search(animation, "action", bpy.data, "actions", text="")
-            if action is None:
-                draw_wrapped(layout, context, f"'{scene_rig.armature_object.name}' has no action.", "ERROR")
-            else:
+            layout.prop(view, "action", text="", icon="ACTION", placeholder="Choose an Action")
+            text = "No action is active"
+            if action is not None:
                 first_frame, last_frame = (round(frame) for frame in action.frame_range)
-                layout.label(text=f"Frames {first_frame} to {last_frame}", icon="TIME")
+                text = f"Frames {first_frame} to {last_frame}"
+            layout.label(text=text, icon="TIME")
         row = layout.row()
         row.scale_y = 1.4
         row.enabled = view.source == "RANDOM" or action is not None

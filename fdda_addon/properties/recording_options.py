@@ -44,6 +44,14 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
     )
 
 
+def complete_settings(scene_rig: SceneRig) -> "RecordingSettings | None":
+    """Return the settings of a recording of a character; None if the bones to pose have not been chosen."""
+    try:
+        return recording_settings(scene_rig)
+    except RigError:
+        return None
+
+
 def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
     """Return the settings of the target object of a character."""
     from ..rig.pose_setter import TargetSettings

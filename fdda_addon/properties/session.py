@@ -11,12 +11,12 @@ from ..jobs.job import current
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
 from .not_animatable import not_animatable
-from .recording_options import recording_settings
+from .recording_options import complete_settings, recording_settings
 
 
 def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
-    """Show the random pose with the number that was entered in the sidebar; the first has number 1."""
-    from ..recording.preview import show_random_pose
+    """Show the random pose with the number that was entered in the sidebar: 1 is the first, 0 is the rest pose."""
+    from ..recording.preview import show_random_pose, show_rest_pose
 
     context, job = bpy.context, current()
     rig = cached_active_rig(context)
@@ -24,7 +24,11 @@ def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
         return
     # If no random pose can be shown, the section Rig shows the reason.
     with suppress(FDDAError):
-        session.pose_index = show_random_pose(rig, recording_settings(rig), number - 1)
+        if number:
+            session.pose_index = show_random_pose(rig, recording_settings(rig), number - 1)
+        else:
+            show_rest_pose(rig, complete_settings(rig))
+            session.pose_index = -1
         undo.push_undo_soon("Preview Pose")
 
 
@@ -39,12 +43,13 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
         default=True,
     )
 
-    pose_index: IntProperty(name="Pose Index", description="Index of the random pose that is shown", min=0)
+    pose_index: IntProperty(
+        name="Pose Index", description="Index of the random pose that is shown; -1 before the first", default=-1, min=-1
+    )
     preview_pose: IntProperty(
         name="Preview Pose",
-        description="Show one of the random poses that will be recorded",
-        min=1,
-        default=1,
+        description="Show one of the random poses that will be recorded. 0 for the rest pose",
+        min=0,
         get=lambda session: session.pose_index + 1,
         set=_show_random_pose,
     )

@@ -2,10 +2,13 @@
 """Settings of the section "Compare with Rig": `WindowManager.fdda_view`, which is not saved in the .blend file."""
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from ..core.defaults import EVALUATION_SEED, MARKERS, SIDEBAR_EVALUATION_POSES
+from ..scene import undo
+from ..scene.active_rig import cached_active_rig
 from ..scene.viewport import redraw_views
+from .recording_options import action_moves_bones
 
 
 def _redraw(_view: "FDDA_PG_view", _context: bpy.types.Context) -> None:
@@ -19,6 +22,32 @@ def show_graph(is_shown: bool) -> None:
     (timeline.start if is_shown else timeline.stop)()
 
 
+def _active_action(_view: "FDDA_PG_view") -> str:
+    """Return the name of the active action of the armature that the sidebar shows; empty without one."""
+    rig = cached_active_rig(bpy.context)
+    animation = rig.armature_object.animation_data if rig is not None else None
+    return animation.action.name if animation is not None and animation.action is not None else ""
+
+
+def _set_active_action(_view: "FDDA_PG_view", name: str) -> None:
+    """Make an action the active one of the armature that the sidebar shows; an empty name removes the active one."""
+    from ..scene.temporary_state import assign_action
+
+    rig, action = cached_active_rig(bpy.context), bpy.data.actions.get(name)
+    if rig is None or (name and action is None):
+        return
+    if action is not None:
+        assign_action(rig.armature_object, action)
+    elif rig.armature_object.animation_data is not None:
+        rig.armature_object.animation_data.action = None
+    undo.push_undo_soon("Choose Action")
+
+
+def _actions_of_rig(_view: "FDDA_PG_view", context: bpy.types.Context, _text: str) -> list[str]:
+    rig = cached_active_rig(context)
+    return [a.name for a in bpy.data.actions if rig is not None and action_moves_bones(a, rig.armature_object)]
+
+
 class FDDA_PG_view(bpy.types.PropertyGroup):
     """Settings of the evaluation, of the colors in the viewport, and of the markers and graph in the timeline."""
 
@@ -30,6 +59,13 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
             ("RANDOM", "Random Poses", "New random poses within the limits, which are in no recording"),
         ),
         default="ACTION",
+    )
+    action: StringProperty(
+        name="Action",
+        description="Active action of the armature; the model is compared with the rig in all of its frames",
+        get=_active_action,
+        set=_set_active_action,
+        search=_actions_of_rig,
     )
     poses: IntProperty(
         name="Poses", description="Number of random poses", default=SIDEBAR_EVALUATION_POSES, min=1, soft_max=1000

@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shows random poses of a recording in advance."""
+"""Shows random poses of a recording in advance, and the rest pose."""
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from ..core.errors import RigError
 from ..scene.scene_rig import SceneRig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
+    import numpy as np
+
     from .plan import RecordingSettings
+
+_shown_pose: "tuple[int, np.ndarray] | None" = None
+"""Session id of the armature object that shows a random pose, and the values of the pose."""
 
 
 def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: int) -> int:
@@ -27,8 +34,9 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
     Raises:
         RigError: there is no channel to sample.
     """
+    global _shown_pose
     from ..core.poses import sample_pose
-    from ..scene.armature import Poser, clear_pose
+    from ..scene.armature import Poser, clear_pose, pose_values
     from .plan import make_recording_margin, read_sampled_rig
 
     settings = replace(settings, poses=max(1, settings.poses))
@@ -40,4 +48,38 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
     clear_pose(scene_rig.armature_object)
     Poser(scene_rig, channels).set(sample_pose(channels, settings.seed, index, settings.spread))
     scene_rig.armature_object.update_tag(refresh={"DATA"})
+    _shown_pose = scene_rig.armature_object.session_uid, pose_values(scene_rig.armature_object)
     return index
+
+
+def shows_random_pose(scene_rig: SceneRig) -> bool:
+    """Return whether the rig is still in the pose that `show_random_pose` has set."""
+    from ..scene.armature import pose_values
+
+    armature_object = scene_rig.armature_object
+    if _shown_pose is None or _shown_pose[0] != armature_object.session_uid:
+        return False
+    values = pose_values(armature_object)
+    return values.shape == _shown_pose[1].shape and bool((values == _shown_pose[1]).all())
+
+
+def show_rest_pose(scene_rig: SceneRig, settings: "RecordingSettings | None") -> None:
+    """Set the rest pose, and the extra inputs of random poses to their defaults; inputs with drivers keep theirs.
+
+    Args:
+        scene_rig: the rig.
+        settings: settings of the recording; None to keep the extra inputs.
+    """
+    from ..scene.armature import clear_pose
+    from ..scene.control_names import control_default
+    from ..scene.controls import can_be_set, is_driven, owner_of, set_control
+    from .plan import read_sample_selection
+
+    clear_pose(scene_rig.armature_object)
+    if settings is None:
+        return
+    # While a chosen bone or action is missing, random poses change no input.
+    with suppress(RigError):
+        for control in read_sample_selection(scene_rig, settings)[0].controls:
+            if can_be_set(control.name) and not is_driven(owner_of(scene_rig, control.owner), control.path):
+                set_control(scene_rig, control.name, control_default(scene_rig, control.name))

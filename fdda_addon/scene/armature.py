@@ -7,7 +7,7 @@ from mathutils import Euler, Quaternion
 
 from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import STATIC_JOINT
-from .arrays import POSE_CHANNELS, POSE_MATRIX_ELEMENT, PropertyReader, write
+from .arrays import POSE_CHANNELS, POSE_MATRIX_ELEMENT, PropertyReader, read, write
 from .controls import set_control
 from .scene_rig import SceneRig
 
@@ -73,6 +73,12 @@ def clear_pose(armature_object: bpy.types.Object) -> None:
     for channel, values in zip(POSE_CHANNELS, _REST_CHANNEL_VALUES, strict=True):
         write(bones, channel, np.tile(np.float32(values), (len(bones), 1)))
     armature_object.update_tag(refresh={"DATA"})
+
+
+def pose_values(armature_object: bpy.types.Object) -> np.ndarray:
+    """Return the values of all properties that define the pose, (B, 17) float32, in the order of the bones."""
+    bones = armature_object.pose.bones
+    return np.concatenate([read(bones, channel) for channel in POSE_CHANNELS], axis=1)
 
 
 class Poser:

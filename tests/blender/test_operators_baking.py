@@ -43,6 +43,20 @@ class TestOperator:
         assert sorted(file_contents(tmp_path)) == ["a.blend", "b.pc2"]
         assert np.abs(read_pc2(tmp_path / "b.pc2")[2] - wave).max() < 1e-6
 
+    @pytest.mark.parametrize("shape_keys", [False, True])
+    def test_the_baked_file_has_the_baked_frames_and_no_model(self, active, elbow_files, tmp_path, shape_keys):
+        bpy.ops.fdda.pack_model()
+        scene, model_bytes = bpy.context.scene, active.fdda.models[0].packed_bytes
+        scene.frame_start, scene.frame_end = 100, 120
+        out = tmp_path / "a.blend"
+        assert bpy.ops.fdda.bake(filepath=str(out), action="elbow_wave", shape_keys=shape_keys) == {"FINISHED"}
+        assert (scene.frame_start, scene.frame_end) == (100, 120)
+        assert active.fdda.packed == active.fdda.models[0].packed and active.fdda.packed is not None
+        assert_plays(active, elbow_files.model)
+        bpy.ops.wm.open_mainfile(filepath=str(out))
+        assert (bpy.context.scene.frame_start, bpy.context.scene.frame_end) == (1, 30)
+        assert not bpy.data.texts and not bpy.data.objects[ELBOW].fdda.models and model_bytes > 10_000
+
     def test_a_wrong_path_action_or_binding_is_refused(self, active, tmp_path):
         refused(bpy.ops.fdda.bake, "No file was chosen; give the name of a .pc2 or .blend file.")
         refused(lambda: bpy.ops.fdda.bake(filepath=str(tmp_path / "a.txt")), "ends in neither .pc2 nor .blend")

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import error_statistics, heat_colors
+from fdda_addon.core.metrics import error_statistics, viewport_colors
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.evaluation import heat_map, last_evaluation, markers, overlay
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate, evaluate_action
@@ -66,13 +66,26 @@ def test_random_poses_are_evaluated(active, elbow_files):
 
 
 def test_an_evaluation_without_action_or_results_is_refused(active):
+    last_evaluation.remove(active)
     refused(lambda: bpy.ops.fdda.evaluate(action="jump"), "no action 'jump'")
     bpy.data.objects[ELBOW_RIG].animation_data.action = None
-    refused(bpy.ops.fdda.evaluate, "'elbow_rig' has no action; give it one, or compare on random poses.")
+    refused(bpy.ops.fdda.evaluate, "'elbow_rig' has no active action; choose one under Compare On, or compare on random poses.")
     for name in ("fit_color_range", "add_worst_markers", "jump_to_worst"):
         refused(getattr(bpy.ops.fdda, name), "Nothing has been compared in this session; press Evaluate first")
     refused(lambda: bpy.ops.fdda.color_mesh(colors="ERRORS"), "'elbow' has not been compared in this session")
     assert last_evaluation.get(active) is None and active.fdda.mode == "FDDA"
+
+
+def test_the_action_picker_makes_an_action_active(active, view):
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    assert view.action == "elbow_wave"
+    armature_object.animation_data_clear()
+    assert view.action == ""
+    view.action = "no such action"
+    assert armature_object.animation_data is None
+    view.action = "elbow_wave"
+    assert armature_object.animation_data.action.name == "elbow_wave"
+    assert bpy.ops.fdda.evaluate(source="ACTION") == {"FINISHED"}
 
 
 def test_colors_are_those_of_the_report(active, evaluated_action, view):
@@ -82,9 +95,9 @@ def test_colors_are_those_of_the_report(active, evaluated_action, view):
     assert view.range_mm == pytest.approx(np.percentile(errors["fdda"].mean(axis=0), 99.5) * 1000, rel=0.06)
     view.range_mm = 10.0
     bpy.ops.fdda.color_mesh()
-    np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["fdda"].mean(axis=0)))
+    np.testing.assert_array_equal(heat_map.colors_of(active), viewport_colors(errors["fdda"].mean(axis=0), 0.01))
     view.deformation, view.statistic, view.range_mm = "linear", "max", 2.0
-    np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["linear"].max(axis=0), 0.002))
+    np.testing.assert_array_equal(heat_map.colors_of(active), viewport_colors(errors["linear"].max(axis=0), 0.002))
     assert bpy.ops.fdda.fit_color_range() == {"FINISHED"}
     expected = np.percentile(errors["linear"].max(axis=0), 99.5) * 1000
     assert view.range_mm == pytest.approx(expected, rel=0.06)
@@ -98,7 +111,7 @@ def test_colors_follow_the_timeline(active, evaluated_action, view):
     for frame in (evaluated_action.first_frame, 12):
         bpy.context.scene.frame_set(frame)
         errors = evaluated_action.errors["fdda"][frame - evaluated_action.first_frame]
-        expected = heat_colors(errors, view.range_mm / 1000)
+        expected = viewport_colors(errors, view.range_mm / 1000)
         np.testing.assert_array_equal(heat_map.colors_of(active), expected)
     bpy.context.scene.frame_set(evaluated_action.first_frame + evaluated_action.poses)
     assert heat_map.colors_of(active) is None
@@ -206,6 +219,26 @@ def test_a_missing_report_is_refused_with_its_path(active, elbow_files, monkeypa
         refused(bpy.ops.fdda.open_report, f"There is no report '{report}'")
     finally:
         report.with_suffix(".away").rename(report)
+
+
+def test_an_evaluation_and_its_colors_survive_opening_the_file_again(active, elbow_files, tmp_path):
+    path = tmp_path / "shot.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=3)
+    last, name = last_evaluation.get(active), active.name
+    bpy.ops.fdda.color_mesh(colors="ERRORS")
+    bpy.ops.wm.save_mainfile()
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(path))
+        reopened = bpy.data.objects[name]
+        assert last_evaluation.get(reopened) is last and heat_map.paint_kind(reopened) == heat_map.ERRORS
+        # Another file has an object of this name too.
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
+        assert last_evaluation.get(bpy.data.objects[name]) is not last
+    finally:
+        heat_map.clear_all()
 
 
 def test_only_the_latest_evaluations_are_stored(active):

@@ -46,6 +46,30 @@ def test_the_number_field_shows_a_pose(saved):
     assert session.preview_pose == 3, "there is nothing to pose"
 
 
+def test_the_number_field_begins_with_the_rest_pose_and_no_pose_is_skipped(saved):
+    session, bones = bpy.context.window_manager.fdda, saved.armature_object.pose.bones
+    bpy.ops.fdda.rest_pose()
+    assert session.preview_pose == 0
+    bpy.ops.fdda.preview_pose(step=1)
+    first = [tuple(bone.rotation_euler) for bone in bones]
+    assert session.preview_pose == 1
+    session.preview_pose = 0
+    assert session.preview_pose == 0 and not any(any(bone.rotation_euler) for bone in bones)
+    # The arrow of the field adds 1.
+    session.preview_pose += 1
+    assert [tuple(bone.rotation_euler) for bone in bones] == first
+
+
+def test_the_previewed_pose_follows_changed_limits_and_a_pose_by_hand_does_not(saved):
+    bone = saved.armature_object.pose.bones["upper"]
+    bpy.ops.fdda.preview_pose(number=1)
+    bpy.ops.fdda.set_limit(bone="upper", axis="Y", low=math.radians(70), high=math.radians(80))
+    assert math.radians(70) <= bone.rotation_euler[1] <= math.radians(80)
+    bone.rotation_euler = (0.1, 0.2, 0.3)
+    bpy.ops.fdda.set_limit(bone="upper", axis="Y", low=math.radians(10), high=math.radians(20))
+    np.testing.assert_allclose(bone.rotation_euler, (0.1, 0.2, 0.3), atol=1e-6)
+
+
 def test_rest_pose_resets_the_bones_and_can_be_undone(saved):
     bpy.ops.fdda.preview_pose(number=1)
     bpy.ops.ed.undo_push()

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import NO_ERROR_COLOR, distances, error_statistics, heat_colors, worst_poses
+from fdda_addon.core.metrics import NO_ERROR_COLOR, distances, error_statistics, heat_colors, viewport_colors, worst_poses
 
 
 def test_distances_are_computed_per_vertex():
@@ -80,3 +80,10 @@ def test_worst_poses_keep_a_distance_and_are_sorted():
     assert worst_poses(errors, 5, 1) == [3, 7, 2]
     assert worst_poses(errors, 1, 1) == [3]
     assert worst_poses(np.zeros((4, 2)), 3, 1) == []
+
+
+def test_viewport_colors_are_those_of_weight_paint():
+    colors = viewport_colors(np.array([0.0, 0.0025, 0.005, 0.0075, 0.01, 1.0]), 0.01)
+    blue, cyan, green, yellow, red = (0, 0, 1), (0, 1, 1), (0, 1, 0), (1, 1, 0), (1, 0, 0)
+    np.testing.assert_allclose(colors, [blue, cyan, green, yellow, red, red], atol=1e-6)
+    assert colors.dtype == np.float32

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Keeps evaluations and colors while a file is opened again: Blender gives its objects new session ids.
+
+They return to the object of the same name in the same file, if it is still bound to the same model.
+"""
+
+import os
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..scene.stored_paths import absolute_path
+from . import last_evaluation
+from .loaded_heat_map import loaded_heat_map
+
+_closed: dict[tuple, tuple[last_evaluation.LastEvaluation, str]] = {}
+"""Evaluations and kinds of colors of closed files, by `_character_key`, oldest first."""
+
+
+def _character_key(mesh_object: bpy.types.Object) -> tuple:
+    """Return values by which a character and its bound model are recognized after the file was opened again."""
+    binding = mesh_object.fdda
+    model_state: tuple = (binding.packed.name, len(binding.packed.get("fdda_model", b""))) if binding.packed else ()
+    if not model_state:
+        try:
+            status = os.stat(absolute_path(mesh_object, binding.model))
+            model_state = (status.st_mtime_ns, status.st_size)
+        except OSError:
+            model_state = ()
+    library = mesh_object.library.filepath if mesh_object.library else ""
+    vertex_count = len(mesh_object.data.vertices)
+    return (bpy.data.filepath, library, mesh_object.name, vertex_count, binding.model, model_state)
+
+
+def _bound_objects() -> list[bpy.types.Object]:
+    return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
+
+
+@persistent
+def _on_load_pre(*_: object) -> None:
+    if not bpy.data.filepath:
+        return
+    heat_map = loaded_heat_map()
+    for mesh_object in _bound_objects():
+        evaluation = last_evaluation.get(mesh_object)
+        if evaluation is not None:
+            key = _character_key(mesh_object)
+            _closed.pop(key, None)
+            _closed[key] = evaluation, heat_map.paint_kind(mesh_object) if heat_map else ""
+    while len(_closed) > last_evaluation.MAX_STORED_EVALUATIONS:
+        del _closed[next(iter(_closed))]
+
+
+@persistent
+def _on_load_post(*_: object) -> None:
+    if not _closed:
+        return
+    for mesh_object in _bound_objects():
+        evaluation, painted_colors = _closed.get(_character_key(mesh_object), (None, ""))
+        if evaluation is None:
+            continue
+        last_evaluation.restore(mesh_object, evaluation)
+        heat_map = loaded_heat_map()
+        if heat_map is not None and painted_colors == heat_map.ERRORS:
+            heat_map.paint_errors(mesh_object)
+
+
+HANDLERS = {"load_pre": _on_load_pre, "load_post": _on_load_post}
