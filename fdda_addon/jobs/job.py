@@ -7,7 +7,6 @@ time works on a character (`operators.job` iterates it), and one on the training
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 
 import bpy
 from bpy.app.handlers import persistent
@@ -15,117 +14,7 @@ from bpy.app.handlers import persistent
 from ..core.errors import FDDAError
 from ..core.progress import Progress
 from ..scene import draw_cache
-
-CHARACTER, ENVIRONMENT = "character", "environment"
-"""Kinds of jobs. A job on a character ends when another file is opened. A job on the training environment uses no data
-of Blender and continues."""
-STAGE_UNITS = {
-    "fit": "vertices fitted",
-    "probes": "poses compared with the rig",
-    "target": "poses of the target checked",
-    "epochs": "training passes",
-    "repeatability": "poses repeated",
-    "evaluation": "poses compared",
-    "benchmark": "measurements",
-}
-"""Labels of the steps of a stage, where they differ from the name of the stage."""
-STAGE_LABELS = {
-    "influences": "Step 1 of 2: testing bones",
-    "starting": "Step 1 of 3: reading the recording",
-    "partitions prepared": "Step 2 of 3: preparing body parts",
-}
-"""Labels of preparing stages in panels."""
-PREPARING_STAGES = {*STAGE_LABELS, "poses to fit", "fit", "target", "probes"}
-"""Stages that are always followed by another stage of the same job."""
-
-
-@dataclass
-class JobState:
-    """State of a running or ended job, for panels.
-
-    Attributes:
-        verb: name of the job in the operator's bl_idname ("record").
-        title: label of the job ("Recording").
-        subject: session_uid of its object, 0 for none.
-        works_on: `CHARACTER` or `ENVIRONMENT`.
-        can_cancel: whether it can be canceled.
-        changes_scene: whether the job changes the scene and restores it.
-        is_running: whether it is running.
-        cancel_requested: whether the user has requested cancellation.
-        current_object: name of the object that the job works on now; empty for a job on one object.
-        stage, done, total: progress. If the number of steps is unknown, total is 0 and done counts seconds.
-        started, ended: times of `time.monotonic`, seconds.
-        outcome: message at the end of the job; empty while it runs.
-        outcome_level: 'INFO', 'WARNING' (canceled) or 'ERROR'.
-        warnings: messages about the recording.
-        curves: error after each epoch, mm, by name ("training", "validation"); empty for other jobs.
-    """
-
-    verb: str
-    title: str
-    subject: int = 0
-    changes_scene: bool = False
-    works_on: str = CHARACTER
-    can_cancel: bool = True
-    is_running: bool = True
-    cancel_requested: bool = False
-    current_object: str = ""
-    stage: str = ""
-    done: int = 0
-    total: int = 0
-    started: float = field(default_factory=time.monotonic)
-    ended: float = 0.0
-    outcome: str = ""
-    outcome_level: str = "INFO"
-    warnings: list[str] = field(default_factory=list)
-    curves: dict[str, list[float]] = field(default_factory=dict)
-    _stage_start: tuple[float, int] = (0.0, 0)
-
-    @property
-    def fraction(self) -> float:
-        """Return the completed ratio of the stage, 0 to 1."""
-        return self.done / self.total if self.total else 0.0
-
-    @property
-    def remaining_seconds(self) -> float | None:
-        """Return the estimated remaining time of the stage; None if it is unknown."""
-        stage_start, first_done = self._stage_start
-        if not self.total or self.done <= first_done or not self.is_running:
-            return None
-        return (time.monotonic() - stage_start) / (self.done - first_done) * (self.total - self.done)
-
-    @property
-    def sentence(self) -> str:
-        """Return the progress as text: "212 of 1,000 poses"."""
-        stage, separator, mesh_part = self.stage.partition(" of '")
-        unit = STAGE_UNITS.get(stage, stage) + separator + mesh_part
-        if not self.stage:
-            text = "Starting…"
-        elif stage in STAGE_LABELS:
-            count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
-            text = f"{STAGE_LABELS[stage]}{separator}{mesh_part} ({count})"
-        elif not self.total:
-            text = f"{unit[:1].upper()}{unit[1:]}: {self.done} s"
-        else:
-            text = f"{self.done:,} of {self.total:,} {unit}"
-        return f"{self.current_object}: {text}" if self.current_object else text
-
-    @property
-    def is_finishing(self) -> bool:
-        """Return whether the last stage is complete."""
-        return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in PREPARING_STAGES
-
-    def begin_object(self, name: str) -> None:
-        """Reset the progress and the curves, because the job begins with another object."""
-        self.current_object, self.stage, self.done, self.total = name, "", 0, 0
-        self.curves.clear()
-
-    def show(self, progress: Progress) -> None:
-        """Update the progress."""
-        if progress.stage != self.stage:
-            self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
-        self.done, self.total = progress.done, progress.total
-
+from .state import CHARACTER, ENVIRONMENT, JobState
 
 _states: dict[str, JobState] = {}
 _running: "dict[str, JobRunner]" = {}

@@ -6,10 +6,12 @@ from collections.abc import Iterator
 import bpy
 
 from ..core.errors import RigError
+from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
+from ..properties.recording_options import planned_pose_count
 from .job import JobOperator
 from .playback import bind_model
-from .recording import is_recorded, record_rigs
+from .recording import is_recorded, record_rigs, recording_plan
 from .training import TrainingOperator
 
 
@@ -34,7 +36,10 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
             if rig.mesh_object.library is not None:
                 raise RigError(f"'{rig.mesh_object.name}' is linked; make its model in the file that it comes from.")
         files = [(rig, recording_folder(rig.mesh_object), model_file(rig.mesh_object)) for rig in rigs]
+        pose_count = planned_pose_count(self.rig(context))
+        trainings = [step for rig in rigs for step in self.training_plan(rig.mesh_object, pose_count)]
         missing = [(rig, recording) for rig, recording, _ in files if not is_recorded(recording)]
+        self.state.plan = JobPlan([*(recording_plan(self.rig(context)) if missing else ()), *trainings])
         if missing:
             # An interrupted recording is resumed.
             resume = any((recording / "recording.json").exists() for _, recording in missing)
@@ -44,8 +49,9 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
                     return
         self.changes_scene = self.state.changes_scene = False
         meshes = [(rig.mesh_object, recording, model) for rig, recording, model in files]
-        for mesh_object, recording, model in meshes:
+        for number, (mesh_object, recording, model) in enumerate(meshes):
             self.state.begin_object(mesh_object.name if len(meshes) > 1 else "")
+            self.state.plan.begin_training(number)
             yield from self.train(mesh_object, recording, model)
             if self.state.cancel_requested:
                 return

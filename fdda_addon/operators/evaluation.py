@@ -110,7 +110,10 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
     def _action_name(self, armature_object: bpy.types.Object) -> str:
         animation = armature_object.animation_data
         if not self.action and (animation is None or animation.action is None):
-            raise RigError(f"'{armature_object.name}' has no active action; choose one under Compare On, or compare on random poses.")
+            raise RigError(
+                f"'{armature_object.name}' has no active action; choose one under Compare On, or compare on random "
+                "poses."
+            )
         return self.action or animation.action.name
 
 

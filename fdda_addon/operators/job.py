@@ -5,6 +5,7 @@ Invoked in a window, an operator iterates the job at each tick of a timer. In th
 runs the job to its end.
 """
 
+import functools
 import time
 from collections.abc import Iterator
 
@@ -161,8 +162,7 @@ class JobOperator:
         progress = (state.stage, state.done, len(state.warnings), state.cancel_requested)
         if progress != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
             self._drawn_progress, self._last_redraw = progress, now
-            text = f"{self.title}: {state.sentence} (ESC: cancel)" if self.changes_scene else None
-            self._set_status_text(context, text)
+            self._show_status(context)
             redraw()
         return None
 
@@ -176,17 +176,46 @@ class JobOperator:
         self.report({state.outcome_level}, state.outcome)
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
+    def _show_status(self, context: bpy.types.Context) -> None:
+        """Show the progress in the status bar, beside Blender's hints if the user can work meanwhile."""
+        text = f"{self.title}: {self.state.sentence}"
+        if self.state.remaining_seconds is not None:
+            text += f", {self.state.remaining_text.lower()}"
+        if self.changes_scene:
+            self._set_status_text(context, f"{text} (ESC: cancel)")
+        elif len(context.window.modal_operators) <= 1:
+            # Another modal operator, such as Move, shows its own keys.
+            self._set_status_text(context, text)
+
     def _set_status_text(self, context: bpy.types.Context, text: str | None) -> None:
         """Show a text in the status bar; None restores Blender's own."""
-        if text != self._status_text and context.workspace is not None:
+        if text == self._status_text or context.workspace is None:
+            return
+        if text is None or self.changes_scene:
             context.workspace.status_text_set(text)
-            self._status_text = text
+        else:
+            context.workspace.status_text_set(functools.partial(_draw_status, text))
+        self._status_text = text
 
     def _end_modal(self, context: bpy.types.Context) -> None:
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None
             self._set_status_text(context, None)
+
+
+def _draw_status(text: str, header: bpy.types.Header, _context: bpy.types.Context) -> None:
+    """Draw the status bar as Blender does, with a text before its information at the right."""
+    layout = header.layout
+    layout.template_input_status()
+    layout.separator_spacer()
+    layout.template_reports_banner()
+    layout.template_running_jobs()
+    layout.label(text=text, icon="SORTTIME")
+    layout.separator_spacer()
+    row = layout.row()
+    row.alignment = "RIGHT"
+    row.template_status_info()
 
 
 def _is_view_event(context: bpy.types.Context, event: bpy.types.Event) -> bool:

@@ -10,9 +10,10 @@ import bpy
 from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import FDDAError
 from ..jobs.job import current
+from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder
-from ..properties.recording_options import copy_sampling_settings, recording_settings
+from ..properties.recording_options import copy_sampling_settings, planned_pose_count, recording_settings
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
 from .rig_operator import RigOperator
@@ -34,6 +35,13 @@ def record_rigs(shown_rig: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: 
                 copy_sampling_settings(rig.mesh_object.fdda.settings, shown_rig.mesh_object.fdda.settings)
         # The settings of the shown mesh are used even if this mesh is recorded already.
         yield from record_meshes(rigs, recording_settings(shown_rig, resume))
+
+
+def recording_plan(rig: SceneRig) -> list[JobStep]:
+    """Return the steps of a recording with the settings of a rig."""
+    settings = rig.mesh_object.fdda.settings
+    pose_count = planned_pose_count(rig)
+    return recording_steps(pose_count, settings.fit_linear != "RIG", bool(settings.target))
 
 
 def is_recorded(path: Path) -> bool:
@@ -76,6 +84,7 @@ class FDDA_OT_record(RigOperator, JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         rigs = self.rigs(context)
+        self.state.plan = JobPlan(recording_plan(self.rig(context)))
         # The other meshes get the settings of the shown one.
         self.changes_file = len(rigs) > 1
         if self.folder:

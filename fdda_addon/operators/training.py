@@ -12,6 +12,7 @@ from bpy.app.handlers import persistent
 from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.progress import Progress
 from ..jobs.job import current
+from ..jobs.plan import JobPlan, JobStep, training_steps
 from ..properties.character import model_file, recording_folder
 from ..scene.scene_rig import armature_of
 from .confirm import ConfirmFirst
@@ -61,6 +62,11 @@ class TrainingOperator(RigOperator):
                     # Another file is opened, or Blender quits.
                     training.detach()
                 raise
+
+    def training_plan(self, mesh_object: bpy.types.Object, pose_count: int) -> list[JobStep]:
+        """Return the steps of a training on a recording with this number of poses."""
+        mesh, epochs = mesh_object.data, mesh_object.fdda.settings.epochs
+        return training_steps(len(mesh_object.vertex_groups), len(mesh.vertices), pose_count, epochs)
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
         from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
@@ -196,8 +202,15 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         files = [(rig.mesh_object, *self._files(rig.mesh_object)) for rig in self.rigs(context)]
-        for mesh_object, recording, model in files:
+        steps = [
+            step
+            for files_of_mesh in files
+            for step in self.training_plan(files_of_mesh[0], _pose_count(files_of_mesh[1]))
+        ]
+        self.state.plan = JobPlan(steps)
+        for number, (mesh_object, recording, model) in enumerate(files):
             self.state.begin_object(mesh_object.name if len(files) > 1 else "")
+            self.state.plan.begin_training(number)
             yield from self.train(mesh_object, recording, model, self.warm_start)
             if self.state.cancel_requested:
                 return
@@ -221,6 +234,16 @@ def _check_recording(path: Path) -> None:
         raise RecordingError(
             f"The recording '{path.name}' has {index['complete']} of {index['poses']} poses; resume it first."
         )
+
+
+def _pose_count(recording: Path) -> int:
+    """Return the number of poses of a recording; 0 if it cannot be read, which the training reports."""
+    from ..core.recording.index import read_index
+
+    try:
+        return read_index(recording)["poses"]
+    except FDDAError:
+        return 0
 
 
 def _make_folder(model: Path) -> None:

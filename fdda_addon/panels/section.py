@@ -154,7 +154,7 @@ def draw_job(
             draw_wrapped(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
         return False
     column = layout.column(align=True)
-    if state.total:
+    if state.total or state.plan is not None:
         column.progress(factor=state.fraction, text=state.sentence)
     else:
         # A progress bar that stays at 0 would look as if the job did nothing.
@@ -162,16 +162,6 @@ def draw_job(
     row = column.row(align=True)
     row.enabled = not state.cancel_requested
     row.operator("fdda.cancel", text="Canceling…" if state.cancel_requested else "Cancel", icon="X")
-    seconds_left = state.remaining_seconds
     # This line is always drawn, so that the elements below it do not move.
-    text = f"About {format_duration(seconds_left)} left" if seconds_left is not None else "…"
-    layout.label(text="Finishing…" if state.is_finishing else text, icon="TIME")
+    layout.label(text=state.remaining_text, icon="TIME")
     return True
-
-
-def format_duration(seconds: float) -> str:
-    """Return a duration as text: "40 s", "5 min", "2 h 10 min"."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"

@@ -123,6 +123,15 @@ def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
     )
 
 
+def planned_pose_count(scene_rig: SceneRig) -> int:
+    """Return the number of poses that a recording with the settings of a character has."""
+    from ..poses.action_range import action_frames
+
+    settings = scene_rig.mesh_object.fdda.settings
+    frames = sum(len(action_frames(bpy.data.actions[name])) for name in recorded_actions(scene_rig.armature_object))
+    return settings.poses + frames * (2 if settings.mirror else 1)
+
+
 def action_moves_bones(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
     """Return whether an action animates a bone of an armature."""
     from ..scene.compatibility import animation_curves

@@ -69,7 +69,10 @@ def test_an_evaluation_without_action_or_results_is_refused(active):
     last_evaluation.remove(active)
     refused(lambda: bpy.ops.fdda.evaluate(action="jump"), "no action 'jump'")
     bpy.data.objects[ELBOW_RIG].animation_data.action = None
-    refused(bpy.ops.fdda.evaluate, "'elbow_rig' has no active action; choose one under Compare On, or compare on random poses.")
+    refused(
+        bpy.ops.fdda.evaluate,
+        "'elbow_rig' has no active action; choose one under Compare On, or compare on random poses.",
+    )
     for name in ("fit_color_range", "add_worst_markers", "jump_to_worst"):
         refused(getattr(bpy.ops.fdda, name), "Nothing has been compared in this session; press Evaluate first")
     refused(lambda: bpy.ops.fdda.color_mesh(colors="ERRORS"), "'elbow' has not been compared in this session")

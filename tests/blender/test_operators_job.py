@@ -10,6 +10,7 @@ from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.progress import Progress
 from fdda_addon.jobs import job
 from fdda_addon.jobs.job import JobRunner, JobState
+from fdda_addon.jobs.plan import JobPlan, recording_steps, training_steps
 from fdda_addon.operators.job import JobOperator
 
 events: list[str] = []
@@ -180,6 +181,64 @@ def test_remaining_time_comes_from_the_speed_of_the_stage(monkeypatch):
     now[0] += 3
     state.show(Progress("starting", 3, 0))
     assert state.remaining_seconds is None, "without a total, the progress counts seconds"
+
+
+def test_a_job_with_a_plan_has_one_number_of_steps_and_one_remaining_time(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    state = JobState("build_model", "Record, Train & Bind", started=100.0)
+    # The training takes 6, 6 and 24 s.
+    state.plan = JobPlan([*recording_steps(1000), *training_steps(22, 20_000, 1000, 200)])
+    assert state.sentence == "Step 1 of 5: testing bones" and state.remaining_text == "…"
+    state.show(Progress("influences", 0, 100))
+    now[0] += 1
+    state.show(Progress("influences", 10, 100))
+    assert state.sentence == "Step 1 of 5: testing bones (10 of 100)"
+    # 9 s of this step, 100 s for 1,000 poses at the same speed, and the training.
+    assert state.remaining_seconds == pytest.approx(9 + 100 + 36)
+    fractions = [state.fraction]
+    state.show(Progress("influences", 100, 100))
+    assert not state.is_finishing
+    state.show(Progress("poses", 0, 1000))
+    now[0] += 50
+    state.show(Progress("poses", 500, 1000))
+    assert state.sentence == "Step 2 of 5: recording (500 of 1,000)"
+    assert state.remaining_seconds == pytest.approx(50 + 36)
+    fractions.append(state.fraction)
+    now[0] += 50
+    state.show(Progress("poses", 1000, 1000))
+    assert not state.is_finishing, "the training follows"
+    state.plan.begin_training(0)
+    state.show(Progress("starting", 0, 0))
+    now[0] += 2
+    state.show(Progress("starting", 2, 0))
+    assert state.sentence == "Step 3 of 5: reading the recording (2 s)"
+    assert state.remaining_seconds == pytest.approx(4 + 6 + 24)
+    fractions.append(state.fraction)
+    state.show(Progress("epochs", 0, 200))
+    now[0] += 10
+    state.show(Progress("epochs", 50, 200))
+    assert state.sentence == "Step 5 of 5: training (50 of 200)" and state.remaining_text == "About 30 s left"
+    fractions.append(state.fraction)
+    assert fractions == sorted(fractions) and fractions[0] > 0 and fractions[-1] < 1
+    state.show(Progress("epochs", 200, 200))
+    assert state.is_finishing and state.remaining_text == "Finishing…"
+
+
+def test_the_progress_bar_does_not_go_back(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    state = JobState("train", "Training", started=100.0)
+    state.plan = JobPlan(training_steps(0, 0, 0, 200))
+    now[0] += 5
+    state.show(Progress("epochs", 0, 200))
+    now[0] += 1
+    state.show(Progress("epochs", 100, 200))
+    fraction = state.fraction
+    assert 0.8 < fraction < 0.9
+    now[0] += 60
+    state.show(Progress("epochs", 101, 200))
+    assert state.fraction == fraction
 
 
 @pytest.mark.parametrize("stage", ["poses", "epochs", "frames of 'arm'"])

@@ -12,9 +12,10 @@ import pytest
 from fdda_addon.core.recording.folder import FolderState
 from fdda_addon.jobs import job
 from fdda_addon.jobs.job import JobRunner, JobState
+from fdda_addon.jobs.state import format_duration
 from fdda_addon.panels import checks, curves, playback
 from fdda_addon.panels.recording import cached_content
-from fdda_addon.panels.section import format_duration, panel_rig
+from fdda_addon.panels.section import panel_rig
 from fdda_addon.panels.training import _read_report
 from fdda_addon.properties.character import model_file, recording_folder
 from fdda_addon.scene.scene_rig import SceneRig

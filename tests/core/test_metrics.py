@@ -4,7 +4,14 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import NO_ERROR_COLOR, distances, error_statistics, heat_colors, viewport_colors, worst_poses
+from fdda_addon.core.metrics import (
+    NO_ERROR_COLOR,
+    distances,
+    error_statistics,
+    heat_colors,
+    viewport_colors,
+    worst_poses,
+)
 
 
 def test_distances_are_computed_per_vertex():

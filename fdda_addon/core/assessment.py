@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Says in sentences what the errors of a training or an evaluation mean, and what to do next."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+from .metrics import ErrorStatistics
+
+MAX_GOOD_RATIO = 0.7
+"""Largest ratio of an error of the model to that of skinning alone at which the model clearly beats it."""
+MIN_SKINNING_ERROR_MM = 0.01
+"""With a smaller mean error, skinning alone is the rig, and a model brings nothing."""
+MIN_RISE_RATIO = 1.05
+"""Ratio of the last to the smallest error in unseen poses from which the error counts as rising."""
+MIN_OVERFIT_RATIO = 3.0
+"""Ratio of the errors in unseen and in seen poses from which the model needs more poses."""
+MAX_UNNOTICED_RATIO = 0.3
+"""Ratio of percentile 99.9 of the model to that of skinning alone up to which a model is good however well it fits."""
+LAST_EPOCHS = 5
+"""Number of epochs whose mean is the last error; single epochs vary."""
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What errors mean.
+
+    Attributes:
+        sentence: the errors, compared with skinning alone.
+        warnings: what is wrong, each with its remedy; empty for a good result.
+        next_step: what to do next; empty if there are warnings.
+    """
+
+    sentence: str
+    warnings: tuple[str, ...]
+    next_step: str
+
+    @property
+    def is_good(self) -> bool:
+        """Return whether there are no warnings."""
+        return not self.warnings
+
+
+def assess_training(report: Mapping) -> Assessment:
+    """Assess a training.
+
+    Args:
+        report: the content of `report.json`, as `core.report.read_report` returns it.
+    """
+    model, skinning = (_statistics(report[method]["held_out"]) for method in ("fdda", "linear"))
+    warnings = []
+    if skinning.mean < MIN_SKINNING_ERROR_MM:
+        warnings.append("Skinning alone already equals the rig, so a model brings nothing here.")
+    elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
+        warnings.append(
+            "The model is hardly closer than skinning alone: set Rotation Limits, raise Random Poses, and record again."
+        )
+    elif tail := _unimproved_tail(model, skinning):
+        warnings.append(f"{tail}: press Add Poses at Worst Errors, then Continue Training.")
+    if overfit := _describe_overfitting(report, _ratio(model.p999, skinning.p999)):
+        warnings.append(f"{overfit}: the model needs more poses. Raise Random Poses or check more actions, and record.")
+    next_step = "" if warnings else "Next: bind the model, then compare it with the rig on an action."
+    return Assessment(f"Unseen poses: {describe_errors(model, skinning)}", tuple(warnings), next_step)
+
+
+def assess_evaluation(model: ErrorStatistics, skinning: ErrorStatistics, is_bound: bool = True) -> Assessment:
+    """Assess the comparison of a model with its rig.
+
+    Args:
+        model, skinning: errors of the model and of skinning alone, over all vertices and poses.
+        is_bound: whether the compared model is still bound.
+    """
+    warnings = []
+    if not is_bound:
+        warnings.append("Another model is bound now: press Evaluate again.")
+    elif skinning.mean < MIN_SKINNING_ERROR_MM:
+        warnings.append(
+            "Skinning alone already equals the rig in these poses, so they do not show what the model does."
+        )
+    elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
+        warnings.append(
+            "The model is hardly closer than skinning alone: these poses are unlike the recorded ones. Check this "
+            "action in Training Poses, record and train again."
+        )
+    elif tail := _unimproved_tail(model, skinning):
+        warnings.append(
+            f"{tail}: click a worst frame and open Confidence in This Pose. Below 100 %, widen the limits; else press "
+            "Add Poses at Worst Errors."
+        )
+    next_step = "" if warnings else "Next: play the action, and look at the worst frames."
+    return Assessment(describe_errors(model, skinning), tuple(warnings), next_step)
+
+
+def describe_errors(model: ErrorStatistics, skinning: ErrorStatistics) -> str:
+    """Return a sentence that compares the errors of a model with those of skinning alone."""
+    comparison = f"skinning alone {format_mm(skinning.mean)} mm"
+    if model.mean > 0 and skinning.mean > model.mean:
+        comparison = (
+            f"{_format_factor(skinning.mean / model.mean)}x closer than skinning alone ({format_mm(skinning.mean)} mm)"
+        )
+    return (
+        f"{format_mm(model.mean)} mm from the rig on average, {comparison}; at most {format_mm(model.max)} mm, "
+        f"skinning alone {format_mm(skinning.max)} mm."
+    )
+
+
+def rising_from_epoch(partitions: Sequence[Mapping]) -> int:
+    """Return the epoch from which the error in unseen poses rises until the end of a training; 0 if it does not.
+
+    Args:
+        partitions: the partitions of a report: "vertices", and "curve" with the rms error "validation" after each
+            epoch, mm. The partitions are weighted by their vertices.
+    """
+    errors = _mean_curve(partitions, "validation")
+    if len(errors) < 4 * LAST_EPOCHS:
+        return 0
+    best_epoch = errors.index(min(errors)) + 1
+    is_early = best_epoch <= len(errors) - 2 * LAST_EPOCHS
+    return best_epoch if is_early and _last(errors) > MIN_RISE_RATIO * min(errors) else 0
+
+
+def _describe_overfitting(report: Mapping, tail_ratio: float) -> str:
+    """Return a sentence without its end about errors in unseen poses that stay behind; empty if there is nothing."""
+    partitions = report["partitions"]
+    if epoch := rising_from_epoch(partitions):
+        return f"The error in unseen poses rises from pass {epoch} on"
+    seen, unseen = (_last(_mean_curve(partitions, name)) for name in ("training", "validation"))
+    if tail_ratio > MAX_UNNOTICED_RATIO and unseen > MIN_OVERFIT_RATIO * seen > 0:
+        return f"The error in unseen poses is {_format_factor(unseen / seen)} times that in seen poses"
+    return ""
+
+
+def _mean_curve(partitions: Sequence[Mapping], name: str) -> list[float]:
+    """Return the rms over the trained partitions of a curve, mm by epoch, weighted by their vertices."""
+    partitions = [partition for partition in partitions if partition["curve"][name]]
+    count = min((len(partition["curve"][name]) for partition in partitions), default=0)
+    vertex_count = sum(partition["vertices"] for partition in partitions)
+    squares = [
+        sum(partition["vertices"] * partition["curve"][name][epoch] ** 2 for partition in partitions)
+        for epoch in range(count)
+    ]
+    return [math.sqrt(square / vertex_count) for square in squares]
+
+
+def _last(errors: Sequence[float]) -> float:
+    """Return the mean of the last errors; 0 without errors."""
+    last = errors[-LAST_EPOCHS:]
+    return sum(last) / len(last) if last else 0.0
+
+
+def _statistics(values: Mapping) -> ErrorStatistics:
+    return ErrorStatistics(**{field.name: values[field.name] for field in fields(ErrorStatistics)})
+
+
+def format_mm(value: float) -> str:
+    """Return an error with the digits that matter: "0.024", "0.24", "2.4", "24"."""
+    if value < 0.1:
+        return f"{value:.3f}"
+    if value < 1:
+        return f"{value:.2f}"
+    return f"{value:.1f}" if value < 100 else f"{value:,.0f}"
+
+
+def _unimproved_tail(model: ErrorStatistics, skinning: ErrorStatistics) -> str:
+    """Return a sentence without its end about largest errors that hardly beat skinning alone; empty if all beat it."""
+    for label, name in (("99.9 % of the points are within", "p999"), ("The largest error is", "max")):
+        model_mm, skinning_mm = getattr(model, name), getattr(skinning, name)
+        if _ratio(model_mm, skinning_mm) > MAX_GOOD_RATIO:
+            return f"{label} {format_mm(model_mm)} mm, which hardly beats skinning alone ({format_mm(skinning_mm)} mm)"
+    return ""
+
+
+def _ratio(model_mm: float, skinning_mm: float) -> float:
+    return model_mm / skinning_mm if skinning_mm > 0 else math.inf
+
+
+def _format_factor(factor: float) -> str:
+    return f"{factor:.1f}" if factor < 10 else f"{factor:.0f}"

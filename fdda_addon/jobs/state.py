@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The state of a running or ended job, which panels draw."""
+
+import time
+from dataclasses import dataclass, field
+
+from ..core.progress import Progress
+from .plan import JobPlan
+
+CHARACTER, ENVIRONMENT = "character", "environment"
+"""Kinds of jobs. A job on a character ends when another file is opened. A job on the training environment uses no data
+of Blender and continues."""
+STAGE_UNITS = {
+    "fit": "vertices fitted",
+    "probes": "poses compared with the rig",
+    "target": "poses of the target checked",
+    "epochs": "training passes",
+    "repeatability": "poses repeated",
+    "evaluation": "poses compared",
+    "benchmark": "measurements",
+}
+"""Labels of the steps of a stage, where they differ from the name of the stage."""
+PREPARING_STAGES = {"influences", "starting", "partitions prepared", "poses to fit", "fit", "target", "probes"}
+"""Stages that are always followed by another stage of the same job."""
+
+
+@dataclass
+class JobState:
+    """State of a running or ended job, for panels.
+
+    Attributes:
+        verb: name of the job in the operator's bl_idname ("record").
+        title: label of the job ("Recording").
+        subject: session_uid of its object, 0 for none.
+        works_on: `CHARACTER` or `ENVIRONMENT`.
+        can_cancel: whether it can be canceled.
+        changes_scene: whether the job changes the scene and restores it.
+        is_running: whether it is running.
+        cancel_requested: whether the user has requested cancellation.
+        current_object: name of the object that the job works on now; empty for a job on one object.
+        plan: the steps of a job that has several; None for others.
+        stage, done, total: progress. If the number of steps is unknown, total is 0 and done counts seconds.
+        started, ended: times of `time.monotonic`, seconds.
+        outcome: message at the end of the job; empty while it runs.
+        outcome_level: 'INFO', 'WARNING' (canceled) or 'ERROR'.
+        warnings: messages about the recording.
+        curves: error after each epoch, mm, by name ("training", "validation"); empty for other jobs.
+    """
+
+    verb: str
+    title: str
+    subject: int = 0
+    changes_scene: bool = False
+    works_on: str = CHARACTER
+    can_cancel: bool = True
+    is_running: bool = True
+    cancel_requested: bool = False
+    current_object: str = ""
+    plan: JobPlan | None = None
+    stage: str = ""
+    done: int = 0
+    total: int = 0
+    started: float = field(default_factory=time.monotonic)
+    ended: float = 0.0
+    outcome: str = ""
+    outcome_level: str = "INFO"
+    warnings: list[str] = field(default_factory=list)
+    curves: dict[str, list[float]] = field(default_factory=dict)
+    _stage_start: tuple[float, int] = (0.0, 0)
+    _shown_fraction: float = 0.0
+
+    @property
+    def fraction(self) -> float:
+        """Return the completed ratio of the job, 0 to 1: by time if it has a plan, else of its only stage."""
+        if self.plan is None:
+            return self.done / self.total if self.total else 0.0
+        remaining, elapsed = self.remaining_seconds, time.monotonic() - self.started
+        if remaining is not None and elapsed > 0:
+            # Estimates change, but a bar should not go back.
+            self._shown_fraction = max(self._shown_fraction, elapsed / (elapsed + remaining))
+        return self._shown_fraction
+
+    @property
+    def remaining_seconds(self) -> float | None:
+        """Return the estimated remaining time of the job; None if it is unknown."""
+        if not self.is_running:
+            return None
+        stage_start, first_done = self._stage_start
+        if self.total and self.done > first_done:
+            seconds_per_step = (time.monotonic() - stage_start) / (self.done - first_done)
+            stage_seconds = seconds_per_step * (self.total - self.done)
+        elif self.plan is not None and self.plan.current.seconds is not None:
+            seconds_per_step = None
+            stage_seconds = max(1.0, self.plan.current.seconds - (time.monotonic() - (stage_start or self.started)))
+        else:
+            return None
+        later_seconds = self.plan.later_seconds(seconds_per_step) if self.plan is not None else 0.0
+        return None if later_seconds is None else stage_seconds + later_seconds
+
+    @property
+    def sentence(self) -> str:
+        """Return the progress as text: "212 of 1,000 poses", or "Step 2 of 5: recording (212 of 1,000)"."""
+        stage, separator, mesh_part = self.stage.partition(" of '")
+        unit = STAGE_UNITS.get(stage, stage) + separator + mesh_part
+        if self.plan is not None:
+            count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
+            text = f"{self.plan.heading}{separator}{mesh_part}" + (f" ({count})" if self.stage else "")
+        elif not self.stage:
+            text = "Starting…"
+        elif not self.total:
+            text = f"{unit[:1].upper()}{unit[1:]}: {self.done} s"
+        else:
+            text = f"{self.done:,} of {self.total:,} {unit}"
+        return f"{self.current_object}: {text}" if self.current_object else text
+
+    @property
+    def remaining_text(self) -> str:
+        """Return the remaining time as text: "About 5 min left"; "…" while it is unknown."""
+        if self.is_finishing:
+            return "Finishing…"
+        seconds_left = self.remaining_seconds
+        return "…" if seconds_left is None else f"About {format_duration(seconds_left)} left"
+
+    @property
+    def is_finishing(self) -> bool:
+        """Return whether the last stage is complete."""
+        is_last = self.plan is None or self.plan.is_last
+        return is_last and 0 < self.total == self.done and self.stage.partition(" of '")[0] not in PREPARING_STAGES
+
+    def begin_object(self, name: str) -> None:
+        """Reset the progress and the curves, because the job begins with another object."""
+        self.current_object, self.stage, self.done, self.total = name, "", 0, 0
+        self.curves.clear()
+
+    def show(self, progress: Progress) -> None:
+        """Update the progress."""
+        if progress.stage != self.stage:
+            self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
+            if self.plan is not None:
+                self.plan.enter(progress.stage.partition(" of '")[0])
+        self.done, self.total = progress.done, progress.total
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration as text: "40 s", "5 min", "2 h 10 min"."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"

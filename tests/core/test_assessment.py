@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is said about the errors of a training or an evaluation.
+
+The reports in `reports/` are those of the sample arm with 1,476 vertices, trained for 120 epochs on 20 and on 400
+poses, without the keys that an assessment does not read.
+"""
+
+import copy
+import json
+from pathlib import Path
+
+import pytest
+
+from fdda_addon.core.assessment import assess_evaluation, assess_training, format_mm, rising_from_epoch
+from fdda_addon.core.metrics import ErrorStatistics
+
+REPORTS = Path(__file__).with_name("reports")
+
+
+def read(name: str) -> dict:
+    return json.loads((REPORTS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def statistics(mean: float, p999: float, largest: float) -> ErrorStatistics:
+    return ErrorStatistics(mean, mean, p999, p999, largest)
+
+
+def test_a_good_training_is_called_good_with_the_next_step():
+    assessment = assess_training(read("arm_400_poses"))
+    assert assessment.is_good and assessment.next_step.startswith("Next: bind the model")
+    assert assessment.sentence == (
+        "Unseen poses: 0.032 mm from the rig on average, 78x closer than skinning alone (2.5 mm); at most 2.3 mm, "
+        "skinning alone 30.6 mm."
+    )
+
+
+def test_too_few_poses_are_named_with_the_remedy():
+    assessment = assess_training(read("arm_20_poses"))
+    assert not assessment.is_good and assessment.next_step == ""
+    assert assessment.warnings == (
+        "The error in unseen poses is 24 times that in seen poses: the model needs more poses. Raise Random Poses or "
+        "check more actions, and record.",
+    )
+
+
+def test_a_rising_error_in_unseen_poses_is_named_with_its_pass():
+    report = read("arm_400_poses")
+    for partition in report["partitions"]:
+        curve = partition["curve"]["validation"]
+        # From pass 20 on, each pass is 1 % worse than the one before.
+        partition["curve"]["validation"] = [
+            error if epoch < 20 else curve[19] * 1.01 ** (epoch - 19) for epoch, error in enumerate(curve)
+        ]
+    assert rising_from_epoch(report["partitions"]) == 20
+    assert assess_training(report).warnings[0].startswith("The error in unseen poses rises from pass 20 on")
+    # A rise by less than 5 % is noise.
+    for partition in report["partitions"]:
+        curve = partition["curve"]["validation"]
+        curve[20:] = [curve[19] * 1.02] * len(curve[20:])
+    assert rising_from_epoch(report["partitions"]) == 0
+
+
+@pytest.mark.parametrize(
+    "errors, start",
+    [
+        ({"max": 30.0}, "The largest error is 30.0 mm, which hardly beats skinning alone (30.6 mm)"),
+        ({"p999": 20.0}, "99.9 % of the points are within 20.0 mm, which hardly beats skinning alone (26.1 mm)"),
+        ({"mean": 2.4}, "The model is hardly closer than skinning alone"),
+    ],
+)
+def test_errors_that_hardly_beat_skinning_are_named_with_a_remedy(errors, start):
+    report = copy.deepcopy(read("arm_400_poses"))
+    report["fdda"]["held_out"].update(errors)
+    warning = assess_training(report).warnings[0]
+    assert warning.startswith(start)
+    assert "Add Poses at Worst Errors" in warning or "record again" in warning
+
+
+def test_a_rig_that_is_skinning_alone_needs_no_model():
+    report = read("arm_400_poses")
+    report["linear"]["held_out"].update(mean=0.001)
+    assert assess_training(report).warnings[0].startswith("Skinning alone already equals the rig")
+
+
+def test_a_report_without_curves_is_assessed_by_its_errors():
+    report = read("arm_400_poses")
+    report["partitions"] = []
+    assert assess_training(report).is_good
+
+
+def test_an_evaluation_is_assessed_with_what_to_do_next():
+    skinning = statistics(2.0, 20.0, 25.0)
+    good = assess_evaluation(statistics(0.1, 1.0, 2.0), skinning)
+    assert good.is_good and good.sentence.startswith("0.10 mm from the rig on average, 20x closer")
+    assert good.next_step == "Next: play the action, and look at the worst frames."
+    beyond = assess_evaluation(statistics(0.1, 1.0, 24.0), skinning)
+    assert "open Confidence in This Pose" in beyond.warnings[0] and beyond.next_step == ""
+    unlike = assess_evaluation(statistics(1.9, 19.0, 24.0), skinning)
+    assert unlike.warnings[0].startswith("The model is hardly closer than skinning alone: these poses are unlike")
+    other = assess_evaluation(statistics(0.1, 1.0, 2.0), skinning, is_bound=False)
+    assert other.warnings == ("Another model is bound now: press Evaluate again.",)
+    still = assess_evaluation(statistics(0.0, 0.0, 0.0), statistics(0.0, 0.0, 0.0))
+    assert still.warnings[0].startswith("Skinning alone already equals the rig") and "inf" not in still.sentence
+
+
+@pytest.mark.parametrize(
+    "value, text", [(0, "0.000"), (0.0243, "0.024"), (0.5, "0.50"), (7.53, "7.5"), (44.27, "44.3"), (31643.7, "31,644")]
+)
+def test_millimeters_have_the_digits_that_matter(value, text):
+    assert format_mm(value) == text
