@@ -3,9 +3,11 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
-from .metrics import ErrorStatistics
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from .metrics import ErrorStatistics
 
 MAX_GOOD_RATIO = 0.7
 """Largest ratio of an error of the model to that of skinning alone at which the model clearly beats it."""
@@ -19,6 +21,14 @@ MAX_UNNOTICED_RATIO = 0.3
 """Ratio of percentile 99.9 of the model to that of skinning alone up to which a model is good however well it fits."""
 LAST_EPOCHS = 5
 """Number of epochs whose mean is the last error; single epochs vary."""
+
+
+class HeldOutErrors(NamedTuple):
+    """Errors of a report, mm, with the names of `ErrorStatistics`."""
+
+    mean: float
+    p999: float
+    max: float
 
 
 @dataclass(frozen=True)
@@ -47,7 +57,7 @@ def assess_training(report: Mapping) -> Assessment:
     Args:
         report: the content of `report.json`, as `core.report.read_report` returns it.
     """
-    model, skinning = (_statistics(report[method]["held_out"]) for method in ("fdda", "linear"))
+    model, skinning = (_held_out_errors(report, method) for method in ("fdda", "linear"))
     warnings = []
     if skinning.mean < MIN_SKINNING_ERROR_MM:
         warnings.append("Skinning alone already equals the rig, so a model brings nothing here.")
@@ -63,7 +73,9 @@ def assess_training(report: Mapping) -> Assessment:
     return Assessment(f"Unseen poses: {describe_errors(model, skinning)}", tuple(warnings), next_step)
 
 
-def assess_evaluation(model: ErrorStatistics, skinning: ErrorStatistics, is_bound: bool = True) -> Assessment:
+def assess_evaluation(
+    model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors", is_bound: bool = True
+) -> Assessment:
     """Assess the comparison of a model with its rig.
 
     Args:
@@ -91,7 +103,7 @@ def assess_evaluation(model: ErrorStatistics, skinning: ErrorStatistics, is_boun
     return Assessment(describe_errors(model, skinning), tuple(warnings), next_step)
 
 
-def describe_errors(model: ErrorStatistics, skinning: ErrorStatistics) -> str:
+def describe_errors(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:
     """Return a sentence that compares the errors of a model with those of skinning alone."""
     comparison = f"skinning alone {format_mm(skinning.mean)} mm"
     if model.mean > 0 and skinning.mean > model.mean:
@@ -148,8 +160,10 @@ def _last(errors: Sequence[float]) -> float:
     return sum(last) / len(last) if last else 0.0
 
 
-def _statistics(values: Mapping) -> ErrorStatistics:
-    return ErrorStatistics(**{field.name: values[field.name] for field in fields(ErrorStatistics)})
+def _held_out_errors(report: Mapping, method: str) -> HeldOutErrors:
+    """Return the errors of a method, "fdda" or "linear", in unseen poses."""
+    values = report[method]["held_out"]
+    return HeldOutErrors(values["mean"], values["p999"], values["max"])
 
 
 def format_mm(value: float) -> str:
@@ -161,7 +175,7 @@ def format_mm(value: float) -> str:
     return f"{value:.1f}" if value < 100 else f"{value:,.0f}"
 
 
-def _unimproved_tail(model: ErrorStatistics, skinning: ErrorStatistics) -> str:
+def _unimproved_tail(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:
     """Return a sentence without its end about largest errors that hardly beat skinning alone; empty if all beat it."""
     for label, name in (("99.9 % of the points are within", "p999"), ("The largest error is", "max")):
         model_mm, skinning_mm = getattr(model, name), getattr(skinning, name)

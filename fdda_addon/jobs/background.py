@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 
 import bpy
 
-from .job import ENVIRONMENT, JobRunner, JobState, current, redraw
+from .job import JobRunner, current, redraw
+from .state import ENVIRONMENT, JobState
 
 TICK_SECONDS, TICK_WORK_SECONDS = 0.2, 0.02
 THREAD_JOIN_SECONDS = 10.0

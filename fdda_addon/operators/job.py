@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import bpy
 
 from ..core.errors import FDDAError
-from ..jobs.job import JobRunner, JobState, current, redraw, request_cancel, stop, unregister
+from ..jobs.job import JobRunner, current, redraw, request_cancel, stop, unregister
+from ..jobs.state import JobState
 
 TICK_BUDGET, MAX_BUDGET = 0.03, 0.2
 """Shortest and longest time that a job may work in one tick, seconds. A tick does not interrupt a step.

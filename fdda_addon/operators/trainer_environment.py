@@ -14,7 +14,8 @@ from bpy.props import StringProperty
 from ..core.errors import FDDAError, TrainerEnvironmentError
 from ..core.progress import Progress
 from ..jobs.background import iterate_in_thread, run_in_background, unregister
-from ..jobs.job import ENVIRONMENT, JobRunner, JobState, current, request_cancel
+from ..jobs.job import JobRunner, current, request_cancel
+from ..jobs.state import ENVIRONMENT, JobState
 from ..properties.preferences import wheels_folder
 from ..training.environment import choice, folder, session
 from ..training.environment.check_result import CheckResult

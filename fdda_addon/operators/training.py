@@ -69,6 +69,7 @@ class TrainingOperator(RigOperator):
         return training_steps(len(mesh_object.vertex_groups), len(mesh.vertices), pose_count, epochs)
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
+        from ..models.former_model import keep_former_model
         from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
         from ..training.process import Training
 
@@ -76,6 +77,7 @@ class TrainingOperator(RigOperator):
             return AttachedTraining(model)
         _check_recording(recording)
         _make_folder(model)
+        keep_former_model(model)
         settings = mesh_object.fdda.settings
         arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
         arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
@@ -104,12 +106,15 @@ class TrainingOperator(RigOperator):
 
     def add_trained_models_to_list(self) -> None:
         """Add the trained models to the Model Library of their meshes."""
+        from ..models.former_model import add_former_model
         from ..models.model_list import add_model
 
         self.changes_file = bool(self.trained_models)
         for uid, model in self.trained_models:
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
             if mesh_object is not None:
+                add_former_model(mesh_object, model)
+                # The last one that is added is the active one.
                 add_model(mesh_object, model)
 
     def on_failure(self) -> None:

@@ -3,6 +3,7 @@
 
 import bpy
 
+from ..core.assessment import assess_evaluation
 from ..evaluation import last_evaluation, markers, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..jobs import job
@@ -25,6 +26,11 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
     def is_done(cls, context: bpy.types.Context) -> bool:
         rig = panel_rig(context)[0]
         return rig is not None and last_evaluation.get(rig.mesh_object) is not None
+
+    @classmethod
+    def has_warning(cls, context: bpy.types.Context) -> bool:
+        last = last_evaluation.get(panel_rig(context)[0].mesh_object)
+        return not assess_evaluation(last.total["fdda"], last.total["linear"]).is_good
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, view = self.enabled_layout(), context.window_manager.fdda_view
@@ -104,15 +110,18 @@ def _draw_statistics(
     if body is None:
         return
     draw_wrapped(body, context, f"{last.model} on {poses_text}")
-    if bound != last.model:
-        draw_wrapped(body, context, f"{last.model} is no longer the bound model; evaluate again.", "INFO")
     table = body.column(align=True)
     _draw_table_row(table, "", [label for label, _ in STATISTICS])
     for label, method in (("Model", "fdda"), ("Skinning", "linear")):
         _draw_table_row(table, label, [_format_mm(getattr(last.total[method], name)) for _, name in STATISTICS])
+    assessment = assess_evaluation(last.total["fdda"], last.total["linear"], bound == last.model)
+    draw_wrapped(body, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
+    for sentence in (*assessment.warnings, assessment.next_step):
+        if sentence:
+            draw_wrapped(body, context, sentence, "BLANK1")
     body.separator()
     row = body.row()
-    row.label(text="Body parts, worst first")
+    row.label(text="Worst Body Parts")
     if len(last.partitions) > SHOWN_PARTITIONS:
         row.prop(view, "show_partitions", text="All", toggle=True)
     active = active_bone_name(context, rig)

@@ -87,51 +87,63 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
         _draw_folder(layout, context, rig)
         draw_job(layout, context, "record", ("ERROR",))
         if (advanced := draw_advanced(layout, "fdda_recording_advanced")) is not None:
-            advanced.prop(rig.mesh_object.fdda.settings, "min_partition_vertices")
+            _draw_settings(advanced, context, rig.mesh_object.fdda.settings)
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    """Draw the folder, the button of the next step, and below it the state of the recording."""
     from ..core.recording.folder import FolderState
 
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording", default_recording(rig.mesh_object))
-    _draw_settings(layout, context, settings)
     folder_content = read_content(rig)
     if isinstance(folder_content, str):
+        _draw_record(layout, context, "Record", False)
         draw_wrapped(layout, context, folder_content, "ERROR")
         return
     path, content = folder_content
     check = checks.last_check(rig)
     can_record = check is not None and not check.problems
-    if check is not None and check.problems:
-        draw_wrapped(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
-    if content.state is FolderState.FREE:
-        draw_wrapped(layout, context, f"{_describe_poses(rig)} will go into '{path.name}'.")
-        _draw_record(layout, context, "Record", can_record)
+    if content.state is FolderState.COMPLETE:
+        row = layout.row()
+        row.scale_y = 1.3
+        draw_button(row, context, "fdda.train", "Train", "PLAY")
+        draw_wrapped(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
     elif content.state is FolderState.INCOMPLETE:
+        _draw_record(layout, context, "Resume", can_record, resume=True)
         text = f"{content.complete:,} of {content.poses:,} poses recorded. Press Resume to continue."
         draw_wrapped(layout, context, text, "INFO")
-        _draw_record(layout, context, "Resume", can_record, resume=True)
-    elif content.state is FolderState.COMPLETE:
-        draw_wrapped(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
-        for sentence in content.measured_sentences:
-            draw_wrapped(layout, context, sentence)
-        if content.sentence:
-            draw_wrapped(layout, context, content.sentence, "INFO")
     else:
-        draw_wrapped(layout, context, content.sentence, "ERROR")
+        is_free = content.state is FolderState.FREE
+        _draw_record(layout, context, "Record", can_record and is_free)
+        if is_free:
+            draw_wrapped(layout, context, f"{_describe_poses(rig)} will go into '{path.name}'.")
+    if check is not None and check.problems:
+        draw_wrapped(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
+    if settings.target:
+        draw_wrapped(layout, context, f"It learns from '{settings.target}' (Advanced).", "INFO")
+    for sentence in content.measured_sentences:
+        draw_wrapped(layout, context, sentence)
+    if content.sentence:
+        draw_wrapped(layout, context, content.sentence, "INFO" if content.state is FolderState.COMPLETE else "ERROR")
     if content.is_recording:
         layout.operator("fdda.delete_recording", text="Delete Recording…", icon="TRASH").object = rig.mesh_object.name
 
 
-def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
-    column = layout.column()
-    column.use_property_split, column.use_property_decorate = True, False
-    column.prop_search(settings, "target", context.scene, "objects", icon="OUTLINER_OB_MESH")
+def _draw_settings(column: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
+    # The labels are above the fields, because a narrow sidebar would cut them off beside the fields.
+    for name in ("target", "fit_linear"):
+        field = column.column(align=True)
+        field.use_property_split = False
+        field.label(text=settings.bl_rna.properties[name].name)
+        if name == "target":
+            field.prop_search(settings, name, context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
+        else:
+            field.prop(settings, name, text="")
     if settings.target:
         column.prop(settings, "pre_roll")
         column.prop(settings, "max_settle_frames")
-    column.prop(settings, "fit_linear")
+    column.prop(settings, "min_partition_vertices")
 
 
 def _draw_record(

@@ -53,8 +53,12 @@ def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, r
         if not count:
             draw_wrapped(column, context, "Select bones in Pose Mode, then press the button.", "INFO")
         column.operator("fdda.use_selected_bones", icon="RESTRICT_SELECT_OFF").object = rig.mesh_object.name
+
+
+def draw_channel_counts(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    """Draw how many bones and extra inputs random poses move."""
     check = checks.last_check(rig)
-    if check is not None and check.channels and (settings.sample != "WEIGHTS" or check.rig.controls):
+    if check is not None and check.channels:
         draw_wrapped(layout, context, describe_channels(check))
 
 

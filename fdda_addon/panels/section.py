@@ -43,9 +43,14 @@ class Section:
         """Return whether the step of this section is done, so that its header shows a check mark."""
         return False
 
+    @classmethod
+    def has_warning(cls, _context: bpy.types.Context) -> bool:
+        """Return whether the result of the step has a warning, which its header then shows instead of the mark."""
+        return False
+
     def draw_header_preset(self, context: bpy.types.Context) -> None:
         if self.is_done(context):
-            self.layout.label(text="", icon="CHECKMARK")
+            self.layout.label(text="", icon="ERROR" if self.has_warning(context) else "CHECKMARK")
         self.layout.operator("fdda.help", text="", icon="QUESTION", emboss=False).section = self.bl_label
 
 

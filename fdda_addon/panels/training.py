@@ -6,11 +6,13 @@ from pathlib import Path
 
 import bpy
 
+from ..core.assessment import Assessment, assess_training
 from ..core.errors import TrainingError
 from ..core.report import Verdict, checkpoint_path, read_report, report_path
 from ..jobs import job
 from ..properties.character import default_model
 from ..properties.preferences import MODULE, preferences
+from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
@@ -40,6 +42,13 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         trained = find_trained_file(rig)
         return trained is not None and not trained.mismatch
 
+    @classmethod
+    def has_warning(cls, context: bpy.types.Context) -> bool:
+        rig = panel_rig(context)[0]
+        trained = find_trained_file(rig) if rig is not None else None
+        assessment = _assessment(trained.path) if trained is not None else None
+        return assessment is not None and not assessment.is_good
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
         running_job = job.current()
@@ -66,10 +75,14 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         if state is not None and state.subject == rig.mesh_object.session_uid:
             curves.draw(layout, state.curves)
         if trained is not None and not trained.mismatch:
+            _draw_assessment(layout, context, trained.path)
+            _draw_next_buttons(layout, context, rig, trained, can_train)
             _draw_report(layout, context, rig, trained.path)
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
-            advanced.prop(rig.mesh_object.fdda.settings, "tolerance_mm")
-            advanced.prop(rig.mesh_object.fdda.settings, "training_seed")
+            settings = rig.mesh_object.fdda.settings
+            for name in ("epochs", "tolerance_mm", "training_seed"):
+                advanced.prop(settings, name)
+            draw_path(advanced, settings, "model", default_model(rig.mesh_object))
 
 
 def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
@@ -109,27 +122,32 @@ def _draw_settings(
     goal = row.row()
     goal.active = settings.use_goal
     goal.prop(settings, "goal_mm", text="")
-    column.prop(settings, "epochs")
-    draw_path(layout, settings, "model", default_model(rig.mesh_object))
     content = read_content(rig)
+    is_recorded = not isinstance(content, str) and content[1].state is FolderState.COMPLETE
+    row = layout.row()
+    row.enabled = can_train and is_recorded
+    row.scale_y = 1.3
+    draw_button(row, context, "fdda.train", "Train" if trained is None else "Train Again", "PLAY")
     if isinstance(content, str):
         draw_wrapped(layout, context, content, "ERROR")
-        can_train = False
-    elif content[1].state is not FolderState.COMPLETE:
+    elif not is_recorded:
         draw_wrapped(layout, context, "This rig has no complete recording yet; record first.", "INFO")
-        can_train = False
     if trained is not None and trained.mismatch:
         text = f"{trained.path.name} belongs to another rig: {trained.mismatch}. Train asks before it overwrites it."
         draw_wrapped(layout, context, text, "ERROR")
     elif trained is not None:
-        draw_wrapped(layout, context, f"{trained.path.name} exists; Train will overwrite it.", "CHECKMARK")
-    row = layout.row()
-    row.enabled = can_train
-    row.scale_y = 1.3
-    draw_button(row, context, "fdda.train", "Train" if trained is None else "Train Again", "PLAY")
-    if trained is None or trained.mismatch:
-        return
-    # Buttons that improve the model, in the order of their use.
+        draw_wrapped(layout, context, f"{trained.path.name} exists; Train Again keeps it as the previous model.")
+
+
+def _draw_next_buttons(
+    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile, can_train: bool
+) -> None:
+    """Draw the buttons that follow a training: the model is bound, or improved."""
+    if not rig.mesh_object.fdda.is_bound:
+        row = layout.row()
+        row.scale_y = 1.3
+        bind = row.operator("fdda.bind", text=f"Bind '{trained.path.name}'", icon="LINKED")
+        bind.object, bind.filepath = rig.mesh_object.name, str(trained.path)
     improve = layout.column(align=True)
     improve.enabled = can_train
     improve.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
@@ -137,23 +155,37 @@ def _draw_settings(
         improve.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
     else:
         draw_wrapped(layout, context, "Its checkpoint is missing, so training cannot continue from it.", "INFO")
-    if not rig.mesh_object.fdda.is_bound:
-        bind = layout.operator("fdda.bind", text=f"Bind '{trained.path.name}'", icon="LINKED")
-        bind.object, bind.filepath = rig.mesh_object.name, str(trained.path)
+
+
+def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, model: Path) -> None:
+    """Draw what the errors of the training mean, and what to do next."""
+    report = _read_report(report_path(model))
+    if report is None or report["model"] != model.name:
+        return
+    assessment = _assessment(model)
+    box = layout.box()
+    draw_wrapped(box, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
+    if goal := report.get("goal"):
+        draw_wrapped(box, context, *_describe_goal(goal))
+    for warning in assessment.warnings:
+        draw_wrapped(box, context, warning, "BLANK1")
+    for warning in report.get("warnings", ()):
+        draw_wrapped(box, context, f"Warning: {warning['name']}; see the training report.", "INFO")
+    if assessment.next_step:
+        draw_wrapped(box, context, assessment.next_step, "BLANK1")
+
+
+@draw_cached
+def _assessment(model: Path) -> Assessment | None:
+    """Return what the report of a model means; None without a report."""
+    report = _read_report(report_path(model))
+    return assess_training(report) if report is not None and report["model"] == model.name else None
 
 
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
     report = _read_report(report_path(model))
     if report is None or report["model"] != model.name:
         return
-    if goal := report.get("goal"):
-        draw_wrapped(layout, context, *_describe_goal(goal))
-    for warning in report.get("warnings", ()):
-        draw_wrapped(layout, context, f"Warning: {warning['name']}; see the training report.", "INFO")
-    model_mm, skinning_mm = (report[method]["held_out"] for method in ("fdda", "linear"))
-    text = f"Unseen poses: mean {model_mm['mean']:.2f} mm (skinning alone {skinning_mm['mean']:.2f}), max "
-    draw_wrapped(layout, context, f"{text}{model_mm['max']:.1f} ({skinning_mm['max']:.1f})")
-    draw_wrapped(layout, context, f"99.9 % of points within {model_mm['p999']:.2f} mm")
     header, body = layout.panel("fdda_held_out", default_closed=True)
     header.label(text="Error by Body Part")
     if body is None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 
-from ..jobs.job import ENVIRONMENT, JobState, current
+from ..jobs.job import current
+from ..jobs.state import ENVIRONMENT, JobState
 from ..scene import folder_trust
 from ..training.environment import choice, session
 from ..training.environment.check_result import CheckResult

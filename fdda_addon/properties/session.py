@@ -32,6 +32,20 @@ def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
         undo.push_undo_soon("Preview Pose")
 
 
+def _active_bone_index(_session: "FDDA_PG_session") -> int:
+    """Return the index of the bone that is active in the viewport; -1 without one."""
+    rig = cached_active_rig(bpy.context)
+    active_bone = rig.armature_object.data.bones.active if rig is not None else None
+    return rig.armature_object.pose.bones.find(active_bone.name) if active_bone is not None else -1
+
+
+def _set_active_bone(_session: "FDDA_PG_session", index: int) -> None:
+    """Make a bone active in the viewport."""
+    rig = cached_active_rig(bpy.context)
+    if rig is not None and 0 <= index < len(rig.armature_object.pose.bones):
+        rig.armature_object.data.bones.active = rig.armature_object.pose.bones[index].bone
+
+
 @not_animatable
 class FDDA_PG_session(bpy.types.PropertyGroup):
     """State of the sidebar: the shown mesh, the active entries of lists, and the previewed pose."""
@@ -53,7 +67,9 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
         get=lambda session: session.pose_index + 1,
         set=_show_random_pose,
     )
-    bone_index: IntProperty(name="Bone")
+    bone_index: IntProperty(
+        name="Bone", description="Active bone of the armature", get=_active_bone_index, set=_set_active_bone
+    )
     action_index: IntProperty(name="Action")
     show_all_partitions: BoolProperty(
         name="Show All", description="List all body parts of the model, not only the worst"

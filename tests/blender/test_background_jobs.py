@@ -13,7 +13,8 @@ from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.progress import Progress
 from fdda_addon.jobs import background
 from fdda_addon.jobs.background import iterate_in_thread, run_in_background
-from fdda_addon.jobs.job import CHARACTER, ENVIRONMENT, JobRunner, JobState, current, request_cancel, state_of
+from fdda_addon.jobs.job import JobRunner, current, request_cancel, state_of
+from fdda_addon.jobs.state import CHARACTER, ENVIRONMENT, JobState
 
 
 class ControlledWork:

@@ -9,8 +9,9 @@ import pytest
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.progress import Progress
 from fdda_addon.jobs import job
-from fdda_addon.jobs.job import JobRunner, JobState
+from fdda_addon.jobs.job import JobRunner
 from fdda_addon.jobs.plan import JobPlan, recording_steps, training_steps
+from fdda_addon.jobs.state import JobState
 from fdda_addon.operators.job import JobOperator
 
 events: list[str] = []

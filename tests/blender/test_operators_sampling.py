@@ -11,7 +11,7 @@ from blend_fixtures.characters import control_rigs, controls
 from fdda_addon.core.poses import CONTROL, LOCATION, ROTATION
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.panels import checks
-from fdda_addon.panels.poses import sampled_channels_by_bone
+from fdda_addon.panels.limits import sampled_channels_by_bone
 from fdda_addon.panels.recording import cached_content
 from fdda_addon.panels.sampling import describe_channels
 from fdda_addon.properties.character import recording_folder

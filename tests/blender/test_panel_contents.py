@@ -11,8 +11,8 @@ import pytest
 
 from fdda_addon.core.recording.folder import FolderState
 from fdda_addon.jobs import job
-from fdda_addon.jobs.job import JobRunner, JobState
-from fdda_addon.jobs.state import format_duration
+from fdda_addon.jobs.job import JobRunner
+from fdda_addon.jobs.state import JobState, format_duration
 from fdda_addon.panels import checks, curves, playback
 from fdda_addon.panels.recording import cached_content
 from fdda_addon.panels.section import panel_rig

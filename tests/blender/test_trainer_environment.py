@@ -12,7 +12,8 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import TrainerEnvironmentError
-from fdda_addon.jobs.job import ENVIRONMENT, JobRunner, current, state_of, stop
+from fdda_addon.jobs.job import JobRunner, current, state_of, stop
+from fdda_addon.jobs.state import ENVIRONMENT
 from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, start_job
 from fdda_addon.training.environment import choice, creation, folder, session
 from fdda_addon.training.environment.choice import Origin

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Keeps the model that a training replaces, so that a worse model can be replaced by the former one."""
+
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import FDDAError, OutputError, os_error_text
+from ..core.model import read_model_info
+from ..core.output import atomic_write
+from ..core.report import page_path, report_path
+from .model_list import add_model
+
+FORMER_FOLDER = "previous"
+"""Name of the folder beside a model that holds the former model with its report."""
+
+
+def former_model_path(model: Path) -> Path:
+    """Return the path at which the former model of a model file is kept."""
+    return model.parent / FORMER_FOLDER / model.name
+
+
+def keep_former_model(model: Path) -> None:
+    """Copy a model and its report, which a training will replace; do nothing if the file is missing or no model.
+
+    Raises:
+        OutputError: a file cannot be copied.
+    """
+    try:
+        read_model_info(model)
+    except FDDAError:
+        return
+    former_model = former_model_path(model)
+    try:
+        former_model.parent.mkdir(exist_ok=True)
+        for path in (model, report_path(model), page_path(model)):
+            if path.is_file():
+                with atomic_write(former_model.parent / path.name) as temporary_path:
+                    temporary_path.write_bytes(path.read_bytes())
+    except OSError as error:
+        raise OutputError(
+            f"Cannot keep the former model in '{former_model.parent}': {os_error_text(error)}; make space, or choose "
+            "another file under Model."
+        ) from error
+
+
+def add_former_model(mesh_object: bpy.types.Object, model: Path) -> None:
+    """Add the former model of a model file to the Model Library of a mesh object, if there is one."""
+    former_model = former_model_path(model)
+    if former_model.is_file():
+        count = len(mesh_object.fdda.models)
+        entry = add_model(mesh_object, former_model)
+        if len(mesh_object.fdda.models) > count:
+            entry.name = f"{model.stem} (previous)"
