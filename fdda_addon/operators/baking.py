@@ -36,6 +36,16 @@ class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
         description="Write one shape key per frame to the .blend file, instead of a .pc2 file next to it",
         options={"SKIP_SAVE"},
     )
+    point_cache: bpy.props.BoolProperty(
+        name="Point Cache",
+        description="Suggest a .pc2 file instead of a .blend file",
+        options={"SKIP_SAVE", "HIDDEN"},
+    )
+    use_frames: bpy.props.BoolProperty(
+        name="Frame Range", description="Bake these frames instead of all of the action", options={"SKIP_SAVE"}
+    )
+    frame_start: bpy.props.IntProperty(name="Start", description="First frame", default=1, options={"SKIP_SAVE"})
+    frame_end: bpy.props.IntProperty(name="End", description="Last frame", default=250, options={"SKIP_SAVE"})
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -50,7 +60,7 @@ class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         file = Path(bpy.data.filepath).stem or "character"
-        self.filepath = bpy.path.abspath(f"//{file}_{name}_baked.blend")
+        self.filepath = bpy.path.abspath(f"//{file}_{name}_baked{'.pc2' if self.point_cache else '.blend'}")
         self._is_confirming = True
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
@@ -58,11 +68,12 @@ class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
     execute = ConfirmFirst.execute
 
     def confirmed_properties(self) -> dict[str, object]:
-        return {name: getattr(self, name) for name in ("object", "filepath", "action", "shape_keys")}
+        names = ("object", "filepath", "action", "shape_keys", "use_frames", "frame_start", "frame_end")
+        return {name: getattr(self, name) for name in names}
 
     def draw(self, _context: bpy.types.Context) -> None:
-        self.layout.prop_search(self, "action", bpy.data, "actions")
-        self.layout.prop(self, "shape_keys")
+        # The sidebar has the fields; the file browser would list them again.
+        pass
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         from ..baking.run import BakeSettings, bake
@@ -72,7 +83,8 @@ class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
         if not self.filepath:
             raise OutputError("No file was chosen; give the name of a .pc2 or .blend file.")
         strength = 0.0 if scene_rig.mesh_object.fdda.mode == "LINEAR" else None
-        settings = BakeSettings(self.action, shape_keys=self.shape_keys, strength=strength)
+        frames = (self.frame_start, self.frame_end) if self.use_frames else None
+        settings = BakeSettings(self.action, frames, self.shape_keys, strength=strength)
         out = Path(bpy.path.abspath(self.filepath))
         yield from bake(scene_rig, network_of(scene_rig.mesh_object), out, settings)
 

@@ -5,7 +5,6 @@ Invoked in a window, an operator iterates the job at each tick of a timer. In th
 runs the job to its end.
 """
 
-import functools
 import time
 from collections.abc import Iterator
 
@@ -195,7 +194,8 @@ class JobOperator:
         if text is None or self.changes_scene:
             context.workspace.status_text_set(text)
         else:
-            context.workspace.status_text_set(functools.partial(_draw_status, text))
+            # Blender accepts a function, but no other callable object.
+            context.workspace.status_text_set(lambda header, _context: _draw_status(header.layout, text))
         self._status_text = text
 
     def _end_modal(self, context: bpy.types.Context) -> None:
@@ -205,9 +205,8 @@ class JobOperator:
             self._set_status_text(context, None)
 
 
-def _draw_status(text: str, header: bpy.types.Header, _context: bpy.types.Context) -> None:
+def _draw_status(layout: bpy.types.UILayout, text: str) -> None:
     """Draw the status bar as Blender does, with a text before its information at the right."""
-    layout = header.layout
     layout.template_input_status()
     layout.separator_spacer()
     layout.template_reports_banner()

@@ -53,7 +53,7 @@ class FDDA_OT_remove_trusted_folder(_FolderOperator, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         folders = preferences().folders
         if self.index >= len(folders):
-            self.report({"ERROR"}, f"There are {len(folders)} trusted folders and none with index {self.index}.")
+            self.report({"ERROR"}, f"No trusted folder has the index {self.index}; the list has {len(folders)}.")
             return {"CANCELLED"}
         folders.remove(self.index)
         context.preferences.is_dirty = True

@@ -74,11 +74,29 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
 
     rank: bpy.props.IntProperty(name="Rank", description="1 is the worst, 2 the next", default=1, min=1, max=50)
 
+    zoom: bpy.props.BoolProperty(
+        name="Zoom to Vertex", description="Look at the vertex with the largest error", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        if properties.zoom:
+            return "Go to this frame or random pose, and look at the vertex with the largest error"
+        return cls.bl_description
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.has_evaluation(context)
 
     def apply(self, context: bpy.types.Context) -> str:
+        message = self._show_pose(context)
+        if self.zoom:
+            scene_rig, last, poses = self.worst_poses(context, self.rank)
+            _look_at_vertex(scene_rig.mesh_object, int(last.errors["fdda"][poses[-1][0]].argmax()))
+        return message
+
+    def _show_pose(self, context: bpy.types.Context) -> str:
+        """Show the pose and return the message to report."""
         scene_rig, last, poses = self.worst_poses(context, self.rank)
         index, error_mm = poses[-1]
         if last.name:
@@ -90,6 +108,16 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
         context.view_layer.update()
         context.window_manager.fdda_view.pose = index
         return f"Random pose {index + 1}: max error {error_mm:.2f} mm."
+
+
+def _look_at_vertex(mesh_object: bpy.types.Object, index: int) -> None:
+    """Look at a vertex of a mesh object in all viewports, from as near as a tenth of the object."""
+    from ..scene.viewport import center_views
+
+    evaluated_object = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    # Modifiers that add vertices, such as a subdivision, keep the first ones.
+    position = evaluated_object.matrix_world @ evaluated_object.data.vertices[index].co
+    center_views(position, max(max(evaluated_object.dimensions) / 20, 1e-4))
 
 
 CLASSES = (FDDA_OT_add_worst_markers, FDDA_OT_remove_markers, FDDA_OT_jump_to_worst)

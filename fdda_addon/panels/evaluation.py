@@ -198,8 +198,10 @@ def _draw_worst(
     column = body.column(align=True)
     for rank, (index, error_mm) in enumerate(_worst_poses(last, view.markers), 1):
         pose_label = f"Frame {last.first_frame + index}" if last.name else f"Pose {index + 1}"
-        button = column.operator("fdda.jump_to_worst", text=f"{pose_label}: {error_mm:.2f} mm")
-        button.rank = rank
+        row = column.row(align=True)
+        row.operator("fdda.jump_to_worst", text=f"{pose_label}: {error_mm:.2f} mm").rank = rank
+        zoom_button = row.operator("fdda.jump_to_worst", text="", icon="ZOOM_SELECTED")
+        zoom_button.rank, zoom_button.zoom = rank, True
     if not last.name:
         return
     body.prop(view, "graph")

@@ -13,7 +13,7 @@ from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
 from ..timing import frame_times
 from .bone_names import short_bone_name
-from .section import Section, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
 from .timed_value import TimedValue
 from .trained_file import find_trained_file
 
@@ -73,6 +73,8 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             self._draw_confidence(context, mesh_object)
             self._draw_bake(context)
         draw_button(layout, context, "fdda.unbind", "Unbind", "UNLINKED")
+        if not mesh_object.fdda.status and (advanced := draw_advanced(layout, "fdda_model_advanced")) is not None:
+            _draw_mask(advanced, mesh_object)
 
     def _draw_unbound(self, context: bpy.types.Context, rig: SceneRig) -> None:
         mesh_object = rig.mesh_object
@@ -112,47 +114,37 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
                 properties.mode, properties.all_meshes = mode, True
         else:
             row.prop(binding, "mode", expand=True)
+        _draw_speed(layout, context, mesh_object)
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         strength = column.row()
         strength.enabled = binding.mode == "FDDA"
         strength.prop(binding, "strength", slider=True)
-        mask = column.row(align=True)
-        mask.enabled = binding.mode == "FDDA"
-        mask.prop_search(binding, "mask", mesh_object, "vertex_groups")
-        invert = mask.row(align=True)
-        invert.active = bool(binding.mask)
-        invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
+        column.prop(binding, "use_in_render")
         if text := mask_problem(mesh_object):
             draw_wrapped(layout, context, text, "ERROR")
-        column.prop(binding, "use_in_render")
 
     def _draw_times(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-        layout = self.enabled_layout()
-        header, body = layout.panel("fdda_frame_times", default_closed=False)
+        times = frame_times.get(mesh_object)
+        if times is None:
+            return
+        header, body = self.layout.panel("fdda_frame_times", default_closed=True)
         header.label(text="Speed")
         if body is None:
             return
-        state = job.state_of("measure_model")
-        if state is not None and state.outcome_level != "INFO":
-            draw_job(body, context, "measure_model")
-        times = frame_times.get(mesh_object)
-        if times is not None:
-            grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-            for label, value in (
-                ("Rig", f"{times.rig:.2f} ms"),
-                ("Armature Only", f"{times.linear:.2f} ms"),
-                ("Model", f"{times.fdda:.2f} ms"),
-                ("   Blender", f"{times.floor:.2f} ms"),
-                ("   Network", f"{times.inference:.2f} ms"),
-                *((("   Memory", f"{times.constant_bytes / 1e6:.1f} MB"),) if times.constant_bytes else ()),
-            ):
-                grid.label(text=label)
-                number = grid.row()
-                number.alignment = "RIGHT"
-                number.label(text=value)
-            draw_wrapped(body, context, times.sentence, "INFO" if times.fdda < times.rig else "ERROR")
-        body.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
+        grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
+        for label, value in (
+            ("Rig", f"{times.rig:.2f} ms"),
+            ("Armature Only", f"{times.linear:.2f} ms"),
+            ("Model", f"{times.fdda:.2f} ms"),
+            ("   Blender", f"{times.floor:.2f} ms"),
+            ("   Network", f"{times.inference:.2f} ms"),
+            *((("   Memory", f"{times.constant_bytes / 1e6:.1f} MB"),) if times.constant_bytes else ()),
+        ):
+            grid.label(text=label)
+            number = grid.row()
+            number.alignment = "RIGHT"
+            number.label(text=value)
 
     def _draw_confidence(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         # While the sub-panel is closed the model is not evaluated.
@@ -182,8 +174,48 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             column.label(text=f"and {len(partitions_beyond_range) - MAX_SHOWN_PARTITIONS} more")
 
     def _draw_bake(self, context: bpy.types.Context) -> None:
-        if not draw_job(self.layout, context, "bake"):
-            self.layout.operator("fdda.bake", text="Bake…", icon="EXPORT")
+        header, body = self.layout.panel("fdda_bake", default_closed=True)
+        header.label(text="Bake")
+        if body is None or draw_job(body, context, "bake"):
+            return
+        session = context.window_manager.fdda
+        column = body.column()
+        column.prop(session, "bake_format", text="")
+        column.prop(session, "bake_action", text="", icon="ACTION", placeholder="Animation of the Scene")
+        column.prop(session, "bake_use_frames")
+        row = column.row(align=True)
+        row.active = session.bake_use_frames
+        row.prop(session, "bake_start")
+        row.prop(session, "bake_end")
+        button = body.operator("fdda.bake", text="Bake…", icon="EXPORT")
+        button.action, button.use_frames = session.bake_action, session.bake_use_frames
+        button.frame_start, button.frame_end = session.bake_start, session.bake_end
+        button.shape_keys, button.point_cache = session.bake_format == "KEYS", session.bake_format == "PC2"
+
+
+def _draw_speed(layout: bpy.types.UILayout, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
+    """Draw the times of a frame with rig and model below the switch between them, and the button that measures them."""
+    times, state = frame_times.get(mesh_object), job.state_of("measure_model")
+    row = layout.row(align=True)
+    if times is not None:
+        row.label(text=f"{times.rig:.2f} → {times.fdda:.2f} ms per frame", icon="TIME")
+        row.operator("fdda.measure_model", text="", icon="FILE_REFRESH")
+        draw_wrapped(layout, context, times.sentence, "CHECKMARK" if times.is_worthwhile else "INFO")
+    else:
+        row.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
+    if state is not None and (state.is_running or state.outcome_level != "INFO"):
+        draw_job(layout, context, "measure_model")
+
+
+def _draw_mask(column: bpy.types.UILayout, mesh_object: bpy.types.Object) -> None:
+    """Draw the vertex group that limits the model."""
+    binding = mesh_object.fdda
+    mask = column.row(align=True)
+    mask.enabled = binding.mode == "FDDA"
+    mask.prop_search(binding, "mask", mesh_object, "vertex_groups")
+    invert = mask.row(align=True)
+    invert.active = bool(binding.mask)
+    invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
 
 
 CLASSES = (FDDA_PT_playback,)

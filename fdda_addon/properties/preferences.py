@@ -63,19 +63,25 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
 
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
-        draw_models(layout, self)
-        layout.separator()
-        layout.use_property_split = True
-        layout.use_property_decorate = False
         layout.label(text="Training needs PyTorch, in a Python of its own. Everything else works without it.")
         draw_own_environment(layout, self)
-        layout.separator()
-        layout.prop(
-            self, "trainer_python", text="Existing Python (optional)", placeholder="The training environment above"
-        )
-        if not self.trainer_python and (named := os.environ.get(choice.PYTHON_VARIABLE)):
-            draw_lines(layout, f"{choice.PYTHON_VARIABLE} is set: {named}", "INFO")
         draw_check(layout)
+        layout.separator()
+        draw_models(layout, self)
+        header, body = layout.panel("fdda_preferences_advanced", default_closed=True)
+        header.label(text="Offline and Existing Python")
+        if body is not None:
+            draw_python_options(body, self)
+
+
+def draw_python_options(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
+    """Draw where packages are installed from, the folder of the environment, and a Python to use instead of it."""
+    layout.use_property_split, layout.use_property_decorate = True, False
+    layout.prop(settings, "wheels_folder", placeholder="None: install from the internet")
+    layout.prop(
+        settings, "trainer_python", text="Existing Python (optional)", placeholder="The training environment above"
+    )
+    draw_lines(layout, f"Folder: {environment_folder()}")
 
 
 def draw_models(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
@@ -132,7 +138,8 @@ def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferenc
     value_part.label(
         text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.INCOMPLETE, FolderState.BROKEN) else "NONE"
     )
-    layout.prop(settings, "wheels_folder", placeholder="None: install from the internet")
+    if not settings.trainer_python and (named := os.environ.get(choice.PYTHON_VARIABLE)):
+        draw_lines(layout, f"{choice.PYTHON_VARIABLE} is set: {named}", "INFO")
     if (job := current(ENVIRONMENT)) is not None:
         draw_job(layout, job)
     else:
@@ -150,7 +157,6 @@ def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferenc
         if reason:
             draw_lines(layout, f"{reason}.", "INFO")
         draw_check_result(layout, session.notice)
-    draw_lines(layout, f"Folder: {environment_folder()}")
 
 
 def _split_row(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import RigError
+from ..scene.active_rig import cached_active_rig
 from ..scene.scene_rig import SceneRig
 from .character import FDDA_PG_character, fit_kind
 
@@ -130,6 +131,12 @@ def planned_pose_count(scene_rig: SceneRig) -> int:
     settings = scene_rig.mesh_object.fdda.settings
     frames = sum(len(action_frames(bpy.data.actions[name])) for name in recorded_actions(scene_rig.armature_object))
     return settings.poses + frames * (2 if settings.mirror else 1)
+
+
+def actions_of_active_rig(context: bpy.types.Context) -> list[str]:
+    """Return the names of the actions that move a bone of the rig that the sidebar shows."""
+    rig = cached_active_rig(context)
+    return [a.name for a in bpy.data.actions if rig is not None and action_moves_bones(a, rig.armature_object)]
 
 
 def action_moves_bones(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:

@@ -8,7 +8,7 @@ from ..core.defaults import EVALUATION_SEED, MARKERS, SIDEBAR_EVALUATION_POSES
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
 from ..scene.viewport import redraw_views
-from .recording_options import action_moves_bones
+from .recording_options import actions_of_active_rig
 
 
 def _redraw(_view: "FDDA_PG_view", _context: bpy.types.Context) -> None:
@@ -43,11 +43,6 @@ def _set_active_action(_view: "FDDA_PG_view", name: str) -> None:
     undo.push_undo_soon("Choose Action")
 
 
-def _actions_of_rig(_view: "FDDA_PG_view", context: bpy.types.Context, _text: str) -> list[str]:
-    rig = cached_active_rig(context)
-    return [a.name for a in bpy.data.actions if rig is not None and action_moves_bones(a, rig.armature_object)]
-
-
 class FDDA_PG_view(bpy.types.PropertyGroup):
     """Settings of the evaluation, of the colors in the viewport, and of the markers and graph in the timeline."""
 
@@ -65,7 +60,7 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
         description="Active action of the armature; the model is compared with the rig in all of its frames",
         get=_active_action,
         set=_set_active_action,
-        search=_actions_of_rig,
+        search=lambda _view, context, _text: actions_of_active_rig(context),
     )
     poses: IntProperty(
         name="Poses", description="Number of random poses", default=SIDEBAR_EVALUATION_POSES, min=1, soft_max=1000

@@ -29,10 +29,19 @@ def frame_objects(objects: Iterable[bpy.types.Object]) -> None:
         Vector([min_or_max(axis) for axis in zip(*corners, strict=True)]) for min_or_max in (min, max)
     )
     radius = max((high_corner - low_corner).length / 2, 1e-6)
+    center_views((low_corner + high_corner) / 2, radius)
+
+
+def center_views(center: Vector, radius: float) -> None:
+    """Look at a sphere in all 3D viewports of the file, without changing the view direction; works without a window.
+
+    Args:
+        center, radius: of the sphere, world space.
+    """
     for screen in bpy.data.screens:
         for space in (area.spaces.active for area in screen.areas if area.type == "VIEW_3D"):
             if space.region_3d.view_perspective == "CAMERA":
                 space.region_3d.view_perspective = "PERSP"
-            space.region_3d.view_location = (low_corner + high_corner) / 2
+            space.region_3d.view_location = center
             space.region_3d.view_distance = VIEW_DISTANCE_RADII * radius * max(1.0, space.lens / DEFAULT_LENS_MM)
             space.clip_start = min(space.clip_start, radius / 10)

@@ -32,8 +32,10 @@ from ..scene.scene_rig import SceneRig, armature_modifier
 from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose
 from .frame_times import FrameTimes, compare_times
 
-ROUNDS = 5
-"""Number of rounds. Each round measures all variants, one after the other."""
+ROUNDS, MAX_ROUNDS = 5, 15
+"""Smallest and largest number of rounds. Each round measures all variants, one after the other."""
+MAX_RATIO_SPREAD = 0.1
+"""Spread of the ratio of two times (`ratio_spread`) at which no further round is measured."""
 WARM_UP_FRAMES = 3
 """Number of frames before each measurement that are not timed."""
 RANDOM_POSE_COUNT, KEY_STEP_FRAMES = 20, 5
@@ -53,6 +55,7 @@ class Benchmark:
         floor: times as for `fdda`, without running the model.
         inference: times of one run of the model for one pose, outside of Blender's evaluation.
         constant_bytes: size of the constants of the model's graph, which each frame reads; 0 if unknown.
+        ratios: ratio of the median times of rig and model in each round.
     """
 
     vertices: int
@@ -63,6 +66,7 @@ class Benchmark:
     floor: list[float]
     inference: list[float]
     constant_bytes: int
+    ratios: list[float]
 
     def frame_times(self, model: str) -> FrameTimes:
         """Return the median times.
@@ -74,12 +78,19 @@ class Benchmark:
             **{variant: float(np.median(times)) for variant, times in self._times_by_variant().items()},
             constant_bytes=self.constant_bytes,
             model=model,
+            ratio_low=self.ratio_range[0],
+            ratio_high=self.ratio_range[1],
         )
 
     @property
     def ratio(self) -> float:
         """Return how many times faster a frame is with the model than with the rig."""
         return float(np.median(self.rig) / np.median(self.fdda))
+
+    @property
+    def ratio_range(self) -> tuple[float, float]:
+        """Return the smallest and the largest ratio of a round."""
+        return min(self.ratios), max(self.ratios)
 
     def to_json(self) -> dict:
         """Return the times as JSON, described in docs/formats.md."""
@@ -116,7 +127,7 @@ class Benchmark:
             lines.append(f"  {labels[variant]:<31}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
         if self.constant_bytes:
             lines.append(f"  {'model data read per frame, MB':<31}{self.constant_bytes / 1e6:>10.2f}")
-        lines.append(f"  {compare_times(float(np.median(self.rig)), float(np.median(self.fdda)))}")
+        lines.append(f"  {compare_times(*map(float, map(np.median, (self.rig, self.fdda))), self.ratio_range)}")
         return "\n".join(lines)
 
 
@@ -154,13 +165,18 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         }
         times: dict[str, list[float]] = {variant: [] for variant in show_variant}
         frames_per_round = max(1, -(-frames // ROUNDS))
-        step_count, total_steps = 0, ROUNDS * len(show_variant)
-        for round_index in range(ROUNDS):
-            for variant, show in show_variant.items():
+        ratios: list[float] = []
+        while len(ratios) < ROUNDS or (len(ratios) < MAX_ROUNDS and ratio_spread(ratios) > MAX_RATIO_SPREAD):
+            medians: dict[str, float] = {}
+            round_count = max(ROUNDS, len(ratios) + 1)
+            for number, (variant, show) in enumerate(show_variant.items(), 1):
                 with show(mesh_object):
-                    times[variant] += time_frames(animation_frames, round_index * frames_per_round, frames_per_round)
-                step_count += 1
-                yield Progress("benchmark", step_count, total_steps)
+                    round_times = time_frames(animation_frames, len(ratios) * frames_per_round, frames_per_round)
+                times[variant] += round_times
+                medians[variant] = float(np.median(round_times))
+                done = len(ratios) * len(show_variant) + number
+                yield Progress("benchmark", done, round_count * len(show_variant))
+            ratios.append(medians["rig"] / medians["fdda"])
         network = model_files.network_of(mesh_object)
         pose_matrices = network.info.rest_matrices[None]
         controls = np.zeros((1, len(network.info.controls)), np.float32)
@@ -168,11 +184,18 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         inference = _time_calls(calls)[WARM_UP_FRAMES:]
     yield Benchmark(
         len(mesh_object.data.vertices),
-        frames_per_round * ROUNDS,
+        frames_per_round * len(ratios),
         **times,
         inference=inference,
         constant_bytes=network.info.constant_bytes,
+        ratios=ratios,
     )
+
+
+def ratio_spread(ratios: list[float]) -> float:
+    """Return the distance of the quartiles of measured ratios, relative to their median."""
+    low, middle, high = np.percentile(ratios, (25, 50, 75))
+    return float((high - low) / middle)
 
 
 @contextmanager

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 import bpy
 
+MIN_WORTHWHILE_RATIO = 1.5
+"""Smallest ratio of the frame times of rig and model at which a model is worth it."""
+
 _frame_times: dict[int, "FrameTimes"] = {}
 """Frame times, by the session ids of mesh objects."""
 
@@ -21,6 +24,7 @@ class FrameTimes:
         inference: time of one run of the model for one pose, outside of Blender's evaluation.
         constant_bytes: size of the constants of the model's graph, which each frame reads; 0 if unknown.
         model: path of the model, as its binding stores it.
+        ratio_low, ratio_high: smallest and largest ratio of the times of rig and model in a round of measurements.
     """
 
     rig: float
@@ -30,18 +34,34 @@ class FrameTimes:
     inference: float
     constant_bytes: int
     model: str
+    ratio_low: float = 0.0
+    ratio_high: float = 0.0
+
+    @property
+    def is_worthwhile(self) -> bool:
+        """Return whether the model is clearly faster than the rig."""
+        return self.rig >= MIN_WORTHWHILE_RATIO * self.fdda
 
     @property
     def sentence(self) -> str:
         """Return a sentence that compares rig and model."""
-        return compare_times(self.rig, self.fdda)
+        return compare_times(self.rig, self.fdda, (self.ratio_low, self.ratio_high))
 
 
-def compare_times(rig_ms: float, fdda_ms: float) -> str:
-    """Return a sentence that compares rig and model, given their milliseconds per frame."""
-    if fdda_ms >= rig_ms:
-        return "Not worth it here: this rig is faster than the model."
-    return f"{rig_ms / fdda_ms:.1f}x faster than the rig."
+def compare_times(rig_ms: float, fdda_ms: float, ratio_range: tuple[float, float] = (0.0, 0.0)) -> str:
+    """Return a sentence that compares rig and model.
+
+    Args:
+        rig_ms, fdda_ms: milliseconds per frame.
+        ratio_range: smallest and largest measured ratio of both; zeros for one measurement.
+    """
+    ratio, (low, high) = rig_ms / fdda_ms, ratio_range
+    spread = f" ({low:.1f} to {high:.1f} in repeated measurements)" if f"{low:.1f}" != f"{high:.1f}" else ""
+    if ratio >= MIN_WORTHWHILE_RATIO:
+        return f"{ratio:.1f}x faster than the rig{spread}."
+    if ratio > 1:
+        return f"Little difference: {ratio:.1f}x faster than the rig{spread}."
+    return f"Not worth it here: this rig is faster than the model{spread}."
 
 
 def store(mesh_object: bpy.types.Object, times: FrameTimes) -> None:

@@ -10,17 +10,18 @@ from ..core.progress import Progress
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
-from .benchmark import skinning_only, temporary_animation, time_frames
+from .benchmark import MAX_RATIO_SPREAD, ratio_spread, skinning_only, temporary_animation, time_frames
+from .frame_times import MIN_WORTHWHILE_RATIO
 
-ROUNDS = 4
-"""Number of rounds. Each round measures the rig and its Armature modifier alone, one after the other."""
+ROUNDS, MAX_ROUNDS = 4, 12
+"""Smallest and largest number of rounds. Each measures the rig and its Armature modifier alone, one after the other."""
 FRAMES_PER_ROUND = 5
 
 PLAYBACK_MS, PLAYBACK_MS_PER_VERTEX = 0.26, 4.7e-6
 """Coefficients of the line that fits the time of a frame with a model beyond that of the Armature modifier alone, ms.
 They are fitted to "Frame times" in docs/benchmarks.md (`make bench`)."""
-MIN_CLEAR_SPEEDUP = 1.3
-"""Smallest estimated ratio of the frame times of rig and model at which the model is called faster."""
+ESTIMATE_ERROR_MS = 0.2
+"""Largest difference between the line and the measured times."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,12 @@ class RigCost:
     def sentence(self) -> str:
         """Return a sentence that says whether a model would be faster than the rig."""
         speedup = self.rig / self.model
-        if speedup >= MIN_CLEAR_SPEEDUP:
-            return f"Worth it: about {speedup:.1f}x faster."
-        if speedup >= 1 / MIN_CLEAR_SPEEDUP:
-            return "Little difference: a model takes about as long as this rig."
-        return "Not worth it here: this rig is faster than a model."
+        if speedup >= MIN_WORTHWHILE_RATIO:
+            slow, fast = self.model + ESTIMATE_ERROR_MS, max(self.linear, self.model - ESTIMATE_ERROR_MS)
+            return f"Worth it: {self.rig / slow:.1f} to {self.rig / fast:.1f}x faster (estimate)."
+        if speedup >= 1 / MIN_WORTHWHILE_RATIO:
+            return "Little difference: a model takes about as long as this rig (estimate)."
+        return "Not worth it here: this rig is faster than a model (estimate)."
 
 
 def estimate_playback_ms(vertex_count: int) -> float:
@@ -74,11 +76,16 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
         check_evaluable(scene_rig)
         times: dict[str, list[float]] = {"rig": [], "linear": []}
         with temporary_animation(scene_rig) as frames:
-            for round_index in range(ROUNDS):
-                first_index = round_index * FRAMES_PER_ROUND
-                times["rig"] += time_frames(frames, first_index, FRAMES_PER_ROUND)
-                yield Progress("frames", 2 * round_index + 1, 2 * ROUNDS)
+            ratios: list[float] = []
+            while len(ratios) < ROUNDS or (len(ratios) < MAX_ROUNDS and ratio_spread(ratios) > MAX_RATIO_SPREAD):
+                first_index, done = len(ratios) * FRAMES_PER_ROUND, 2 * len(ratios)
+                total = 2 * max(ROUNDS, len(ratios) + 1)
+                rig_times = time_frames(frames, first_index, FRAMES_PER_ROUND)
+                yield Progress("frames", done + 1, total)
                 with skinning_only(mesh_object):
-                    times["linear"] += time_frames(frames, first_index, FRAMES_PER_ROUND)
-                yield Progress("frames", 2 * round_index + 2, 2 * ROUNDS)
+                    linear_times = time_frames(frames, first_index, FRAMES_PER_ROUND)
+                yield Progress("frames", done + 2, total)
+                ratios.append(float(np.median(rig_times) / np.median(linear_times)))
+                times["rig"] += rig_times
+                times["linear"] += linear_times
     yield RigCost(len(mesh_object.data.vertices), *(float(np.median(times[variant])) for variant in ("rig", "linear")))

@@ -108,8 +108,12 @@ def test_frame_times_include_downstream_modifiers(rig, elbow_files, monkeypatch)
     drain(benchmark.benchmark(rig, elbow_files.model, 5))
     drain(rig_cost.measure(rig))
     true, linear, model = ([*own, "Subdivision"] for own in (["Armature", "CorrectiveSmooth"], ["Armature"], ["FDDA"]))
-    rounds = benchmark.ROUNDS
-    assert seen == [true, linear, model, model] * rounds + [true, linear] * rig_cost.ROUNDS
+    # More rounds follow while the times vary.
+    rounds = next(index for index in range(0, len(seen), 4) if seen[index + 2 : index + 3] != [model]) // 4
+    rig_rounds = (len(seen) - 4 * rounds) // 2
+    assert seen == [true, linear, model, model] * rounds + [true, linear] * rig_rounds
+    assert benchmark.ROUNDS <= rounds <= benchmark.MAX_ROUNDS
+    assert rig_cost.ROUNDS <= rig_rounds <= rig_cost.MAX_ROUNDS
     assert_same_state(before, scene_state(rig))
 
 

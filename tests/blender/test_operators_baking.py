@@ -57,6 +57,14 @@ class TestOperator:
         assert (bpy.context.scene.frame_start, bpy.context.scene.frame_end) == (1, 30)
         assert not bpy.data.texts and not bpy.data.objects[ELBOW].fdda.models and model_bytes > 10_000
 
+    def test_a_range_of_frames_is_baked(self, active, wave, tmp_path):
+        options = {"use_frames": True, "frame_start": 5, "frame_end": 9}
+        assert bpy.ops.fdda.bake(filepath=str(tmp_path / "a.pc2"), action="elbow_wave", **options) == {"FINISHED"}
+        start, _, positions = read_pc2(tmp_path / "a.pc2")
+        assert start == 5 and np.abs(positions - wave[4:9]).max() < 1e-6
+        with pytest.raises(RuntimeError, match="There is nothing to bake from frame 9 to 5"):
+            bpy.ops.fdda.bake(filepath=str(tmp_path / "b.pc2"), use_frames=True, frame_start=9, frame_end=5)
+
     def test_a_wrong_path_action_or_binding_is_refused(self, active, tmp_path):
         refused(bpy.ops.fdda.bake, "No file was chosen; give the name of a .pc2 or .blend file.")
         refused(lambda: bpy.ops.fdda.bake(filepath=str(tmp_path / "a.txt")), "ends in neither .pc2 nor .blend")

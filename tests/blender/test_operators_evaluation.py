@@ -224,6 +224,17 @@ def test_a_missing_report_is_refused_with_its_path(active, elbow_files, monkeypa
         report.with_suffix(".away").rename(report)
 
 
+def test_the_view_goes_to_the_worst_vertex(active, evaluated_action):
+    bpy.ops.fdda.jump_to_worst(rank=1, zoom=True)
+    index, _ = evaluated_action.worst_poses(1)[0]
+    vertex = int(evaluated_action.errors["fdda"][index].argmax())
+    evaluated = active.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    expected = evaluated.matrix_world @ evaluated.data.vertices[vertex].co
+    views = [a.spaces.active.region_3d for s in bpy.data.screens for a in s.areas if a.type == "VIEW_3D"]
+    for view in views:
+        assert (view.view_location - expected).length < 1e-5
+
+
 def test_an_evaluation_and_its_colors_survive_opening_the_file_again(active, elbow_files, tmp_path):
     path = tmp_path / "shot.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))

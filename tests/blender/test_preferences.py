@@ -40,7 +40,7 @@ def test_a_trusted_folder_is_added_and_removed(preferences, tmp_path: Path):
         assert bpy.ops.fdda.add_trusted_folder(directory=str(tmp_path / name)) == {"FINISHED"}
     assert bpy.ops.fdda.remove_trusted_folder(index=0) == {"FINISHED"}
     assert trusted_folders() == [(tmp_path / "second").resolve()]
-    refused(lambda: bpy.ops.fdda.remove_trusted_folder(index=1), "There are 1 trusted folders and none with index 1")
+    refused(lambda: bpy.ops.fdda.remove_trusted_folder(index=1), "No trusted folder has the index 1; the list has 1.")
     refused(bpy.ops.fdda.add_trusted_folder, "No folder was chosen")
 
 
