@@ -27,6 +27,7 @@ VERBS = {
     "check-trainer": ("check_trainer", "check the Python that trains, and show its device"),
     "train": ("train", "train a model on a recording"),
     "bind": ("bind", "save a file in which a model replaces the modifiers of a rig"),
+    "fast-rig": ("fast_rig", "save a fast rig: the character without what its model and controls do not need"),
     "evaluate": ("evaluate", "compare a model with its rig on poses that are in no recording"),
     "benchmark": ("benchmark", "measure the time per frame of rig, linear skinning and model"),
     "farm": ("farm", "record, train and bind many characters on many machines"),

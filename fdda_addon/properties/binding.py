@@ -130,6 +130,10 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         name="Status", description="Why the model is switched off; empty when it is not", override=OVERRIDABLE
     )
 
+    # Not overridable: when a library is relocated to the full rig, nothing of the fast rig may remain.
+    is_fast_rig: BoolProperty(
+        name="Fast Rig", description="The armature lacks the bones that neither the model nor the controls need"
+    )
     is_playing: BoolProperty(
         description="The modifiers of the rig are off, and `modifiers` stores their former visibility",
         override=OVERRIDABLE,

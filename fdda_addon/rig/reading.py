@@ -119,10 +119,16 @@ def _check_rest_matrices(names: tuple[str, ...], rest_matrices: np.ndarray) -> N
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
     """Read a rig with the joints, controls and unit of a model, so that `core.model.check_rig` can compare them.
 
+    A fast rig lacks modifiers and bones of the rig that the model was trained for, so skin weights and deformation
+    count as those of the model.
+
     Raises:
         RigError: as `read_rig`.
     """
     rig = read_rig(scene_rig, info.joint_names)
+    if scene_rig.mesh_object.fdda.is_fast_rig:
+        skin_weights, deformation = info.fingerprint.skin_weights, info.fingerprint.deformation
+        rig = replace(rig, fingerprint=replace(rig.fingerprint, skin_weights=skin_weights, deformation=deformation))
     return replace(rig, controls=info.controls, metres_per_unit=info.metres_per_unit)
 
 

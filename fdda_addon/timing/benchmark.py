@@ -181,7 +181,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         pose_matrices = network.info.rest_matrices[None]
         controls = np.zeros((1, len(network.info.controls)), np.float32)
         calls = [lambda: network.positions(pose_matrices, controls)] * (frames + WARM_UP_FRAMES)
-        inference = _time_calls(calls)[WARM_UP_FRAMES:]
+        inference = time_calls(calls)[WARM_UP_FRAMES:]
     yield Benchmark(
         len(mesh_object.data.vertices),
         frames_per_round * len(ratios),
@@ -260,10 +260,10 @@ def time_frames(animation_frames: range, first_index: int, count: int) -> list[f
         return lambda: scene.frame_set(animation_frames[index % len(animation_frames)])
 
     calls = [make_call(first_index + offset) for offset in range(-WARM_UP_FRAMES, count)]
-    return _time_calls(calls)[WARM_UP_FRAMES:]
+    return time_calls(calls)[WARM_UP_FRAMES:]
 
 
-def _time_calls(calls: list[Callable[[], object]]) -> list[float]:
+def time_calls(calls: list[Callable[[], object]]) -> list[float]:
     """Time each call, in milliseconds."""
     times = []
     for call in calls:

@@ -18,5 +18,5 @@ class CommandOutput:
 
 def output_of(*arguments: object) -> CommandOutput:
     with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
-        assert run(*arguments) == 0
+        assert run(*arguments) == 0, err.getvalue()
     return CommandOutput(out.getvalue().splitlines(), err.getvalue().splitlines())

@@ -15,7 +15,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("panels",),
     ("operators",),
     ("properties",),
-    ("models", "baking"),
+    ("models", "baking", "fast_rig"),
     ("recording", "evaluation", "timing"),
     ("training", "runtime", "jobs"),
     ("rig",),

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`fast-rig RIG.blend MODEL.onnx OUT.blend`: saves a fast rig, without what the model and the controls do not need."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..fast_rig.run import FastRig
+
+MAX_LISTED = 10
+DEFAULT_CONTROLS = ("visible", "keyed")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    from .files import add_rig_options
+    from .outputs import add_overwrite_option
+
+    add_rig_options(parser)
+    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
+    parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, with the fast rig")
+    parser.add_argument(
+        "--controls",
+        nargs="+",
+        default=DEFAULT_CONTROLS,
+        metavar="CHOICE",
+        help="control bones to keep: visible, keyed (in an action of the file), collection:NAME of a bone collection "
+        "(default: visible keyed)",
+    )
+    parser.add_argument(
+        "--frames",
+        type=int,
+        default=60,
+        help="number of frames to time with each rig (default 60); 0 for none",
+    )
+    add_overwrite_option(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    from ..core.errors import WrongUsageError
+    from ..core.file_kind import BLEND
+    from ..core.output import check_outputs
+    from ..core.progress import Progress
+    from ..fast_rig.controls import check_choices
+    from ..fast_rig.frame_times import measure_frames
+    from ..fast_rig.run import make_fast_rig
+    from .folders import open_rigs
+    from .progress import ProgressPrinter
+
+    if options.frames < 0:
+        raise WrongUsageError("--frames must be 0 or more.")
+    check_choices(options.controls)
+    # The source is the full rig that renders need, so it is never overwritten.
+    check_outputs({options.out: BLEND}, (options.rig, options.model), options.overwrite)
+    _check_other_file(options.out, options.rig)
+    rigs_and_models = list(open_rigs(options).values())
+    object_name = rigs_and_models[0][0].mesh_object.name
+    times = None
+    with ProgressPrinter() as progress:
+        for step in make_fast_rig(rigs_and_models, options.out, tuple(options.controls)):
+            if isinstance(step, Progress):
+                progress.show(step.stage, step.done, step.total)
+        fast_rig = step
+        print(f"{options.out}: {_summary(fast_rig)}")
+        if options.frames:
+            controls, size = fast_rig.controls, fast_rig.size
+            for step in measure_frames(options.rig, options.out, object_name, controls, options.frames, size):
+                if isinstance(step, Progress):
+                    progress.show(step.stage, step.done, step.total)
+            times = step
+    if times is not None:
+        print(f"{options.out}: {times.sentence}")
+
+
+def _check_other_file(out: Path, rig: Path) -> None:
+    from ..core.errors import OutputError
+
+    if out.exists() and rig.exists() and out.samefile(rig):
+        raise OutputError(f"'{out}' is the full rig, which renders need; give the fast rig another name.")
+
+
+def _summary(fast_rig: "FastRig") -> str:
+    """Return what was removed and compared, a line each."""
+    lines = [
+        f"'{fast_rig.armature_name}' has {fast_rig.bones_after:,} of {fast_rig.bones_before:,} bones; the model reads "
+        f"{fast_rig.joints:,}, and {len(fast_rig.controls):,} are controls",
+        f"  removed {_count(fast_rig.removed_objects, 'object')}, {_count(fast_rig.removed_modifiers, 'modifier')} "
+        f"and {fast_rig.removed_drivers:,} driver{'s' * (fast_rig.removed_drivers != 1)}",
+        f"  the joints move as in the full rig in {fast_rig.pose_count} poses (largest difference "
+        f"{fast_rig.largest_difference:.1e} of the size)",
+    ]
+    for action, counts in fast_rig.lost_channels.items():
+        lines.append(
+            f"  '{action}': {sum(counts.values()):,} keyed channels have no bone any more: {_names(tuple(counts))}"
+        )
+    return "\n".join(lines)
+
+
+def _count(names: tuple[str, ...], noun: str) -> str:
+    plural = "s" if len(names) != 1 else ""
+    return f"{len(names):,} {noun}{plural}" + (f" ({_names(names)})" if names else "")
+
+
+def _names(names: tuple[str, ...]) -> str:
+    more = f" and {len(names) - MAX_LISTED:,} more" if len(names) > MAX_LISTED else ""
+    return ", ".join(f"'{name}'" for name in names[:MAX_LISTED]) + more

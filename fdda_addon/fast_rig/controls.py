@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Chooses the control bones that a fast rig keeps, and the actions that animate them."""
+
+from collections.abc import Iterable
+
+import bpy
+
+from ..core.errors import RigError, WrongUsageError
+from ..scene.compatibility import curves_of, is_bone_hidden
+from .driver_reader import bone_of_path
+
+VISIBLE, KEYED, COLLECTION = "visible", "keyed", "collection:"
+
+
+def check_choices(choices: Iterable[str]) -> None:
+    """Check the syntax of choices of control bones.
+
+    Raises:
+        WrongUsageError: a choice is none of `visible`, `keyed` and `collection:NAME`.
+    """
+    for choice in choices:
+        if choice not in {VISIBLE, KEYED} and not choice.startswith(COLLECTION):
+            raise WrongUsageError(
+                f"'{choice}' chooses no control bones; give {VISIBLE}, {KEYED} or {COLLECTION}NAME, a bone collection."
+            )
+
+
+def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> set[str]:
+    """Return the names of the chosen control bones.
+
+    Args:
+        armature_object: the armature object.
+        choices: each is `visible`, `keyed` (in an action of the file) or `collection:NAME`.
+
+    Raises:
+        WrongUsageError: as `check_choices`.
+        RigError: there is no bone collection of that name.
+    """
+    choices = list(choices)
+    check_choices(choices)
+    bones = armature_object.pose.bones
+    names: set[str] = set()
+    for choice in choices:
+        if choice == VISIBLE:
+            names |= {bone.name for bone in bones if not is_bone_hidden(bone)}
+        elif choice == KEYED:
+            actions = animating_actions(armature_object)
+            names |= {name for action in actions for name in keyed_bones(armature_object, action) if name in bones}
+        else:
+            collection_name = choice.removeprefix(COLLECTION)
+            collection = armature_object.data.collections_all.get(collection_name)
+            if collection is None:
+                known = ", ".join(f"'{c.name}'" for c in armature_object.data.collections_all) or "none"
+                raise RigError(
+                    f"'{armature_object.name}' has no bone collection '{collection_name}'; its collections: {known}."
+                )
+            names |= {bone.name for bone in collection.bones_recursive}
+    return names
+
+
+def animating_actions(armature_object: bpy.types.Object) -> list[bpy.types.Action]:
+    """Return the actions of the file that key bones of an armature, except those that only Action constraints play."""
+    constraints = (constraint for bone in armature_object.pose.bones for constraint in bone.constraints)
+    constraint_actions = {c.action for c in constraints if c.type == "ACTION" and c.action is not None}
+    animation = armature_object.animation_data
+    if animation is not None:
+        strips = (strip for track in animation.nla_tracks for strip in track.strips)
+        constraint_actions -= {animation.action, *(strip.action for strip in strips)}
+    bones = armature_object.pose.bones
+    return [
+        action
+        for action in bpy.data.actions
+        if action not in constraint_actions and any(name in bones for name in keyed_bones(armature_object, action))
+    ]
+
+
+def keyed_bones(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, int]:
+    """Return how many channels of each bone an action keys, by the name of the bone, which may be missing."""
+    counts: dict[str, int] = {}
+    for curve in curves_of(action, armature_object):
+        if curve.data_path.startswith("pose.bones[") and (name := bone_of_path(curve.data_path)):
+            counts[name] = counts.get(name, 0) + 1
+    return counts

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads what drivers need: the variables of every type, and the names in scripted expressions."""
+
+import re
+from collections.abc import Iterator
+
+import bpy
+
+from .bone_reader import bone_node, datablock_node, is_armature
+from .dependency_graph import DependencyGraph, Node
+
+_BONE_PATH = re.compile(r'(?:^|\.)bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]')
+_OBJECT_PATH = re.compile(r'objects\["(?P<name>(?:[^"\\]|\\.)*)"\]')
+_QUOTED_TEXT = re.compile(r"""(["'])(?P<text>(?:(?!\1).)+)\1""")
+_ELEMENT_INDEX = re.compile(r"\[\d+\]$")
+
+
+def drivers_of(datablock: bpy.types.ID) -> list[tuple[bpy.types.ID, bpy.types.FCurve]]:
+    """Return the drivers of a datablock and of its embedded node tree, each with its owner."""
+    owners = [datablock]
+    node_tree = getattr(datablock, "node_tree", None)
+    if isinstance(node_tree, bpy.types.NodeTree) and node_tree.is_embedded_data:
+        owners.append(node_tree)
+    # Some types of datablocks cannot be animated.
+    animations = [(owner, getattr(owner, "animation_data", None)) for owner in owners]
+    return [(owner, curve) for owner, animation in animations if animation for curve in animation.drivers]
+
+
+def driven_node(owner: bpy.types.ID, path: str) -> Node:
+    """Return the node of a driven property, given a path of it or of one of its elements."""
+    return Node(datablock_node(owner).datablock, driven_path=_ELEMENT_INDEX.sub("", path))
+
+
+def bone_of_path(path: str) -> str:
+    """Return the name of the bone in a path of an armature object or of an armature; empty for other paths."""
+    match = _BONE_PATH.search(path)
+    return bpy.utils.unescape_identifier(match["bone"]) if match else ""
+
+
+def add_drivers(graph: DependencyGraph, datablock: bpy.types.ID, optional_paths: tuple[str, ...] = ()) -> None:
+    """Add what the drivers of a datablock need, and what needs them.
+
+    A driver of a custom property is needed only where another driver reads the property.
+
+    Args:
+        graph: the graph.
+        datablock: the datablock.
+        optional_paths: prefixes of further paths whose drivers the datablock does not need.
+    """
+    for owner, curve in drivers_of(datablock):
+        path = curve.data_path
+        node = driven_node(owner, path)
+        graph.add(node, *driver_needs(curve.driver))
+        bone_name = bone_of_path(path)
+        if bone_name:
+            for armature_object in _armature_objects(datablock):
+                graph.add(bone_node(armature_object, bone_name), node)
+        elif not path.startswith(('["', *optional_paths)):
+            graph.add(datablock_node(datablock), node)
+
+
+def driver_needs(driver: bpy.types.Driver) -> Iterator[Node]:
+    """Yield the datablocks, bones and driven properties that a driver reads."""
+    for variable in driver.variables:
+        for target in variable.targets:
+            if variable.type == "CONTEXT_PROP":
+                yield from _path_needs(bpy.context.scene, target.data_path)
+            elif target.id is None:
+                continue
+            elif variable.type == "SINGLE_PROP":
+                yield datablock_node(target.id)
+                yield from _path_needs(target.id, target.data_path)
+            else:
+                yield datablock_node(target.id)
+                if is_armature(target.id) and target.bone_target:
+                    yield bone_node(target.id, target.bone_target)
+    if driver.type == "SCRIPTED":
+        yield from _expression_needs(driver.expression)
+
+
+def _path_needs(datablock: bpy.types.ID, path: str) -> Iterator[Node]:
+    """Yield the bone, the object and the driven property at a path of a datablock."""
+    yield driven_node(datablock, path)
+    if match := _OBJECT_PATH.search(path):
+        scene_object = bpy.data.objects.get(bpy.utils.unescape_identifier(match["name"]))
+        if scene_object is None:
+            return
+        yield datablock_node(scene_object)
+        datablock, path = scene_object, path[match.end() :].removeprefix(".")
+        yield driven_node(datablock, path)
+    if bone_name := bone_of_path(path):
+        yield from (bone_node(armature_object, bone_name) for armature_object in _armature_objects(datablock))
+
+
+def _expression_needs(expression: str) -> Iterator[Node]:
+    """Yield the objects and bones whose names are quoted in an expression, such as `bpy.data.objects["rig"]`."""
+    for match in _QUOTED_TEXT.finditer(expression):
+        name = match["text"]
+        if (scene_object := bpy.data.objects.get(name)) is not None:
+            yield datablock_node(scene_object)
+        for armature_object in bpy.data.objects:
+            if is_armature(armature_object) and name in armature_object.data.bones:
+                yield bone_node(armature_object, name)
+
+
+def _armature_objects(datablock: bpy.types.ID) -> list[bpy.types.Object]:
+    """Return the armature objects whose bones a path of a datablock names: itself, or the users of an armature."""
+    if isinstance(datablock, bpy.types.Armature):
+        return [o for o in bpy.data.objects if o.data == datablock]
+    return [datablock] if is_armature(datablock) else []

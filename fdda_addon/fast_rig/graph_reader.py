@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads the dependency graph of a file in which models play, and the objects that a fast rig shows."""
+
+from collections.abc import Iterable, Iterator
+
+import bpy
+
+from ..rig.sources import Sources
+from ..scene.compatibility import node_input
+from ..scene.scene_rig import SceneRig
+from ..scene.temporary_state import animated_paths
+from .bone_reader import add_bones, constraint_needs, datablock_node, deforming_bones, is_armature, pointer_needs
+from .dependency_graph import DependencyGraph, Node
+from .driver_reader import add_drivers
+
+_INVISIBLE_TYPES = {"ARMATURE", "LATTICE", "SPEAKER", "LIGHT_PROBE"}
+"""Types of objects that no render shows."""
+_CAGE_DISPLAY_TYPES = {"BOUNDS", "WIRE"}
+_UNFOLLOWED_TYPES = (bpy.types.Scene, bpy.types.WindowManager, bpy.types.Screen, bpy.types.WorkSpace)
+"""Datablocks that use all objects, and need none of them."""
+
+
+def read_graph(scene_rigs: list[SceneRig], replaced_modifiers: dict[str, set[str]]) -> DependencyGraph:
+    """Read the dependency graph of the open file.
+
+    Args:
+        scene_rigs: the rigs whose meshes models deform; they share one armature object.
+        replaced_modifiers: names of the modifiers that a model replaces, by name of the mesh object.
+    """
+    graph = DependencyGraph()
+    armature_object = scene_rigs[0].armature_object
+    mesh_objects = {rig.mesh_object for rig in scene_rigs}
+    shape_keys = {mesh_object.data.shape_keys for mesh_object in mesh_objects} - {None}
+    for datablock, used in _used_datablocks().items():
+        node = datablock_node(datablock)
+        if isinstance(datablock, _UNFOLLOWED_TYPES):
+            continue
+        if datablock in mesh_objects:
+            replaced = replaced_modifiers[datablock.name]
+            modifiers = [m for m in datablock.modifiers if m.name not in replaced]
+            replaced_needs = {n for name in replaced for n in _modifier_needs(datablock, datablock.modifiers[name])}
+            graph.add(node, *(set(map(datablock_node, used)) - replaced_needs))
+            graph.add(node, *_object_needs(datablock, modifiers))
+            add_drivers(graph, datablock, tuple(datablock.modifiers[name].path_from_id() for name in replaced))
+            continue
+        # The model replaces the shape keys, so only those that it reads need their drivers.
+        add_drivers(graph, datablock, ("key_blocks[", "eval_time") if datablock in shape_keys else ())
+        if datablock in shape_keys:
+            continue
+        if not isinstance(datablock, bpy.types.Object):
+            graph.add(node, *map(datablock_node, used))
+            continue
+        graph.add(node, *_object_needs(datablock, datablock.modifiers))
+        if is_armature(datablock):
+            add_bones(graph, datablock, animated_paths(datablock))
+            if datablock != armature_object:
+                graph.add(node, *(Node(node.datablock, bone=bone.name) for bone in datablock.data.bones))
+        else:
+            graph.add(node, *map(datablock_node, used))
+    return graph
+
+
+def shown_objects(scene_rigs: list[SceneRig]) -> list[bpy.types.Object]:
+    """Return the objects that a fast rig shows besides the meshes of its models.
+
+    These are the objects of the scene that renders show, except cages that only the replaced deformation reads, and
+    the objects of other scenes.
+    """
+    cages = {
+        scene_object
+        for scene_rig in scene_rigs
+        for scene_object in Sources(scene_rig, scene_rig.mesh_object).objects
+        if scene_object.type in {"LATTICE", "CURVE", "EMPTY"} or scene_object.display_type in _CAGE_DISPLAY_TYPES
+    }
+    scene = bpy.context.scene
+    rendered = set(_rendered_objects(bpy.context.view_layer.layer_collection))
+    candidates = [o for o in bpy.data.objects if o in rendered or (o.name not in scene.objects and o.users_scene)]
+    return [o for o in candidates if o not in cages and o.type not in _INVISIBLE_TYPES and not o.hide_render]
+
+
+def _used_datablocks() -> dict[bpy.types.ID, set[bpy.types.ID]]:
+    """Return the datablocks that each datablock of the file uses."""
+    used: dict[bpy.types.ID, set[bpy.types.ID]] = {}
+    for datablock, users in bpy.data.user_map().items():
+        used.setdefault(datablock, set())
+        for user in users:
+            used.setdefault(user, set()).add(datablock)
+    return used
+
+
+def _object_needs(scene_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[Node]:
+    """Yield what an object needs, with the given modifiers; not its bones and drivers."""
+    if scene_object.data is not None:
+        yield datablock_node(scene_object.data)
+    parent = scene_object.parent
+    if parent is not None:
+        yield datablock_node(parent)
+        if is_armature(parent) and scene_object.parent_type == "BONE":
+            yield Node(datablock_node(parent).datablock, bone=scene_object.parent_bone)
+        elif is_armature(parent) and scene_object.parent_type == "ARMATURE":
+            yield from deforming_bones(scene_object, parent)
+    for constraint in scene_object.constraints:
+        yield from constraint_needs(constraint)
+    for modifier in modifiers:
+        yield from _modifier_needs(scene_object, modifier)
+
+
+def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier) -> Iterator[Node]:
+    """Yield the datablocks and bones that a modifier reads, except through drivers."""
+    yield from pointer_needs(modifier)
+    if modifier.type == "ARMATURE" and modifier.object is not None:
+        yield from deforming_bones(scene_object, modifier.object, modifier.use_bone_envelopes)
+    elif modifier.type == "NODES" and modifier.node_group is not None:
+        for item in modifier.node_group.interface.items_tree:
+            value = node_input(modifier, item.identifier) if item.item_type == "SOCKET" else None
+            if isinstance(value, bpy.types.ID):
+                yield datablock_node(value)
+
+
+def _rendered_objects(layer_collection: bpy.types.LayerCollection) -> Iterator[bpy.types.Object]:
+    """Yield the objects of the collections that renders show."""
+    if layer_collection.exclude or layer_collection.collection.hide_render:
+        return
+    yield from layer_collection.collection.objects
+    for child in layer_collection.children:
+        yield from _rendered_objects(child)

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Evaluates the joints of a rig in the same random poses and actions before and after bones are removed."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+from mathutils import Euler, Quaternion
+
+from ..core.progress import Progress
+from ..poses.action_range import action_frames
+from ..scene.armature import PoseMatrixReader, clear_pose
+from ..scene.temporary_state import assign_action, temporary_pose
+
+RANDOM_POSE_COUNT = 200
+MAX_ACTION_FRAMES = 40
+"""Largest number of frames of one action that are evaluated, evenly over its length."""
+ROTATION_DEGREES, LOCATION_RATIO, SCALE_RATIO = 25.0, 0.03, 0.05
+"""Standard deviations of random poses: about each axis, of the size of the rig along each axis, and of the scale."""
+RIG_SEED = 1 << 32
+"""Seed of the custom properties of the armature object; those of bones have the indices of the bones."""
+MAX_PROPERTY_WIDTH = 1000.0
+"""Custom properties with a wider range keep their value."""
+
+
+@dataclass(frozen=True)
+class JointPoses:
+    """What `evaluate_joints` evaluates.
+
+    Attributes:
+        armature_object: the armature object.
+        joint_names: names of the J joints to read.
+        control_names: names of the bones that random poses move.
+        actions: the actions to play.
+        size: size of the rig, armature units.
+        pose_count: number of random poses.
+    """
+
+    armature_object: bpy.types.Object
+    joint_names: tuple[str, ...]
+    control_names: tuple[str, ...]
+    actions: tuple[bpy.types.Action, ...]
+    size: float
+    pose_count: int = RANDOM_POSE_COUNT
+
+
+def evaluate_joints(poses: JointPoses, stage: str) -> Iterator[Progress | np.ndarray]:
+    """Evaluate the joints in all poses, as a generator that restores the rig.
+
+    Args:
+        poses: the poses.
+        stage: stage of the progress.
+
+    Yields:
+        Progress, and at the end (P, J, 4, 4) float32 pose matrices, armature space, armature units.
+    """
+    armature_object = poses.armature_object
+    reader = PoseMatrixReader(armature_object, poses.joint_names)
+    shown_poses = list(_pose_setters(poses))
+    matrices = np.empty((len(shown_poses), len(poses.joint_names), 4, 4), np.float32)
+    with temporary_pose(armature_object, poses.actions), _temporary_properties(armature_object, poses.control_names):
+        for index, show_pose in enumerate(shown_poses):
+            show_pose()
+            depsgraph = bpy.context.evaluated_depsgraph_get()
+            matrices[index] = reader.read(armature_object.evaluated_get(depsgraph))
+            yield Progress(stage, index + 1, len(shown_poses))
+    yield matrices
+
+
+def differing_joints(poses: JointPoses, before: np.ndarray, after: np.ndarray, tolerance: float) -> dict[str, float]:
+    """Compare the joints of two evaluations.
+
+    Args:
+        poses: the poses.
+        before, after: (P, J, 4, 4), as from `evaluate_joints`.
+        tolerance: largest accepted difference, as a ratio of the size of the rig for translations, and absolute for
+            rotations and scales.
+
+    Returns:
+        The largest difference of each joint that differs, by name, in the unit of `tolerance`.
+    """
+    differences = np.abs(before.astype(np.float64) - after)
+    differences[..., :3, 3] /= poses.size
+    largest = differences.max(axis=(0, 2, 3), initial=0)
+    # NaN compares as different, also where both are NaN: the pose cannot be checked.
+    return {
+        name: float(value) for name, value in zip(poses.joint_names, largest, strict=True) if not value <= tolerance
+    }
+
+
+def rig_size(armature_object: bpy.types.Object) -> float:
+    """Return the diagonal of the bounding box of the bones at rest, armature units."""
+    ends = np.array([[*bone.head_local, *bone.tail_local] for bone in armature_object.data.bones]).reshape(-1, 3)
+    return float(np.linalg.norm(np.ptp(ends, axis=0)))
+
+
+def set_random_pose(armature_object: bpy.types.Object, names: Iterable[str], size: float, seed: int) -> None:
+    """Set the channels and custom properties of some bones at random, except locked channels; others do not change.
+
+    Args:
+        armature_object: the armature object.
+        names: names of the bones. The values of a bone depend only on the seed and on its index in `names`.
+        size: size of the rig, armature units.
+        seed: seed of the pose.
+    """
+    for index, name in enumerate(names):
+        bone = armature_object.pose.bones[name]
+        generator = np.random.default_rng((seed, index))
+        angles = np.radians(ROTATION_DEGREES) * generator.normal(size=3)
+        _set_rotation(bone, np.where(bone.lock_rotation, 0.0, angles))
+        offsets = LOCATION_RATIO * size * generator.normal(size=3)
+        bone.location = np.where(bone.lock_location, 0.0, offsets)
+        bone.scale = np.where(bone.lock_scale, 1.0, 1.0 + SCALE_RATIO * generator.normal(size=3))
+        _set_properties(bone, generator)
+    _set_properties(armature_object, np.random.default_rng((seed, RIG_SEED)))
+    armature_object.update_tag(refresh={"OBJECT", "DATA"})
+
+
+def _pose_setters(poses: JointPoses) -> Iterator[Callable[[], None]]:
+    """Yield functions that show the random poses, and then the frames of the actions."""
+    armature_object = poses.armature_object
+
+    def show_random(seed: int) -> None:
+        set_random_pose(armature_object, poses.control_names, poses.size, seed)
+        bpy.context.view_layer.update()
+
+    def show_first_frame(action: bpy.types.Action, frame: int) -> None:
+        clear_pose(armature_object)
+        assign_action(armature_object, action)
+        bpy.context.scene.frame_set(frame)
+
+    for seed in range(poses.pose_count):
+        yield lambda seed=seed: show_random(seed)
+    for action in poses.actions:
+        frames = list(action_frames(action))
+        indices = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_ACTION_FRAMES)).round().astype(int))
+        yield lambda action=action, frame=frames[0]: show_first_frame(action, frame)
+        yield from (lambda frame=frames[index]: bpy.context.scene.frame_set(frame) for index in indices[1:])
+
+
+def _set_rotation(bone: bpy.types.PoseBone, angles: np.ndarray) -> None:
+    rotation = Euler(angles)
+    if bone.rotation_mode == "QUATERNION":
+        bone.rotation_quaternion = rotation.to_quaternion()
+    elif bone.rotation_mode == "AXIS_ANGLE":
+        axis, angle = Quaternion(rotation.to_quaternion()).to_axis_angle()
+        bone.rotation_axis_angle = (angle, *axis)
+    else:
+        bone.rotation_euler = angles
+
+
+def _set_properties(owner: bpy.types.PoseBone | bpy.types.Object, generator: np.random.Generator) -> None:
+    for key, low, high in _ranged_properties(owner):
+        value = generator.uniform(low, high)
+        owner[key] = type(owner[key])(round(value)) if isinstance(owner[key], bool | int) else value
+
+
+def _ranged_properties(owner: bpy.types.PoseBone | bpy.types.Object) -> Iterator[tuple[str, float, float]]:
+    """Yield the custom properties of a bone or an object that are numbers with a range: key, lowest, highest value."""
+    for key in sorted(owner.keys()):
+        value = owner[key]
+        if isinstance(value, bool):
+            yield key, 0, 1
+        elif isinstance(value, int | float):
+            settings = owner.id_properties_ui(key).as_dict()
+            low, high = settings["soft_min"], settings["soft_max"]
+            if 0 < high - low <= MAX_PROPERTY_WIDTH:
+                yield key, low, high
+
+
+@contextmanager
+def _temporary_properties(armature_object: bpy.types.Object, names: Iterable[str]) -> Iterator[None]:
+    """Restore the custom properties that random poses set."""
+    owners = [armature_object, *(armature_object.pose.bones[name] for name in names)]
+    values = [(owner, key, owner[key]) for owner in owners for key, _, _ in _ranged_properties(owner)]
+    try:
+        yield
+    finally:
+        for owner, key, value in values:
+            owner[key] = value
+        armature_object.update_tag(refresh={"OBJECT", "DATA"})
+        bpy.context.view_layer.update()

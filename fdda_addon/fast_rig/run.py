@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Makes a fast rig of the open file: binds the models, removes what nothing needs, compares, and saves a copy."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import bpy
+
+from ..core.errors import ModelError, RigError
+from ..core.model import read_model
+from ..core.progress import Progress
+from ..core.rig import STATIC_JOINT
+from ..rig.modifier_stack import check_evaluable, deforming_modifiers, recorded_modifiers
+from ..runtime import packed_model
+from ..runtime.binding import bind, unbind
+from ..runtime.model_files import network_of
+from ..scene.blend_file import save_copy
+from ..scene.controls import owner_of
+from ..scene.scene_rig import SceneRig
+from .bone_reader import bone_node, datablock_node
+from .controls import animating_actions, control_bones, keyed_bones
+from .dependency_graph import Node
+from .driver_reader import bone_of_path, driven_node
+from .graph_reader import read_graph, shown_objects
+from .joint_poses import JointPoses, differing_joints, evaluate_joints, rig_size
+from .pruning import remove_bones, remove_drivers, remove_modifiers, remove_objects
+
+TOLERANCE = 1e-5
+"""Largest accepted difference of a joint between full rig and fast rig, as a ratio of the size of the rig."""
+REPEATED_POSES = 10
+"""Number of random poses that are evaluated again, to find out whether the full rig repeats its result."""
+MAX_NAMED_BONES = 5
+
+
+@dataclass(frozen=True)
+class FastRig:
+    """The result of `make_fast_rig`.
+
+    Attributes:
+        armature_name: name of the armature object.
+        size: size of the full rig, armature units.
+        bones_before, bones_after: number of bones of the full rig and of the fast rig.
+        joints: number of joints that the models read.
+        controls: names of the chosen control bones.
+        removed_objects, removed_modifiers, removed_drivers: names of objects and modifiers, and number of drivers.
+        lost_channels: number of keyed channels that have lost their bones, by action and bone.
+        pose_count: number of poses in which the joints were compared.
+        largest_difference: largest difference of a joint in these, as a ratio of the size of the rig.
+    """
+
+    armature_name: str
+    size: float
+    bones_before: int
+    bones_after: int
+    joints: int
+    controls: tuple[str, ...]
+    removed_objects: tuple[str, ...]
+    removed_modifiers: tuple[str, ...]
+    removed_drivers: int
+    lost_channels: dict[str, dict[str, int]] = field(default_factory=dict)
+    pose_count: int = 0
+    largest_difference: float = 0.0
+
+
+def make_fast_rig(
+    rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choices: tuple[str, ...]
+) -> Iterator[Progress | FastRig]:
+    """Make a fast rig of the open file and save it, as a generator that works while it is iterated.
+
+    The open file is changed and not saved itself, so run this in a process of its own.
+
+    Args:
+        rigs_and_models: the rigs, which share one armature, each with the path of its model.
+        out: path of the file to write.
+        choices: the control bones to keep, as for `control_bones`.
+
+    Yields:
+        Progress, and at the end the FastRig.
+
+    Raises:
+        FDDAError: a rig or model is refused, a joint moves in another way without the removed bones, or the file cannot
+            be written. Nothing is written.
+    """
+    scene_rigs = [scene_rig for scene_rig, _ in rigs_and_models]
+    armature_object = _shared_armature(scene_rigs)
+    for scene_rig, model in rigs_and_models:
+        _bind_packed(scene_rig, model)
+    networks = [network_of(rig.mesh_object) for rig in scene_rigs]
+    joint_names = tuple(dict.fromkeys(n for network in networks for n in network.info.joint_names if n != STATIC_JOINT))
+    controls = tuple(sorted(control_bones(armature_object, choices)))
+    actions = tuple(animating_actions(armature_object))
+    poses = JointPoses(armature_object, joint_names, controls, actions, rig_size(armature_object))
+    before = yield from _evaluate(poses, "full rig")
+    again = yield from _evaluate(replace(poses, actions=(), pose_count=REPEATED_POSES), "repeated poses")
+    if differences := differing_joints(poses, before[:REPEATED_POSES], again, TOLERANCE):
+        raise RigError(
+            f"{_named_bones(differences)} of '{armature_object.name}' move differently when the same pose is evaluated "
+            "again, so a fast rig cannot be compared; look for dependency cycles among their constraints and drivers."
+        )
+    bones_before = len(armature_object.data.bones)
+    removed = _prune(scene_rigs, _roots(scene_rigs, joint_names, controls))
+    after = yield from _evaluate(poses, "fast rig")
+
+    if differences := differing_joints(poses, before, after, TOLERANCE):
+        raise RigError(
+            f"{_named_bones(differences)} of '{armature_object.name}', which the model reads, move differently without "
+            "the removed bones; keep more bones with --controls collection:NAME."
+        )
+    save_copy(out)
+    yield FastRig(
+        armature_object.name,
+        poses.size,
+        bones_before,
+        len(armature_object.data.bones),
+        len(joint_names),
+        controls,
+        removed.objects,
+        removed.modifiers,
+        removed.drivers,
+        _lost_channels(armature_object, removed.bones),
+        len(before),
+        max(differing_joints(poses, before, after, -1.0).values(), default=0.0),
+    )
+
+
+class _Removed(NamedTuple):
+    """What `_prune` has removed: the names, and the number of drivers."""
+
+    bones: set[str]
+    objects: tuple[str, ...]
+    modifiers: tuple[str, ...]
+    drivers: int
+
+
+def _prune(scene_rigs: list[SceneRig], roots: list[Node]) -> _Removed:
+    """Remove everything that neither the roots nor the models need, and play the models in the rest."""
+    replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
+    graph = read_graph(scene_rigs, replaced)
+    kept = graph.kept(roots)
+    for scene_rig in scene_rigs:
+        scene_rig.mesh_object.fdda.mode = "RIG"
+    drivers = remove_drivers(scene_rigs, graph.nodes, kept)
+    bones = set(remove_bones(scene_rigs[0].armature_object, kept))
+    modifiers = [name for rig in scene_rigs for name in _remove_replaced(rig, replaced[rig.mesh_object.name])]
+    objects = remove_objects(kept)
+    for scene_rig in scene_rigs:
+        scene_rig.mesh_object.fdda.is_fast_rig = True
+        scene_rig.mesh_object.fdda.mode = "FDDA"
+        _evaluate_model(scene_rig.mesh_object)
+    return _Removed(bones, tuple(objects), tuple(modifiers), drivers)
+
+
+def _shared_armature(scene_rigs: list[SceneRig]) -> bpy.types.Object:
+    armature_objects = {rig.armature_object.name: rig.armature_object for rig in scene_rigs}
+    if len(armature_objects) > 1:
+        names = " and ".join(f"'{name}'" for name in armature_objects)
+        raise RigError(f"The models play on several armatures, {names}; make a fast rig of one armature at a time.")
+    for scene_rig in scene_rigs:
+        if scene_rig.mesh_object.fdda.is_fast_rig:
+            raise RigError(f"'{scene_rig.mesh_object.name}' is a fast rig already; give the file of the full rig.")
+    return scene_rigs[0].armature_object
+
+
+def _bind_packed(scene_rig: SceneRig, model: Path) -> None:
+    """Bind a model and pack it."""
+    mesh_object = scene_rig.mesh_object
+    unbind(mesh_object)
+    check_evaluable(scene_rig)
+    data = read_model(model)[1]
+    text = packed_model.pack(model.name, data)
+    bind(scene_rig, model, use_in_render=True, packed_text=text)
+    binding = mesh_object.fdda
+    # The other models of the library were trained for the full rig, and their files may not be there.
+    binding.models.clear()
+    entry = binding.models.add()
+    entry.name, entry.path, entry.packed, entry.packed_bytes = model.stem, binding.model, text, len(data)
+    binding.model_index = 0
+    _evaluate_model(mesh_object)
+
+
+def _evaluate_model(mesh_object: bpy.types.Object) -> None:
+    """Evaluate the scene, and raise a ModelError if the model of an object cannot play."""
+    bpy.context.view_layer.update()
+    if mesh_object.fdda.status:
+        raise ModelError(mesh_object.fdda.status)
+
+
+def _replaced_modifiers(mesh_object: bpy.types.Object) -> set[str]:
+    """Return the names of the modifiers that the model of a bound object replaces, on or off."""
+    return {m.name for m in (*deforming_modifiers(mesh_object), *recorded_modifiers(mesh_object))}
+
+
+def _remove_replaced(scene_rig: SceneRig, names: set[str]) -> list[str]:
+    """Remove the replaced modifiers, except the first Armature modifier, which tells which armature the mesh has."""
+    mesh_object = scene_rig.mesh_object
+    kept = next((m.name for m in mesh_object.modifiers if m.type == "ARMATURE" and m.name in names), None)
+    return remove_modifiers(mesh_object, [m.name for m in mesh_object.modifiers if m.name in names - {kept}])
+
+
+def _roots(scene_rigs: list[SceneRig], joint_names: tuple[str, ...], controls: tuple[str, ...]) -> list[Node]:
+    """Return what a fast rig shows, what its models read, and what animators pose."""
+    armature_object = scene_rigs[0].armature_object
+    roots = [datablock_node(armature_object)]
+    roots += [bone_node(armature_object, name) for name in (*joint_names, *controls)]
+    roots += [datablock_node(scene_object) for scene_object in shown_objects(scene_rigs)]
+    for scene_rig in scene_rigs:
+        roots.append(datablock_node(scene_rig.mesh_object))
+        for control in network_of(scene_rig.mesh_object).info.controls:
+            owner = owner_of(scene_rig, control.owner)
+            roots += [datablock_node(owner), driven_node(owner, control.path)]
+            if bone_name := bone_of_path(control.path):
+                roots.append(bone_node(armature_object, bone_name))
+    return roots
+
+
+def _evaluate(poses: JointPoses, stage: str) -> Iterator[Progress]:
+    """Yield the progress of `evaluate_joints`, and return its matrices."""
+    for step in evaluate_joints(poses, stage):
+        if isinstance(step, Progress):
+            yield step
+    return step
+
+
+def _named_bones(differences: dict[str, float]) -> str:
+    """Return the number of bones that differ, with the names and differences of the largest."""
+    names = sorted(differences, key=differences.__getitem__, reverse=True)
+    shown = ", ".join(f"'{name}' by {differences[name]:.1e} of the size" for name in names[:MAX_NAMED_BONES])
+    more = f" and {len(names) - MAX_NAMED_BONES} more" if len(names) > MAX_NAMED_BONES else ""
+    return f"{len(names)} bones ({shown}{more})"
+
+
+def _lost_channels(armature_object: bpy.types.Object, removed_bones: set[str]) -> dict[str, dict[str, int]]:
+    """Count the keyed channels whose bones were removed, by action and bone."""
+    lost: dict[str, dict[str, int]] = {}
+    for action in bpy.data.actions:
+        keyed = keyed_bones(armature_object, action)
+        if counts := {name: count for name, count in keyed.items() if name in removed_bones}:
+            lost[action.name] = counts
+    return lost

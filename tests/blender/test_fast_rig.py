@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fast rigs: what they keep, what they refuse, and what a shot with one shows and renders."""
+
+import shutil
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
+from fdda_addon.core.errors import RigError
+from fdda_addon.fast_rig import run as fast_rig_run
+from fdda_addon.fast_rig.bone_reader import bone_node
+from fdda_addon.fast_rig.controls import control_bones
+from fdda_addon.fast_rig.dependency_graph import Node
+from fdda_addon.fast_rig.graph_reader import read_graph
+from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, evaluate_joints
+from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+
+from .command_output import output_of
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, run, train
+from .test_renders import set_camera, still
+
+REPLACED = {ELBOW: {"Armature", "Mush", "Lattice"}}
+CHARACTER, ACTION = "Character", "wave"
+POSE_COUNT = 12
+SIZE = 0.5
+"""Length of the arm, meters."""
+
+
+def kept_for_joints(scene_rig: SceneRig) -> tuple[set[Node], set[Node]]:
+    """Return all nodes of the dependency graph, and those that `lower` needs."""
+    graph = read_graph([scene_rig], REPLACED)
+    return graph.nodes, graph.kept([bone_node(scene_rig.armature_object, "lower")])
+
+
+def joint_matrices(scene_rig: SceneRig, *control_names: str) -> tuple[JointPoses, np.ndarray]:
+    """Evaluate `lower` in some random poses of control bones."""
+    poses = JointPoses(scene_rig.armature_object, ("lower",), control_names, (), SIZE, POSE_COUNT)
+    *_, matrices = evaluate_joints(poses, "poses")
+    return poses, matrices
+
+
+@pytest.mark.parametrize("name", DEPENDENCIES)
+def test_a_joint_keeps_the_bones_that_it_depends_on(name):
+    scene_rig = SceneRig(*studio_arm(name))
+    armature_object, source = scene_rig.armature_object, f"{SOURCE}.{name}"
+    nodes, kept = kept_for_joints(scene_rig)
+    poses, full = joint_matrices(scene_rig, "control", source)
+
+    remove_drivers([scene_rig], nodes, kept)
+    assert set(remove_bones(armature_object, kept)) == {UNUSED, f"{UNUSED}_child"}
+    _, fast = joint_matrices(scene_rig, "control", source)
+    assert differing_joints(poses, full, fast, 0.0) == {}
+
+    # The same comparison finds the difference if the bone is missing.
+    missing = kept - {bone_node(armature_object, source)}
+    remove_drivers([scene_rig], nodes, missing)
+    assert remove_bones(armature_object, missing) == [source]
+    _, broken = joint_matrices(scene_rig, "control")
+    assert differing_joints(poses, full, broken, 1e-3).keys() == {"lower"}
+
+
+def test_a_bone_keeps_the_bone_at_which_its_custom_shape_is_drawn():
+    scene_rig = SceneRig(*studio_arm())
+    armature_object = scene_rig.armature_object
+    bone = armature_object.pose.bones["control"]
+    bone.custom_shape, bone.custom_shape_transform = scene_rig.mesh_object, armature_object.pose.bones[UNUSED]
+    kept = read_graph([scene_rig], REPLACED).kept([bone_node(armature_object, "control")])
+    assert bone_node(armature_object, UNUSED) in kept
+
+
+def test_muted_constraints_count_only_if_animation_unmutes_them():
+    scene_rig = SceneRig(*studio_arm("target"))
+    armature_object, source = scene_rig.armature_object, f"{SOURCE}.target"
+    constraint = armature_object.pose.bones["lower"].constraints[source]
+    constraint.mute = True
+    assert bone_node(armature_object, source) not in kept_for_joints(scene_rig)[1]
+    constraint.driver_add("mute")
+    assert bone_node(armature_object, source) in kept_for_joints(scene_rig)[1]
+
+
+def test_control_bones_are_visible_or_keyed_or_in_a_collection():
+    armature_object = studio_arm("action")[1]
+    wave(armature_object, UNUSED)
+    assert control_bones(armature_object, ["visible"]) == {"control"}
+    # The action that only a constraint plays keys no controls.
+    assert control_bones(armature_object, ["keyed"]) == {UNUSED}
+    assert control_bones(armature_object, ["visible", "keyed"]) == {"control", UNUSED}
+    assert control_bones(armature_object, [f"collection:{CONTROLS}"]) == {"control"}
+    with pytest.raises(RigError, match=r"has no bone collection 'Faces'; its collections: 'Controls', 'Mechanism'\."):
+        control_bones(armature_object, ["collection:Faces"])
+
+
+def wave(armature_object: bpy.types.Object, bone_name: str) -> bpy.types.Action:
+    """Key a rotation of a bone in a new action, which the armature object then no longer has."""
+    bone = armature_object.pose.bones[bone_name]
+    bone.rotation_mode = "XYZ"
+    animation = armature_object.animation_data_create()
+    animation.action = bpy.data.actions.new(f"{ACTION} {bone_name}")
+    animation.action.use_fake_user = True
+    for frame, angle in ((1, -0.4), (20, 0.6)):
+        bone.rotation_euler = (angle, 0.3 * angle, 0.0)
+        bone.keyframe_insert("rotation_euler", frame=frame)
+    action, animation.action = animation.action, None
+    bone.rotation_euler = (0, 0, 0)
+    return action
+
+
+@pytest.fixture(scope="module")
+def studio_files(tmp_path_factory) -> Path:
+    """Make a folder with the file of an arm with all dependencies, full.blend, and its model, model.onnx."""
+    folder = tmp_path_factory.mktemp("studio")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    # With IK and Spline IK on one bone, Blender does not repeat its own result.
+    objects = studio_arm(*(name for name in DEPENDENCIES if name != "spline_ik"))
+    wave(objects[1], "control")
+    wave(objects[1], UNUSED)
+    collection = bpy.data.collections.new(CHARACTER)
+    bpy.context.scene.collection.children.link(collection)
+    for scene_object in list(bpy.context.scene.collection.objects):
+        bpy.context.scene.collection.objects.unlink(scene_object)
+        collection.objects.link(scene_object)
+    save_copy(folder / "full.blend")
+    assert run("record", folder / "full.blend", folder / "recording", "--object", ELBOW, "--poses", 60) == 0
+    train(folder / "recording", folder / "model.onnx", "--epochs", 3)
+    return folder
+
+
+@pytest.fixture
+def folder(studio_files, tmp_path) -> Path:
+    """Copy the files, so that a test may change them."""
+    for name in ("full.blend", "model.onnx"):
+        shutil.copy(studio_files / name, tmp_path)
+    return tmp_path
+
+
+def fast_rig_arguments(folder: Path, *options: object) -> list[object]:
+    files = [folder / name for name in ("full.blend", "model.onnx", "fast.blend")]
+    return ["fast-rig", *files, "--object", ELBOW, *options]
+
+
+def test_a_fast_rig_has_the_same_names_and_plays(folder):
+    source = (folder / "full.blend").read_bytes()
+    lines = output_of(*fast_rig_arguments(folder, "--controls", "visible", "--frames", 6)).out
+    assert (folder / "full.blend").read_bytes() == source
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
+    full_count = len(bpy.data.objects[ELBOW_RIG].data.bones)
+
+    # The model is packed, so the file plays without it.
+    (folder / "model.onnx").rename(folder / "moved.onnx")
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "fast.blend"))
+    mesh_object, armature_object = bpy.data.collections[CHARACTER].objects[ELBOW], bpy.data.objects[ELBOW_RIG]
+    assert find_rig(ELBOW).armature_object == armature_object
+    assert not {UNUSED, f"{UNUSED}_child"} & set(armature_object.data.bones.keys())
+    assert {"cage"} & set(bpy.data.objects.keys()) == set()
+    assert {m.type for m in mesh_object.modifiers} == {"ARMATURE", "NODES"}
+    assert {f"{ACTION} control", f"{ACTION} {UNUSED}"} <= set(bpy.data.actions.keys())
+    armature_object.pose.bones["control"].rotation_euler = (0.5, 0.2, 0.0)
+    bpy.context.view_layer.update()
+    assert_plays(mesh_object, folder / "moved.onnx")
+
+    assert f"has {full_count - 2} of {full_count} bones" in lines[0] and "1 are controls" in lines[0]
+    assert "1 object ('cage'), 2 modifiers ('Mush', 'Lattice')" in lines[1]
+    assert "in 240 poses (largest difference 0.0e+00 of the size)" in lines[2]
+    assert lines[3].strip() == f"'{ACTION} {UNUSED}': 3 keyed channels have no bone any more: '{UNUSED}'"
+    assert "times as fast" in lines[4] and len(lines) == 5
+
+
+def test_keyed_controls_lose_no_channels(folder):
+    lines = output_of(*fast_rig_arguments(folder, "--frames", 0)).out
+    assert len(lines) == 3
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "fast.blend"))
+    assert UNUSED in bpy.data.objects[ELBOW_RIG].data.bones
+
+
+def test_bones_that_differ_are_named_and_nothing_is_written(folder, monkeypatch, capsys):
+    """Without one dependency, the comparison refuses the fast rig."""
+    missing = f"{SOURCE}.distance"
+
+    def read_incomplete_graph(scene_rigs, replaced_modifiers):
+        graph = read_graph(scene_rigs, replaced_modifiers)
+        for needed in graph.needs.values():
+            needed.discard(bone_node(scene_rigs[0].armature_object, missing))
+        return graph
+
+    monkeypatch.setattr(fast_rig_run, "read_graph", read_incomplete_graph)
+    assert run(*fast_rig_arguments(folder)) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert (
+        "bones ('lower' by " in error and "which the model reads, move differently without the removed bones" in error
+    )
+    assert not (folder / "fast.blend").exists()
+
+
+def test_a_rig_that_does_not_repeat_itself_is_refused(folder, capsys):
+    """Where the full rig moves differently in the same pose, no comparison is possible."""
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    DEPENDENCIES["spline_ik"](armature_object, f"{SOURCE}.target")
+    bpy.ops.wm.save_mainfile()
+    assert run(*fast_rig_arguments(folder)) == 1
+    assert (
+        "of the size) of 'elbow_rig' move differently when the same pose is evaluated again" in capsys.readouterr().err
+    )
+    assert not (folder / "fast.blend").exists()
+
+
+def test_refusals(folder, capsys):
+    assert run(*fast_rig_arguments(folder, "--controls", "shown")) == 2
+    assert "'shown' chooses no control bones; give visible, keyed or collection:NAME" in capsys.readouterr().err
+    full = folder / "full.blend"
+    assert run("fast-rig", full, folder / "model.onnx", full, "--object", ELBOW, "--overwrite") == 1
+    assert "is the full rig, which renders need; give the fast rig another name." in capsys.readouterr().err
+    assert run(*fast_rig_arguments(folder, "--frames", 0)) == 0
+    again = folder / "again.blend"
+    assert run("fast-rig", folder / "fast.blend", folder / "model.onnx", again, "--object", ELBOW) == 1
+    assert "'elbow' is a fast rig already; give the file of the full rig." in capsys.readouterr().err
+    bpy.ops.wm.open_mainfile(filepath=str(full))
+    other = bpy.data.objects.new("other", bpy.data.objects[ELBOW_RIG].data)
+    bpy.context.scene.collection.objects.link(other)
+    bpy.ops.wm.save_mainfile()
+    assert run("fast-rig", full, folder / "model.onnx", again, "--object", ELBOW) == 1
+    assert "'other' uses the armature of 'elbow_rig' too, and would lose its bones" in capsys.readouterr().err
+    assert not again.exists()
+
+
+def open_shot(path: Path) -> bpy.types.Object:
+    """Open an empty shot with an override of the character of a file and return the armature object.
+
+    Its rotation comes from the linked action, its location from an action of the shot.
+    """
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(path), link=True) as (_, linked):
+        linked.collections, linked.actions = [CHARACTER], [f"{ACTION} control"]
+    root = linked.collections[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    set_camera()
+    armature_object = next(o for o in root.all_objects if o.type == "ARMATURE")
+    animation = armature_object.animation_data_create()
+    animation.nla_tracks.new().strips.new("strip", 1, linked.actions[0])
+    bone = armature_object.pose.bones["control"]
+    animation.action = bpy.data.actions.new("shot")
+    for frame, x in ((1, 0.0), (20, 0.05)):
+        bone.location = (x, 0.5 * x, 0.0)
+        assert bone.keyframe_insert("location", frame=frame)
+    return armature_object
+
+
+def shown(armature_object: bpy.types.Object, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the evaluated matrix of `lower` and the rendered pixels of a frame."""
+    bpy.context.scene.frame_set(15)
+    evaluated = armature_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    control = evaluated.pose.bones["control"]
+    assert control.location.length > 0.03 and abs(control.rotation_euler.x) > 0.2
+    return np.array(evaluated.pose.bones["lower"].matrix), still(path)
+
+
+def relocate_in_window(fast: Path, full: Path) -> None:
+    """Relocate the library as in the Outliner, in the open shot."""
+    library = next(lib for lib in bpy.data.libraries if Path(bpy.path.abspath(lib.filepath)).samefile(fast))
+    bpy.ops.wm.lib_relocate(library=library.name, directory=f"{full.parent}/", filename=full.name)
+
+
+def relocate_by_script(fast: Path, full: Path) -> None:
+    """Relocate the library as a script of a render farm does, in the saved shot."""
+    shot = fast.with_name("shot.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot))
+    bpy.ops.wm.open_mainfile(filepath=str(shot))
+    library = next(lib for lib in bpy.data.libraries if Path(bpy.path.abspath(lib.filepath)).samefile(fast))
+    library.filepath = str(full)
+    library.reload()
+
+
+@pytest.mark.parametrize("relocate", [relocate_in_window, relocate_by_script])
+def test_a_shot_that_is_relocated_to_the_full_rig_renders_as_the_full_rig(folder, relocate):
+    """Link the fast rig, override it, animate it, relocate the library to the full rig, save, reopen and render."""
+    assert run(*fast_rig_arguments(folder, "--controls", "visible", "--frames", 0)) == 0
+    armature_object = open_shot(folder / "full.blend")
+    expected_matrix, expected = shown(armature_object, folder / "expected.png")
+
+    armature_object = open_shot(folder / "fast.blend")
+    mesh_object = next(o for o in bpy.data.objects if o.type == "MESH" and o.override_library)
+    matrix, preview = shown(armature_object, folder / "preview.png")
+    assert_plays(mesh_object, folder / "model.onnx")
+    assert np.array_equal(matrix, expected_matrix)
+    assert not np.array_equal(preview, expected)
+
+    relocate(folder / "fast.blend", folder / "full.blend")
+    for _ in range(2):
+        mesh_object, armature_object = (
+            next(o for o in bpy.data.objects if o.type == kind and o.override_library and o.name.startswith(ELBOW))
+            for kind in ("MESH", "ARMATURE")
+        )
+        assert {m.name for m in mesh_object.modifiers if m.show_viewport} == REPLACED[ELBOW]
+        matrix, rendered = shown(armature_object, folder / "rendered.png")
+        assert np.array_equal(matrix, expected_matrix)
+        assert np.array_equal(rendered, expected)
+        assert not mesh_object.fdda.status and not mesh_object.fdda.is_fast_rig
+        bpy.ops.wm.save_as_mainfile(filepath=str(folder / "relocated.blend"))
+        bpy.ops.wm.open_mainfile(filepath=str(folder / "relocated.blend"))
