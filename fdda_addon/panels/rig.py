@@ -5,8 +5,10 @@ import bpy
 
 from ..jobs import job
 from ..operators.rig import measured_cost
+from ..properties.character import file_problem
 from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
+from ..timing import frame_times
 from . import checks, curves
 from .frame_profile import draw_profile
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
@@ -40,7 +42,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
             draw_wrapped(layout, context, message, "INFO")
             layout.operator("fdda.add_sample_arm", text="Add Sample Arm", icon="ADD")
             return
-        _draw_build_model(layout, context)
+        _draw_build_model(layout, context, rig)
         _draw_meshes(layout, context, rig)
         _draw_counts(layout, rig)
         check = checks.last_check(rig)
@@ -93,7 +95,7 @@ def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, re
         column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
 
 
-def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """Draw the button that records, trains and binds, or the progress of its job."""
     if draw_job(layout, context, "build_model"):
         state = job.state_of("build_model")
@@ -102,7 +104,11 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) ->
         return
     row = layout.row()
     row.scale_y = 1.3
+    problem = file_problem(rig.mesh_object)
+    row.enabled = not problem
     draw_button(row, context, "fdda.build_model", "Record, Train & Bind", "PLAY")
+    if problem:
+        draw_wrapped(layout, context, problem, "INFO")
 
 
 def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
@@ -112,15 +118,16 @@ def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
         draw_job(layout, context, "measure")
     if cost is not None:
         column = layout.column(align=True)
+        measured = frame_times.get(rig.mesh_object)
         for label, time_text in (
             ("Rig", f"{cost.rig:.2f} ms per frame"),
             ("Armature Only", f"{cost.linear:.2f} ms"),
-            ("Model (estimate)", f"{cost.model:.1f} ms"),
+            ("Model", f"{measured.fdda:.2f} ms") if measured else ("Model (estimate)", f"{cost.model:.1f} ms"),
         ):
             row = column.split(factor=0.45)
             row.label(text=label)
             row.label(text=time_text)
-        draw_wrapped(layout, context, cost.sentence, "INFO")
+        draw_wrapped(layout, context, measured.sentence if measured else cost.sentence, "INFO")
     if state is None or not state.is_running:
         layout.operator("fdda.measure", text="Measure Speed", icon="TIME")
 

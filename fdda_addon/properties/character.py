@@ -259,6 +259,16 @@ def model_file(mesh_object: bpy.types.Object) -> Path:
     return _resolve_path(mesh_object.fdda.settings.model, default_model(mesh_object), "model", "Model file")
 
 
+def file_problem(mesh_object: bpy.types.Object) -> str:
+    """Return a sentence if recording and model cannot be stored before the .blend file is saved; empty if they can."""
+    try:
+        recording_folder(mesh_object)
+        model_file(mesh_object)
+    except OutputError as error:
+        return str(error)
+    return ""
+
+
 def trained_file(mesh_object: bpy.types.Object) -> Path | None:
     """Return the model file that a training of the character has written; None if there is none."""
     try:
