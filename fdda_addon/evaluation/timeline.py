@@ -11,8 +11,11 @@ from gpu_extras.batch import batch_for_shader
 from ..scene.scene_rig import armature_of
 from . import last_evaluation
 
-GRAPH_HEIGHT, GRAPH_BOTTOM = 34, 18
-"""Height of the graph, and its distance from the bottom of the region, in pixels at a UI scale of 1."""
+GRAPH_HEIGHT, GRAPH_BOTTOM, FRAME_NUMBERS_HEIGHT = 34, 4, 24
+"""Largest height of the graph, its distance from the bottom of the region, and height of the frame numbers at the top
+of the region, in pixels at a UI scale of 1."""
+CAPTION_DISTANCE = 8
+"""Distance of the caption from the end of the graph, in pixels at a UI scale of 1."""
 FILL_COLOR, LINE_COLOR = (0.9, 0.3, 0.2, 0.35), (1.0, 0.45, 0.3, 0.9)
 
 _draw_handles: list[object] = []
@@ -82,7 +85,11 @@ def _draw() -> None:
     context = bpy.context
     ui_scale, view = context.preferences.system.ui_scale, context.region.view2d
     max_error_mm = max(error for _, error in curve) or 1.0
-    bottom, height = GRAPH_BOTTOM * ui_scale, GRAPH_HEIGHT * ui_scale
+    bottom = GRAPH_BOTTOM * ui_scale
+    free_height = context.region.height - FRAME_NUMBERS_HEIGHT * ui_scale - bottom
+    height = min(GRAPH_HEIGHT * ui_scale, free_height)
+    if height <= 0:
+        return
     # The view maps frames linearly to pixels, so the positions of the first and last frame define all others.
     (first_frame, _), (last_frame, _) = curve[0], curve[-1]
     left, right = (view.view_to_region(frame, 0, clip=False)[0] for frame in (first_frame, last_frame))
@@ -95,8 +102,11 @@ def _draw() -> None:
     gpu.state.blend_set("NONE")
     blf.size(0, 11 * ui_scale)
     blf.color(0, 1, 1, 1, 0.9)
-    blf.position(0, 8 * ui_scale, bottom + 3 * ui_scale, 0)
-    blf.draw(0, f"FDDA: max error per frame, up to {max_error_mm:.2f} mm")
+    caption = f"FDDA: max error per frame, up to {max_error_mm:.2f} mm"
+    # Beside the graph; over its end if there is no space.
+    max_x = context.region.width - blf.dimensions(0, caption)[0] - CAPTION_DISTANCE * ui_scale
+    blf.position(0, max(0, min(right + CAPTION_DISTANCE * ui_scale, max_x)), bottom + 3 * ui_scale, 0)
+    blf.draw(0, caption)
 
 
 def _batches(

@@ -76,8 +76,10 @@ class JobState:
             return self.done / self.total if self.total else 0.0
         remaining, elapsed = self.remaining_seconds, time.monotonic() - self.started
         if remaining is not None and elapsed > 0:
-            # Estimates change, but a bar should not go back.
-            self._shown_fraction = max(self._shown_fraction, elapsed / (elapsed + remaining))
+            # Estimates change, but a bar should neither go back nor be full before the last step is.
+            step_fraction = (self.plan.index + self.done / max(self.total, 1)) / len(self.plan.steps)
+            limit = min(step_fraction, 1.0) if self.total else 1.0
+            self._shown_fraction = max(self._shown_fraction, min(elapsed / (elapsed + remaining), limit))
         return self._shown_fraction
 
     @property

@@ -9,6 +9,7 @@ import bpy
 from ..scene.compatibility import node_input
 from ..scene.controls import fcurve_target, owner_name
 from ..scene.scene_rig import SceneRig
+from .modifier_stack import is_fdda_modifier
 
 _BONE_PATH = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]')
 _MODIFIER_PATH = re.compile(r'modifiers\["(?P<name>(?:[^"\\]|\\.)*)"\](?P<rest>.*)')
@@ -99,7 +100,9 @@ class Sources:
         return f"{owner}/{path}" if owner else ""
 
     def _is_followed(self, scene_object: bpy.types.Object, modifier: bpy.types.Modifier | None) -> bool:
-        """Return whether a modifier of an object is followed."""
+        """Return whether a modifier of an object is followed. The FDDA modifier is not: it replaces the rig."""
+        if modifier is not None and is_fdda_modifier(modifier):
+            return False
         if modifier is None or not self._only_active:
             return modifier is not None
         if scene_object == self._root and modifier.name not in self._modifiers:

@@ -18,6 +18,7 @@ from fdda_addon.panels.recording import cached_content
 from fdda_addon.panels.section import panel_rig
 from fdda_addon.panels.training import _read_report
 from fdda_addon.properties.character import model_file, recording_folder
+from fdda_addon.rig.dependencies import read_dependencies
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing.rig_cost import RigCost, estimate_playback_ms
 
@@ -87,6 +88,8 @@ class TestChecks:
         bpy.context.view_layer.objects.active = bound_elbow
         rig, sentence = panel_rig(bpy.context)
         assert bound_elbow.fdda.is_playing and sentence == ""
+        # The driver of the model reads bones and the strength; these are no inputs of the rig.
+        assert not read_dependencies(rig).controls and not read_dependencies(rig).bones
         assert checks.check_now(rig).problems == ()
 
     def test_a_missing_rig_is_a_message_and_not_an_exception(self):
