@@ -12,6 +12,7 @@ from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job
 from fdda_addon.properties.character import model_file
+from fdda_addon.runtime.model_files import model_path
 from fdda_addon.scene.scene_rig import SceneRig
 
 from .scene_state import assert_same_state, scene_state
@@ -37,6 +38,26 @@ def test_a_model_is_trained_with_the_settings_and_learning_curves_are_stored(sav
     assert (state.done, state.total) == (6, 6) and state.outcome.startswith("Trained 'a.onnx' in ")
     assert [len(state.curves[name]) for name in ("training", "validation")] == [6, 6]
     assert state.curves["validation"][-1] < state.curves["validation"][0]
+
+
+def test_training_again_keeps_the_former_model_in_the_library(saved, elbow_files, tmp_path):
+    mesh_object = saved.mesh_object
+    mesh_object.fdda.settings.model = "//models/a.onnx"
+    assert train(saved, elbow_files) == {"FINISHED"}
+    model = tmp_path / "models" / "a.onnx"
+    former_files = {name: (model.parent / name).read_bytes() for name in ("a.onnx", "report.json", "report.html")}
+    assert not (model.parent / "previous").exists() and [m.name for m in mesh_object.fdda.models] == ["a"]
+    mesh_object.fdda.settings.training_seed = 4
+    assert bpy.ops.fdda.train(recording=str(elbow_files.recording)) == {"FINISHED"}
+    assert {path.name: path.read_bytes() for path in (model.parent / "previous").iterdir()} == former_files
+    assert model.read_bytes() != former_files["a.onnx"]
+    models = mesh_object.fdda.models
+    assert [entry.name for entry in models] == ["a", "a (previous)"] and models[
+        mesh_object.fdda.model_index
+    ].name == "a"
+    mesh_object.fdda.model_index = 1
+    assert bpy.ops.fdda.bind() == {"FINISHED"}
+    assert model_path(mesh_object) == model.parent / "previous" / "a.onnx"
 
 
 def test_a_canceled_training_writes_no_model(saved, elbow_files, tmp_path, monkeypatch):

@@ -57,6 +57,7 @@ def choose_the_soft_body_as_target(folder: Path) -> Iterator[float]:
     settings = arm_object().fdda.settings
     settings.poses, settings.epochs = POSES, EPOCHS
     yield from sidebar.open_section("recording")
+    yield from sidebar.open_subpanel("fdda.record", "settings.target", across=0.7)
     yield from sidebar.type_into_search_field("settings.target", FLESH)
     yield from press_keys("Return")
     yield from wait_until(lambda: settings.target == FLESH, 5, f"the field has '{settings.target}'")

@@ -105,6 +105,8 @@ def mirror_and_copy_limits(folder: Path) -> Iterator[float]:
     session.bone_index = bones.find(left.name)
     yield from redraw_window()
     yield from sidebar.open_section("poses")
+    yield from sidebar.open_subpanel("fdda.rest_pose", ".select", across=0.07, across_above=0.85)
+    yield from sidebar.open_subpanel("lock_rotation", "fdda.mirror_limits(", across=0.8, across_above=0.15)
     yield from sidebar.press_button("fdda.mirror_limits(", across=0.8)
     yield from wait_until(
         lambda: abs(_x_range_width(right, ranges) - 0.75) < 0.01, 5, "the other forearm does not have the limits"

@@ -59,6 +59,7 @@ def choose_a_mask(folder: Path) -> Iterator[float]:
     is_in_group = x_coordinates < np.median(x_coordinates)
     arm_object().vertex_groups.new(name=GROUP_NAME).add(np.flatnonzero(is_in_group).tolist(), 1.0, "REPLACE")
     yield from sidebar.open_section("playback")
+    yield from sidebar.open_subpanel("fdda.unbind", "fdda.mask", across=0.7)
     yield from sidebar.type_into_search_field("fdda.mask", GROUP_NAME)
     yield from save_screenshot(folder / "mask_search.png")
     yield from press_keys("Return")

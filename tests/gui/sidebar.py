@@ -28,6 +28,8 @@ HEADER_CENTER_PIXELS, HEADER_SPACING_PIXELS = 15, 28
 SEARCH_STEP_PIXELS = 18
 """Distance between two mouse positions of a search. It is less than the height of a button."""
 MAX_HEADER_CLICKS = 4
+SUBPANEL_ROWS, CONTENT_ROWS = 12, 10
+"""Number of rows below a button in which the header of a sub-panel is searched, and rows of its content."""
 
 _drawn_sections: set[str] = set()
 _open_index = 0
@@ -128,3 +130,44 @@ def press_button(identifier: str, across: float = 0.5) -> Iterator[float]:
     """Find a button of the sidebar (`find_button`) and click it."""
     x, y = yield from find_button(identifier, across)
     yield from click(x, y)
+
+
+def open_subpanel(above: str, content: str, across: float = 0.5, across_above: float = 0.5) -> Iterator[float]:
+    """Open a closed sub-panel of the open section with the mouse.
+
+    Headers of sub-panels have no description, so each row without one is clicked until the content appears.
+
+    Args:
+        above: identifier of a button above the header, as for `find_button`.
+        content: identifier of a button of the sub-panel.
+        across, across_above: horizontal position of the button of the sub-panel, and of the button above.
+
+    Raises:
+        StepError: no such sub-panel opens.
+    """
+    sidebar, scale = view_region("UI"), bpy.context.preferences.system.ui_scale
+    _, top = yield from find_button(above, across_above)
+    header_x = sidebar.x + 0.4 * sidebar.width
+    content_x = sidebar.x + 15 * scale + across * (sidebar.width - 60 * scale)
+    step = SEARCH_STEP_PIXELS * scale
+    for row in range(1, SUBPANEL_ROWS):
+        y = top - row * step
+        if (yield from _description_at(header_x, y)):
+            continue
+        yield from click(header_x, y)
+        yield from redraw_window()
+        for content_row in range(1, CONTENT_ROWS):
+            if content in (yield from _description_at(content_x, y - content_row * step)):
+                return
+        # It was another sub-panel, which is closed again, or a label.
+        yield from click(header_x, y)
+        yield from redraw_window()
+    require(False, f"no sub-panel below {above} has {content}")
+
+
+def _description_at(x: float, y: float) -> Iterator[float]:
+    """Return the description of the button at a position of the sidebar; empty without one."""
+    move_mouse(x, y)
+    yield from wait_for_events()
+    with region_override("UI"):
+        return describe_button_below_mouse()

@@ -52,6 +52,7 @@ def bake_asks_each_time(folder: Path) -> Iterator[float]:
     baked_file = folder / "work" / "alone" / "first.pc2"
     bpy.context.scene.frame_end = 5
     yield from sidebar.open_section("playback")
+    yield from sidebar.open_subpanel("use_in_render", "fdda.bake", across_above=0.7)
     yield from sidebar.press_button("fdda.bake")
     yield from wait_until(file_browser_count, 5, "Bake… opens no file browser")
     yield from save_screenshot(folder / "bake_dialog.png")
@@ -97,6 +98,7 @@ def select_bones_in_the_list(folder: Path) -> Iterator[float]:
     for bone in bones:
         compatibility.select_bone(bone, False)
     yield from sidebar.open_section("poses")
+    yield from sidebar.open_subpanel("fdda.rest_pose", ".select", across=0.07, across_above=0.85)
     yield from sidebar.press_button(".select", across=0.07)
     selected = [bone.name for bone in bones if compatibility.is_selected(bone)]
     require(len(selected) == 1, f"{selected} are selected instead of one bone")
