@@ -16,7 +16,7 @@ class TrainingConfig:
     """Settings of a training; docs/experiments.md has the measurements behind the defaults.
 
     Attributes:
-        seed: seed of the split, the initial weights, the order of the poses and the dropout.
+        seed: seed of the split, the initial weights and the order of the poses.
         tolerance_mm: rms error over training poses and all vertices that the components may leave, mm.
         hidden: units of each hidden layer of a network.
         activation: activation of the hidden layers, one of `ACTIVATIONS`.
@@ -24,13 +24,9 @@ class TrainingConfig:
         batch_size: poses per step.
         learning_rate: maximum of the one-cycle schedule.
         weight_decay: decoupled weight decay of AdamW.
-        dropout: probability that a step drops a hidden unit.
-        l1, l2: factors of the sums of absolute and of squared weights in the loss.
-        averaging: decay of the exponential moving average of the weights; 0 for no average.
         validation_fraction: part of the poses that select the best weights; the networks are not trained on them.
         held_out_fraction: part of the poses that measure the error, and are used for nothing else.
         goal_mm: distance that 99.9 % of the held-out vertices should not exceed, mm; 0 for no goal.
-        patience: epochs without improvement of any partition after which the training stops; 0 for all epochs.
         include_unsettled: also use poses in which the target did not come to rest.
     """
 
@@ -42,14 +38,9 @@ class TrainingConfig:
     batch_size: int = 64
     learning_rate: float = 1e-2
     weight_decay: float = 0.2
-    dropout: float = 0.0
-    l1: float = 0.0
-    l2: float = 0.0
-    averaging: float = 0.99
     validation_fraction: float = 0.05
     held_out_fraction: float = 0.1
     goal_mm: float = 0.0
-    patience: int = 0
     include_unsettled: bool = False
 
     def __post_init__(self):
@@ -62,14 +53,9 @@ class TrainingConfig:
             "batch_size": self.batch_size >= 1,
             "learning_rate": self.learning_rate > 0,
             "weight_decay": self.weight_decay >= 0,
-            "dropout": 0 <= self.dropout < 1,
-            "l1": self.l1 >= 0,
-            "l2": self.l2 >= 0,
-            "averaging": 0 <= self.averaging < 1,
             "validation_fraction": 0 < self.validation_fraction <= 0.4,
             "held_out_fraction": 0 < self.held_out_fraction <= 0.4,
             "goal_mm": self.goal_mm >= 0,
-            "patience": self.patience >= 0,
             "include_unsettled": isinstance(self.include_unsettled, bool),
         }
         for name, is_valid in checks.items():
@@ -109,14 +95,9 @@ OPTION_HELP = {
     "batch_size": "poses per step",
     "learning_rate": "maximum of the one-cycle schedule",
     "weight_decay": "of AdamW",
-    "dropout": "probability of a hidden unit to be dropped in a step",
-    "l1": "factor of the sum of absolute weights in the loss",
-    "l2": "factor of the sum of squared weights in the loss",
-    "averaging": "decay of the moving average of the weights, 0 for no average",
     "validation_fraction": "part of the poses that selects the best weights and does not train",
     "held_out_fraction": "part of the poses that measures the error, and neither trains nor selects weights",
     "goal_mm": "distance that 99.9 %% of the held-out vertices should not exceed, in mm; 0 for no goal",
-    "patience": "epochs without improvement after which the training stops, 0 for never",
     "include_unsettled": "also use poses in which the target did not come to rest",
 }
 

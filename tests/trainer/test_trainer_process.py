@@ -132,7 +132,7 @@ def test_an_impossible_setting_is_refused(recording, tmp_path, capsys):
 
 
 def test_a_diverging_training_fails_with_one_sentence(recording, tmp_path, capsys):
-    text = run_failing_training([recording, tmp_path / "m.onnx", "--learning-rate", "1e30", "--averaging", "0"], capsys)
+    text = run_failing_training([recording, tmp_path / "m.onnx", "--learning-rate", "1e30"], capsys)
     assert "diverged in epoch 1" in text and "smaller learning rate than 1e+30" in text
     assert list(tmp_path.iterdir()) == []
 

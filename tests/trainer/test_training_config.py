@@ -24,7 +24,6 @@ def test_an_unknown_setting_is_an_error():
         ("hidden", ()),
         ("hidden", (0,)),
         ("activation", "sine"),
-        ("dropout", 1.0),
         ("validation_fraction", 0.9),
         ("held_out_fraction", 0.0),
         ("goal_mm", -1.0),
@@ -41,10 +40,9 @@ def test_every_setting_is_an_option():
     add_options(parser)
     option_text = (
         "--seed 3 --tolerance-mm 0.2 --hidden 8 9 10 --activation gelu --epochs 7 --batch-size 5 --learning-rate 0.1 "
-        "--weight-decay 0.3 --dropout 0.25 --l1 1e-4 --l2 1e-3 --averaging 0.5 --validation-fraction 0.3 "
-        "--held-out-fraction 0.2 --goal-mm 0.5 --patience 4 --include-unsettled"
+        "--weight-decay 0.3 --validation-fraction 0.3 --held-out-fraction 0.2 --goal-mm 0.5 --include-unsettled"
     )
     assert config_from_arguments(parser.parse_args(option_text.split())) == TrainingConfig(
-        3, 0.2, (8, 9, 10), "gelu", 7, 5, 0.1, 0.3, 0.25, 1e-4, 1e-3, 0.5, 0.3, 0.2, 0.5, 4, True
+        3, 0.2, (8, 9, 10), "gelu", 7, 5, 0.1, 0.3, 0.3, 0.2, 0.5, True
     )
     assert config_from_arguments(parser.parse_args([])) == TrainingConfig()

@@ -9,9 +9,9 @@ class Curves:
     """Errors of one partition after each epoch: rms distances over the vertices, mm.
 
     Attributes:
-        training_mm: mean over the training poses, with the current weights.
-        validation_mm: mean over the validation poses, with the averaged weights.
-        worst_mm: maximum over the validation poses, with the averaged weights.
+        training_mm: mean over the training poses.
+        validation_mm: mean over the validation poses.
+        worst_mm: maximum over the validation poses.
         best_epoch: epoch with the lowest `validation_mm`; epoch 1 is the first.
     """
 

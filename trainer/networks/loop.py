@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch.func import functional_call
 
 from fdda_addon.core.errors import TrainingError
 
@@ -109,11 +108,9 @@ class _Loop:
             [array.shape[1] for array in targets],
             config.hidden,
             config.activation,
-            config.dropout,
             torch.Generator().manual_seed(config.seed),
         ).to(device)
-        self._start_average()
-        self.best_parameters = [parameter.clone() for parameter in self.averaged_parameters]
+        self.best_parameters = [parameter.detach().clone() for parameter in self.model.parameters()]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
         # (P, F) product of all factors by which the standardized features were rescaled.
         self.input_scales = torch.ones_like(self.inputs[:, 0])
@@ -130,7 +127,7 @@ class _Loop:
         """
         generator = torch.Generator().manual_seed(self.config.seed + 3)
         inputs = self.inputs[:, :: -(-self.inputs.shape[1] // RELEVANCE_POSES)].clone().requires_grad_(True)
-        outputs = self._averaged_outputs(inputs)
+        outputs = self.model(inputs)
         # Along random directions the mean square over poses estimates the sum over all outputs.
         directions = torch.randn(outputs.shape, generator=generator).to(self.device)
         (gradients,) = torch.autograd.grad(outputs, inputs, directions)
@@ -162,13 +159,7 @@ class _Loop:
                 rows, columns = weight.shape
                 self.model.weights[layer][index, :rows, :columns] = torch.from_numpy(weight * factor)
                 self.model.biases[layer][index, 0, :columns] = torch.from_numpy(bias * factor)
-        self._start_average()
-        factors = self.rescale_inputs_by_relevance()
-        for first_layer in (self.model.weights[0], self.averaged_parameters[0]):
-            first_layer /= factors.transpose(1, 2)
-
-    def _start_average(self) -> None:
-        self.averaged_parameters = [parameter.detach().clone() for parameter in self.model.parameters()]
+        self.model.weights[0] /= self.rescale_inputs_by_relevance().transpose(1, 2)
 
     def run(
         self,
@@ -185,8 +176,7 @@ class _Loop:
             all_partitions: the P partitions and the partitions without components. The reported progress is a mean
                 over all of them.
         """
-        config, pose_count = self.config, self.inputs.shape[1]
-        step_count = -(-pose_count // config.batch_size)
+        config, step_count = self.config, -(-self.inputs.shape[1] // self.config.batch_size)
         optimizer = OneCycleAdamW(
             self.model.parameters(),
             config.learning_rate,
@@ -195,79 +185,64 @@ class _Loop:
             WARM_UP_FRACTION,
         )
         order_generator = torch.Generator().manual_seed(config.seed + 1)
-        dropout_generator = torch.Generator(self.device).manual_seed(config.seed + 2)
-        vertex_counts = np.array([p.vertex_count for p in all_partitions])
-        constant_partitions = [p for p in all_partitions if not len(p.basis.components)]
-        constant_mm = sum(
-            float(p.validation_truncation.mean()) * p.mm_per_unit * p.vertex_count for p in constant_partitions
-        )
-        learning_vertex_counts = np.array([p.vertex_count for p in self.partitions])
         rescaling_epochs = {round(fraction * config.epochs) for fraction in RELEVANCE_EPOCH_FRACTIONS} - {0}
         for epoch in range(1, config.epochs + 1):
             if epoch - 1 in rescaling_epochs:
                 self.rescale_inputs_by_relevance()
-            pose_order = torch.randperm(pose_count, generator=order_generator).to(self.device)
-            training_mm = torch.zeros(len(self.partitions), device=self.device)
-            for step in range(step_count):
-                if should_stop():
-                    raise Cancelled
-                batch_poses = pose_order[step * config.batch_size : (step + 1) * config.batch_size]
-                errors = self._step(optimizer, batch_poses, dropout_generator)
-                self._update_average((epoch - 1) * step_count + step)
-                training_mm += (errors * self.to_mm.square() + self.truncation_mm.square()).sqrt().sum(dim=1)
+            training_mm = self._train_epoch(optimizer, order_generator, should_stop)
             validation_mm, worst_mm = self._validate()
             self._update_best(validation_mm, epoch, curves)
-            validation = validation_mm.cpu().numpy()
-            if not np.isfinite(validation).all():
+            if not torch.isfinite(validation_mm).all():
                 raise TrainingError(
                     f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
                     f"{config.learning_rate:g}."
                 )
-            training = (training_mm / pose_count).tolist()
-            errors_mm = zip(curves, training, validation.tolist(), worst_mm.tolist(), strict=True)
-            for curve, training_error, validation_error, worst_error in errors_mm:
+            errors_mm = (training_mm.tolist(), validation_mm.tolist(), worst_mm.tolist())
+            for curve, training_error, validation_error, worst_error in zip(curves, *errors_mm, strict=True):
                 curve.training_mm.append(training_error)
                 curve.validation_mm.append(validation_error)
                 curve.worst_mm.append(worst_error)
             if on_epoch:
-                means = [
-                    (float(errors @ learning_vertex_counts) + constant_mm) / vertex_counts.sum()
-                    for errors in (np.array(training), validation)
-                ]
+                means = (self._mean_over_vertices(errors, all_partitions) for errors in errors_mm[:2])
                 on_epoch(Progress(epoch, config.epochs, *means))
-            if config.patience and epoch - max(curve.best_epoch for curve in curves) >= config.patience:
-                break
 
-    def _step(self, optimizer: OneCycleAdamW, poses: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def _train_epoch(
+        self, optimizer: OneCycleAdamW, order_generator: torch.Generator, should_stop: Callable[[], bool]
+    ) -> torch.Tensor:
+        """Train on all poses once, in random order; returns (P,) mean errors, mm."""
+        pose_count, total_mm = self.inputs.shape[1], torch.zeros(len(self.partitions), device=self.device)
+        pose_order = torch.randperm(pose_count, generator=order_generator).to(self.device)
+        for batch_poses in pose_order.split(self.config.batch_size):
+            if should_stop():
+                raise Cancelled
+            squared_errors = self._step(optimizer, batch_poses)
+            total_mm += (squared_errors * self.to_mm.square() + self.truncation_mm.square()).sqrt().sum(dim=1)
+        return total_mm / pose_count
+
+    def _mean_over_vertices(self, errors_mm: list[float], all_partitions: Sequence[PreparedPartition]) -> float:
+        """Return the mean error over all vertices, mm; constant partitions have the error of their basis."""
+        errors, learned_errors = [], iter(errors_mm)
+        for partition in all_partitions:
+            constant_mm = float(partition.validation_truncation.mean()) * partition.mm_per_unit
+            errors.append(next(learned_errors) if len(partition.basis.components) else constant_mm)
+        return float(np.average(errors, weights=[partition.vertex_count for partition in all_partitions]))
+
+    def _step(self, optimizer: OneCycleAdamW, poses: torch.Tensor) -> torch.Tensor:
         """Take one optimization step; returns (P, n) squared errors in units of each partition's residual."""
         optimizer.zero_grad()
-        differences = self.model(self.inputs[:, poses], generator) - self.targets[:, poses]
+        differences = self.model(self.inputs[:, poses]) - self.targets[:, poses]
         squared_errors = differences.square().sum(dim=2)
         # The loss is a mean distance, like the reported error. Unlike a mean square, it is robust to outliers.
         # The sum over partitions gives each network the same gradient as if it were trained alone.
         loss = (squared_errors + LOSS_EPSILON).sqrt().mean(dim=1).sum()
-        if self.config.l1:
-            loss = loss + self.config.l1 * sum(weight.abs().sum() for weight in self.model.weights)
-        if self.config.l2:
-            loss = loss + self.config.l2 * sum(weight.square().sum() for weight in self.model.weights)
         loss.backward()
         optimizer.step()
         return squared_errors.detach()
 
     @torch.no_grad()
-    def _update_average(self, step: int) -> None:
-        """Update the running average of the weights, faster in the first steps, where they change most."""
-        decay = min(self.config.averaging, (1 + step) / (10 + step)) if self.config.averaging else 0.0
-        torch._foreach_lerp_(self.averaged_parameters, list(self.model.parameters()), 1 - decay)
-
-    def _averaged_outputs(self, inputs: torch.Tensor) -> torch.Tensor:
-        names = [name for name, _ in self.model.named_parameters()]
-        return functional_call(self.model, dict(zip(names, self.averaged_parameters, strict=True)), (inputs,))
-
-    @torch.no_grad()
     def _validate(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (P,) mean and (P,) maximum error of the validation poses with the averaged weights, mm."""
-        differences = self._averaged_outputs(self.validation_inputs) - self.validation_targets
+        """Return (P,) mean and (P,) maximum error of the validation poses, mm."""
+        differences = self.model(self.validation_inputs) - self.validation_targets
         squared = differences.square().sum(dim=2) * self.to_mm.square()
         errors = (squared + self.validation_truncation_mm.square()).sqrt()
         return errors.mean(dim=1), errors.max(dim=1).values
@@ -275,8 +250,8 @@ class _Loop:
     def _update_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
         is_better = validation_mm < self.best_mm
         self.best_mm = torch.where(is_better, validation_mm, self.best_mm)
-        for best_parameter, averaged_parameter in zip(self.best_parameters, self.averaged_parameters, strict=True):
-            best_parameter[is_better] = averaged_parameter[is_better]
+        for best_parameter, parameter in zip(self.best_parameters, self.model.parameters(), strict=True):
+            best_parameter[is_better] = parameter.detach()[is_better]
         for index in torch.nonzero(is_better).flatten().tolist():
             curves[index].best_epoch = epoch
 

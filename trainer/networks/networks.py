@@ -64,19 +64,17 @@ class PartitionNetworks(torch.nn.Module):
         output_counts: list[int],
         hidden: tuple[int, ...],
         activation: str,
-        dropout: float,
         generator: torch.Generator,
     ):
         """Draw the initial weights.
 
         Args:
             input_counts, output_counts: numbers of features and of components of the P partitions.
-            hidden, activation, dropout: as in `TrainingConfig`.
+            hidden, activation: as in `TrainingConfig`.
             generator: random generator of the initial weights.
         """
         super().__init__()
         self.activation = ACTIVATION_FUNCTIONS[activation]
-        self.dropout = dropout
         sizes = [max(input_counts), *hidden, max(output_counts)]
         weights, biases = [], []
         for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
@@ -93,23 +91,18 @@ class PartitionNetworks(torch.nn.Module):
         self.weights = torch.nn.ParameterList(weights)
         self.biases = torch.nn.ParameterList(biases)
 
-    def forward(self, inputs: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """Evaluate the networks.
 
         Args:
             inputs: (P, n, F) standardized features, padded.
-            generator: random generator of the dropout; None for no dropout.
 
         Returns:
             (P, n, K) coefficients in units of each partition's residual, padded.
         """
         values = inputs
-        last = len(self.weights) - 1
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = torch.baddbmm(bias, values, weight)
-            if layer < last:
+            if layer < len(self.weights) - 1:
                 values = self.activation(values)
-                if generator is not None and self.dropout > 0:
-                    mask = torch.rand(values.shape, generator=generator, device=values.device) >= self.dropout
-                    values = values * mask / (1 - self.dropout)
         return values
