@@ -28,7 +28,6 @@ from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import split_poses
 from trainer.fits.joint_fit import make_joint_regression
 from trainer.inputs.joints import JointFeatures
-from trainer.inputs.neighbor_positions import NeighborPositions
 from trainer.inputs.network_inputs import NetworkInputs
 from trainer.networks.loop import train
 from trainer.networks.networks import Network
@@ -100,8 +99,7 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
         joints: (N, 3, 4) local matrices of each input joint, by name, cm.
         residuals: (N, Vp, 3) float32, cm.
 
-    Not every joint was recorded. The motion of an unrecorded joint is unknown: its local matrix is the identity, and
-    the inputs leave out every pair of joints that depends on it.
+    Not every joint was recorded. The motion of an unrecorded joint is unknown: its local matrix is the identity.
     """
     names = ["elbow"]
     for joint in [name, *joints]:
@@ -111,20 +109,16 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
             joint = parent_of(joint)
         names += reversed(chain)
     poses = np.tile(np.eye(4), (len(residuals), len(names), 1, 1))
-    # The rest positions of the surface were not recorded: three points, a centimeter from each joint, replace them.
-    points = np.tile(np.eye(3) * METERS_PER_CM, (len(names), 1, 1))
     for joint, local in joints.items():
         index = names.index(joint)
         poses[:, index, :3] = local
         poses[:, index, :3, 3] *= METERS_PER_CM
-        # Move the points of the parent halfway to this joint, to the middle of the surface that the parent moves.
-        points[names.index(parent_of(joint))] += local[0, :, 3] / 2 * METERS_PER_CM
     parents = np.array([names.index(parent_of(joint)) if parent_of(joint) else -1 for joint in names])
     for index in range(1, len(names)):
         poses[:, index] = poses[:, parents[index]] @ poses[:, index]
     partition = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
     joints = JointFeatures(parents, np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
-    inputs = NetworkInputs.of([joints, NeighborPositions.between(parents, points, [partition])], [partition])
+    inputs = NetworkInputs.of([joints], [partition])
     features = inputs.compute_features(poses.astype(np.float32), np.zeros((len(poses), 0)))
     residuals = residuals * np.float32(METERS_PER_CM)
     data = PartitionData(

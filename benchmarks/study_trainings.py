@@ -19,11 +19,9 @@ from fdda_addon.core.skinning import skin_matrices
 from trainer.config import TrainingConfig
 from trainer.data.split import split_poses
 from trainer.export.export import PositionErrors, build_model, measure, write_model
-from trainer.fits.joint_paths import static_joints
 from trainer.inputs.block import State
 from trainer.inputs.controls import ControlFeatures
 from trainer.inputs.joints import JointFeatures
-from trainer.inputs.neighbor_positions import NeighborPositions, partition_centers
 from trainer.inputs.network_inputs import NetworkInputs, fit_inputs
 from trainer.inputs.surface_frames import SurfaceFrameFeatures
 from trainer.model import TrainedModel, is_sheared
@@ -104,13 +102,11 @@ def read_study_data(training: Path, held_out: Path, names: tuple[str, ...]) -> S
 def make_study_inputs(study_data: StudyData, states: dict[str, State]) -> NetworkInputs:
     """Make the inputs of the partitions as in a training of the whole character."""
     whole, partitions = study_data.whole_training, study_data.training.partitions
-    centers = partition_centers(whole.rig, whole.partitions)
     surface_frames = SurfaceFrameFeatures.make(whole.rig, whole.partitions, states.get(SurfaceFrameFeatures.name, {}))
     is_selected = np.isin(surface_frames.main_joints, [partition.joint for partition in partitions])
     blocks = (
         JointFeatures.make(whole.rig, partitions, {}),
         ControlFeatures.make(whole.rig, partitions, {}),
-        NeighborPositions.between(whole.rig.parents, centers, partitions, static_joints(whole.rig)),
         surface_frames.subset(is_selected),
     )
     return NetworkInputs.of(blocks, partitions)

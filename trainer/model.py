@@ -8,7 +8,6 @@ import numpy as np
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
-from .fits.partition_refinement import partition_indices
 from .inputs.network_inputs import NetworkInputs
 from .networks.checkpoint import Checkpoint, PartitionCheckpoint
 from .networks.confidence import TrainingRange
@@ -85,7 +84,6 @@ class TrainedModel:
             tuple(history),
             tuple(partitions),
             self.inputs.states,
-            partition_indices(self.partitions),
         )
 
     def component_counts(self) -> list[int]:

@@ -11,7 +11,6 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 
 from .blocks import BLOCK_ELEMENTS
-from .data.residuals import residuals_of
 from .data.split import Split
 from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
 from .fits.half_rotations import regression_matrices
@@ -97,7 +96,7 @@ def partition_data(
 
     Args:
         recording: recording with the poses.
-        partitions: partitions of the recording, possibly refined.
+        partitions: partitions of the recording.
         inputs: input features of the networks.
         use_half_rotations: whether residuals are also regressed on half-rotation matrices.
     """
@@ -110,7 +109,7 @@ def partition_data(
         PartitionData(
             rig.joints[partition.joint].name,
             features[:, columns],
-            lambda partition=partition: residuals_of(recording, partition),
+            lambda partition=partition: recording.residuals[:, partition.vertices],
             len(partition.vertices),
             lambda partition=partition: joint_regression(rig, partition, matrices),
             min_spread[columns],

@@ -24,7 +24,6 @@ from .data.split import Split, holdout_fingerprint, split_recording
 from .export.export import build_model, measure, measure_surface, write_model
 from .fits.gravity import drop_gravity_input
 from .fits.half_rotations import half_rotations_help
-from .fits.partition_refinement import partition_indices, refine_partitions
 from .goal import GoalResult, evaluate_goal
 from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
 from .inputs.surface_frames import SurfaceFrameFeatures
@@ -98,16 +97,7 @@ def train_model(
         sink.send(
             MessageType.LOG, text="The rig blends rotations: residuals are fitted to half-rotation features, too."
         )
-    if checkpoint:
-        partitions = checkpoint.reassign(recording.partitions)
-    else:
-        partitions = refine_partitions(
-            recording, split, use_half_rotations, config.tolerance_mm, config.hidden[-1], should_stop
-        )
-    if reassigned := int((partition_indices(partitions) != partition_indices(recording.partitions)).sum()):
-        sink.send(
-            MessageType.LOG, text=f"Partitions refined: {reassigned} vertices are reassigned to a neighbor partition."
-        )
+    partitions = recording.partitions
     inputs = make_inputs(recording.rig, partitions, input_states)
     prepared = _prepare_partitions(recording, partitions, inputs, use_half_rotations, split, config, sink, should_stop)
     columns = [

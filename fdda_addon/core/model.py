@@ -45,7 +45,6 @@ class ModelPartition:
         joint, influencing, controls, merged: as in `Partition`.
         vertices: number of vertices.
         basis: number of components.
-        reassigned: indices of the vertices in this partition that have another main joint.
     """
 
     joint: int
@@ -54,11 +53,10 @@ class ModelPartition:
     basis: int
     controls: tuple[int, ...] = ()
     merged: tuple[int, ...] = ()
-    reassigned: tuple[int, ...] = ()
 
     def to_json(self) -> dict:
         value = asdict(self)
-        return {key: value[key] for key in value if value[key] or key not in ("controls", "merged", "reassigned")}
+        return {key: value[key] for key in value if value[key] or key not in ("controls", "merged")}
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,6 @@ class ModelInfo:
             {p.joint: p.influencing for p in self.partitions},
             {p.joint: p.controls for p in self.partitions},
             {joint: p.joint for p in self.partitions for joint in p.merged},
-            {p.joint: p.reassigned for p in self.partitions},
         )
 
     def budget(self) -> Budget:
@@ -175,7 +172,7 @@ def _read_info(value: dict) -> ModelInfo:
     partitions = tuple(
         ModelPartition(
             *(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"])),
-            *(tuple(map(int, p.get(key, ()))) for key in ("controls", "merged", "reassigned")),
+            *(tuple(map(int, p.get(key, ()))) for key in ("controls", "merged")),
         )
         for p in value["partitions"]
     )
@@ -187,9 +184,6 @@ def _read_info(value: dict) -> ModelInfo:
         raise ValueError("a partition names a control that is none of its controls")
     if not partitions or not all(p.vertices > 0 and p.basis >= 0 for p in partitions):
         raise ValueError("it has no partitions, or one without vertices")
-    reassigned = [vertex for p in partitions for vertex in p.reassigned]
-    if len(set(reassigned)) < len(reassigned) or not all(0 <= vertex < int(value["vertices"]) for vertex in reassigned):
-        raise ValueError("a partition has a reassigned vertex that is none of its vertices, or another's")
     if sum(p.vertices for p in partitions) != int(value["vertices"]):
         raise ValueError("the partitions do not add up to the vertices")
     rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(joint_count, 4, 4)

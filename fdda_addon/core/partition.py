@@ -2,7 +2,6 @@
 """Partitions: the vertices that share a main joint, and the joints that move their residuals."""
 
 import colorsys
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,7 +53,6 @@ def make_partitions(
     influencing: dict[int, tuple[int, ...]] | None = None,
     controls: dict[int, tuple[int, ...]] | None = None,
     merged: dict[int, int] | None = None,
-    reassigned: dict[int, Sequence[int]] | None = None,
 ) -> tuple[Partition, ...]:
     """Partition the mesh by main joint, in ascending order of the joints.
 
@@ -63,7 +61,6 @@ def make_partitions(
         influencing: influencing joints of each partition, by main joint; None where no partition has any.
         controls: influencing controls of each partition, by main joint; None where no partition has any.
         merged: by main joint of a merged partition, the main joint of the partition into which it is merged.
-        reassigned: by main joint, vertices with another main joint that belong to its partition.
     """
     main = main_joints(rig.skin_joints, rig.skin_weights)
     influencing, controls, merged = influencing or {}, controls or {}, merged or {}
@@ -71,8 +68,6 @@ def make_partitions(
     for joint, other in sorted(merged.items()):
         main[main == joint] = other
         merged_joints.setdefault(other, []).append(joint)
-    for joint, vertices in (reassigned or {}).items():
-        main[list(vertices)] = joint
     return tuple(
         Partition(
             joint,

@@ -81,7 +81,7 @@ def test_model_metadata_contains_controls():
         controls=(SMILE, FIST),
         partitions=(
             ModelPartition(0, (), 1, 0),
-            ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,), reassigned=(0, 2)),
+            ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,)),
         ),
     )
     decoded_info = ModelInfo.from_json(info.to_json())

@@ -179,19 +179,7 @@ PARTITION_JSON = {"joint": 0, "influencing": [], "vertices": 4, "basis": 1}
         ({"partitions": [{**PARTITION_JSON, "joint": 3}]}, "none of its joints"),
         ({"partitions": [{**PARTITION_JSON, "influencing": [9]}]}, "none of its joints"),
         ({"vertices": 5}, "the partitions do not add up to the vertices"),
-        (
-            {"partitions": [{**PARTITION_JSON, "reassigned": [4]}]},
-            "a reassigned vertex that is none of its vertices, or another's",
-        ),
-        (
-            {"partitions": [{**PARTITION_JSON, "reassigned": [-1]}]},
-            "a reassigned vertex that is none of its vertices, or another's",
-        ),
-        (
-            {"partitions": [{**PARTITION_JSON, "reassigned": [1, 1]}]},
-            "a reassigned vertex that is none of its vertices, or another's",
-        ),
-        ({"partitions": [{**PARTITION_JSON, "reassigned": 1}]}, "its metadata cannot be read"),
+        ({"partitions": [{**PARTITION_JSON, "merged": 1}]}, "its metadata cannot be read"),
         ({"rest_matrices": [[float("nan")] * 16] * 3}, "its rest pose holds values that are not numbers"),
         ({"rest_matrices": [[0.0] * 16] * 2}, "cannot reshape"),
     ],

@@ -31,16 +31,6 @@ def test_influencing_joints_may_be_left_out():
     assert all(p.influencing == () for p in make_partitions(make_rig()))
 
 
-def test_vertices_are_reassigned():
-    rig = make_rig()
-    first_partition, second_partition, *other_partitions = partitions_of(rig)
-    reassigned = second_partition.vertices[:2].tolist()
-    changed_partitions = make_partitions(rig, INFLUENCING, reassigned={first_partition.joint: reassigned})
-    assert changed_partitions[0].vertices.tolist() == sorted([*first_partition.vertices.tolist(), *reassigned])
-    assert changed_partitions[1].vertices.tolist() == second_partition.vertices[2:].tolist()
-    assert [p.vertices.tolist() for p in changed_partitions[2:]] == [p.vertices.tolist() for p in other_partitions]
-
-
 def test_residual_changes_are_the_largest_distances_in_each_partition():
     partitions = partitions_of(make_rig())
     residuals = np.random.default_rng(0).normal(size=(2, VERTEX_COUNT, 3)).astype(np.float32)

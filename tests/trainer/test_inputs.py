@@ -7,83 +7,37 @@ import numpy as np
 import onnx
 import pytest
 
-from fdda_addon.core.features import joint_features
-from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.skinning import skin_matrices
 from trainer.__main__ import main
 from trainer.inputs import network_inputs
 from trainer.inputs.controls import ControlFeatures
 from trainer.inputs.joints import JointFeatures
-from trainer.inputs.neighbor_positions import NeighborPositions, partition_centers
 from trainer.inputs.network_inputs import NetworkInputs, make_inputs
 
-from .chain import chain_angles, chain_rig, pose_chain
+from .chain import chain_angles, pose_chain
 from .conftest import QUICK_OPTIONS, REPOSITORY
 
 PARENTS = np.array([-1, 0, 1, 1, 3])
 """Joint 0 is the parent of joint 1, joint 1 of joints 2 and 3, and joint 3 of joint 4."""
 
 
-def make_partition(joint: int, *influencing: int) -> Partition:
-    return Partition(joint, influencing, np.zeros(0, np.int32))
-
-
-def pairs(*partitions: Partition) -> list[tuple[int, int]]:
-    neighbors = NeighborPositions.between(PARENTS, np.zeros((5, 1, 3)), partitions)
-    return list(zip(neighbors.main_joints.tolist(), neighbors.pair_points.tolist(), strict=True))
-
-
 def inputs_of(partitions: list[Partition], control_count: int = 0) -> NetworkInputs:
     joints = JointFeatures(PARENTS, np.tile(np.eye(4, dtype=np.float32), (5, 1, 1)))
-    neighbors = NeighborPositions.between(PARENTS, np.zeros((5, 1, 3)), partitions)
-    return NetworkInputs.of([joints, ControlFeatures(control_count), neighbors], partitions)
+    return NetworkInputs.of([joints, ControlFeatures(control_count)], partitions)
 
 
-def test_pairs_include_siblings_and_grandchildren():
-    assert pairs(make_partition(2, 2, 3, 4)) == [(2, 3), (2, 4)]
-    assert pairs(make_partition(0, 1, 3), make_partition(4, 3, 4)) == [(0, 3), (4, 1)]
-
-
-def test_pairs_need_an_influencing_path():
-    assert pairs(make_partition(2, 2, 4)) == []
-
-
-def test_columns_of_joints_and_pairs():
-    inputs = inputs_of([make_partition(2, 2, 3, 4), make_partition(0, 1, 3), make_partition(1)])
-    assert inputs.columns[0].tolist() == [*range(24, 60), *range(60, 66)]
-    assert inputs.columns[1].tolist() == [*range(12, 24), *range(36, 48), *range(66, 69)]
-    assert inputs.columns[2].tolist() == []
-
-
-def test_controls_are_between_joints_and_pairs():
-    partitions = [Partition(2, (2, 3, 4), np.zeros(0, np.int32), (0, 2)), Partition(1, (), np.zeros(0, np.int32), (1,))]
+def test_networks_take_the_features_of_influencing_joints_and_controls():
+    partitions = [Partition(2, (2, 3), np.zeros(0, np.int32), (0, 2)), Partition(1, (), np.zeros(0, np.int32), (1,))]
     inputs = inputs_of(partitions, control_count=3)
-    assert inputs.columns[0].tolist() == [*range(24, 60), 60, 62, *range(63, 69)]
+    assert inputs.columns[0].tolist() == [*range(24, 48), 60, 62]
     assert inputs.columns[1].tolist() == [61]
     poses = np.tile(np.eye(4), (2, 5, 1, 1))
     controls = np.float32([[1, 2, 3], [4, 5, 6]])
     features = inputs.compute_features(poses, controls)
-    assert features.shape == (2, 69) and np.array_equal(features[:, 60:63], controls)
+    assert features.shape == (2, 63) and np.array_equal(features[:, 60:63], controls)
     with pytest.raises(ValueError, match=r"are \(2, 0\) and should be \(2, 3\)"):
         inputs.compute_features(poses, np.zeros((2, 0)))
-
-
-def test_a_pair_is_the_center_of_a_partition_in_the_space_of_a_joint():
-    rig = chain_rig(4)
-    partitions = make_partitions(rig)
-    partition = make_partition(1, 1, 2, 3)
-    neighbors = NeighborPositions.between(rig.parents, partition_centers(rig, partitions), [partition])
-    assert list(zip(neighbors.main_joints, neighbors.pair_points, strict=True)) == [(1, 3)]
-    inputs = NetworkInputs.of([JointFeatures.make(rig, partitions, {}), neighbors], [partition])
-    poses = pose_chain(rig, chain_angles(5, 4, 0))
-    features = inputs.compute_features(poses, np.zeros((5, 0)))
-    joints = joint_features(poses, rig.rest_matrices, rig.parents)
-    np.testing.assert_array_equal(features[:, :48], joints.reshape(5, -1))
-    center = np.append(rig.rest_positions[partitions[3].vertices].mean(axis=0), 1)
-    carried = skin_matrices(poses, rig.rest_matrices)[:, 3] @ center
-    expected = np.linalg.solve(poses[:, 1], carried[:, :, None])[:, :3, 0]
-    np.testing.assert_allclose(features[:, 48:], expected, atol=1e-5)
 
 
 def test_a_block_is_added_as_the_documentation_says(recording, tmp_path, monkeypatch):

@@ -108,7 +108,10 @@ def test_models_have_the_same_errors(results_by_unit, name):
     step = 1000 * float(np.spacing(np.float32(UNITS_AND_DISTANCES[name][1])))
     for method in ("fdda", "linear"):
         for statistic, value in reference[method]["held_out"].items():
-            assert report[method]["held_out"][statistic] == pytest.approx(value, rel=0.1, abs=step), (method, statistic)
+            assert report[method]["held_out"][statistic] == pytest.approx(value, rel=0.15, abs=step), (
+                method,
+                statistic,
+            )
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)

@@ -17,7 +17,6 @@ from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.config import ACTIVATIONS, TrainingConfig
 from trainer.data.split import split_recording
-from trainer.fits.partition_refinement import partition_indices
 
 from .chain import MAX_ANGLE, chain_angles, chain_residuals, pose_chain, write_chain
 
@@ -189,7 +188,9 @@ def test_the_report_has_the_surface_errors(report, recording, session, trained):
     skinning, split = LinearSkinning(source_recording.rig), split_recording(source_recording, TrainingConfig())
     triangles = source_recording.rig.face_vertices.reshape(-1, 3)
     edge_vertices = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    partition_of_vertex = partition_indices(read_model_info(trained / "model.onnx").partitions_of(source_recording.rig))
+    partition_of_vertex = np.empty(source_recording.rig.vertex_count, np.int64)
+    for index, partition in enumerate(read_model_info(trained / "model.onnx").partitions_of(source_recording.rig)):
+        partition_of_vertex[partition.vertices] = index
     is_across = partition_of_vertex[edge_vertices[:, 0]] != partition_of_vertex[edge_vertices[:, 1]]
     rest_lengths = np.linalg.norm(np.subtract(*source_recording.rig.rest_positions[edge_vertices.T]), axis=1)
     errors = []

@@ -198,18 +198,15 @@ def model_info(
         training_info: settings and versions.
     """
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
-    partitions = zip(trained_model.partitions, recording.partitions, trained_model.component_counts(), strict=True)
+    partitions = zip(trained_model.partitions, trained_model.component_counts(), strict=True)
     return ModelInfo(
         rig.joints,
         rig.rest_matrices,
         rig.vertex_count,
         rig.fingerprint,
         tuple(
-            ModelPartition(
-                *(p.joint, p.influencing, len(p.vertices), count, p.controls, p.merged),
-                tuple(np.setdiff1d(p.vertices, recorded.vertices).tolist()),
-            )
-            for p, recorded, count in partitions
+            ModelPartition(p.joint, p.influencing, len(p.vertices), count, p.controls, p.merged)
+            for p, count in partitions
         ),
         *(bound[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         trained_model.training_range.controls,

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdda_addon.core.partition import Partition
-from fdda_addon.core.rig import Rig
+from fdda_addon.core.rig import STATIC_JOINT, Rig
 
 from ..blocks import BLOCK_ELEMENTS
-from .joint_paths import joints_on_path, static_joints
 
 RIDGE = 1e-6
 """Ridge, as a part of the number of poses. It makes joints that move alike share the fit, and keeps factors small."""
@@ -205,3 +204,24 @@ def make_joint_regression(
     local = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ relative
     local[:, :, :, 3] += is_skin * (local[:, :, :, :3] @ center - center)
     return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1))
+
+
+def static_joints(rig: Rig) -> frozenset[int]:
+    """Return the joints of a rig that never move; they influence nothing."""
+    return frozenset(index for index, joint in enumerate(rig.joints) if joint.name == STATIC_JOINT)
+
+
+def joints_on_path(parents: np.ndarray, first: int, second: int) -> set[int]:
+    """Return the joints whose parent-relative transforms compose the transform of one joint relative to another.
+
+    Without a common ancestor, these are all joints from either one up to its root.
+    """
+    return set(_chain_to_root(parents, first)) ^ set(_chain_to_root(parents, second))
+
+
+def _chain_to_root(parents: np.ndarray, joint: int) -> list[int]:
+    chain = []
+    while joint >= 0:
+        chain.append(joint)
+        joint = int(parents[joint])
+    return chain

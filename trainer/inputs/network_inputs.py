@@ -17,10 +17,9 @@ from ..data.split import Split
 from .block import FeatureBlock, State
 from .controls import ControlFeatures
 from .joints import JointFeatures
-from .neighbor_positions import NeighborPositions
 from .surface_frames import SurfaceFrameFeatures
 
-BLOCKS: tuple[type[FeatureBlock], ...] = (JointFeatures, ControlFeatures, NeighborPositions, SurfaceFrameFeatures)
+BLOCKS: tuple[type[FeatureBlock], ...] = (JointFeatures, ControlFeatures, SurfaceFrameFeatures)
 """All blocks, in the order of their features. The direct blocks come first."""
 
 

@@ -13,11 +13,9 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.input_file import open_input
-from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.arrays import MAX_VALUE, NPY_HEADER_ERRORS
 from fdda_addon.core.rig import Fingerprint
 
-from ..fits.partition_refinement import reassign_vertices
 from ..inputs.block import State
 from .networks import Network
 
@@ -67,7 +65,6 @@ class Checkpoint:
             `{"poses", "p999"}`, mm.
         partitions: state of each partition, in the order of the recording.
         input_states: state of each block of the inputs, by its name (`inputs.block`).
-        partition_indices: (V,) int64, index of the partition of each vertex.
     """
 
     fingerprint: Fingerprint
@@ -78,18 +75,6 @@ class Checkpoint:
     history: tuple[dict, ...]
     partitions: tuple[PartitionCheckpoint, ...]
     input_states: dict[str, State]
-    partition_indices: np.ndarray
-
-    def reassign(self, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
-        """Assign the vertices of a recording to its partitions as in the checkpoint.
-
-        Raises:
-            TrainingError: the recording has other partitions.
-        """
-        vertex_count = sum(len(partition.vertices) for partition in partitions)
-        if (len(self.partitions), len(self.partition_indices)) != (len(partitions), vertex_count):
-            raise TrainingError(OTHER_PARTITIONS_SENTENCE)
-        return reassign_vertices(partitions, self.partition_indices)
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
@@ -111,7 +96,6 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     arrays = {"about": np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
     for block, state in checkpoint.input_states.items():
         arrays |= {f"{INPUTS_PREFIX}{block}/{name}": array for name, array in state.items()}
-    arrays["partition_indices"] = checkpoint.partition_indices
     for index, partition in enumerate(checkpoint.partitions):
         partition_arrays = {name: array for name, array in vars(partition).items() if name != "network"}
         partition_arrays |= {f"weight_{layer}": weight for layer, weight in enumerate(partition.network.weights)}
@@ -168,17 +152,7 @@ def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
         tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in metadata["history"]),
         tuple(partitions),
         _read_input_states(arrays),
-        _read_partition_indices(arrays["partition_indices"], partitions),
     )
-
-
-def _read_partition_indices(partition_indices: np.ndarray, partitions: list[PartitionCheckpoint]) -> np.ndarray:
-    if partition_indices.dtype != np.int64 or partition_indices.ndim != 1 or partition_indices.min(initial=0) < 0:
-        raise ValueError(CONTRADICTION_CLAUSE)
-    sizes = [len(partition.basis_mean) for partition in partitions]
-    if (3 * np.bincount(partition_indices, minlength=len(sizes))).tolist() != sizes:
-        raise ValueError(CONTRADICTION_CLAUSE)
-    return partition_indices
 
 
 def _read_input_states(arrays: np.lib.npyio.NpzFile) -> dict[str, State]:

@@ -10,7 +10,6 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.refinement import nearest_recorded_distances
 
-from ..data.residuals import residuals_of
 from ..data.split import Split
 from ..fits.half_rotations import regression_matrices
 from ..model import TrainedModel
@@ -210,7 +209,7 @@ def _truncation_fraction(
     """
     unique_poses, rows = np.unique(poses, return_inverse=True)
     pose_indices = held_out_poses[unique_poses]
-    remaining_residuals = residuals_of(recording, partition, pose_indices).astype(np.float64)
+    remaining_residuals = recording.residuals[np.ix_(pose_indices, partition.vertices)].astype(np.float64)
     if len(prepared.fit.joints):
         use_half_rotations = prepared.fit.joints.max() >= len(recording.rig.joints)
         pose_matrices = np.array(recording.pose_matrices[pose_indices])
