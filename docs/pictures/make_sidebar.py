@@ -16,7 +16,7 @@ TEXT_BRIGHTNESS = 150
 BOTTOM_MARGIN = 16
 COLUMN_GAP = 12
 SECTION_PICTURES = {
-    "manual_prepare": ("03_measure_the_rig", "04_show_a_random_pose", "07_record"),
+    "manual_prepare": ("03_measure_the_rig", "04_preview_a_random_pose", "07_record"),
     "simulation_sections": ("target", "flesh_recorded"),
     "manual_play": ("09_train", "12_measure_the_model", "14_evaluate"),
 }

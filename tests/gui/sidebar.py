@@ -16,6 +16,7 @@ from window import (
     redraw_window,
     region_override,
     require,
+    run_xdotool,
     view_area,
     view_region,
     wait_for_events,
@@ -68,6 +69,7 @@ def drawn_sections() -> set[str]:
 def open_section(name: str) -> Iterator[float]:
     """Close all sections with the mouse, from the top, and open one of them."""
     global _open_index
+    yield from _scroll("up")
     open_names = yield from list_open_sections()
     for index, section in enumerate(SECTIONS):
         for _ in range(MAX_HEADER_CLICKS):
@@ -91,6 +93,8 @@ def _click_header(index: int) -> Iterator[float]:
 def find_button(identifier: str, across: float = 0.5) -> Iterator[float]:
     """Move the mouse down the sidebar until it is over a button; return the position of the button in the window.
 
+    If the button is not visible, the sidebar is scrolled down.
+
     Args:
         identifier: part of the text that `describe_button_below_mouse` returns for the button.
         across: horizontal position of the search in the sidebar, 0 at the left and 1 at the right.
@@ -107,12 +111,12 @@ def find_button(identifier: str, across: float = 0.5) -> Iterator[float]:
     # The last position first; all others twice, because Blender may redraw the sidebar during the search.
     last_heights = [_button_heights[identifier]] if identifier in _button_heights else []
     for y in [*last_heights, *search_heights, *search_heights]:
-        move_mouse(x, y)
-        yield from wait_for_events()
-        with region_override("UI"):
-            description = describe_button_below_mouse()
-        if identifier in description:
+        if identifier in (yield from _description_at(x, y)):
             _button_heights[identifier] = y
+            return x, y
+    yield from _scroll("down")
+    for y in [sidebar.y + sidebar.height - index * step for index in range(int(sidebar.height / step))]:
+        if identifier in (yield from _description_at(x, y)):
             return x, y
     require(False, f"there is no button {identifier} in the sidebar")
 
@@ -163,6 +167,15 @@ def open_subpanel(above: str, content: str, across: float = 0.5, across_above: f
         yield from click(header_x, y)
         yield from redraw_window()
     require(False, f"no sub-panel below {above} has {content}")
+
+
+def _scroll(direction: str) -> Iterator[float]:
+    """Scroll the sidebar to its end with the mouse wheel, "up" or "down"."""
+    sidebar = view_region("UI")
+    move_mouse(sidebar.x + 0.4 * sidebar.width, sidebar.y + 0.5 * sidebar.height)
+    yield from wait_for_events()
+    run_xdotool("click", "--repeat", 40, "--delay", 10, 4 if direction == "up" else 5)
+    yield from redraw_window()
 
 
 def _description_at(x: float, y: float) -> Iterator[float]:
