@@ -69,5 +69,7 @@ def _profile(options: argparse.Namespace) -> None:
         for step in profile_frame(scene_rig):
             if isinstance(step, Progress):
                 progress.show(step.stage, step.done, step.total)
-    write_json(options.json, step.to_json())
-    print(step.table())
+            else:
+                write_json(options.json, step.to_json())
+                progress.end_line()
+                print(step.table())

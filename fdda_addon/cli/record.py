@@ -80,7 +80,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="WHAT",
         help="bones that random poses move, instead of the deforming bones: collection:NAME, action:NAME (the bones "
-        "that the action keys, in the ranges that it uses), bone:NAME or selected; repeatable",
+        "that the action keys, in the ranges that it uses), bone:NAME, selected, or remix (every second pose takes "
+        "each limb from a random frame of the actions of --action, with noise); repeatable",
     )
     parser.add_argument(
         "--control",

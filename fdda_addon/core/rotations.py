@@ -28,14 +28,14 @@ def rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
         (F, 3) float64, radians, continuous past 180 degrees from the rest pose.
     """
     unit_quaternions = _normalize(quaternions)
-    vectors = _to_rotation_vectors(unit_quaternions)
+    vectors = to_rotation_vectors(unit_quaternions)
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
     # The other vector of each rotation: about the opposite axis, by the remaining angle to a full turn.
     alternatives = np.where(
         angles > MIN_ANGLE_RADIANS, vectors * (1 - FULL_TURN / np.maximum(angles, MIN_ANGLE_RADIANS)), vectors
     )
     return _choose_narrow_range(
-        np.stack([vectors, alternatives], axis=1), _to_rotation_vectors(_mean_quaternion(unit_quaternions)[None])[0]
+        np.stack([vectors, alternatives], axis=1), to_rotation_vectors(_mean_quaternion(unit_quaternions)[None])[0]
     )
 
 
@@ -104,8 +104,27 @@ def _mean_quaternion(unit_quaternions: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(unit_quaternions.T @ unit_quaternions)[1][:, -1]
 
 
-def _to_rotation_vectors(unit_quaternions: np.ndarray) -> np.ndarray:
-    """Compute (F, 3) rotation vectors of at most 180 degrees."""
+def to_quaternions(vectors: np.ndarray) -> np.ndarray:
+    """Compute (F, 4) unit quaternions, w first, from (F, 3) rotation vectors in radians."""
+    half_angles = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
+    # numpy's sinc is sin(pi x) / (pi x), which is defined at 0.
+    return np.hstack([np.cos(half_angles), vectors / 2 * np.sinc(half_angles / np.pi)])
+
+
+def multiply_quaternions(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Multiply (F, 4) quaternions, w first: the rotation `second` in the space that `first` has rotated."""
+    scalar, vector = first[:, :1], first[:, 1:]
+    other_scalar, other_vector = second[:, :1], second[:, 1:]
+    return np.hstack(
+        [
+            scalar * other_scalar - (vector * other_vector).sum(axis=1, keepdims=True),
+            scalar * other_vector + other_scalar * vector + np.cross(vector, other_vector),
+        ]
+    )
+
+
+def to_rotation_vectors(unit_quaternions: np.ndarray) -> np.ndarray:
+    """Compute (F, 3) rotation vectors of at most 180 degrees, radians, from (F, 4) quaternions, w first."""
     unit_quaternions = np.where(unit_quaternions[:, :1] < 0, -unit_quaternions, unit_quaternions)
     sines = np.linalg.norm(unit_quaternions[:, 1:], axis=1, keepdims=True)
     angles = 2 * np.arctan2(sines, unit_quaternions[:, :1])

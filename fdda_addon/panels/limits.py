@@ -183,7 +183,7 @@ def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBo
     if channels is None:
         _draw_limits(layout.box(), rig, bone)
     elif bone.name in channels:
-        if rig.mesh_object.fdda.settings.sample == "ACTIONS":
+        if rig.mesh_object.fdda.settings.sample in {"ACTIONS", "REMIX"}:
             sampling.draw_channels(layout.box(), bone, channels[bone.name])
         else:
             _draw_limits(layout.box(), rig, bone)

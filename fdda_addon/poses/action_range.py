@@ -130,7 +130,7 @@ def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> ChannelRanges:
 
 def _measure(armature_object: bpy.types.Object, action: bpy.types.Action) -> _Measurement:
     """Measure an action, and cache the result until its keyframes change, because many bones take a second."""
-    frames, curves = action_frames(action), _curves_by_bone(armature_object, action)
+    frames, curves = action_frames(action), curves_by_bone(armature_object, action)
     content_key = _keyframe_content_key(armature_object, frames, curves)
     cache_key = armature_object.session_uid, action.session_uid
     measurement = _cache.get(cache_key)
@@ -175,7 +175,7 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
         actions: the actions.
     """
     controls = []
-    for (owner, path), bounds in _keyed_controls(scene_rig, actions).items():
+    for (owner, path), bounds in keyed_controls(scene_rig, actions).items():
         if has_width(bounds):
             with suppress(RigError):
                 controls.append(make_control(scene_rig, owner, path, bounds))
@@ -185,7 +185,7 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
 def constant_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Channel, ...]:
     """Find numbers of a rig that actions key at a single value other than the current one, as constant channels."""
     channels = []
-    for (owner, path), (low, high) in _keyed_controls(scene_rig, actions).items():
+    for (owner, path), (low, high) in keyed_controls(scene_rig, actions).items():
         datablock = owner_of(scene_rig, owner)
         if is_number(datablock, path) and not has_width((low, high)):
             channel = Channel(f"{owner}/{path}", CONTROL, 0, low, low)
@@ -194,24 +194,35 @@ def constant_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
     return tuple(channels)
 
 
-def _keyed_controls(
+def keyed_controls(
     scene_rig: SceneRig, actions: Iterable[bpy.types.Action]
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Measure the lowest and highest value of keyed numbers, by owner and path."""
     ranges: dict[tuple[str, str], tuple[float, float]] = {}
     for action in actions:
-        frames = action_frames(action)
-        for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
-            datablock = owner_of(scene_rig, owner)
-            for curve in _unmuted_curves(action, datablock) if datablock else ():
-                if _CONTROL_PATH.fullmatch(curve.data_path):
-                    values = [curve.evaluate(frame) for frame in frames]
-                    low, high = ranges.get((owner, curve.data_path), (np.inf, -np.inf))
-                    ranges[owner, curve.data_path] = min(low, *values), max(high, *values)
+        for key, values in keyed_numbers(scene_rig, action).items():
+            low, high = ranges.get(key, (np.inf, -np.inf))
+            ranges[key] = min(low, float(values.min())), max(high, float(values.max()))
     return ranges
 
 
-def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, CurvesByChannel]:
+def keyed_numbers(scene_rig: SceneRig, action: bpy.types.Action) -> dict[tuple[str, str], np.ndarray]:
+    """Evaluate the numbers, besides the channels of bones, that an action keys.
+
+    Returns:
+        (F,) float64 values in the frames of the action, by owner and path as in `Control`.
+    """
+    frames, numbers = action_frames(action), {}
+    for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
+        datablock = owner_of(scene_rig, owner)
+        for curve in _unmuted_curves(action, datablock) if datablock else ():
+            if _CONTROL_PATH.fullmatch(curve.data_path):
+                numbers[owner, curve.data_path] = np.array([curve.evaluate(frame) for frame in frames])
+    return numbers
+
+
+def curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, CurvesByChannel]:
+    """Return the unmuted F-curves of an action that animate locations, rotations and scales of bones."""
     curves: dict[str, CurvesByChannel] = {}
     for curve in _unmuted_curves(action, armature_object):
         match = _BONE_CHANNEL_PATH.fullmatch(curve.data_path)
@@ -244,22 +255,22 @@ def _channel_values(
     """
     for kind in (LOCATION, SCALE):
         for axis in curves.get(kind, {}):
-            yield kind, axis, _evaluate_curves(curves[kind], kind, frames)[:, axis]
+            yield kind, axis, evaluate_curves(curves[kind], kind, frames)[:, axis]
     channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}.get(bone.rotation_mode)
     channel = channel or "rotation_euler"
     keyed_curves = curves.get(channel)
     if keyed_curves:
-        values = _evaluate_curves(keyed_curves, channel, frames)
+        values = evaluate_curves(keyed_curves, channel, frames)
         if channel != "rotation_euler":
             if channel == "rotation_axis_angle":
-                values = np.array([_axis_angle_to_quaternion(value) for value in values])
+                values = np.array([axis_angle_to_quaternion(value) for value in values])
             rotations[bone.name] = values.astype(np.float32)
         angles = _continuous_angles(channel, bone.rotation_mode, values)
         for axis in keyed_curves if channel == "rotation_euler" else range(3):
             yield ROTATION, axis, angles[:, axis]
 
 
-def _evaluate_curves(curves: dict[int, bpy.types.FCurve], channel: str, frames: range) -> np.ndarray:
+def evaluate_curves(curves: dict[int, bpy.types.FCurve], channel: str, frames: range) -> np.ndarray:
     """Evaluate the F-curves of a channel, (F, 3 or 4) float64; components without an F-curve have their rest values."""
     values = np.tile(np.float64(_REST_VALUES[channel]), (len(frames), 1))
     for index, curve in curves.items():
@@ -290,6 +301,6 @@ def _continuous_angles(channel: str, rotation_mode: str, values: np.ndarray) -> 
     return angles
 
 
-def _axis_angle_to_quaternion(value: np.ndarray) -> Quaternion:
+def axis_angle_to_quaternion(value: np.ndarray) -> Quaternion:
     axis = Vector(value[1:])
     return Quaternion(axis, value[0]) if axis.length else Quaternion()

@@ -9,11 +9,15 @@ import bpy
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.poses import Channel
+from ..core.remix import Remix
 from ..scene.compatibility import is_selected
 from ..scene.scene_rig import SceneRig
 from .action_range import constant_controls, keyed_ranges, measured_controls
 from .clip import find_action
+from .remix import read_remix
 
+REMIX = "remix"
+"""Entry for the bones of the recorded actions, whose limbs are combined from different frames (`core.remix`)."""
 SELECTED_BONES, COLLECTION_PREFIX, ACTION_PREFIX, BONE_PREFIX = "selected", "collection:", "action:", "bone:"
 """Forms of an entry: the selected bones, and the prefixes of a bone collection, an action and a single bone."""
 
@@ -39,6 +43,7 @@ class SampleSelection:
     controls: tuple[Control, ...] = ()
     constant_channels: tuple[Channel, ...] = ()
     control_bones: frozenset[str] = frozenset()
+    remix: Remix | None = None
 
 
 DEFAULT_SELECTION = SampleSelection()
@@ -62,15 +67,21 @@ def select_bones(
     Raises:
         RigError: there is no such collection, action or bone.
     """
-    texts = list(texts)
+    texts, recorded_actions = list(texts), list(recorded_actions)
     measured = keyed_ranges(scene_rig.armature_object, recorded_actions if control_bones else ())
     control_ranges = {key: bounds for key, bounds in measured.items() if key[0] in control_bones}
     if not texts:
         return replace(DEFAULT_SELECTION, measured=tuple(control_ranges.items()), control_bones=control_bones)
     selected_bones = set(control_bones)
     actions = []
+    remix = None
     for text in texts:
-        if text.startswith(ACTION_PREFIX):
+        if text == REMIX:
+            if not recorded_actions:
+                raise RigError("Remixed poses combine the limbs of recorded actions; name some (--action NAME).")
+            actions += recorded_actions
+            remix = read_remix(scene_rig, recorded_actions)
+        elif text.startswith(ACTION_PREFIX):
             actions.append(find_action(text.removeprefix(ACTION_PREFIX)))
         else:
             selected_bones |= parse_bones(scene_rig, text)
@@ -84,6 +95,7 @@ def select_bones(
         controls,
         constant_channels,
         control_bones,
+        remix,
     )
 
 
@@ -107,6 +119,6 @@ def parse_bones(scene_rig: SceneRig, text: str) -> set[str]:
     if not text.startswith(BONE_PREFIX) or name not in bones:
         raise RigError(
             f"'{text}' chooses nothing of '{armature_object.name}'; give {SELECTED_BONES}, {COLLECTION_PREFIX}NAME, "
-            f"{ACTION_PREFIX}NAME or {BONE_PREFIX}NAME of what is there."
+            f"{ACTION_PREFIX}NAME, {BONE_PREFIX}NAME of what is there, or {REMIX}."
         )
     return {name}

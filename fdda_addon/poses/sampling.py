@@ -10,6 +10,7 @@ from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.model import ModelInfo
 from ..core.poses import CHANNEL_KINDS, CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
+from ..core.remix import replace_bone_channels
 from ..core.rig import Rig
 from ..scene.controls import can_be_set, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
@@ -112,7 +113,8 @@ def _bone_channels(
 ) -> tuple[Channel, ...]:
     """Return the channels of the bones of a selection; `names` is passed to `default_channels`."""
     if selection.bones is not None:
-        return selected_channels(armature_object, selection)
+        channels = selected_channels(armature_object, selection)
+        return channels if selection.remix is None else replace_bone_channels(channels, selection.remix.channels)
     channels = default_channels(armature_object, names)
     if not selection.control_bones:
         return channels

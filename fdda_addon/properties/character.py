@@ -107,6 +107,11 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
                 "Bones in the Checked Actions",
                 "The bones that the checked actions key, in the ranges they use",
             ),
+            (
+                "REMIX",
+                "Limbs from the Checked Actions",
+                "The bones that the checked actions key; every second pose combines limbs from different frames",
+            ),
             ("SELECTED", "Selected Bones", "The bones that were selected when Use Selected Bones was pressed"),
         ),
         default="WEIGHTS",

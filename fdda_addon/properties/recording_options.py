@@ -93,12 +93,11 @@ def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tu
                 "Bones to Pose is set to Bone Collection, but no collection is chosen; choose one in Training Poses."
             )
         return (f"collection:{settings.bone_collection}",)
-    if settings.sample == "ACTIONS":
+    if settings.sample in {"ACTIONS", "REMIX"}:
         if not actions:
-            raise RigError(
-                "Bones to Pose is set to Bones in the Checked Actions, but no action is checked; check one below it."
-            )
-        return tuple(f"action:{name}" for name in actions)
+            label = settings.bl_rna.properties["sample"].enum_items[settings.sample].name
+            raise RigError(f"Bones to Pose is set to {label}, but no action is checked; check one below it.")
+        return tuple(f"action:{name}" for name in actions) if settings.sample == "ACTIONS" else ("remix",)
     if settings.sample == "SELECTED":
         if not settings.sampled_bones:
             raise RigError(

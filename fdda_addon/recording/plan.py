@@ -13,10 +13,12 @@ from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.poses import Channel, Margin, make_margin
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
+from ..core.remix import PoseSampler
 from ..core.rig import Rig
 from ..poses.clip import find_clips
 from ..poses.control_bones import split_control_bones
-from ..poses.sample_selection import SampleSelection, select_bones
+from ..poses.remix import read_remix
+from ..poses.sample_selection import REMIX, SampleSelection, select_bones
 from ..poses.sampling import (
     ControlRanges,
     controls_of_bones,
@@ -94,6 +96,18 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
     return replace(rig, controls=selection.controls), channels
 
 
+def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseSampler:
+    """Make the sampler of the random poses of a recording.
+
+    Raises:
+        RigError: as `select_bones`.
+    """
+    remix = None
+    if REMIX in settings.sample and settings.poses:
+        remix = read_remix(scene_rig, find_actions(settings))
+    return PoseSampler(settings.seed, settings.spread, remix)
+
+
 def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
     """Return whether the target of the settings depends on more than the pose, as a simulation does.
 
@@ -151,7 +165,8 @@ def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tu
     Raises:
         RigError: an action or strip of the settings does not exist.
     """
-    sources = [Source(RANDOM, settings.poses)] if settings.poses else []
+    name = REMIX if REMIX in settings.sample else ""
+    sources = [Source(RANDOM, settings.poses, name)] if settings.poses else []
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
     sampled_channels_of_recording = channels if settings.poses else ()

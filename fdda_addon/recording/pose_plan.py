@@ -2,18 +2,19 @@
 """Plans and sets the poses of one or several recordings: random poses, then the frames of clips."""
 
 from collections.abc import Callable, Collection, Container, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..core.controls import MESH_OBJECT, SHAPE_KEYS
-from ..core.poses import CONTROL, Channel, sample_pose
+from ..core.poses import CONTROL, Channel
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits
 from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest, reversible_frames
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, make_recording_margin
+from .plan import RecordingSettings, make_pose_sampler, make_recording_margin
 
 REPEATABILITY_INDEX_OFFSET = 1 << 36
 """First index of the random poses from which a pose is approached again to measure the repeatability.
@@ -60,6 +61,7 @@ class PosePlan:
         self._channels = tuple(channel for _, channel in unique_channels.values())
         self._margin = make_recording_margin(self._rigs[0], settings, self._channels)
         self.in_range_count = settings.poses - (self._margin.poses if self._margin else 0)
+        self._sampler = make_pose_sampler(self._rigs[0], settings)
 
     def channels_of_mesh(self, mesh_index: int) -> tuple[Channel, ...]:
         """Return the channels of the recording of one mesh: the shared channels and its own."""
@@ -142,7 +144,9 @@ class PosePlan:
         self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]
     ) -> Callable[[float], None]:
         """Return a function that blends from the rest pose to a random pose by a factor of 0 to 1."""
-        values = sample_pose(channels, self._settings.seed, index, self._settings.spread)
+        is_in_range = index < self.in_range_count or index >= REPEATABILITY_INDEX_OFFSET
+        sampler = self._sampler if is_in_range else replace(self._sampler, remix=None)
+        values = sampler.draw_pose(channels, index)
         return blend_from_rest(set_pose, np.array([channel.rest for channel in channels]), values)
 
     def _make_setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:

@@ -35,18 +35,18 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
         RigError: there is no channel to sample.
     """
     global _shown_pose
-    from ..core.poses import sample_pose
     from ..scene.armature import Poser, clear_pose, pose_values
-    from .plan import make_recording_margin, read_sampled_rig
+    from .plan import make_pose_sampler, make_recording_margin, read_sampled_rig
 
     settings = replace(settings, poses=max(1, settings.poses))
     index = min(index, settings.poses - 1)
     _, channels = read_sampled_rig(scene_rig, settings)
     margin = make_recording_margin(scene_rig, settings, channels)
+    sampler = make_pose_sampler(scene_rig, settings)
     if margin and index >= settings.poses - margin.poses:
-        channels = margin.channels
+        channels, sampler = margin.channels, replace(sampler, remix=None)
     clear_pose(scene_rig.armature_object)
-    Poser(scene_rig, channels).set(sample_pose(channels, settings.seed, index, settings.spread))
+    Poser(scene_rig, channels).set(sampler.draw_pose(channels, index))
     scene_rig.armature_object.update_tag(refresh={"DATA"})
     _shown_pose = scene_rig.armature_object.session_uid, pose_values(scene_rig.armature_object)
     return index

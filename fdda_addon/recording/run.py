@@ -11,7 +11,6 @@ import bpy
 
 from ..core.errors import RecordingError
 from ..core.partition import GOLDEN_RATIO, assume_nearby_influences, make_merged_partitions
-from ..core.poses import sample_pose
 from ..core.progress import Progress
 from ..core.recording.estimate import check_disk_space, recording_bytes
 from ..core.recording.folder_check import check_recordable
@@ -31,7 +30,7 @@ from .appender import PoseAppender, append_poses
 from .influences import InfluenceSearch, detect_influences
 from .mesh_group import common_armature, group_into_passes, split_controls
 from .phases import InfluencesReady, MeshPlanned, TimedEvaluator, WeightsFitted, describe_estimate
-from .plan import RecordingSettings, find_actions, make_sampling, read_sampled_rig
+from .plan import RecordingSettings, find_actions, make_pose_sampler, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
 from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
 from .repeatability import measure_repeatability
@@ -193,9 +192,10 @@ def _find_influences(
 ) -> Generator[Progress, None, InfluencesReady]:
     """Read previous influences on the partitions of a mesh, or detect them with the channels of this mesh alone."""
     scene_rig, channels = mesh.planned.scene_rig, mesh.planned.channels
+    sampler = make_pose_sampler(scene_rig, settings)
     search = InfluenceSearch(
         channels,
-        lambda index: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + index, settings.spread),
+        lambda index: sampler.draw_pose(channels, INFLUENCE_SEED_OFFSET + index),
         lambda index: _show_frame(player, clips, index),
         player.stop,
         settings.influence_poses,

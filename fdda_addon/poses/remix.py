@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads the frames of actions from which random poses combine limbs (`core.remix`)."""
+
+from collections.abc import Iterable, Sequence
+
+import bpy
+import numpy as np
+from mathutils import Euler
+
+from ..core.errors import RigError
+from ..core.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION_VECTOR, SCALE, Channel
+from ..core.remix import Remix, find_limbs
+from ..core.rotations import rotation_vectors
+from ..scene.controls import is_driven, is_number, owner_of
+from ..scene.scene_rig import SceneRig
+from .action_range import (
+    CurvesByChannel,
+    action_frames,
+    axis_angle_to_quaternion,
+    curves_by_bone,
+    evaluate_curves,
+    keyed_numbers,
+)
+
+_REST_VALUES = {ROTATION_VECTOR: 0.0, LOCATION: 0.0, SCALE: 1.0}
+
+
+def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remix:
+    """Read the frames of actions.
+
+    A bone that an action does not key is in its rest pose in the frames of this action. Locations, scales and custom
+    properties of a bone come from the same frame as its rotation, without noise; numbers that belong to no bone, such
+    as shape keys, all come from another frame.
+
+    Args:
+        scene_rig: the rig.
+        actions: the actions.
+
+    Raises:
+        RigError: the actions move no bone.
+    """
+    clips = [(action_frames(action), curves_by_bone(scene_rig.armature_object, action)) for action in actions]
+    bones = [bone for bone in scene_rig.armature_object.pose.bones if any(bone.name in curves for _, curves in clips)]
+    limbs = dict(zip((bone.name for bone in bones), find_limbs(_parents(bones)).tolist(), strict=True))
+    columns: list[tuple[Channel, np.ndarray, int, bool]] = []
+    for bone in bones:
+        for kind, values in _bone_values(bone, clips).items():
+            is_used = np.abs(values - _REST_VALUES[kind]).max(axis=0) > RANGE_TOLERANCE
+            for axis in range(3):
+                if is_used[axis] or (kind == ROTATION_VECTOR and is_used.any()):
+                    channel = Channel(bone.name, kind, axis, *_bounds(values[:, axis]))
+                    has_noise = kind == ROTATION_VECTOR and not bone.lock_rotation[axis]
+                    columns.append((channel, values[:, axis], limbs[bone.name], has_noise))
+    if not columns:
+        names = ", ".join(f"'{action.name}'" for action in actions)
+        raise RigError(f"There is no pose to remix: {names} moves no bone of '{scene_rig.armature_object.name}'.")
+    limbs_by_path = {bone.path_from_id(): limbs[bone.name] for bone in bones}
+    for (owner, path), values in _number_values(scene_rig, actions).items():
+        limb = limbs_by_path.get(path[: path.find('"]') + 2], len(bones))
+        columns.append((Channel(f"{owner}/{path}", CONTROL, 0, *_bounds(values)), values, limb, False))
+    channels, values, channel_limbs, has_noise = zip(*columns, strict=True)
+    return Remix(channels, np.stack(values, axis=1), np.array(channel_limbs, np.int64), np.array(has_noise, bool))
+
+
+def _parents(bones: Sequence[bpy.types.PoseBone]) -> list[int]:
+    """Return the index of the nearest ancestor of each bone among the bones, -1 without one."""
+    indices = {bone.name: index for index, bone in enumerate(bones)}
+    return [
+        next((indices[ancestor.name] for ancestor in bone.parent_recursive if ancestor.name in indices), -1)
+        for bone in bones
+    ]
+
+
+def _bounds(values: np.ndarray) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
+
+
+def _bone_values(
+    bone: bpy.types.PoseBone, clips: Iterable[tuple[range, dict[str, CurvesByChannel]]]
+) -> dict[str, np.ndarray]:
+    """Return (F, 3) values of a bone in all frames, by kind; `clips` has the frames and F-curves of each action."""
+    quaternions, locations, scales = [], [], []
+    for frames, curves_of_bones in clips:
+        curves = curves_of_bones.get(bone.name, {})
+        quaternions.append(_quaternions(bone, curves, frames))
+        locations.append(evaluate_curves(curves.get(LOCATION, {}), LOCATION, frames))
+        scales.append(evaluate_curves(curves.get(SCALE, {}), SCALE, frames))
+    return {
+        ROTATION_VECTOR: rotation_vectors(np.concatenate(quaternions)),
+        LOCATION: np.concatenate(locations),
+        SCALE: np.concatenate(scales),
+    }
+
+
+def _quaternions(bone: bpy.types.PoseBone, curves: CurvesByChannel, frames: range) -> np.ndarray:
+    """Return the (F, 4) rotations of a bone relative to its rest pose, in its rotation mode."""
+    if bone.rotation_mode == "QUATERNION":
+        return evaluate_curves(curves.get("rotation_quaternion", {}), "rotation_quaternion", frames)
+    if bone.rotation_mode == "AXIS_ANGLE":
+        values = evaluate_curves(curves.get("rotation_axis_angle", {}), "rotation_axis_angle", frames)
+        return np.array([axis_angle_to_quaternion(value) for value in values])
+    angles = evaluate_curves(curves.get("rotation_euler", {}), "rotation_euler", frames)
+    return np.array([Euler(angle, bone.rotation_mode).to_quaternion() for angle in angles])
+
+
+def _number_values(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> dict[tuple[str, str], np.ndarray]:
+    """Return (F,) values of the numbers that actions key, by owner and path.
+
+    A number has its current value in the frames of an action that does not key it.
+    """
+    numbers_by_action = [keyed_numbers(scene_rig, action) for action in actions]
+    values: dict[tuple[str, str], np.ndarray] = {}
+    for owner, path in dict.fromkeys(key for numbers in numbers_by_action for key in numbers):
+        datablock = owner_of(scene_rig, owner)
+        if is_number(datablock, path) and not is_driven(datablock, path):
+            current = float(datablock.path_resolve(path))
+            values[owner, path] = np.concatenate(
+                [
+                    numbers.get((owner, path), np.full(len(action_frames(action)), current))
+                    for action, numbers in zip(actions, numbers_by_action, strict=True)
+                ]
+            )
+    return values
