@@ -5,7 +5,6 @@ Thousands of bones cannot be timed one by one. The group that takes the most tim
 single bones or too small to measure.
 """
 
-import heapq
 import statistics
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ from .durations import Duration, scene_times
 MAX_GROUPS = 10
 MAX_MEASUREMENTS = 40
 """Largest number of groups that are measured."""
-ROUNDS, FRAMES_PER_ROUND = 3, 6
+ROUNDS, FRAMES_PER_ROUND = 3, 8
 MIN_GROUP_MS = 0.02
 """A group that takes less time is not divided."""
 NO_BONE = ""
@@ -86,28 +85,34 @@ def find_expensive_groups(
         At most `MAX_GROUPS` groups, largest first.
     """
     mutables = mutables_by_bone(armature_object)
-    names = list(mutables)
-    queue: list[tuple[float, int, BoneGroup]] = []
-    leaves: list[BoneGroup] = []
-    pending = [names] if names else []
+    if not mutables:
+        return ()
     measured_count = 0
-    while pending:
-        for group_names in pending:
-            group = _measure_group(mutables, group_names, scene, frames)
-            heapq.heappush(queue, (-group.duration.median, measured_count, group))
-            measured_count += 1
-            yield Progress("bones", min(measured_count, MAX_MEASUREMENTS), MAX_MEASUREMENTS)
-        pending = []
-        while queue and not pending and measured_count + 2 <= MAX_MEASUREMENTS:
-            _, _, group = heapq.heappop(queue)
-            if len(group.bones) > 1 and group.duration.median > max(MIN_GROUP_MS, group.duration.spread):
-                middle = len(group.bones) // 2
-                pending = [group.bones[:middle], group.bones[middle:]]
-            else:
-                leaves.append(group)
-    groups = sorted([*leaves, *(group for _, _, group in queue)], key=lambda group: -group.duration.median)
-    # A group within the noise says nothing.
-    return tuple(group for group in groups if group.duration.median > group.duration.spread)[:MAX_GROUPS]
+
+    def measure(names: Iterable[str]) -> Generator[Progress, None, BoneGroup]:
+        nonlocal measured_count
+        group = _measure_group(mutables, names, scene, frames)
+        measured_count += 1
+        yield Progress("bones", measured_count, MAX_MEASUREMENTS)
+        return group
+
+    queue = [(yield from measure(mutables))]
+    groups: list[BoneGroup] = []
+    while queue:
+        queue.sort(key=lambda group: group.duration.median)
+        group = queue.pop()
+        halves = []
+        if len(group.bones) > 1 and group.duration.median > MIN_GROUP_MS and measured_count + 2 <= MAX_MEASUREMENTS:
+            middle = len(group.bones) // 2
+            for names in (group.bones[:middle], group.bones[middle:]):
+                halves.append((yield from measure(names)))
+        # A half within the noise says nothing. If both are, the group stays whole.
+        if clear_halves := [half for half in halves if half.duration.is_clear]:
+            queue += clear_halves
+        elif group.duration.is_clear:
+            groups.append(group)
+    yield Progress("bones", MAX_MEASUREMENTS, MAX_MEASUREMENTS)
+    return tuple(sorted(groups, key=lambda group: -group.duration.median)[:MAX_GROUPS])
 
 
 def mutables_by_bone(armature_object: bpy.types.Object) -> dict[str, list[Mutable]]:
