@@ -169,10 +169,13 @@ def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, mod
         draw_wrapped(box, context, *_describe_goal(goal))
     for warning in assessment.warnings:
         draw_wrapped(box, context, warning, "BLANK1")
-    for warning in report.get("warnings", ()):
-        draw_wrapped(box, context, f"Warning: {warning['name']}; see the training report.", "INFO")
     if assessment.next_step:
         draw_wrapped(box, context, assessment.next_step, "BLANK1")
+    if warnings := report.get("warnings"):
+        header, body = layout.panel("fdda_recording_warnings", default_closed=True)
+        header.label(text=f"Recording Warnings ({len(warnings)})", icon="INFO")
+        for warning in warnings if body is not None else ():
+            draw_wrapped(body, context, warning["text"], "DOT")
 
 
 @draw_cached
