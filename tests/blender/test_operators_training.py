@@ -11,11 +11,14 @@ from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job
+from fdda_addon.panels import checks
 from fdda_addon.properties.character import model_file
 from fdda_addon.runtime.model_files import model_path
 from fdda_addon.scene.scene_rig import SceneRig
 
+from .drawing import texts_of
 from .scene_state import assert_same_state, scene_state
+from .test_panel_drawing import draw_section
 
 
 def recorded_folder(tmp_path: Path) -> Path:
@@ -38,6 +41,16 @@ def test_a_model_is_trained_with_the_settings_and_learning_curves_are_stored(sav
     assert (state.done, state.total) == (6, 6) and state.outcome.startswith("Trained 'a.onnx' in ")
     assert [len(state.curves[name]) for name in ("training", "validation")] == [6, 6]
     assert state.curves["validation"][-1] < state.curves["validation"][0]
+
+
+def test_the_section_says_what_the_errors_mean_and_offers_the_next_step(saved, elbow_files):
+    assert train(saved, elbow_files) == {"FINISHED"}
+    bpy.context.view_layer.objects.active = saved.mesh_object
+    checks.check_now(saved)
+    texts = texts_of(draw_section("training"))
+    assert any(text.startswith("Unseen poses: ") for text in texts)
+    assert "Bind 'elbow.onnx'" in texts and "Train Again" in texts
+    assert len(texts) > texts.index("Bind 'elbow.onnx'") > texts.index("Train Again")
 
 
 def test_training_again_keeps_the_former_model_in_the_library(saved, elbow_files, tmp_path):
