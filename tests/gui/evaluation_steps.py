@@ -74,15 +74,19 @@ def mark_the_worst_frames(folder: Path) -> Iterator[float]:
         {marker.frame for marker in timeline_markers} == {index + 1 for index, _ in worst},
         f"markers are at {sorted(marker.frame for marker in timeline_markers)}, the worst frames are {worst}",
     )
+    region3d = view_area().spaces[0].region_3d
+    initial_location, initial_distance = region3d.view_location.copy(), region3d.view_distance
     yield from sidebar.press_button("fdda.jump_to_worst")
     yield 0.2
     frame = bpy.context.scene.frame_current
     require(frame == worst[0][0] + 1, f"it jumps to frame {frame}, the worst is {worst[0][0] + 1}")
-    region3d = view_area().spaces[0].region_3d
-    initial_location, initial_distance = region3d.view_location.copy(), region3d.view_distance
+    distance = region3d.view_distance
+    require(distance == initial_distance, f"the button without the lens changes the view from {initial_distance}")
     yield from sidebar.press_button("zoom=True", across=0.98)
     yield from wait_until(
-        lambda: region3d.view_distance < initial_distance, 5, "the view does not go to the worst vertex"
+        lambda: region3d.view_distance < initial_distance,
+        5,
+        f"the view stays {initial_distance} away and does not go to the worst vertex",
     )
     yield from save_screenshot(folder / "worst_vertex.png")
     region3d.view_location, region3d.view_distance = initial_location, initial_distance
