@@ -172,7 +172,8 @@ def open_subpanel(above: str, content: str, across: float = 0.5, across_above: f
 def _scroll(direction: str) -> Iterator[float]:
     """Scroll the sidebar to its end with the mouse wheel, "up" or "down"."""
     sidebar = view_region("UI")
-    move_mouse(sidebar.x + 0.4 * sidebar.width, sidebar.y + 0.5 * sidebar.height)
+    # At the top there is always a panel; where there is none, the mouse wheel zooms the view.
+    move_mouse(sidebar.x + 0.4 * sidebar.width, sidebar.y + sidebar.height - HEADER_CENTER_PIXELS)
     yield from wait_for_events()
     run_xdotool("click", "--repeat", 40, "--delay", 10, 4 if direction == "up" else 5)
     yield from redraw_window()
