@@ -3,6 +3,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.checks.warning import RecordingWarning, raise_first_warning
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import atomic_write_all
-from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.estimate import training_size_sentence
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import report_text
@@ -21,15 +21,16 @@ from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
 from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
-from .export.export import build_model, measure, measure_surface, write_model
+from .export.export import ExportedModel, build_model, measure, measure_surface, write_model
 from .fits.gravity import drop_gravity_input
 from .fits.half_rotations import half_rotations_help
 from .goal import GoalResult, evaluate_goal
 from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
 from .inputs.surface_frames import SurfaceFrameFeatures
 from .model import TrainedModel, is_sheared
-from .networks.checkpoint import write_checkpoint
+from .networks.checkpoint import Checkpoint, write_checkpoint
 from .networks.confidence import measure_training_range
+from .networks.curves import Progress
 from .networks.loop import TrainingResult, choose_device, train
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import check_training_outputs, training_outputs
@@ -73,88 +74,22 @@ def train_model(
     split = split_recording(recording, config)
     holdout = holdout_fingerprint(recording, split)
     checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
-    device = choose_device()
-    sink.send(
-        MessageType.STARTED,
-        partitions=len(recording.partitions),
-        poses=len(recording.pose_matrices),
-        vertices=recording.rig.vertex_count,
-        device=str(device),
-    )
-    sink.send(MessageType.LOG, text=training_size_sentence(recording))
-    warnings = _check_recording(recording, sink, strict)
-    _raise_if_stopped(should_stop)
+    job = _Job(config, sink, should_stop)
+    warnings = job.start(recording, strict)
     recording = drop_gravity_input(recording, split)
-    # A warm start keeps the inputs of the checkpoint.
-    input_states = checkpoint.input_states if checkpoint else fit_inputs(recording, split, config, should_stop)
-    for block in make_inputs(recording.rig, recording.partitions, input_states).blocks:
-        if block.log_text:
-            sink.send(MessageType.LOG, text=block.log_text)
-    # Surface frames make half-rotation features unnecessary.
-    has_surface_frames = bool(input_states.get(SurfaceFrameFeatures.name))
-    use_half_rotations = not has_surface_frames and half_rotations_help(recording, split.training, should_stop)
-    if use_half_rotations:
-        sink.send(
-            MessageType.LOG, text="The rig blends rotations: residuals are fitted to half-rotation features, too."
-        )
-    partitions = recording.partitions
-    inputs = make_inputs(recording.rig, partitions, input_states)
-    prepared = _prepare_partitions(recording, partitions, inputs, use_half_rotations, split, config, sink, should_stop)
-    columns = [
-        offered_columns[partition.columns] for offered_columns, partition in zip(inputs.columns, prepared, strict=True)
-    ]
-    result = train(
-        prepared,
-        split,
-        warm_start_config(config) if checkpoint else config,
-        device,
-        lambda progress: sink.send(
-            MessageType.PROGRESS,
-            epoch=progress.epoch,
-            epochs=progress.epochs,
-            training_mm=round(progress.training_mm, 6),
-            validation_mm=round(progress.validation_mm, 6),
-        ),
-        should_stop,
-        initial_networks(checkpoint, prepared, columns) if checkpoint else None,
-    )
-    trained_model = _make_trained_model(recording, partitions, inputs, split, prepared, result, config)
-    _raise_if_stopped(should_stop)
-    training_info = {
-        **config.to_json(),
-        "torch": str(torch.__version__),
-        "onnxruntime": onnxruntime.__version__,
-        "device": str(device),
-        "training_poses": len(split.training),
-        "validation_poses": len(split.validation),
-        "held_out_poses": len(split.held_out),
-        "warm_start": warm_start,
-        "sheared": trained_model.sheared,
-    }
-    sink.send(MessageType.LOG, text=f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
-    exported = build_model(recording, trained_model, split.held_out, training_info)
-    _raise_if_stopped(should_stop)
-    training_sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
-    training_errors = measure(exported.session, recording, trained_model, training_sample)
-    surface = measure_surface(exported.session, recording, trained_model, split.held_out)
-    analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
-    report = make_report(
-        recording, trained_model, exported, training_errors, surface, result.curves, model_path.name, analyses
-    )
+    inputs = job.fit_inputs(recording, split, checkpoint)
+    prepared = job.prepare(recording, inputs, split)
+    result = job.train_networks(prepared, inputs, split, checkpoint)
+    trained_model = _make_trained_model(recording, inputs, split, prepared, result, config)
+    exported = job.export(recording, trained_model, split, warm_start)
+    report = job.measure(recording, trained_model, split, exported, result, model_path)
+    history = _history(recording, exported, checkpoint)
+    goal_result = _evaluate_goal(config, history, report, recording_path, model_path)
     # The time is in the report only, so that equal recordings and settings give equal models.
     report["training"] = {**report["training"], "seconds": round(time.perf_counter() - start_time, 2)}
-    if recording.info.repeatability:
-        report["repeatability"] = recording.info.repeatability.to_json()
     report["warnings"] = [warning.to_json() for warning in warnings]
-    pose_count, p999_mm = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
-    history = [*(checkpoint.history if checkpoint else ()), {"poses": pose_count, "p999": p999_mm}]
-    goal_result = None
-    if config.goal_mm:
-        training_p999_mm = report["fdda"]["training"]["p999"]
-        goal_result = evaluate_goal(config.goal_mm, history, training_p999_mm, recording_path, model_path)
-        report["goal"] = goal_result.to_json()
     page = render_html(report)
-    _raise_if_stopped(should_stop)
+    job.raise_if_stopped()
     # The training cannot be stopped while it writes, because model, checkpoint and report belong together.
     with atomic_write_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
@@ -164,18 +99,173 @@ def train_model(
     _send_final_messages(sink, model_path, report, goal_result, time.perf_counter() - start_time)
 
 
-def _check_recording(recording: Recording, sink: MessageSink, strict: bool) -> list[RecordingWarning]:
-    """Check the recording, send its warnings, and return them.
+@dataclass(frozen=True)
+class _Job:
+    """The steps of a training that send messages and can be stopped; arguments as in `train_model`."""
 
-    Raises:
-        RecordingError: there are warnings, and `strict` is set.
-    """
-    warnings = check_recording(recording)
-    for warning in warnings:
-        sink.send(MessageType.WARNING, **warning.to_json())
-    if strict:
-        raise_first_warning(warnings)
-    return warnings
+    config: TrainingConfig
+    sink: MessageSink
+    should_stop: Callable[[], bool]
+
+    def raise_if_stopped(self) -> None:
+        if self.should_stop():
+            raise Cancelled
+
+    def log(self, text: str) -> None:
+        self.sink.send(MessageType.LOG, text=text)
+
+    def start(self, recording: Recording, strict: bool) -> list[RecordingWarning]:
+        """Send what is trained on which device, check the recording, and return its warnings.
+
+        Raises:
+            RecordingError: there are warnings, and `strict` is set.
+        """
+        self.sink.send(
+            MessageType.STARTED,
+            partitions=len(recording.partitions),
+            poses=len(recording.pose_matrices),
+            vertices=recording.rig.vertex_count,
+            device=str(choose_device()),
+        )
+        self.log(training_size_sentence(recording))
+        warnings = check_recording(recording)
+        for warning in warnings:
+            self.sink.send(MessageType.WARNING, **warning.to_json())
+        if strict:
+            raise_first_warning(warnings)
+        self.raise_if_stopped()
+        return warnings
+
+    def fit_inputs(self, recording: Recording, split: Split, checkpoint: Checkpoint | None) -> NetworkInputs:
+        """Fit the inputs of the networks. A warm start keeps the inputs of the checkpoint."""
+        states = checkpoint.input_states if checkpoint else fit_inputs(recording, split, self.config, self.should_stop)
+        inputs = make_inputs(recording.rig, recording.partitions, states)
+        for block in inputs.blocks:
+            if block.log_text:
+                self.log(block.log_text)
+        return inputs
+
+    def prepare(self, recording: Recording, inputs: NetworkInputs, split: Split) -> list[PreparedPartition]:
+        """Fit the linear part of each partition, and compute its components."""
+        # Surface frames make half-rotation features unnecessary.
+        use_half_rotations = not inputs.states.get(SurfaceFrameFeatures.name) and half_rotations_help(
+            recording, split.training, self.should_stop
+        )
+        if use_half_rotations:
+            self.log("The rig blends rotations: residuals are fitted to half-rotation features, too.")
+
+        def send_progress(prepared_count: int) -> None:
+            self.sink.send(MessageType.PREPARING, done=prepared_count, total=len(recording.partitions))
+            self.raise_if_stopped()
+
+        return prepare_partitions(
+            partition_data(recording, recording.partitions, inputs, use_half_rotations),
+            split,
+            self.config.tolerance_mm,
+            self.config.seed,
+            recording.rig.metres_per_unit,
+            self.config.hidden[-1],
+            send_progress,
+        )
+
+    def train_networks(
+        self, prepared: list[PreparedPartition], inputs: NetworkInputs, split: Split, checkpoint: Checkpoint | None
+    ) -> TrainingResult:
+        """Train the networks from random weights, or from a checkpoint."""
+
+        def send_progress(progress: Progress) -> None:
+            errors = {"training_mm": progress.training_mm, "validation_mm": progress.validation_mm}
+            rounded_errors = {name: round(error, 6) for name, error in errors.items()}
+            self.sink.send(MessageType.PROGRESS, epoch=progress.epoch, epochs=progress.epochs, **rounded_errors)
+
+        columns = [offered[partition.columns] for offered, partition in zip(inputs.columns, prepared, strict=True)]
+        return train(
+            prepared,
+            split,
+            warm_start_config(self.config) if checkpoint else self.config,
+            on_epoch=send_progress,
+            should_stop=self.should_stop,
+            initial=initial_networks(checkpoint, prepared, columns) if checkpoint else None,
+        )
+
+    def export(
+        self, recording: Recording, trained_model: TrainedModel, split: Split, warm_start: bool
+    ) -> ExportedModel:
+        """Build the model, and compare it with PyTorch on the held-out poses."""
+        self.raise_if_stopped()
+        training_info = {
+            **self.config.to_json(),
+            "torch": str(torch.__version__),
+            "onnxruntime": onnxruntime.__version__,
+            "device": str(choose_device()),
+            "training_poses": len(split.training),
+            "validation_poses": len(split.validation),
+            "held_out_poses": len(split.held_out),
+            "warm_start": warm_start,
+            "sheared": trained_model.sheared,
+        }
+        self.log(f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
+        exported = build_model(recording, trained_model, split.held_out, training_info)
+        self.raise_if_stopped()
+        return exported
+
+    def measure(
+        self,
+        recording: Recording,
+        trained_model: TrainedModel,
+        split: Split,
+        exported: ExportedModel,
+        result: TrainingResult,
+        model_path: Path,
+    ) -> dict:
+        """Measure the model on training and held-out poses; returns the content of the report."""
+        training_sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
+        training_errors = measure(exported.session, recording, trained_model, training_sample)
+        surface = measure_surface(exported.session, recording, trained_model, split.held_out)
+        analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
+        return make_report(
+            recording, trained_model, exported, training_errors, surface, result.curves, model_path.name, analyses
+        )
+
+
+def _make_trained_model(
+    recording: Recording,
+    inputs: NetworkInputs,
+    split: Split,
+    prepared: list[PreparedPartition],
+    result: TrainingResult,
+    config: TrainingConfig,
+) -> TrainedModel:
+    matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
+    features = inputs.compute_features(matrices, controls)
+    return TrainedModel(
+        recording.rig,
+        recording.partitions,
+        inputs,
+        tuple(prepared),
+        result.networks,
+        measure_training_range(features, recording.rig, recording.partitions),
+        config.activation,
+        is_sheared(recording.pose_matrices),
+    )
+
+
+def _history(recording: Recording, exported: ExportedModel, checkpoint: Checkpoint | None) -> list[dict]:
+    """Return the pose count and held-out error of this training and of its predecessors, as in `Checkpoint`."""
+    entry = {"poses": len(recording.pose_matrices), "p999": exported.info.held_out_mm["p999"]}
+    return [*(checkpoint.history if checkpoint else ()), entry]
+
+
+def _evaluate_goal(
+    config: TrainingConfig, history: list[dict], report: dict, recording_path: Path, model_path: Path
+) -> GoalResult | None:
+    """Compare the model with the accuracy goal, and add the result to the report; returns None without a goal."""
+    if not config.goal_mm:
+        return None
+    training_p999_mm = report["fdda"]["training"]["p999"]
+    goal_result = evaluate_goal(config.goal_mm, history, training_p999_mm, recording_path, model_path)
+    report["goal"] = goal_result.to_json()
+    return goal_result
 
 
 def _send_final_messages(
@@ -199,57 +289,3 @@ def _send_final_messages(
         held_out_p999_mm=held_out["p999"],
         **({"verdict": goal_result.verdict.value} if goal_result else {}),
     )
-
-
-def _prepare_partitions(
-    recording: Recording,
-    partitions: tuple[Partition, ...],
-    inputs: NetworkInputs,
-    use_half_rotations: bool,
-    split: Split,
-    config: TrainingConfig,
-    sink: MessageSink,
-    should_stop: Callable[[], bool],
-) -> list[PreparedPartition]:
-    def send_progress(prepared_count: int) -> None:
-        sink.send(MessageType.PREPARING, done=prepared_count, total=len(recording.partitions))
-        _raise_if_stopped(should_stop)
-
-    return prepare_partitions(
-        partition_data(recording, partitions, inputs, use_half_rotations),
-        split,
-        config.tolerance_mm,
-        config.seed,
-        recording.rig.metres_per_unit,
-        config.hidden[-1],
-        send_progress,
-    )
-
-
-def _make_trained_model(
-    recording: Recording,
-    partitions: tuple[Partition, ...],
-    inputs: NetworkInputs,
-    split: Split,
-    prepared: list[PreparedPartition],
-    result: TrainingResult,
-    config: TrainingConfig,
-) -> TrainedModel:
-    rig = recording.rig
-    matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
-    features = inputs.compute_features(matrices, controls)
-    return TrainedModel(
-        rig,
-        partitions,
-        inputs,
-        tuple(prepared),
-        result.networks,
-        measure_training_range(features, rig, partitions),
-        config.activation,
-        is_sheared(recording.pose_matrices),
-    )
-
-
-def _raise_if_stopped(should_stop: Callable[[], bool]) -> None:
-    if should_stop():
-        raise Cancelled

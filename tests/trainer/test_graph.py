@@ -160,30 +160,6 @@ def test_only_small_partitions_share_a_product():
     assert [len(product) for product in skinning_nodes._group_products([small] * 12)] == [4, 4, 4]
 
 
-def test_translations_are_packed_by_three():
-    def make_layout(joints: int) -> skinning_nodes._RowLayout:
-        return skinning_nodes._RowLayout(
-            component_count=2, half_rotation_joints=(), joints=tuple(range(joints)), skin_joint_count=1
-        )
-
-    for counts in ([4], [3, 6], [4, 5, 2, 2, 7], [2, 2, 2]):
-        layouts = skinning_nodes._pack_translations([make_layout(count) for count in counts])
-        assert layouts[0].leading_translation_count == 0 and all(layout.padding == 0 for layout in layouts[:-1])
-        assert layouts[-1].padding == -sum(counts) % 3
-        assert [layout.row_count for layout in layouts] == [6 + 4 * count for count in counts[:-1]] + [
-            6 + 4 * counts[-1] + layouts[-1].padding
-        ]
-    # A slice is completed only if the next partition has enough joints, because its first rows complete the slice.
-    assert [
-        (layout.leading_translation_count, layout.padding)
-        for layout in skinning_nodes._pack_translations([make_layout(4), make_layout(1), make_layout(4)])
-    ] == [
-        (0, 2),
-        (0, 0),
-        (2, 1),
-    ]
-
-
 @pytest.mark.parametrize("joints", [(0, 1, 2), (0, 1), (2,)])
 def test_partial_slices_of_translations_agree_with_pytorch(trained_model, joints):
     """The fits of some partitions lose joints, so that slices of translations are only partly filled."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Graph nodes that compute the positions: each partition, or group of small partitions, takes one matrix product."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,17 +33,17 @@ class _RowLayout:
         half_rotation_joints: joints with half-rotation matrices in the partition's fit, as in `JointFit`.
         joints: the joints of the partition's skin weights, followed by the joints of its fit.
         skin_joint_count: number of joints of the skin weights.
-        leading_translation_count: number of joints whose translations are the first rows. They are gathered in one
-            slice with the last translations of the preceding partition.
-        padding: number of zero rows at the end.
     """
 
     component_count: int
     half_rotation_joints: tuple[int, ...]
     joints: tuple[int, ...]
     skin_joint_count: int
-    leading_translation_count: int = 0
-    padding: int = 0
+
+    @property
+    def padding(self) -> int:
+        """Number of zero rows at the end, which fill the last slice of three translations."""
+        return -len(self.joints) % 3
 
     @property
     def row_count(self) -> int:
@@ -53,10 +53,9 @@ class _RowLayout:
     def skin_mask(self) -> np.ndarray:
         """Return (row_count,) bool, which rows belong to the joints of the skin weights."""
         is_skin = np.arange(len(self.joints)) < self.skin_joint_count
-        leading_rows, trailing_rows = np.split(is_skin, [self.leading_translation_count])
         linear_only_rows = np.zeros(3 * (self.component_count + len(self.half_rotation_joints)), bool)
         padding_rows = np.zeros(self.padding, bool)
-        return np.concatenate([leading_rows, linear_only_rows, np.repeat(is_skin, 3), trailing_rows, padding_rows])
+        return np.concatenate([linear_only_rows, np.repeat(is_skin, 3), is_skin, padding_rows])
 
 
 def add_skinning(
@@ -78,9 +77,9 @@ def add_skinning(
     | each joint j of the skin weights | P_j | w_vj B_j^-1 (x_v, 1) |
     | each joint j of the fit | t P_j | B_j^-1 u_vj, for m including the mean residual |
 
-    The translations of the first joints come first, then the linear parts of all matrices, then the translations of the
-    other joints. Components and half rotations have no translation. In a large partition all constants except those of
-    the skin joints are factorized (`low_rank`). The rows are then multiplied by a matrix with few columns first.
+    The linear parts of all matrices come first, then the translations of the joints. Components and half rotations have
+    no translation. In a large partition all constants except those of the skin joints are factorized (`low_rank`). The
+    rows are then multiplied by a matrix with few columns first.
 
     Args:
         graph: graph to which the nodes are added.
@@ -97,34 +96,47 @@ def add_skinning(
     ]
     products = _group_products(matrix_shapes)
     ordered_partitions = [index for product in products for index in product]
-    layouts = dict(
-        zip(ordered_partitions, _pack_translations([layouts[index] for index in ordered_partitions]), strict=True)
-    )
-    row_slices, slice_order = _add_row_slices(graph, features, coefficients, outside, trained_model, layouts)
-    rows = graph.add("Gather", [row_slices, graph.integers("row_slice_order", slice_order)], "ordered_slices", axis=1)
-    rows = graph.reshape(rows, [0, 3 * len(slice_order), VECTOR_SIZE], "rows")
-    rows = graph.add("Transpose", [rows], "rows_by_axis", perm=[0, 2, 1])
+    layouts = {index: layouts[index] for index in ordered_partitions}
+    rows = _add_rows(graph, features, coefficients, outside, trained_model, layouts)
     row_counts = [sum(layouts[index].row_count for index in product) for product in products]
     row_blocks = graph.split(
         rows, row_counts, [f"rows_{product_index}" for product_index in range(len(products))], axis=2
     )
     order = vertex_order([partitions[index].vertices for index in ordered_partitions])
     column_order = dict(zip(ordered_partitions, order.columns, strict=True))
-    position_blocks = []
-    for product_index, (product_rows, product) in enumerate(zip(row_blocks, products, strict=True)):
-        matrices = [_partition_matrix(trained_model, index, skins[index], layouts[index]) for index in product]
-        vertex_factors = trained_model.prepared[product[0]].vertex_factors
-        if len(product) == 1 and vertex_factors is not None:
-            left_factor, matrices[0] = _factorized_matrix(matrices[0], layouts[product[0]], vertex_factors)
-            left_factor = graph.floats(f"left_factor_{product_index}", left_factor)
-            product_rows = graph.add("MatMul", [product_rows, left_factor], f"low_rank_{product_index}")
-        for slot, index in enumerate(product):
-            matrices[slot] = _reorder_columns(matrices[slot], partitions[index].vertices, column_order[index])
-        matrix = graph.floats(f"matrix_{product_index}", _block_diagonal(matrices))
-        position_blocks.append(graph.add("MatMul", [product_rows, matrix], f"block_{product_index}"))
+    position_blocks = [
+        _add_product(graph, product_rows, f"{number}", product, trained_model, skins, layouts, column_order)
+        for number, (product_rows, product) in enumerate(zip(row_blocks, products, strict=True))
+    ]
     joined_positions = graph.join(position_blocks, "blocks", axis=2)
     joined_positions = graph.add("Transpose", [joined_positions], "positions_by_partition", perm=[0, 2, 1])
     order.add(graph, joined_positions, POSITIONS_OUTPUT)
+
+
+def _add_product(
+    graph: GraphBuilder,
+    rows: str,
+    suffix: str,
+    product: list[int],
+    trained_model: TrainedModel,
+    skins: list[SkinBlock],
+    layouts: dict[int, _RowLayout],
+    column_order: dict[int, np.ndarray],
+) -> str:
+    """Add the product of rows with the matrices of the partitions of a product; returns the name of the positions."""
+    matrices = [_partition_matrix(trained_model, index, skins[index], layouts[index]) for index in product]
+    vertex_factors = trained_model.prepared[product[0]].vertex_factors
+    if len(product) == 1 and vertex_factors is not None:
+        left_factor, matrices[0] = _factorized_matrix(matrices[0], layouts[product[0]], vertex_factors)
+        left_factor = graph.floats(f"left_factor_{suffix}", left_factor)
+        rows = graph.add("MatMul", [rows, left_factor], f"low_rank_{suffix}")
+    vertices = (trained_model.partitions[index].vertices for index in product)
+    reordered = [
+        _reorder_columns(matrix, vertices_of_matrix, column_order[index])
+        for matrix, vertices_of_matrix, index in zip(matrices, vertices, product, strict=True)
+    ]
+    matrix = graph.floats(f"matrix_{suffix}", _block_diagonal(reordered))
+    return graph.add("MatMul", [rows, matrix], f"block_{suffix}")
 
 
 def _row_layout(trained_model: TrainedModel, index: int, skin: SkinBlock) -> _RowLayout:
@@ -138,41 +150,51 @@ def _row_layout(trained_model: TrainedModel, index: int, skin: SkinBlock) -> _Ro
     )
 
 
-def _pack_translations(layouts: list[_RowLayout]) -> list[_RowLayout]:
-    """Pack translations into slices of three; a slice may span the end of one partition and the start of the next."""
-    packed_layouts, leading_translation_count = [], 0
-    for index, layout in enumerate(layouts):
-        missing_count = (leading_translation_count - len(layout.joints)) % 3
-        is_shared = index + 1 < len(layouts) and missing_count <= len(layouts[index + 1].joints)
-        packed_layouts.append(
-            replace(
-                layout, leading_translation_count=leading_translation_count, padding=0 if is_shared else missing_count
-            )
-        )
-        leading_translation_count = missing_count if is_shared else 0
-    return packed_layouts
-
-
-def _add_row_slices(
+def _add_rows(
     graph: GraphBuilder,
     features: Features,
     coefficients: Coefficients | None,
     outside: str,
     trained_model: TrainedModel,
     layouts: dict[int, _RowLayout],
-) -> tuple[str, list[int]]:
-    """Add the scaled matrices that the rows of all partitions consist of, in slices of nine elements.
+) -> str:
+    """Add the (N, 3, rows) rows of all partitions.
 
     Args:
         graph, features, coefficients, outside, trained_model: as in `add_skinning`.
         layouts: layout of each partition, by partition index, in the order of the products.
+    """
+    scaled_matrices, slice_order = _order_slices(features, coefficients, trained_model, layouts)
+    joint_of_matrix, factor_of_matrix = zip(*scaled_matrices, strict=True)
+    scalar_values = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
+    factors = graph.integers("row_factors", np.array(factor_of_matrix)[:, None])
+    factors = graph.add("Gather", [graph.join(scalar_values, "scalars", axis=1), factors], "factors", axis=1)
+    # A product repeats each factor twelve times: broadcasting the multiplication takes three times as long.
+    factors = graph.add("MatMul", [factors, graph.floats("twelve_ones", np.ones((1, 12)))], "factors_of_poses")
+    matrices = graph.integers("row_poses", features.pose_rows[list(joint_of_matrix)])
+    matrices = graph.add("Gather", [features.table, matrices], "unscaled", axis=1)
+    matrices = graph.add("Mul", [matrices, factors], "scaled")
+    linear_parts, translations = graph.split(
+        matrices, [LINEAR_PART_SIZE, VECTOR_SIZE], ["linear_parts", "translations"], axis=2
+    )
+    translations = graph.reshape(translations, [0, -1, LINEAR_PART_SIZE], "translations_by_three")
+    rows = graph.add("Concat", [linear_parts, translations], "row_slices", axis=1)
+    rows = graph.add("Gather", [rows, graph.integers("row_slice_order", slice_order)], "ordered_slices", axis=1)
+    rows = graph.reshape(rows, [0, 3 * len(slice_order), VECTOR_SIZE], "rows")
+    return graph.add("Transpose", [rows], "rows_by_axis", perm=[0, 2, 1])
+
+
+def _order_slices(
+    features: Features, coefficients: Coefficients | None, trained_model: TrainedModel, layouts: dict[int, _RowLayout]
+) -> tuple[list[tuple[int, int]], list[int]]:
+    """List the scaled matrices of all rows, and the order of their slices; arguments as in `_add_rows`.
 
     Returns:
-        Name of the (N, ·, 9) slices, and their order in the rows.
+        For each matrix its index in `Features.pose_rows`, and the index of its factor among the scalars. Then the order
+        of the slices of nine elements: M linear parts, then M / 3 slices of translations.
     """
     # The scalars are `outside`, whose last element is the constant 1, then the confidence, then the coefficients.
     ones_index, confidence_start = VECTOR_SIZE * features.ones_vector, VECTOR_SIZE * (features.ones_vector + 1)
-    # Each pair is the index of a matrix and the index of its factor among the scalars.
     scaled_matrices: list[tuple[int, int]] = []
     joint_starts = {}
     for index, layout in layouts.items():
@@ -187,34 +209,13 @@ def _add_row_slices(
         if layout.component_count:
             first_coefficient = confidence_start + len(layouts) + coefficients.start_by_partition[index]
             main_joint = trained_model.partitions[index].joint
-            scaled_matrices += [
-                (main_joint, first_coefficient + component) for component in range(layout.component_count)
-            ]
+            scaled_matrices += [(main_joint, first_coefficient + k) for k in range(layout.component_count)]
         scaled_matrices += [(joint, confidence_start + index) for joint in layout.half_rotation_joints]
         joint_end = joint_starts[index] + len(layout.joints)
         slice_order += [*range(linear_start, len(scaled_matrices)), *range(joint_starts[index], joint_end)]
-        slice_order += [
-            ~(matrix_index // 3)
-            for matrix_index in range(joint_starts[index] + layout.leading_translation_count, joint_end, 3)
-        ]
+        slice_order += [~(matrix_index // 3) for matrix_index in range(joint_starts[index], joint_end, 3)]
     scaled_matrices += -len(scaled_matrices) % 3 * [(0, ones_index)]
-    slice_order = [
-        len(scaled_matrices) + ~slice_index if slice_index < 0 else slice_index for slice_index in slice_order
-    ]
-    joint_of_matrix, factor_of_matrix = zip(*scaled_matrices, strict=True)
-    scalar_values = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
-    factors = graph.integers("row_factors", np.array(factor_of_matrix)[:, None])
-    factors = graph.add("Gather", [graph.join(scalar_values, "scalars", axis=1), factors], "factors", axis=1)
-    # A product repeats each factor twelve times: broadcasting the multiplication takes three times as long.
-    factors = graph.add("MatMul", [factors, graph.floats("twelve_ones", np.ones((1, 12)))], "factors_of_poses")
-    matrices = graph.integers("row_poses", features.pose_rows[list(joint_of_matrix)])
-    matrices = graph.add("Gather", [features.table, matrices], "unscaled", axis=1)
-    matrices = graph.add("Mul", [matrices, factors], "scaled")
-    linear_parts, translations = graph.split(
-        matrices, [LINEAR_PART_SIZE, VECTOR_SIZE], ["linear_parts", "translations"], axis=2
-    )
-    translations = graph.reshape(translations, [0, -1, LINEAR_PART_SIZE], "translations_by_three")
-    return graph.add("Concat", [linear_parts, translations], "row_slices", axis=1), slice_order
+    return scaled_matrices, [len(scaled_matrices) + ~i if i < 0 else i for i in slice_order]
 
 
 def _group_products(matrix_shapes: list[tuple[int, int]]) -> list[list[int]]:
@@ -286,14 +287,12 @@ def _partition_matrix(trained_model: TrainedModel, index: int, skin: SkinBlock, 
     component_rows = basis.components.reshape(-1, vertex_count, 3)
     component_rows = np.einsum("ab,kvb->kav", inverse_rest[partition.joint, :3, :3], component_rows)
     joint_rows = np.concatenate([inverse_rest[skin.joints] @ weighted_rest, fit_rows[has_translation]])
-    leading_translations, trailing_translations = np.split(joint_rows[:, 3], [layout.leading_translation_count])
     padding_rows = np.zeros((layout.padding, vertex_count))
     row_blocks = [
-        leading_translations,
         component_rows,
         fit_rows[~has_translation, :3],
         joint_rows[:, :3],
-        trailing_translations,
+        joint_rows[:, 3],
         padding_rows,
     ]
     return np.concatenate([rows.reshape(-1, vertex_count) for rows in row_blocks])

@@ -11,11 +11,14 @@ import numpy as np
 from fdda_addon.core.metrics import error_statistics
 
 if TYPE_CHECKING:
+    from fdda_addon.core.partition import Partition
     from fdda_addon.core.recording.reader import Recording
+    from fdda_addon.core.rig import Rig
 
     from ..export.export import ExportedModel, PositionErrors
     from ..model import TrainedModel
     from ..networks.curves import Curves
+    from ..preparation import PreparedPartition
     from .error_analysis import ErrorAnalysis
 
 HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
@@ -41,36 +44,13 @@ def make_report(
         model_name: file name of the model.
         analyses: analysis of the largest errors of each partition.
     """
-    names, controls = recording.rig.joint_names, [control.name for control in recording.rig.controls]
-    held_out = exported.held_out
-    partitions = []
-    for partition, prepared, curve, analysis in zip(
-        trained_model.partitions, trained_model.prepared, curves, analyses, strict=True
-    ):
-        vertices = partition.vertices
-        partitions.append(
-            {
-                "joint": names[partition.joint],
-                "vertices": len(vertices),
-                "influencing": [names[joint] for joint in partition.influencing],
-                **({"controls": [controls[control] for control in partition.controls]} if partition.controls else {}),
-                **({"merged": [names[joint] for joint in partition.merged]} if partition.merged else {}),
-                "features": len(prepared.columns),
-                "basis": len(prepared.basis.components),
-                "truncation": prepared.basis.truncation_rms * prepared.mm_per_unit,
-                "training": error_statistics(training_errors.fdda[:, vertices]).to_json(),
-                "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),
-                "linear": error_statistics(held_out.linear[:, vertices]).to_json(),
-                "histogram": _histogram(held_out.fdda[:, vertices]),
-                "largest_errors": analysis.to_json(),
-                "curve": {
-                    "training": [round(value, 6) for value in curve.training_mm],
-                    "validation": [round(value, 6) for value in curve.validation_mm],
-                    "worst": [round(value, 6) for value in curve.worst_mm],
-                    "best_epoch": curve.best_epoch,
-                },
-            }
+    controls, held_out = [control.name for control in recording.rig.controls], exported.held_out
+    partitions = [
+        _partition_entry(recording.rig, partition, prepared, curve, analysis, held_out, training_errors)
+        for partition, prepared, curve, analysis in zip(
+            trained_model.partitions, trained_model.prepared, curves, analyses, strict=True
         )
+    ]
     return {
         "unit": "mm",
         "model": model_name,
@@ -78,7 +58,7 @@ def make_report(
         "recording": recording.path.name,
         "object": recording.info.object_name,
         "vertices": recording.rig.vertex_count,
-        "joints": len(names),
+        "joints": len(recording.rig.joints),
         **({"controls": controls} if controls else {}),
         "poses": len(recording.pose_matrices),
         "training": exported.info.training,
@@ -96,6 +76,40 @@ def make_report(
             "linear": _histogram(held_out.linear),
         },
         "partitions": partitions,
+        **({"repeatability": recording.info.repeatability.to_json()} if recording.info.repeatability else {}),
+    }
+
+
+def _partition_entry(
+    rig: Rig,
+    partition: Partition,
+    prepared: PreparedPartition,
+    curve: Curves,
+    analysis: ErrorAnalysis,
+    held_out: PositionErrors,
+    training_errors: PositionErrors,
+) -> dict:
+    names, controls, vertices = rig.joint_names, [control.name for control in rig.controls], partition.vertices
+    return {
+        "joint": names[partition.joint],
+        "vertices": len(vertices),
+        "influencing": [names[joint] for joint in partition.influencing],
+        **({"controls": [controls[control] for control in partition.controls]} if partition.controls else {}),
+        **({"merged": [names[joint] for joint in partition.merged]} if partition.merged else {}),
+        "features": len(prepared.columns),
+        "basis": len(prepared.basis.components),
+        "truncation": prepared.basis.truncation_rms * prepared.mm_per_unit,
+        "training": error_statistics(training_errors.fdda[:, vertices]).to_json(),
+        "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),
+        "linear": error_statistics(held_out.linear[:, vertices]).to_json(),
+        "histogram": _histogram(held_out.fdda[:, vertices]),
+        "largest_errors": analysis.to_json(),
+        "curve": {
+            "training": [round(value, 6) for value in curve.training_mm],
+            "validation": [round(value, 6) for value in curve.validation_mm],
+            "worst": [round(value, 6) for value in curve.worst_mm],
+            "best_epoch": curve.best_epoch,
+        },
     }
 
 
