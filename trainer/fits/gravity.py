@@ -17,6 +17,7 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import POSE
 
 from ..data.split import Split
+from .least_squares import solve_ridge
 
 MAX_POSES, MAX_COMPONENTS = 300, 16
 """Maximum numbers of poses, and of principal components of each partition's residuals."""
@@ -97,8 +98,7 @@ def _best_error(distances: np.ndarray, values: np.ndarray) -> float:
         for ridge in RIDGES:
             error = 0.0
             for is_tested in (fold == index for index in range(FOLD_COUNT)):
-                gram = kernel[np.ix_(~is_tested, ~is_tested)] + ridge * np.eye(int((~is_tested).sum()))
-                factors = np.linalg.solve(gram, values[~is_tested])
+                factors = solve_ridge(kernel[np.ix_(~is_tested, ~is_tested)], values[~is_tested], ridge)
                 predicted = kernel[np.ix_(is_tested, ~is_tested)] @ factors
                 error += float(((values[is_tested] - predicted) ** 2).sum())
             errors.append(error)

@@ -15,6 +15,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
 from ..blocks import BLOCK_ELEMENTS
+from .least_squares import add_ridge, solve_ridge
 
 RIDGE = 1e-6
 """Ridge, as a part of the number of poses. It makes joints that move alike share the fit, and keeps factors small."""
@@ -116,10 +117,10 @@ class JointRegression:
             total += (values**2).sum()
         ridge = np.ones(width)
         ridge[3::4] /= self.metres_per_unit**2
-        gram += RIDGE * len(training) * np.diag(ridge)
-        selected = _select_joints(gram, moments, total)
+        ridge *= RIDGE * len(training)
+        selected = _select_joints(add_ridge(gram, ridge), moments, total)
         columns = (4 * selected[:, None] + np.arange(4)).ravel()
-        solution = np.linalg.solve(gram[np.ix_(columns, columns)], moments[columns])
+        solution = solve_ridge(gram[np.ix_(columns, columns)], moments[columns], ridge[columns])
         remaining = np.empty_like(residuals)
         for start in range(0, len(residuals), step):
             poses = slice(start, start + step)

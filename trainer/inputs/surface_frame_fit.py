@@ -20,6 +20,7 @@ from fdda_addon.core.surface import adjacent_corners
 
 from ..data.split import Split
 from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
+from ..fits.least_squares import solve_ridge
 from ..process import Cancelled
 from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
@@ -202,8 +203,9 @@ def _select_candidates(
         )
         selected_residual = remaining_by_axis[:, :, worst_vertex].copy()
         gram = selected_residual.T.astype(np.float64) @ selected_residual
-        gram += MIN_SINGULAR_VALUE_RATIO**2 * np.trace(gram) * np.eye(3)
-        remaining -= selected_residual @ np.linalg.solve(gram, selected_residual.T @ remaining).astype(np.float32)
+        ridge = MIN_SINGULAR_VALUE_RATIO**2 * np.trace(gram)
+        solution = solve_ridge(gram, selected_residual.T @ remaining, ridge)
+        remaining -= selected_residual @ solution.astype(np.float32)
     return candidates
 
 
@@ -306,8 +308,8 @@ def _fit_lengths(
         is_used, residual = surface_frames.lengths[:, index] != 0, candidate.residual
         regressors = local_vectors[index][..., is_used].reshape(len(residual), -1)
         regressors = _remove_projection(poses.column_spaces[candidate.partition], regressors)
-        gram = regressors.T @ regressors + RIDGE_RADIANS**2 * len(poses.matrices) * np.eye(is_used.sum())
-        lengths[:, index][is_used] = np.linalg.solve(gram, regressors.T @ residual)
+        gram, ridge = regressors.T @ regressors, RIDGE_RADIANS**2 * len(poses.matrices)
+        lengths[:, index][is_used] = solve_ridge(gram, regressors.T @ residual, ridge)
         error = residual - regressors @ lengths[:, index][is_used]
         explained_fractions[index] = 1 - error @ error / (residual @ residual)
     return lengths, explained_fractions
