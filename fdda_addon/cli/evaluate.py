@@ -4,12 +4,13 @@
 import argparse
 from pathlib import Path
 
-from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
+from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED, FILM_TIMED_FRAMES
 from ..core.errors import WrongUsageError
-from ..core.file_kind import EVALUATION, PICTURE
+from ..core.file_kind import EVALUATION, PICTURE, VIDEO
 from ..core.output import atomic_write_all, check_outputs, to_json_text
 from ..core.progress import Progress
 from ..evaluation.run import Evaluation, EvaluationSettings, evaluate
+from ..poses.clip import find_clips
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from .files import add_rig_options
@@ -61,6 +62,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="picture to write, with rig, linear skinning and model as heat maps",
     )
+    parser.add_argument(
+        "--video",
+        metavar="OUT.mp4",
+        type=Path,
+        help="film of the first --action or --strip to write (.mp4 or .webm): rig, linear skinning, model and heat map",
+    )
     add_overwrite_option(parser)
 
 
@@ -71,14 +78,22 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError(
             "With --poses 0 only actions and strips are compared; give --action and no --range-scale."
         )
+    if options.video and not (options.action or options.strip):
+        raise WrongUsageError("--video shows the frames of an action; give --action or --strip.")
     target = target_settings(options)
     outputs = [(options.json, EVALUATION), *([(options.heatmap, PICTURE)] if options.heatmap else [])]
+    if options.video:
+        from ..evaluation.video import check_video_path
+
+        check_video_path(options.video)
+        check_outputs([*outputs, (options.video, VIDEO)], (options.rig, options.model), options.overwrite)
     check_outputs(outputs, (options.rig, options.model), options.overwrite)
     rigs = open_rigs(options)
-    if options.heatmap and len(rigs) > 1:
-        raise WrongUsageError(
-            f"--heatmap draws one mesh, and '{options.model}' holds models of several; give --object."
-        )
+    for option in ("heatmap", "video"):
+        if getattr(options, option) and len(rigs) > 1:
+            raise WrongUsageError(
+                f"--{option} draws one mesh, and '{options.model}' holds models of several; give --object."
+            )
     settings = EvaluationSettings(
         options.poses,
         options.seed,
@@ -100,8 +115,37 @@ def run(options: argparse.Namespace) -> None:
             draw_comparison(scene_rig, model, poses, picture, is_heat_map=True, reference_label=reference_name)
         content = to_json_by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
         errors.write_text(to_json_text(content), encoding="utf-8")
+    if options.video:
+        ((name, (scene_rig, model)),) = rigs.items()
+        write_video(scene_rig, model, evaluations[name], options)
     for name, evaluation in evaluations.items():
         print(with_heading(name, table(evaluation)))
+
+
+def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, options: argparse.Namespace) -> None:
+    """Time the rig and the model, write the film of the first action, and print the progress to stderr."""
+    import bpy
+
+    from ..evaluation.film import FDDA, LABELS, LINEAR, RIG, FilmSettings, film
+    from ..timing.benchmark import Benchmark, benchmark
+
+    clip = find_clips(scene_rig.armature_object, options.action, options.strip)[0]
+    with ProgressPrinter() as progress:
+        for step in benchmark(scene_rig, model, FILM_TIMED_FRAMES):
+            if isinstance(step, Progress):
+                progress.show(step.stage, step.done, step.total)
+            elif isinstance(step, Benchmark):
+                times = step.frame_times("")
+        settings = FilmSettings(
+            fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base,
+            times_ms={RIG: times.rig, LINEAR: times.linear, FDDA: times.fdda},
+            reference_label=f"Target {options.target}" if options.target else LABELS[RIG],
+        )
+        with model_disabled(scene_rig.mesh_object):
+            steps = film(scene_rig, model, evaluation.actions[0], clip.frames.start, options.video, settings)
+            for step in steps:
+                if isinstance(step, Progress):
+                    progress.show(step.stage, step.done, step.total)
 
 
 def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:

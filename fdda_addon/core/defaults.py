@@ -29,5 +29,7 @@ EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100
 """Numbers of random poses in which a model is compared with its rig; fewer in the sidebar, where the user waits."""
 EVALUATION_SEED = 1
 """Seed of the poses of an evaluation; it differs from the default seed of a recording."""
+FILM_TIMED_FRAMES = 50
+"""Number of frames that are timed for the frame times in a film."""
 MARKERS = 5
 """Number of frames that an evaluation marks in the timeline, those with the largest errors."""

@@ -46,4 +46,6 @@ BENCHMARK = FileKind("the JSON of a benchmark", _OBJECTS_PREFIX + rb'"unit":\s*"
 WARNINGS = FileKind("the JSON of a check", rb'\s*\{\s*"warnings":')
 RECORDING = FileKind("the index of a recording", rb'\s*\{\s*"format":\s*"fdda-recording"')
 PICTURE = FileKind("a PNG picture", rb"\x89PNG\r\n")
+VIDEO = FileKind("a video", rb".{4}ftyp|\x1a\x45\xdf\xa3")
+"""The signatures of MPEG-4 and of Matroska, which WebM files use."""
 POINT_CACHE = FileKind("a point cache", rb"POINTCACHE2\0")

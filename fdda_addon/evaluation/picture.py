@@ -17,9 +17,8 @@ from mathutils import Matrix
 from ..core.errors import OutputError
 from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
 from ..core.output import atomic_write
-from ..scene.arrays import COLOR_ELEMENT, LOOP_START_ELEMENT, VERTEX_INDEX_ELEMENT, write
 from ..scene.blend_file import blender_path
-from ..scene.mesh import set_mesh_positions, topology
+from .colored_mesh import MeshFactory, set_colors, srgb_to_linear
 
 WIDTH_PIXELS = 1440
 CELL_MARGIN_RATIO = 0.06
@@ -59,6 +58,12 @@ class View:
     azimuth: float = 25.0
     elevation: float = 20.0
 
+    @classmethod
+    def from_direction(cls, towards_viewer: np.ndarray) -> "View":
+        """Return the view of a viewer in a direction, (3,) in world space; the vertical stays upright."""
+        x, y, z = (float(value) for value in towards_viewer / np.linalg.norm(towards_viewer))
+        return cls(math.degrees(math.atan2(x, -y)), math.degrees(math.asin(z)))
+
     def axes(self) -> np.ndarray:
         """Return the directions to the right, up and towards the viewer as rows, (3, 3) float64, world space."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
@@ -92,111 +97,134 @@ def draw(
     Raises:
         OutputError: the file cannot be written, or the machine lacks a library that Workbench needs.
     """
-    _check_can_render()
-    picture = _Picture(view)
+    check_can_render()
+    picture = Picture(view)
     try:
         picture.compose(mesh, rows, title, has_heat_scale)
-        picture.render(path, is_sculpted)
+        picture.set_up_render(is_sculpted)
+        with atomic_write(path) as temporary_path:
+            picture.render(temporary_path)
     finally:
         picture.remove()
 
 
-def _check_can_render() -> None:
-    """Check for the library EGL: without it, a render without a window ends the process and raises no error."""
+def check_can_render() -> None:
+    """Check for the library EGL: without it, a render without a window ends the process and raises no error.
+
+    Raises:
+        OutputError: the library is missing.
+    """
     if bpy.app.background and sys.platform == "linux" and ctypes.util.find_library("EGL") is None:
         raise OutputError("Pictures need the library EGL; install the package libegl1.")
 
 
-class _Picture:
-    """The scene of a picture. Positions in it are relative to the camera: x to the right, y up, Blender units."""
+class Picture:
+    """The scene of a picture. Positions in it are relative to the camera: x to the right, y up, Blender units.
+
+    Attributes:
+        axes: directions of the view (`View.axes`).
+        scene: the scene.
+        width, height: size of the picture, Blender units.
+    """
 
     def __init__(self, view: View):
-        self._axes = view.axes()
-        self._view_to_world = Matrix(self._axes.tolist()).transposed().to_4x4()
-        self._scene = bpy.data.scenes.new("FDDA picture")
+        self.axes = view.axes()
+        self._view_to_world = Matrix(self.axes.tolist()).transposed().to_4x4()
+        self.scene = bpy.data.scenes.new("FDDA picture")
         self._datablocks: list[bpy.types.ID] = []
-        self._width = self._height = 0.0
+        self.width = self.height = 0.0
 
     def compose(self, mesh: bpy.types.Mesh, rows: list[list[Cell]], title: str, has_heat_scale: bool) -> None:
         """Lay out the cells from the top left, with the title above and the color scale below the cells."""
-        projections = [cell.positions @ self._axes.T for row in rows for cell in row]
+        projections = [cell.positions @ self.axes.T for row in rows for cell in row]
         cell_size = np.max([np.ptp(projected[:, :2], axis=0) for projected in projections], axis=0)
         column_count = max(len(row) for row in rows)
         gap = cell_size[0] * CELL_MARGIN_RATIO
-        self._width = column_count * (cell_size[0] + gap) + gap
-        text_size = self._width * TEXT_SIZE_RATIO
+        self.width = column_count * (cell_size[0] + gap) + gap
+        text_size = self.width * TEXT_SIZE_RATIO
         cell_step = np.array([cell_size[0] + gap, cell_size[1] + 3.2 * text_size])
-        self._add_text(title, (gap, -2.0 * text_size), 1.3 * text_size)
+        self.add_text(title, (gap, -2.0 * text_size), 1.3 * text_size)
         top = 3.2 * text_size
-        factory = _MeshFactory(mesh)
+        factory = MeshFactory(mesh)
         for row_index, row in enumerate(rows):
             for column_index, cell in enumerate(row):
                 left, cell_top = gap + column_index * cell_step[0], top + row_index * cell_step[1]
-                self._add_text(cell.label, (left, -(cell_top + 1.4 * text_size)), text_size)
+                self.add_text(cell.label, (left, -(cell_top + 1.4 * text_size)), text_size)
                 center = (left + cell_size[0] / 2, -(cell_top + 2.4 * text_size + cell_size[1] / 2))
                 self._add_cell(factory, cell, center)
         bottom = top + len(rows) * cell_step[1]
         if has_heat_scale:
             self._add_heat_scale((gap, -(bottom + 1.2 * text_size)), text_size)
             bottom += 4.4 * text_size
-        self._height = bottom + gap
+        self.height = bottom + gap
 
-    def _move(self, scene_object: bpy.types.Object, x: float, y: float, depth: float = 0.0) -> None:
+    def move(self, scene_object: bpy.types.Object, x: float, y: float, depth: float = 0.0) -> None:
+        """Move an object to a position relative to the camera."""
         scene_object.matrix_world = self._view_to_world @ Matrix.Translation((x, y, depth))
 
-    def _add_object(self, name: str, data: bpy.types.ID | None) -> bpy.types.Object:
+    def add_object(self, name: str, data: bpy.types.ID | None) -> bpy.types.Object:
+        """Add an object with data that belongs to the picture."""
         scene_object = bpy.data.objects.new(name, data)
-        self._scene.collection.objects.link(scene_object)
+        self.scene.collection.objects.link(scene_object)
         self._datablocks += [scene_object, *([data] if data is not None else [])]
         return scene_object
 
-    def _add_cell(self, factory: "_MeshFactory", cell: Cell, center: tuple[float, float]) -> None:
-        projected = (cell.positions @ self._axes.T).astype(np.float32)
+    def _add_cell(self, factory: MeshFactory, cell: Cell, center: tuple[float, float]) -> None:
+        projected = (cell.positions @ self.axes.T).astype(np.float32)
         center_of_bounds = (projected.max(axis=0) + projected.min(axis=0)) / 2
-        self._move(self._add_object("cell", factory.create(projected - center_of_bounds, cell.colors)), *center)
+        self.move(self.add_object("cell", factory.create(projected - center_of_bounds, cell.colors)), *center)
 
-    def _add_text(self, text: str, position: tuple[float, float], size: float) -> None:
+    def add_text(self, text: str, position: tuple[float, float], size: float) -> bpy.types.TextCurve:
+        """Add a line of text at the position of its left end, with its height; return its curve."""
         curve = bpy.data.curves.new("text", "FONT")
         curve.body, curve.size = text, size
-        scene_object = self._add_object("text", curve)
-        scene_object.color = (*_srgb_to_linear(TEXT_COLOR), 1)
-        self._move(scene_object, *position)
+        scene_object = self.add_object("text", curve)
+        scene_object.color = (*srgb_to_linear(TEXT_COLOR), 1)
+        self.move(scene_object, *position)
+        return curve
 
     def _add_heat_scale(self, position: tuple[float, float], text_size: float) -> None:
         """Add the colors of the heat map: a box for no error, and a strip from the first to the last stop."""
         x, y = position
         box_size = 1.2 * text_size
-        self._add_strip((x, y - box_size), (box_size, box_size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
+        self.add_strip((x, y - box_size), (box_size, box_size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
         label_position = (x + 1.5 * box_size, y - box_size + 0.2 * text_size)
-        self._add_text("none (below 0.0001 cm)", label_position, 0.9 * text_size)
-        left, width = x + 16 * text_size, self._width * 0.35
+        self.add_text("none (below 0.0001 cm)", label_position, 0.9 * text_size)
+        left, width = x + 16 * text_size, self.width * 0.35
         strip_colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
-        self._add_strip((left, y - box_size), (width, box_size), strip_colors)
+        self.add_strip((left, y - box_size), (width, box_size), strip_colors)
         max_metres = HEAT_MAP_STOPS[-1][0]
         for meters, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (max_metres, "1 cm and above")):
             label_position = (left + width * meters / max_metres - 0.6 * text_size, y - box_size - 1.2 * text_size)
-            self._add_text(text, label_position, 0.9 * text_size)
+            self.add_text(text, label_position, 0.9 * text_size)
 
-    def _add_strip(self, position: tuple[float, float], size: tuple[float, float], colors: np.ndarray) -> None:
+    def add_strip(self, position: tuple[float, float], size: tuple[float, float], colors: np.ndarray) -> None:
+        """Add a rectangle at the position of its lower left corner, with (N, 3) sRGB colors from left to right."""
         x_values = np.linspace(0, size[0], len(colors))
         points = [(x, y, 0) for x in x_values for y in (0, size[1])]
         faces = [(2 * i, 2 * i + 2, 2 * i + 3, 2 * i + 1) for i in range(len(colors) - 1)]
         mesh = bpy.data.meshes.new("scale")
         mesh.from_pydata(points, [], faces)
-        _set_colors(mesh, np.repeat(colors, 2, axis=0))
-        self._move(self._add_object("scale", mesh), *position)
+        set_colors(mesh, np.repeat(colors, 2, axis=0))
+        self.move(self.add_object("scale", mesh), *position)
 
-    def render(self, path: Path, is_sculpted: bool) -> None:
-        """Write the PNG file."""
-        scene = self._scene
-        camera = self._add_object("camera", bpy.data.cameras.new("camera"))
+    def set_up_render(self, is_sculpted: bool, width_pixels: int = WIDTH_PIXELS, antialiasing: str = "8") -> None:
+        """Add the camera, and set up the render. Width and height in pixels become even, as videos need them.
+
+        Args:
+            is_sculpted: as for `draw`.
+            width_pixels: width of the picture.
+            antialiasing: Blender's name of an antialiasing method of Workbench.
+        """
+        scene = self.scene
+        camera = self.add_object("camera", bpy.data.cameras.new("camera"))
         camera.data.type = "ORTHO"
-        camera.data.ortho_scale = max(self._width, self._height)
-        self._move(camera, self._width / 2, -self._height / 2, 100.0)
+        camera.data.ortho_scale = max(self.width, self.height)
+        self.move(camera, self.width / 2, -self.height / 2, 100.0)
         camera.data.clip_end = 1000.0
         scene.camera = camera
-        scene.render.resolution_x = WIDTH_PIXELS
-        scene.render.resolution_y = round(WIDTH_PIXELS * self._height / self._width)
+        scene.render.resolution_x = width_pixels // 2 * 2
+        scene.render.resolution_y = round(width_pixels * self.height / self.width) // 2 * 2
         scene.render.engine = "BLENDER_WORKBENCH"
         scene.render.image_settings.file_format = "PNG"
         scene.render.image_settings.color_mode = "RGB"
@@ -210,7 +238,7 @@ class _Picture:
             setattr(scene.render, name, False)
         scene.render.film_transparent = False
         scene.view_settings.view_transform = "Standard"
-        scene.display.render_aa = "8"
+        scene.display.render_aa = antialiasing
         shading = scene.display.shading
         shading.light, shading.color_type = "STUDIO", "VERTEX"
         shading.studio_light = "Default" if is_sculpted else "paint.sl"
@@ -220,56 +248,25 @@ class _Picture:
         shading.cavity_ridge_factor = 0.6
         shading.cavity_valley_factor = 1.0
         world = bpy.data.worlds.new("picture")
-        world.color = _srgb_to_linear(BACKGROUND_COLOR)
+        world.color = srgb_to_linear(BACKGROUND_COLOR)
         scene.world = world
         self._datablocks.append(world)
-        with atomic_write(path) as temporary_path:
-            scene.render.filepath = blender_path(temporary_path)
-            try:
-                bpy.ops.render.render(write_still=True, scene=scene.name)
-            except RuntimeError as error:
-                raise OSError(str(error).strip()) from error
-            # Blender does not check whether the whole file reached the disk.
-            if not (temporary_path.exists() and temporary_path.read_bytes().endswith(PNG_END)):
-                raise OSError("Blender wrote no picture or only a part of it, the disk may be full")
+
+    def render(self, path: Path) -> None:
+        """Write the PNG file.
+
+        Raises:
+            OSError: the file is not complete.
+        """
+        self.scene.render.filepath = blender_path(path)
+        try:
+            bpy.ops.render.render(write_still=True, scene=self.scene.name)
+        except RuntimeError as error:
+            raise OSError(str(error).strip()) from error
+        # Blender does not check whether the whole file reached the disk.
+        if not (path.exists() and path.read_bytes().endswith(PNG_END)):
+            raise OSError("Blender wrote no picture or only a part of it, the disk may be full")
 
     def remove(self) -> None:
         """Remove all datablocks of the picture from the file."""
-        bpy.data.batch_remove([*self._datablocks, self._scene])
-
-
-class _MeshFactory:
-    """Creates meshes with the same topology."""
-
-    def __init__(self, mesh: bpy.types.Mesh):
-        self._vertex_count = len(mesh.vertices)
-        self._loop_starts, self._loop_vertices = topology(mesh)
-
-    def create(self, positions: np.ndarray, colors: np.ndarray) -> bpy.types.Mesh:
-        """Create a mesh with (V, 3) positions and (V, 3) sRGB colors."""
-        mesh = bpy.data.meshes.new("cell")
-        mesh.vertices.add(self._vertex_count)
-        mesh.loops.add(len(self._loop_vertices))
-        mesh.polygons.add(len(self._loop_starts))
-        set_mesh_positions(mesh, np.ascontiguousarray(positions, np.float32))
-        write(mesh.loops, VERTEX_INDEX_ELEMENT, self._loop_vertices)
-        write(mesh.polygons, LOOP_START_ELEMENT, self._loop_starts)
-        mesh.update(calc_edges=True)
-        mesh.shade_smooth()
-        _set_colors(mesh, colors)
-        return mesh
-
-
-def _set_colors(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
-    """Set the colors of the vertices, (V, 3) sRGB."""
-    attribute = mesh.color_attributes.new("color", "FLOAT_COLOR", "POINT")
-    rgba = np.ones((len(colors), 4), np.float32)
-    rgba[:, :3] = _srgb_to_linear(colors)
-    write(attribute.data, COLOR_ELEMENT, rgba)
-    mesh.color_attributes.active_color = attribute
-
-
-def _srgb_to_linear(srgb: object) -> np.ndarray:
-    """Convert sRGB to linear colors (IEC 61966-2-1)."""
-    srgb = np.asarray(srgb, np.float64)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        bpy.data.batch_remove([*self._datablocks, self.scene])

@@ -18,6 +18,7 @@ STAGE_UNITS = {
     "repeatability": "poses repeated",
     "evaluation": "poses compared",
     "benchmark": "measurements",
+    "film": "frames rendered",
 }
 """Labels of the steps of a stage, where they differ from the name of the stage."""
 PREPARING_STAGES = {"influences", "starting", "partitions prepared", "poses to fit", "fit", "target", "probes"}

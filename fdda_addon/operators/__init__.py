@@ -16,6 +16,7 @@ MODULES: tuple[str, ...] = (
     "build_model",
     "baking",
     "evaluation",
+    "film",
     "worst_poses",
     "models",
     "help",

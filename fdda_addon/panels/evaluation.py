@@ -20,7 +20,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_evaluation"
     bl_label = "Compare with Rig"
     bl_options = {"DEFAULT_CLOSED"}
-    verbs = ("evaluate",)
+    verbs = ("evaluate", "render_comparison")
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
@@ -50,6 +50,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         if last is not None:
             _draw_worst(layout, context, view, last)
         if scene_rig.mesh_object.fdda.is_bound:
+            _draw_film(layout, context)
             layout.operator("fdda.open_report", icon="URL")
 
     def _draw_evaluate(self, context: bpy.types.Context, scene_rig: object) -> None:
@@ -82,6 +83,14 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         button.source, button.poses, button.seed = view.source, view.poses, view.seed
         if state is not None and state.outcome_level != "INFO":
             draw_job(layout, context, "evaluate")
+
+
+def _draw_film(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    state = job.state_of("render_comparison")
+    if state is None or not state.is_running:
+        layout.operator("fdda.render_comparison", text="Render Comparison…", icon="RENDER_ANIMATION")
+    if state is not None:
+        draw_job(layout, context, "render_comparison")
 
 
 def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, scene_rig: SceneRig) -> None:

@@ -79,3 +79,10 @@ def is_bone_hidden(bone: bpy.types.PoseBone) -> bool:
         not any(collection.is_visible_effectively for collection in bone.bone.collections)
         and bool(bone.bone.collections)
     )
+
+
+def set_video_format(settings: bpy.types.ImageFormatSettings) -> None:
+    """Set the output of a scene to a video, written by FFmpeg (5.0 and later distinguish media types)."""
+    if hasattr(settings, "media_type"):
+        settings.media_type = "VIDEO"
+    settings.file_format = "FFMPEG"

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operator that renders the film of an action: rig, linear skinning, model and heat map side by side."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from ..core.defaults import FILM_TIMED_FRAMES
+from ..core.errors import FDDAError, RigError
+from ..core.progress import Progress
+from .confirm import ConfirmFirst
+from .playback import ModelOperator
+
+
+class FDDA_OT_render_comparison(ModelOperator, ConfirmFirst, bpy.types.Operator):
+    bl_idname = "fdda.render_comparison"
+    bl_label = "Render Comparison"
+    bl_description = (
+        "Render a film of the action: rig, linear skinning, model and heat map side by side, as seen in the 3D View"
+    )
+    bl_options = {"REGISTER"}
+    verb, title = "render_comparison", "Film"
+
+    filepath: bpy.props.StringProperty(
+        name="File", description="Video to write, .mp4 or .webm", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    filter_glob: bpy.props.StringProperty(default="*.mp4;*.webm", options={"HIDDEN"})
+    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+    action: bpy.props.StringProperty(
+        name="Action",
+        description="Action to show. Empty for the active action of the armature",
+        options={"SKIP_SAVE"},
+    )
+    direction: bpy.props.FloatVectorProperty(
+        name="Direction",
+        description="Direction towards the viewer. Zero for a view from the front left",
+        options={"HIDDEN", "SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_idle() and cls.has_bound_model(context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if self.filepath:
+            return ConfirmFirst.invoke(self, context, event)
+        try:
+            scene_rig = self.bound_rig(context)
+            self.action = self._action_name(scene_rig.armature_object)
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if context.region_data is not None:
+            self.direction = context.region_data.view_matrix.inverted().to_3x3().col[2]
+        file = Path(bpy.data.filepath).stem or "character"
+        name = bpy.path.clean_name(f"{file}_{scene_rig.mesh_object.name}_{self.action}")
+        self.filepath = bpy.path.abspath(f"//{name}.mp4")
+        self._is_confirming = True
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    execute = ConfirmFirst.execute
+
+    def confirmed_properties(self) -> dict[str, object]:
+        return {name: getattr(self, name) for name in ("object", "filepath", "action", "direction")}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        self.layout.prop_search(self, "action", bpy.data, "actions")
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        from ..core.file_kind import VIDEO
+        from ..core.output import check_outputs
+        from ..evaluation.film import FDDA, LINEAR, RIG, FilmSettings, film
+        from ..evaluation.picture import View
+        from ..evaluation.run import evaluate_action
+        from ..evaluation.video import check_video_path
+        from ..poses.action_range import action_frames
+        from ..poses.clip import find_action
+        from ..runtime.binding import model_disabled
+        from ..runtime.model_files import network_of
+        from ..timing.benchmark import benchmark
+
+        scene_rig, scene = self.bound_rig(context), context.scene
+        path = Path(bpy.path.abspath(self.filepath))
+        check_video_path(path)
+        check_outputs([(path, VIDEO)], [Path(bpy.data.filepath)])
+        name = self._action_name(scene_rig.armature_object)
+        network = network_of(scene_rig.mesh_object)
+        with model_disabled(scene_rig.mesh_object):
+            times = (yield from _result(benchmark(scene_rig, None, FILM_TIMED_FRAMES))).frame_times("")
+            settings = FilmSettings(
+                view=View.from_direction(self.direction) if any(self.direction) else View(),
+                fps=scene.render.fps / scene.render.fps_base,
+                times_ms={RIG: times.rig, LINEAR: times.linear, FDDA: times.fdda},
+            )
+            evaluation = yield from _result(evaluate_action(scene_rig, network, name))
+            first_frame = action_frames(find_action(name)).start
+            result = yield from _result(film(scene_rig, network, evaluation.held_out, first_frame, path, settings))
+        yield path, result
+
+    def finish(self, _context: bpy.types.Context, result: object) -> str:
+        path, film = result
+        return f"Rendered {film.frames} frames to {path.name}."
+
+    def _action_name(self, armature_object: bpy.types.Object) -> str:
+        animation = armature_object.animation_data
+        if not self.action and (animation is None or animation.action is None):
+            raise RigError(f"'{armature_object.name}' has no action; give it one.")
+        return self.action or animation.action.name
+
+
+def _result(steps: Iterator[object]) -> Iterator[object]:
+    """Yield the progress of a job, and return its result."""
+    for step in steps:
+        if isinstance(step, Progress):
+            yield step
+        else:
+            result = step
+    return result
+
+
+CLASSES = (FDDA_OT_render_comparison,)
