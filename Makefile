@@ -97,8 +97,11 @@ characters: .venv  ## record, train, bind and compare every kind of character on
 	.venv/bin/python benchmarks/characters.py out/characters
 	.venv-$(OTHER_LINE)/bin/python benchmarks/characters.py out/characters
 
-pictures: demo  ## render the README's pictures again from the demo's pictures
-	.venv/bin/python docs/pictures/make_pictures.py out/demo/pictures
+pictures: demo  ## render the README's pictures again from the demo's files
+	.venv/bin/python docs/pictures/make_pictures.py out/demo
+
+films: demo  ## render the films of the demo: rig beside model, and their errors, into out/films
+	.venv/bin/python docs/pictures/make_films.py out/demo out/films
 
 map: .venv  ## draw the diagram of the code's layers for docs/development.md again
 	.venv/bin/python docs/pictures/make_map.py docs/pictures/map.svg
@@ -127,4 +130,4 @@ requirements: .venv  ## pin the packages that pyproject.toml names, and their de
 clean:  ## remove all built files and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures map fixtures lint package release requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures films map fixtures lint package release requirements clean

@@ -128,8 +128,9 @@ def render_frames(
     first_frame: int,
     folder: Path,
     settings: FilmSettings,
+    step: int = 1,
 ) -> Iterator[tuple[Path, tuple[int, int]]]:
-    """Render the frames of a film as PNG files; arguments as for `film`.
+    """Render each frame of a film, or each `step`-th frame, as PNG files; the other arguments are as for `film`.
 
     Yields:
         The path of each file, and its width and height in pixels.
@@ -140,10 +141,10 @@ def render_frames(
         OutputError: the machine lacks a library that Workbench needs.
     """
     check_can_render()
-    source = _FrameSource(scene_rig, model, errors)
+    source = _FrameSource(scene_rig, model, errors, settings.columns)
     picture = _FilmPicture(scene_rig.mesh_object.data, source, settings)
     try:
-        for index in range(len(errors.positions)):
+        for index in range(0, len(errors.positions), step):
             picture.show(index, f"{errors.name}, frame {first_frame + index}")
             path = folder / f"{index:06}.png"
             picture.render(path)
@@ -160,12 +161,13 @@ class _FrameSource:
         max_error: error with the last color of the heat map, meters.
     """
 
-    def __init__(self, scene_rig: SceneRig, model: Path | Network, errors: PoseErrors):
+    def __init__(self, scene_rig: SceneRig, model: Path | Network, errors: PoseErrors, columns: tuple[str, ...]):
         opened = open_model(scene_rig, model)
         self._network, self._skinning = opened.network, LinearSkinning(opened.linear_rig)
         self._mask, self._metres_per_unit = read_mask(scene_rig.mesh_object), opened.network.info.metres_per_unit
         self.errors = errors
-        self.max_error = round_up(float(np.percentile(errors.fdda, COLOR_RANGE_PERCENTILE)))
+        shown_errors = errors.linear if LINEAR_ERROR in columns else errors.fdda
+        self.max_error = round_up(float(np.percentile(shown_errors, COLOR_RANGE_PERCENTILE)))
 
     def positions(self, index: int) -> dict[str, np.ndarray]:
         """Return the positions of a frame by column, (V, 3) float32, mesh-object space, mesh units."""
