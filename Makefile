@@ -52,8 +52,9 @@ farm: .venv-farm  ## record, train and bind the characters of a plan, on this ma
 test-farm: .venv-farm  ## run the tests of the farm: on a local cluster, and its jobs for OpenJD and Flamenco
 	.venv-farm/bin/python -m pytest tests/farm
 
-test-gui: package  ## press the buttons of the sidebar in a Blender with a window, into out/gui (BLENDER=/path/to/blender)
+test-gui: package  ## press the buttons of the sidebar in a Blender with a window, and update the add-on, into out/gui (BLENDER=/path/to/blender)
 	.venv/bin/python tests/gui/run.py out/gui $(BLENDER)
+	.venv/bin/python tests/gui/run_update.py out/gui/update out/gui/work/arm.blend $(BLENDER)
 
 test-windows: .venv  ## run the tests in Python for Windows under Wine, as root on Debian (LINE=5.2: only that LTS line; 40 minutes)
 	setup/windows/setup $(PYTHON_$(LINE))

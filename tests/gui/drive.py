@@ -27,6 +27,7 @@ import path_story
 import ranges_story
 import session_story
 import shot_story
+import update_story
 import work_story
 from window import StepError, park_mouse, save_screenshot
 
@@ -39,6 +40,7 @@ STEPS = {
     "ranges": ranges_story.STEPS,
     "flesh": flesh_story.STEPS,
     "session": session_story.STEPS,
+    "update": update_story.STEPS,
     "endure": endure_story.STEPS,
     "leave": leave_story.STEPS_BEFORE_CLOSING,
     "back": leave_story.STEPS_AFTER_REOPENING,

@@ -114,10 +114,10 @@ def install_and_run_stories(folder: Path, blender: str, stories: Sequence[str]) 
     status = run_command(install, environment, INSTALL_MAX_SECONDS, folder / "install.txt")
     if status != 0:
         return f"Blender did not install {package.name} ({describe_status(status)})"
-    return next(filter(None, (_run_story(folder, name, blender, environment) for name in stories)), "")
+    return next(filter(None, (run_story(folder, name, blender, environment) for name in stories)), "")
 
 
-def _run_story(folder: Path, name: str, blender: str, environment: dict[str, str]) -> str:
+def run_story(folder: Path, name: str, blender: str, environment: dict[str, str]) -> str:
     """Run one story; return a message about its problem, empty if it succeeds."""
     window_options = ["--window-geometry", "0", "0", str(WIDTH), str(HEIGHT), "--no-window-focus"]
     script_options = ["--python", str(Path(__file__).with_name("drive.py")), "--", str(folder), name]
