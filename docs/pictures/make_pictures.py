@@ -47,7 +47,7 @@ def make_film(demo_folder: Path, target: Path) -> None:
                 pictures.append(picture.convert("RGB"))
     duration_ms = round(1000 * FILM_STEP_FRAMES / fps)
     options = {"save_all": True, "append_images": pictures[1:], "duration": duration_ms, "loop": 0}
-    pictures[0].save(target, quality=FILM_QUALITY, method=6, **options)
+    pictures[0].save(target, quality=FILM_QUALITY, method=4, **options)
     if target.stat().st_size > MAX_FILM_BYTES:
         raise SystemExit(f"{target} is larger than {MAX_FILM_BYTES / 1e6:g} MB; lower FILM_QUALITY.")
 
