@@ -37,9 +37,9 @@ def shrink(source: Path, target: Path) -> None:
 
 def make_film(demo_folder: Path, target: Path) -> None:
     """Render the action of the arm, and write it as an animated WebP picture."""
-    scene_rig, model, errors, times = evaluate_demo(demo_folder)
+    scene_rig, model, errors, _ = evaluate_demo(demo_folder)
     fps = bpy.context.scene.render.fps
-    settings = FilmSettings(COMPARISON, VIEW, fps, times, width=WIDTH, text_scale=1.2)
+    settings = FilmSettings(COMPARISON, VIEW, fps, width=WIDTH, text_scale=1.2)
     with tempfile.TemporaryDirectory() as folder:
         pictures = []
         for path, _ in render_frames(scene_rig, model, errors, 1, Path(folder), settings, FILM_STEP_FRAMES):
