@@ -17,10 +17,14 @@ from .section import panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
+    from ..recording.rig_check import RigCheck
 
 AXES = "xyz"
 WIDE_SIDEBAR_PIXELS = 380
 """Sidebar width from which the table shows both ends of a range, pixels at a UI scale of 1."""
+
+_limits_cache: "dict[int, tuple[RigCheck | None, bool]]" = {}
+"""Last check of each rig, and whether a bone had limits then, by session_uid of the mesh object."""
 
 
 class FDDA_UL_bones(bpy.types.UIList):
@@ -86,11 +90,18 @@ def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[s
 
 @draw_cached
 def has_any_limits(rig: SceneRig) -> bool:
-    """Return whether any bone of the armature has limits or a locked axis."""
+    """Return whether any bone of the armature had limits or a locked axis at the last check of the rig.
+
+    Headers show it too, and a control rig has thousands of bones, so it is computed once for each check.
+    """
     from ..poses.motion_range import DEFAULT, rotation_ranges
 
-    bones = rig.armature_object.pose.bones
-    return any(r.source != DEFAULT or r.is_locked for bone in bones for r in rotation_ranges(bone))
+    check, uid = checks.last_check(rig), rig.mesh_object.session_uid
+    if check is None or _limits_cache.get(uid, (None,))[0] is not check:
+        bones = rig.armature_object.pose.bones
+        has_limits = any(r.source != DEFAULT or r.is_locked for bone in bones for r in rotation_ranges(bone))
+        _limits_cache[uid] = (check, has_limits)
+    return _limits_cache[uid][1]
 
 
 @draw_cached

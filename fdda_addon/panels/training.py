@@ -12,7 +12,6 @@ from ..core.report import Verdict, checkpoint_path, read_report, report_path
 from ..jobs import job
 from ..properties.character import default_model
 from ..properties.preferences import MODULE, preferences
-from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
@@ -25,6 +24,9 @@ SHOWN_PARTITIONS = 8
 
 _report_cache: dict[Path, tuple[int, dict | None]] = {}
 """Modification time and content of each training report, by path. The content is None if the report is invalid."""
+
+_assessment_cache: dict[Path, tuple[dict, Assessment]] = {}
+"""The last assessed report and what it means, by path."""
 
 
 class FDDA_PT_training(Section, bpy.types.Panel):
@@ -159,10 +161,9 @@ def _draw_next_buttons(
 
 def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, model: Path) -> None:
     """Draw what the errors of the training mean, and what to do next."""
-    report = _read_report(report_path(model))
-    if report is None or report["model"] != model.name:
+    report, assessment = _read_report(report_path(model)), _assessment(model)
+    if report is None or assessment is None:
         return
-    assessment = _assessment(model)
     box = layout.box()
     draw_wrapped(box, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
     if goal := report.get("goal"):
@@ -178,11 +179,16 @@ def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, mod
             draw_wrapped(body, context, warning["text"], "DOT")
 
 
-@draw_cached
 def _assessment(model: Path) -> Assessment | None:
-    """Return what the report of a model means; None without a report."""
-    report = _read_report(report_path(model))
-    return assess_training(report) if report is not None and report["model"] == model.name else None
+    """Return what the report of a model means; None without a report. It is computed once for each report."""
+    path = report_path(model)
+    report = _read_report(path)
+    if report is None or report["model"] != model.name:
+        return None
+    if path not in _assessment_cache or _assessment_cache[path][0] is not report:
+        _assessment_cache.clear()
+        _assessment_cache[path] = (report, assess_training(report))
+    return _assessment_cache[path][1]
 
 
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
