@@ -36,8 +36,8 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
         description="Number of vertices",
         items=(
             ("1", "1,476 Vertices", "Quick to record and train, but too cheap for a model to be faster"),
-            ("2", "9,960 Vertices", "A model is about 4x faster than the rig, and takes some minutes to make"),
-            ("3", "50,618 Vertices", "A model is about 11x faster than the rig, but recording takes a while"),
+            ("2", "9,960 Vertices", "A model is about 7x faster than the rig, and takes some minutes to make"),
+            ("3", "50,618 Vertices", "A model is about 23x faster than the rig, but recording takes a while"),
         ),
         default="2",
     )
