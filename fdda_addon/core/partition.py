@@ -205,23 +205,6 @@ def _root_joint(rig: Rig, joint: int) -> int:
     return joint
 
 
-def max_residual_changes(
-    partitions: tuple[Partition, ...], residuals: np.ndarray, base_residuals: np.ndarray
-) -> np.ndarray:
-    """Compute the largest change of a local residual in each partition.
-
-    Args:
-        partitions: P partitions.
-        residuals: (N, V, 3) float32 local residuals, axes of the main joint, mesh units.
-        base_residuals: local residuals to compare with, of N poses or of one pose.
-
-    Returns:
-        (N, P) float64, mesh units.
-    """
-    distances = np.linalg.norm(residuals - base_residuals, axis=2)
-    return np.stack([distances[:, p.vertices].max(axis=1, initial=0) for p in partitions], axis=1).astype(np.float64)
-
-
 def partition_colors(partitions: tuple[Partition, ...], vertex_count: int) -> np.ndarray:
     """Choose a color for each partition; returns (V, 3) float32 sRGB by vertex, 0 to 1."""
     colors = np.zeros((vertex_count, 3), np.float32)

@@ -27,7 +27,8 @@ from ..rig.temporary_rig_state import temporary_rig_states
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
 from .appender import PoseAppender, append_poses
-from .influences import InfluenceSearch, detect_influences
+from .influence_trials import InfluenceSearch
+from .influences import detect_influences
 from .mesh_group import common_armature, group_into_passes, split_controls
 from .phases import InfluencesReady, MeshPlanned, TimedEvaluator, WeightsFitted, describe_estimate
 from .plan import RecordingSettings, find_actions, make_pose_sampler, make_sampling, read_sampled_rig

@@ -17,7 +17,7 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.appender import BATCH_POSES
-from fdda_addon.recording.influences import _follows_control_bones
+from fdda_addon.recording.influence_trials import follows_control_bones
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseReader, read_rig
@@ -122,9 +122,9 @@ def test_a_driven_joint_is_found_by_a_name_with_quotes(fresh):
     armature_object, name = fresh.armature_object, 'lo"wer'
     armature_object.data.bones["lower"].name = name
     channels = (Channel("upper", ROTATION, 0, -1.0, 1.0),)
-    assert not _follows_control_bones(fresh, read_rig(fresh), channels)
+    assert not follows_control_bones(fresh, read_rig(fresh), channels)
     armature_object.pose.bones[name].driver_add("location", 0)
-    assert _follows_control_bones(fresh, read_rig(fresh), channels)
+    assert follows_control_bones(fresh, read_rig(fresh), channels)
 
 
 def test_rounding_far_from_the_origin_is_no_influence(fresh, tmp_path):

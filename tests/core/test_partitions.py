@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Partitions by main joint, and how far their residuals change between poses."""
+"""Partitions by main joint."""
 
 import numpy as np
 
-from fdda_addon.core.partition import main_joints, make_partitions, max_residual_changes, partition_colors
+from fdda_addon.core.partition import main_joints, make_partitions, partition_colors
 
 from .limb import INFLUENCING, VERTEX_COUNT, make_rig, partitions_of
 
@@ -29,20 +29,6 @@ def test_each_vertex_is_in_the_partition_of_its_main_joint():
 
 def test_influencing_joints_may_be_left_out():
     assert all(p.influencing == () for p in make_partitions(make_rig()))
-
-
-def test_residual_changes_are_the_largest_distances_in_each_partition():
-    partitions = partitions_of(make_rig())
-    residuals = np.random.default_rng(0).normal(size=(2, VERTEX_COUNT, 3)).astype(np.float32)
-    changed_residuals = residuals.copy()
-    changed_residuals[1, partitions[1].vertices[2]] += (0.3, 0, -0.4)
-    changed_residuals[0, partitions[1].vertices[0]] += (0.1, 0, 0)
-    changed_residuals[0, partitions[3].vertices[-1]] += (0, 0.25, 0)
-    expected = [[0, 0.1, 0, 0.25], [0, 0.5, 0, 0]]
-    np.testing.assert_allclose(max_residual_changes(partitions, changed_residuals, residuals), expected, atol=1e-6)
-    np.testing.assert_allclose(
-        max_residual_changes(partitions, changed_residuals[1:], residuals[1:]), expected[1:], atol=1e-6
-    )
 
 
 def test_every_partition_has_one_distinct_color():

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Patches: small parts of partitions, on which few joints act even where a partition is as large as the body."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .partition import Partition
+from .rig import Rig
+
+MAX_PATCH_VERTICES = 16
+"""Largest number of vertices of a patch. Smaller patches have fewer influences but cost more memory."""
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Division of the V vertices of a mesh into Q patches; each lies in one partition.
+
+    Attributes:
+        vertices: (V,) indices of the vertices, sorted by patch.
+        starts: (Q,) index in `vertices` of the first vertex of each patch.
+        partition_starts: (P,) index of the first patch of each partition.
+    """
+
+    vertices: np.ndarray
+    starts: np.ndarray
+    partition_starts: np.ndarray
+
+    def max_changes(self, residuals: np.ndarray, base_residuals: np.ndarray) -> np.ndarray:
+        """Compute the largest change of a local residual in each patch.
+
+        Args:
+            residuals: (N, V, 3) float32 local residuals, axes of the main joint, mesh units.
+            base_residuals: local residuals to compare with, of N poses or of one pose.
+
+        Returns:
+            (N, Q) float32, mesh units.
+        """
+        distances = np.linalg.norm(residuals - base_residuals, axis=2)
+        return np.maximum.reduceat(distances[:, self.vertices], self.starts, axis=1)
+
+    def nearby_joints(self, rig: Rig) -> np.ndarray:
+        """Find the joints with a weight on a vertex of a patch, or on a vertex that an edge connects with it.
+
+        Returns:
+            (J, Q) bool.
+        """
+        patch_of_vertex = np.empty(len(self.vertices), np.int64)
+        patch_of_vertex[self.vertices] = np.repeat(
+            np.arange(len(self.starts)), np.diff(np.append(self.starts, len(self.vertices)))
+        )
+        next_corners = np.arange(1, len(rig.face_vertices) + 1)
+        next_corners[np.append(rig.face_starts[1:], len(rig.face_vertices)) - 1] = rig.face_starts
+        first, second = rig.face_vertices, rig.face_vertices[next_corners]
+        every = np.arange(rig.vertex_count)
+        weighted, near = np.concatenate([every, first, second]), np.concatenate([every, second, first])
+        nearby = np.zeros((len(rig.joints), len(self.starts)), bool)
+        for slot in range(rig.skin_joints.shape[1]):
+            has_weight = rig.skin_weights[weighted, slot] > 0
+            nearby[rig.skin_joints[weighted[has_weight], slot], patch_of_vertex[near[has_weight]]] = True
+        return nearby
+
+
+def divide_into_patches(rig: Rig, partitions: tuple[Partition, ...], max_vertices: int = MAX_PATCH_VERTICES) -> Patches:
+    """Divide partitions into patches, by cutting each along its longest axis until its parts are small enough."""
+    patches: list[np.ndarray] = []
+
+    def cut(vertices: np.ndarray) -> None:
+        if len(vertices) <= max_vertices:
+            patches.append(vertices)
+            return
+        positions = rig.rest_positions[vertices]
+        axis = int(np.argmax(np.ptp(positions, axis=0)))
+        ordered = vertices[np.argsort(positions[:, axis], kind="stable")]
+        cut(ordered[: len(ordered) // 2])
+        cut(ordered[len(ordered) // 2 :])
+
+    partition_starts = []
+    for partition in partitions:
+        partition_starts.append(len(patches))
+        cut(partition.vertices)
+    starts = np.cumsum([0, *map(len, patches[:-1])])
+    return Patches(np.concatenate(patches), starts, np.array(partition_starts))

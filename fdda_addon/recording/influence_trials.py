@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Moves joints and controls from base poses, to detect their influences.
+
+Joints with sampled channels are moved by these channels. In a control rig, control bones move many joints at once
+through constraints. So in a control rig, each joint is set to its transform in other poses, with all constraints
+muted.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..core.defaults import INFLUENCE_POSES
+from ..core.partition import INFLUENCE_TOLERANCE
+from ..core.poses import CONTROL, Channel
+from ..core.rig import STATIC_JOINT, Rig
+from ..poses.bone_channels import is_moved_by_constraints
+from ..rig.sources import split_bone_path
+from ..scene.armature import Poser, clear_pose
+from ..scene.bone_transform import controls_by_bone
+from ..scene.control_reader import ControlReader
+from ..scene.controls import is_driven, owner_of, set_control
+from ..scene.scene_rig import SceneRig
+from .joint_override import JointOverride, override_joints
+
+JOINT = "joint"
+"""Kind of an input that is a joint; the other kind is `CONTROL`."""
+MIN_TRANSFORM_CHANGE = 1e-5
+"""Smallest change of a joint's relative transform between poses that counts as motion (no unit, or meters)."""
+
+
+@dataclass(frozen=True)
+class InfluenceSearch:
+    """Settings of the detection of influences.
+
+    Attributes:
+        channels: channels of the random poses; may be empty.
+        draw_values: returns random values of the channels, (C,), for an index from 0.
+        show_pose: sets a recorded pose for an index from 0; used without channels.
+        stop_playback: ends the playback of `show_pose`.
+        has_target: the surface is that of a target, which bones other than the joints may deform.
+        poses: number of times that each joint is moved.
+        tolerance: a joint influences a partition when it changes a local residual by more than this ratio of the
+            rig's size.
+    """
+
+    channels: tuple[Channel, ...]
+    draw_values: Callable[[int], np.ndarray]
+    show_pose: Callable[[int], None]
+    stop_playback: Callable[[], None]
+    poses: int = INFLUENCE_POSES
+    tolerance: float = INFLUENCE_TOLERANCE
+    has_target: bool = False
+
+
+class Trials(Protocol):
+    """A base pose for each trial, and for each trial and input a value to which the input moves.
+
+    Attributes:
+        inputs: kind, and index of the joint or control, of each input that moves.
+        undetectable_controls: controls that cannot be moved alone, so that they may influence all partitions.
+    """
+
+    inputs: list[tuple[str, int]]
+    undetectable_controls: frozenset[int]
+
+    def show(self, trial: int, moved: Sequence[int]) -> None:
+        """Set the base pose of a trial, with the inputs at the indices `moved` moved."""
+
+
+@contextmanager
+def prepared_trials(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch) -> Iterator[Trials]:
+    """Prepare the trials of a rig; clear the pose of the armature afterwards."""
+    if not follows_control_bones(scene_rig, rig, search.channels):
+        yield _ChannelTrials(scene_rig, rig, search)
+    else:
+        states = _sample_states(scene_rig, rig, search, 2 * search.poses)
+        clear_pose(scene_rig.armature_object)
+        with override_joints(scene_rig, rig.joints, search.has_target) as override:
+            yield _OverrideTrials(scene_rig, rig, states, override)
+    clear_pose(scene_rig.armature_object)
+
+
+def follows_control_bones(scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...]) -> bool:
+    """Return whether joints move otherwise than by their own sampled channels."""
+    sampled_names = {channel.name for channel in channels}
+    bones = scene_rig.armature_object.pose.bones
+    animation = scene_rig.armature_object.animation_data
+    paths = [curve.data_path for curve in (animation.drivers if animation else ())]
+    driven_bones = {bone for bone, _ in map(split_bone_path, paths) if bone}
+    unsampled_joints = [name for name in rig.joint_names if name not in sampled_names and name != STATIC_JOINT]
+    if any(name not in rig.joint_names for name in sampled_names if name in bones):
+        return True
+    return not sampled_names or any(
+        is_moved_by_constraints(bones[name]) or name in driven_bones for name in unsampled_joints
+    )
+
+
+class _ChannelTrials:
+    """Trials that move joints and controls by their sampled channels."""
+
+    def __init__(self, scene_rig: SceneRig, rig: Rig, search: InfluenceSearch):
+        channels = search.channels
+        self.undetectable_controls = frozenset()
+        self._search, self._poser = search, Poser(scene_rig, channels)
+        joints = {name: index for index, name in enumerate(rig.joint_names)}
+        controls = {control.name: index for index, control in enumerate(rig.controls)}
+        moved_bones = controls_by_bone(rig.controls)
+        channel_indices: dict[tuple[str, int], list[int]] = {}
+        for channel_index, channel in enumerate(channels):
+            index = (controls if channel.kind == CONTROL else joints).get(channel.name)
+            if index is not None:
+                kind = CONTROL if channel.kind == CONTROL else JOINT
+                channel_indices.setdefault((kind, index), []).append(channel_index)
+            # Controls may be numbers of the transform that the channels of a bone set; they change together.
+            if channel.kind != CONTROL and channel.name in moved_bones:
+                channel_indices.setdefault((CONTROL, moved_bones[channel.name][0]), []).append(channel_index)
+        self.inputs = sorted(channel_indices, key=lambda item: (item[0] == CONTROL, item[1]))
+        self._channels_of_inputs = [channel_indices[moved_input] for moved_input in self.inputs]
+        self._joint_count = len(joints)
+        # The base pose is the rest pose in half of the trials, and a random pose in the others.
+        rest_values = np.array([channel.rest for channel in channels])
+        self._base_poses = [rest_values] * (search.poses - search.poses // 2) + [
+            search.draw_values(index) for index in range(search.poses // 2)
+        ]
+
+    def show(self, trial: int, moved: Sequence[int]) -> None:
+        values = self._base_poses[trial].copy()
+        for number in moved:
+            kind, index = self.inputs[number]
+            sample_offset = index if kind != CONTROL else self._joint_count + index
+            moved_values = self._search.draw_values((sample_offset + 1) * self._search.poses + trial)
+            values[self._channels_of_inputs[number]] = moved_values[self._channels_of_inputs[number]]
+        self._poser.set(values)
+
+
+class _OverrideTrials:
+    """Trials that set joints and controls to their values in other poses, and keep all others."""
+
+    def __init__(self, scene_rig: SceneRig, rig: Rig, states: "list[_PoseState]", override: JointOverride):
+        self._scene_rig, self._rig, self._override = scene_rig, rig, override
+        joint_transforms = np.stack([state.joints for state in states])
+        changes = np.abs(joint_transforms - joint_transforms[0])
+        changes[..., :3, 3] *= rig.metres_per_unit
+        moving_joints = np.flatnonzero(changes.max(axis=(0, 2, 3)) > MIN_TRANSFORM_CHANGE).tolist()
+        bones, joint_names = controls_by_bone(rig.controls), set(rig.joint_names)
+        driven_controls = {n for n, c in enumerate(rig.controls) if is_driven(owner_of(scene_rig, c.owner), c.path)}
+        # The transform of a joint is set with the joint.
+        self._movable_bones = {
+            name: indices
+            for name, indices in bones.items()
+            if name not in joint_names and driven_controls.isdisjoint(indices)
+        }
+        bone_controls = {index for indices in bones.values() for index in indices}
+        movable_bone_controls = {index for indices in self._movable_bones.values() for index in indices}
+        self._movable_controls = sorted(set(range(len(rig.controls))) - bone_controls - driven_controls)
+        self._bone_of_control = {indices[0]: name for name, indices in self._movable_bones.items()}
+        self.undetectable_controls = frozenset(range(len(rig.controls))) - movable_bone_controls
+        self.undetectable_controls -= frozenset(self._movable_controls)
+        self.inputs = [(JOINT, index) for index in moving_joints]
+        self.inputs += [(CONTROL, index) for index in sorted([*self._movable_controls, *self._bone_of_control])]
+        trial_count = len(states) // 2
+        rest_state = _PoseState(override.rest, states[0].controls, dict.fromkeys(bones, Matrix()))
+        self._base_states = [rest_state] * (trial_count - trial_count // 2) + states[: trial_count // 2]
+        self._moved_states = states[trial_count:]
+
+    def show(self, trial: int, moved: Sequence[int]) -> None:
+        inputs = [self.inputs[number] for number in moved]
+        state = self._base_states[trial].with_inputs_of(self._moved_states[trial], inputs, self._bone_of_control)
+        self._override.set(state.joints)
+        for index in self._movable_controls:
+            set_control(self._scene_rig, self._rig.controls[index].name, float(state.controls[index]))
+        for name in self._movable_bones:
+            self._scene_rig.armature_object.pose.bones[name].matrix_basis = state.bones[name]
+
+
+@dataclass(frozen=True)
+class _PoseState:
+    """State of joints and controls in a pose.
+
+    Attributes:
+        joints: (J, 4, 4) matrices relative to parent joints.
+        controls: (C,) control values.
+        bones: the transform of each control bone relative to its rest pose, by name.
+    """
+
+    joints: np.ndarray
+    controls: np.ndarray
+    bones: dict[str, Matrix]
+
+    def with_inputs_of(
+        self, other: "_PoseState", inputs: list[tuple[str, int]], bone_of_control: dict[int, str]
+    ) -> "_PoseState":
+        """Return a copy in which some joints, controls and control bones have their values in another state."""
+        joints, controls, bones = self.joints.copy(), self.controls.copy(), dict(self.bones)
+        for kind, index in inputs:
+            if kind != CONTROL:
+                joints[index] = other.joints[index]
+            elif index in bone_of_control:
+                bones[bone_of_control[index]] = other.bones[bone_of_control[index]]
+            else:
+                controls[index] = other.controls[index]
+        return _PoseState(joints, controls, bones)
+
+
+def _sample_states(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, count: int) -> list[_PoseState]:
+    """Read the states of joints and controls in random or recorded poses."""
+    poser = Poser(scene_rig, search.channels)
+    override = JointOverride(scene_rig, rig.joints)
+    reader = ControlReader(scene_rig, rig.controls)
+    states = []
+    for index in range(count):
+        if search.channels:
+            poser.set(search.draw_values(index))
+        else:
+            search.show_pose(index)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        bones = scene_rig.armature_object.evaluated_get(depsgraph).pose.bones
+        transforms = {name: bones[name].matrix_basis.copy() for name in controls_by_bone(rig.controls)}
+        states.append(_PoseState(override.read(), reader.read(scene_rig, depsgraph), transforms))
+    search.stop_playback()
+    return states

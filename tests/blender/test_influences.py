@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Moving joints in groups finds the same influences as moving one after the other, in fewer evaluations."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.characters import meshes
+from blend_fixtures.characters.bones import (
+    NewBone,
+    add_bone_collection,
+    add_bones,
+    limit,
+)
+from fdda_addon.core.group_testing import GroupTesting
+from fdda_addon.core.partition import INFLUENCE_TOLERANCE
+from fdda_addon.core.patches import Patches
+from fdda_addon.recording import influences
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.rig.reading import read_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+TRIALS = 4
+MAX_TOLERANCE_RATIO = 1.5
+"""Largest change, as a ratio of the tolerance, of an influence that only one of the two ways finds."""
+
+
+def chains() -> None:
+    """Build six chains of eight bones, which do not meet."""
+    meshes.five_hundred_bones()
+
+
+def chains_with_distant_influences() -> None:
+    """Let the first bone of each chain drive a shape key of the next chain."""
+    chains()
+    mesh_object, armature_object = bpy.data.objects["creature"], bpy.data.objects["creature_rig"]
+    mesh_object.shape_key_add(name="Basis", from_mix=False)
+    points = np.array([vertex.co for vertex in mesh_object.data.vertices])
+    for chain in range(meshes.CHAINS):
+        key = mesh_object.shape_key_add(name=f"key {chain}", from_mix=False)
+        key.slider_min = -1.0
+        next_y = (chain + 1) % meshes.CHAINS * 0.05
+        for point, is_moved in zip(key.data, np.abs(points[:, 1] - next_y) < 0.02, strict=True):
+            point.co.z += 0.05 if is_moved else 0.0
+        driver = key.driver_add("value").driver
+        variable = driver.variables.new()
+        variable.name = "angle"
+        variable.targets[0].id = armature_object
+        variable.targets[0].data_path = f'pose.bones["finger.{chain:02}.00"].rotation_euler[0]'
+        driver.expression = "angle"
+
+
+def chains_that_copy_each_other() -> None:
+    """Let each bone of a chain add the rotation of the same bone of the previous chain to its own."""
+    chains()
+    armature_object = bpy.data.objects["creature_rig"]
+    for chain in range(1, meshes.CHAINS):
+        for index in range(meshes.BONES_PER_CHAIN):
+            copy = armature_object.pose.bones[f"finger.{chain:02}.{index:02}"].constraints.new("COPY_ROTATION")
+            copy.target, copy.subtarget = armature_object, f"finger.{chain - 1:02}.{index:02}"
+            copy.mix_mode, copy.owner_space, copy.target_space = "ADD", "LOCAL", "LOCAL"
+
+
+def chains_on_controls() -> None:
+    """Let control bones move all chains: the poses come from IK, a copied rotation and a control of all of them."""
+    chains()
+    armature_object = bpy.data.objects["creature_rig"]
+    names = [f"control.{chain}" for chain in range(meshes.CHAINS)]
+    add_bones(
+        armature_object,
+        *(
+            NewBone(name, (0.5, chain * 0.05, 0.0), (0.6, chain * 0.05, 0.0), is_deforming=False)
+            for chain, name in enumerate(names)
+        ),
+    )
+    add_bone_collection(armature_object, "Controls", *names)
+    bones = armature_object.pose.bones
+    for chain, name in enumerate(names):
+        if chain % 2:
+            limit(bones[name], "LIMIT_LOCATION", {axis: (-0.1, 0.1) for axis in range(3)})
+            ik = bones[f"finger.{chain:02}.{meshes.BONES_PER_CHAIN - 1:02}"].constraints.new("IK")
+            ik.target, ik.subtarget = armature_object, name
+            continue
+        limit(bones[name], "LIMIT_ROTATION", {axis: (-20.0, 20.0) for axis in range(3)})
+        for index in range(meshes.BONES_PER_CHAIN):
+            copy = bones[f"finger.{chain:02}.{index:02}"].constraints.new("COPY_ROTATION")
+            copy.target, copy.subtarget, copy.owner_space, copy.target_space = armature_object, name, "LOCAL", "LOCAL"
+
+
+def find_influences(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, is_grouped: bool, sample: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (N, Q) influences on patches, and the changes in each evaluation as ratios of the tolerance."""
+    changes, found = [], []
+
+    def max_changes(*arguments) -> np.ndarray:
+        changes.append(original_changes(*arguments))
+        return changes[-1]
+
+    def test_groups(*arguments):
+        found.append((yield from original_test_groups(*arguments)))
+        return found[0]
+
+    original_changes, original_test_groups = Patches.max_changes, influences._test_groups
+    rig = find_rig()
+    with monkeypatch.context() as patches:
+        patches.setattr(Patches, "max_changes", max_changes)
+        patches.setattr(influences, "_test_groups", test_groups)
+        if not is_grouped:
+            patches.setattr(GroupTesting, "divide_inputs", lambda self: np.arange(len(self.influences))[:, None])
+        settings = RecordingSettings(poses=1, influence_poses=TRIALS, detect_influences=True, sample=sample)
+        for _ in record(rig, folder, settings):
+            pass
+    return found[0], np.concatenate(changes) / (INFLUENCE_TOLERANCE * read_rig(rig).size)
+
+
+@pytest.mark.parametrize(
+    ("build", "sample"),
+    [
+        (chains, ()),
+        (chains_with_distant_influences, ()),
+        (chains_that_copy_each_other, ()),
+        (chains_on_controls, ("collection:Controls",)),
+    ],
+    ids=lambda value: value.__name__ if callable(value) else "",
+)
+def test_groups_find_what_single_joints_find(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, build: Callable[[], None], sample: tuple[str, ...]
+):
+    monkeypatch.setattr(meshes, "CHAINS", 6)
+    monkeypatch.setattr(meshes, "BONES_PER_CHAIN", 8)
+    build()
+    found, group_changes = find_influences(monkeypatch, tmp_path / "groups", True, sample)
+    expected, single_changes = find_influences(monkeypatch, tmp_path / "single", False, sample)
+    assert expected.any() and len(single_changes) == TRIALS * len(expected)
+    largest_changes = single_changes.reshape(TRIALS, *expected.shape).max(axis=0)
+    assert np.array_equal(largest_changes > 1, expected)
+    differs = found != expected
+    assert not (differs & (np.abs(largest_changes - 1) > MAX_TOLERANCE_RATIO - 1)).any()
+    assert len(group_changes) < 0.9 * len(single_changes)
