@@ -26,6 +26,7 @@ from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.mesh import evaluated_positions
+from fdda_addon.timing.benchmark import MAX_ROUNDS
 
 from .conftest import run
 from .scene_state import drain
@@ -200,7 +201,9 @@ def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path, capf
         "is_faster",
         "constant_bytes",
     ]
-    assert (report["unit"], report["vertices"], report["frames"]) == ("ms", 300, 15)
+    assert (report["unit"], report["vertices"]) == ("ms", 300)
+    # At least five rounds of three frames; more while the times vary.
+    assert report["frames"] in range(15, 3 * MAX_ROUNDS + 1, 3)
     assert report["blender"] == bpy.app.version_string
     for method in methods:
         assert 0 < report[method]["median"] <= report[method]["p90"]
