@@ -111,14 +111,15 @@ class FrameProfile:
         letters, bar = "ABCDEFGHIJKLMNOPQRSTUVWXYZ", ""
         lines = [f"A frame takes {self.frame} ms to evaluate (median, ± spread over {ROUNDS} rounds)."]
         rows = []
-        for index, part in enumerate(self.parts):
+        shown_parts = [part for part in self.parts if part.kind == REST or part.duration.median > 0]
+        for index, part in enumerate(shown_parts):
             letter, share = letters[index % len(letters)], part.duration.median / max(self.total, 1e-9)
             bar += letter * round(BAR_WIDTH * share)
             rows.append(f"  {letter} {part.title:<44}{part.duration!s:>16}{share:>7.0%}")
         lines += [f"  {bar}", *rows]
         if self.groups:
             lines.append("Constraints and drivers that take the most time:")
-            lines += [f"  {group.title:<62}{group.duration!s:>16}" for group in self.groups]
+            lines += [f"  {group.title:<82}{group.duration!s:>16}" for group in self.groups]
         return "\n".join([*lines, *self.savings_sentences()])
 
     def savings_sentences(self) -> list[str]:
