@@ -138,7 +138,7 @@ def confidence_of_control(network: Network, control: int, values: np.ndarray) ->
 
 
 def test_confidence_fades_beyond_the_range_of_a_control(network):
-    confidence = confidence_of_control(network, 0, np.linspace(0, 8, 80))
+    confidence = confidence_of_control(network, 0, np.linspace(0, 24, 240))
     assert (confidence[:10, 1:] == 1).all() and (confidence[-1, 1:] == 0).all()
     assert (np.diff(confidence[:, 1:], axis=0) <= 0).all() and np.abs(np.diff(confidence, axis=0)).max() < 0.05
     assert (confidence[:, 0] == 1).all(), "the first partition does not follow this control"
@@ -151,7 +151,7 @@ def test_confidence_fades_beyond_the_range_of_a_control(network):
 
 
 def test_a_control_that_never_moved_lowers_confidence_only_when_it_moves(network):
-    confidence = confidence_of_control(network, 2, np.float32([0.5, 0.7, 1.5, 5]))
+    confidence = confidence_of_control(network, 2, np.float32([0.5, 0.7, 3, 15]))
     assert (confidence[0] == 1).all()
     assert (np.diff(confidence, axis=0) < 0).all() and (confidence[-1] == 0).all(), "its effect is unknown"
 
@@ -163,7 +163,7 @@ def test_a_constant_control_with_a_range_counts_where_it_influences():
     poses, constant_values = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
     training_range = measure_training_range(inputs.compute_features(poses, constant_values), rig, partitions)
     assert training_range.controls == (replace(BULGE, low=0.25, high=0.25),)
-    confidence = training_range.compute_confidence(inputs.compute_features(poses[:3], np.array([[0.25], [1], [6]])))
+    confidence = training_range.compute_confidence(inputs.compute_features(poses[:3], np.array([[0.25], [1], [16]])))
     assert (
         (confidence[:, [0, 2]] == 1).all() and confidence[0, 1] == 1 > confidence[1, 1] > 0.8 and confidence[2, 1] == 0
     )

@@ -19,11 +19,11 @@ from fdda_addon.core.skinning import SkinBlock
 
 MARGIN_RATIO = 0.1
 """Margin of the box on each side, as a part of the range."""
-FADE_RATIO = 6.0
+FADE_RATIO = 18.0
 """Fade width, as a part of the range. It is large, because the residual at the end of the range is a good approximation
-outside the range: docs/experiments.md, Margin around the range of motion."""
+outside the range. The linear fit has no bound without a fade: docs/experiments.md, Fade of the confidence."""
 MIN_MARGINS = (0.01, 0.001)
-MIN_FADE_WIDTHS = (4.0, 0.2)
+MIN_FADE_WIDTHS = (12.0, 0.6)
 """Minimum margin and minimum fade width. The first value is for rotation elements, without unit, and for controls, as a
 part of their recorded range. The second is for translations, as a part of the character's size. These minimums apply
 to a locked axis, which has no range."""
