@@ -104,8 +104,9 @@ pictures: demo  ## render the README's pictures again from the demo's files
 films: demo  ## render the films of the demo: rig beside model, and their errors, into out/films
 	.venv/bin/python docs/pictures/make_films.py out/demo out/films
 
-map: .venv  ## draw the diagram of the code's layers for docs/development.md again
+map: .venv  ## draw the diagrams of the code's layers and of a character's states for docs/development.md again
 	.venv/bin/python docs/pictures/make_map.py docs/pictures/map.svg
+	.venv/bin/python docs/pictures/make_states.py docs/development.md
 
 fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test
 	@$(MAKE) .venv-line LINE=4.5

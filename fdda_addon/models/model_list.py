@@ -10,7 +10,7 @@ from ..core.errors import ModelError, OutputError, os_error_text
 from ..core.model import MAX_BYTES, ModelInfo, check_model, read_model, read_model_info
 from ..core.output import atomic_write, check_writable
 from ..evaluation import last_evaluation
-from ..runtime import model_files, packed_model, playback, registry
+from ..runtime import model_files, packed_model, playback
 from ..runtime.binding import bind, unbind
 from ..runtime.opened_model import read_matching_rig
 from ..scene.scene_rig import SceneRig
@@ -49,7 +49,7 @@ def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGr
             if was_bound and is_changed:
                 last_evaluation.remove(mesh_object)
                 frame_times.remove(mesh_object)
-                registry.reset_players()
+                playback.reload_model(mesh_object)
                 mesh_object.update_tag()
             return entry
     entry = binding.models.add()
@@ -176,7 +176,7 @@ def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pa
     entry.packed, entry.packed_bytes = packed_model.pack(path.name, data), len(data)
     if was_bound:
         mesh_object.fdda.packed = entry.packed
-        registry.reset_players()
+        playback.reload_model(mesh_object)
     return len(data)
 
 
@@ -209,7 +209,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
     model_files.allow_path(path)
     if was_bound:
         mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None
-        registry.reset_players()
+        playback.reload_model(mesh_object)
     packed_model.remove_unused_texts()
 
 

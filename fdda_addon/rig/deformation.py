@@ -28,14 +28,22 @@ def read_deformation(scene_rig: SceneRig) -> dict:
     Raises:
         RigError: as `recorded_modifiers`.
     """
-    mesh_object = scene_rig.mesh_object
     deformation = {
-        "modifiers": [_read_modifier(scene_rig, modifier) for modifier in recorded_modifiers(mesh_object)],
-        "shape_keys": _read_shape_keys(mesh_object),
+        **read_modifiers_and_drivers(scene_rig),
+        "shape_keys": _read_shape_keys(scene_rig.mesh_object),
         "b_bones": read_b_bones(scene_rig.armature_object.data),
-        "drivers": _drivers_digest(scene_rig),
     }
     return {key: value for key, value in deformation.items() if value or key == "modifiers"}
+
+
+def read_modifiers_and_drivers(scene_rig: SceneRig) -> dict:
+    """Read the modifiers that deform the mesh of a rig, and a digest of the drivers, as JSON values.
+
+    Raises:
+        RigError: as `recorded_modifiers`.
+    """
+    modifiers = [_read_modifier(scene_rig, modifier) for modifier in recorded_modifiers(scene_rig.mesh_object)]
+    return {"modifiers": modifiers, "drivers": _drivers_digest(scene_rig)}
 
 
 def read_b_bones(armature: bpy.types.Armature) -> dict:

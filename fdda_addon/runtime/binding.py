@@ -12,9 +12,10 @@ from ..rig.modifier_stack import check_stack
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import stored_path_for
-from . import model_files, modifier_switch, packed_model, playback, playback_modifier, position_buffer, registry
-from .mode_override import override_mode
+from . import model_files, modifier_switch, packed_model, playback, playback_modifier, position_buffer
 from .opened_model import open_model
+from .session import session
+from .transitions import SHOWS_MODEL, Event
 
 
 def bind(
@@ -55,7 +56,6 @@ def bind(
     binding.packed = packed_text
     binding.use_in_render = use_in_render
     binding.is_bound = True
-    registry.reset_players()
     binding.mode = "FDDA"
 
 
@@ -69,7 +69,9 @@ def unbind(mesh_object: bpy.types.Object) -> None:
     if not binding.is_bound:
         return
     _check_editable(mesh_object)
+    character = session.character_of(mesh_object)
     binding.mode = "RIG"
+    session.dispatch(Event.UNBIND, character)
     modifier = playback_modifier.find_modifier(mesh_object)
     if modifier is not None:
         buffer = playback_modifier.buffer_of(modifier)
@@ -80,7 +82,6 @@ def unbind(mesh_object: bpy.types.Object) -> None:
             position_buffer.remove_buffer(buffer)
     for property_name in ("is_bound", "model", "packed", "use_in_render", "status"):
         binding.property_unset(property_name)
-    registry.reset_players()
 
 
 def _check_editable(mesh_object: bpy.types.Object) -> None:
@@ -94,20 +95,22 @@ def _check_editable(mesh_object: bpy.types.Object) -> None:
 
 def on_property_update(mesh_object: bpy.types.Object) -> None:
     """Apply the changed properties of a bound object; the next evaluation shows the result."""
-    if mesh_object.fdda.is_bound:
-        was_playing = mesh_object.fdda.is_playing
-        modifier_switch.switch_modifiers(mesh_object)
-        if mesh_object.fdda.is_playing != was_playing:
-            registry.recreate_player(mesh_object)
-            # Scan now: a handler that sets the mode may run after ours, and a render does not evaluate a third time.
-            registry.scan()
-        mesh_object.update_tag()
+    if not mesh_object.fdda.is_bound:
+        return
+    character = session.character_of(mesh_object)
+    session.dispatch(Event.CHOOSE_MODEL if session.uses_model(mesh_object) else Event.SHOW_RIG, character)
+    with session.isolated_errors(character):
+        # Use in Render may have changed.
+        modifier_switch.switch_modifiers(mesh_object, character.state in SHOWS_MODEL)
+    # Scan now: a handler that sets the mode may run after ours, and a render does not evaluate a third time.
+    playback.scan()
+    mesh_object.update_tag()
 
 
 def on_mask_update(mesh_object: bpy.types.Object) -> None:
     """Apply the changed mask of a bound object."""
     if mesh_object.fdda.is_bound:
-        playback.update_mask(mesh_object)
+        playback.on_mask_update(mesh_object)
 
 
 @contextmanager
@@ -116,7 +119,7 @@ def temporary_mode(mesh_object: bpy.types.Object, mode: str) -> Iterator[None]:
     binding = mesh_object.fdda
     previous_mode = binding.mode
     try:
-        with override_mode(mesh_object, mode):
+        with session.override_mode(mesh_object, mode):
             if binding.is_bound:
                 binding.mode = mode
                 modifier = playback_modifier.find_modifier(mesh_object)

@@ -9,9 +9,7 @@ from ..rig.reading import PoseReader
 from ..scene.control_reader import ControlReader
 from ..scene.scene_rig import SceneRig, armature_of
 from . import model_files
-
-_cached_call: tuple[object, bytes, list[tuple[str, float]] | None] | None = None
-"""The model, its inputs and the result of the last call that ran a model."""
+from .session import session
 
 
 def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
@@ -21,7 +19,6 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
         For each partition the name of its main joint and its confidence, 0 to 1, in ascending order of confidence.
         None if the model has no such output, or if the pose cannot be read.
     """
-    global _cached_call
     armature_object = armature_of(mesh_object)
     if armature_object is None or not mesh_object.fdda.is_bound:
         return None
@@ -38,14 +35,14 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
         pose_matrices = PoseReader(scene_rig, joint_names, network.info.rest_matrices).read(*evaluated_objects)
         controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
         inputs = pose_matrices.tobytes() + controls.tobytes()
-        if _cached_call is None or _cached_call[0] is not network or _cached_call[1] != inputs:
+        if session.confidence is None or session.confidence[0] is not network or session.confidence[1] != inputs:
             confidence = network.confidence(pose_matrices[None], controls[None])
             named_confidences = None
             if confidence is not None:
                 names = (joint_names[partition.joint] for partition in network.info.partitions)
                 named_confidences = sorted(zip(names, confidence[0].tolist(), strict=True), key=lambda pair: pair[1])
-            _cached_call = (network, inputs, named_confidences)
-        return _cached_call[2]
+            session.confidence = (network, inputs, named_confidences)
+        return session.confidence[2]
     except FDDAError:
         # Playback reports this error too, where the user sees it.
         return None

@@ -18,49 +18,44 @@ class DepsgraphChanges:
     """Parts of rigs that an evaluation has changed.
 
     Attributes:
-        mesh_objects: for each changed mesh object: the object, whether its geometry changed, and whether anything
-            besides its pose may have changed.
-        armatures: by the session id of each changed armature: whether the parents of its bones may have changed too.
+        mesh_objects: the changed mesh objects, and whether their geometry changed.
+        armatures: session ids of the armatures that were posed or edited.
         meshes: by the session id of each changed mesh: whether more than its rest positions may have changed.
     """
 
-    mesh_objects: list[tuple[bpy.types.Object, bool, bool]]
-    armatures: dict[int, bool]
+    mesh_objects: list[tuple[bpy.types.Object, bool]]
+    armatures: set[int]
     meshes: dict[int, bool]
 
     @staticmethod
     def read(depsgraph: bpy.types.Depsgraph) -> "DepsgraphChanges":
         """Read the changes of the evaluation that has just ended."""
-        changes = DepsgraphChanges([], {}, changed_meshes(depsgraph))
-        # On Blender 4.5 only changed relations of the scene report that a vertex group was removed.
-        relations_changed = depsgraph.id_type_updated("SCENE")
+        changes = DepsgraphChanges([], set(), changed_meshes(depsgraph))
         for update in depsgraph.updates:
             datablock = update.id
-            geometry_changed, transform_changed = update.is_updated_geometry, update.is_updated_transform
             if isinstance(datablock, Object):
                 original_object = datablock.original
                 if original_object.type == "MESH":
-                    changed_beyond_pose = relations_changed or transform_changed or not geometry_changed
-                    changes.mesh_objects.append((original_object, geometry_changed, changed_beyond_pose))
-                elif original_object.type == "ARMATURE" and geometry_changed and transform_changed:
-                    changes.armatures[original_object.data.session_uid] = True
-            elif isinstance(datablock, Armature):
-                armature_uid, is_only_posed = datablock.original.session_uid, geometry_changed and transform_changed
-                changes.armatures[armature_uid] = changes.armatures.get(armature_uid, False) or not is_only_posed
+                    changes.mesh_objects.append((original_object, update.is_updated_geometry))
+                elif original_object.type == "ARMATURE" and update.is_updated_geometry and update.is_updated_transform:
+                    changes.armatures.add(original_object.data.session_uid)
+            elif isinstance(datablock, Armature) and _is_edited(update):
+                changes.armatures.add(datablock.original.session_uid)
         return changes
 
 
 def has_edited_armature(depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return whether armature data have changed by more than their drivers and keys.
+    """Return whether armature data have changed by more than their drivers and keys."""
+    return any(_is_edited(update) for update in depsgraph.updates if isinstance(update.id, Armature))
+
+
+def _is_edited(update: bpy.types.DepsgraphUpdate) -> bool:
+    """Return whether armature data were posed or edited.
 
     Rigs of Rigify drive the B-Bones, so that Blender reports their armature data in every frame, neither as transformed
-    nor with changed geometry. Edits are reported with both.
+    nor with changed geometry. Edits and poses set by hand are reported with both.
     """
-    return any(
-        update.is_updated_geometry or update.is_updated_transform or update.id.original.animation_data is None
-        for update in depsgraph.updates
-        if isinstance(update.id, Armature)
-    )
+    return update.is_updated_geometry or update.is_updated_transform or update.id.original.animation_data is None
 
 
 def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:

@@ -11,11 +11,7 @@ from ..scene.folder_trust import is_trusted
 from ..scene.stored_paths import absolute_path, path_owner, resolve_path
 from . import packed_model
 from .network import Network
-
-_networks: dict[Path, tuple[tuple, Network]] = {}
-"""By the path of each model file: its modification time and size, and the model that was loaded from it."""
-_chosen_paths: set[Path] = set()
-"""Paths of the models that the user chose in this session."""
+from .session import session
 
 
 def network_of(mesh_object: bpy.types.Object) -> Network:
@@ -39,17 +35,17 @@ def load_network(path: Path) -> Network:
     except OSError as error:
         raise ModelError(f"The model '{path}' cannot be read: {os_error_text(error)}; bind another.") from error
     file_state = (status.st_mtime_ns, status.st_size)
-    if path not in _networks or _networks[path][0] != file_state:
-        _networks[path] = (file_state, Network(path))
-    return _networks[path][1]
+    if path not in session.networks or session.networks[path][0] != file_state:
+        session.networks[path] = (file_state, Network(path))
+    return session.networks[path][1]
 
 
 def release_unused_networks() -> None:
     """Free the models that no object of the open file is bound to."""
     bound_objects = [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
     used_paths = {absolute_path(o, o.fdda.model) for o in bound_objects if o.fdda.packed is None}
-    for path in _networks.keys() - used_paths:
-        del _networks[path]
+    for path in session.networks.keys() - used_paths:
+        del session.networks[path]
     used_texts = {o.fdda.packed.session_uid for o in bound_objects if o.fdda.packed is not None}
     packed_model.release_unused_networks(used_texts)
 
@@ -79,7 +75,7 @@ def allowed_path(mesh_object: bpy.types.Object, stored_path: str) -> Path:
     blend_path = str(resolve_path(library.filepath)) if library else bpy.data.filepath
     # Resolved, because a path relative to the open file may contain "..".
     is_in_folder = not blend_path or path.resolve().is_relative_to(Path(blend_path).resolve().parent)
-    if not (is_in_folder or path.resolve() in _chosen_paths or is_trusted(path)):
+    if not (is_in_folder or path.resolve() in session.chosen_paths or is_trusted(path)):
         raise ModelError(
             f"The model '{path}' lies outside the folder of '{Path(blend_path).name}' and is not followed; "
             "choose it again and pack it, move it beside the file, or add its folder in the preferences."
@@ -89,4 +85,4 @@ def allowed_path(mesh_object: bpy.types.Object, stored_path: str) -> Path:
 
 def allow_path(model_path: Path) -> None:
     """Allow loading a model that the user chose in this session from any folder."""
-    _chosen_paths.add(model_path.resolve())
+    session.chosen_paths.add(model_path.resolve())

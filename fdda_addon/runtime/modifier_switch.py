@@ -3,10 +3,11 @@
 
 import bpy
 
+from ..core.errors import ModelError
 from ..rig.modifier_stack import deforming_modifiers
 from ..scene.temporary_state import animated_paths
 from . import playback_modifier
-from .mode_override import overriding_mode, uses_model
+from .session import session
 
 
 def animated_settings(mesh_object: bpy.types.Object) -> frozenset[str]:
@@ -45,7 +46,7 @@ def apply_visibility(mesh_object: bpy.types.Object, animated: frozenset[str]) ->
         animated: the result of `animated_settings`. Changes of these settings are not the user's.
     """
     binding, modifier = mesh_object.fdda, playback_modifier.find_modifier(mesh_object)
-    if modifier is None or overriding_mode(mesh_object.session_uid):
+    if modifier is None or session.overriding_mode(mesh_object.session_uid):
         return
     if modifier.show_viewport != binding.is_playing:
         if "show_viewport" in animated:
@@ -84,24 +85,18 @@ def disconnect(modifier: bpy.types.NodesModifier) -> None:
         playback_modifier.set_buffer(modifier, None)
 
 
-def switch_modifiers(mesh_object: bpy.types.Object, show_model: bool | None = None) -> None:
+def switch_modifiers(mesh_object: bpy.types.Object, show_model: bool) -> None:
     """Switch a bound object between the modifiers of its rig and the FDDA modifier.
 
     While a model plays, the modifiers of the rig are off in the viewport, and in renders if the user chose so. The
-    object's properties store their visibility, and mode RIG restores it.
+    object's properties store their visibility.
 
-    Args:
-        mesh_object: the bound object.
-        show_model: whether to show the model; None to follow the mode.
+    Raises:
+        ModelError: the FDDA modifier was removed.
     """
-    binding = mesh_object.fdda
-    modifier = playback_modifier.find_modifier(mesh_object)
-    if binding.mode != "RIG" and modifier is None:
-        binding.status = "The FDDA modifier was removed; bind the model again."
-        binding.mode = "RIG"
-        return
-    if show_model is None:
-        show_model = uses_model(mesh_object)
+    binding, modifier = mesh_object.fdda, playback_modifier.find_modifier(mesh_object)
+    if show_model and modifier is None:
+        raise ModelError(f"The FDDA modifier of '{mesh_object.name}' was removed; bind the model again.")
     if show_model and not binding.is_playing:
         _store_visibility(mesh_object)
     elif not show_model and binding.is_playing:
@@ -114,15 +109,6 @@ def switch_modifiers(mesh_object: bpy.types.Object, show_model: bool | None = No
         for stored, rig_modifier in _stored_modifiers(mesh_object):
             rig_modifier.show_viewport = False
             rig_modifier.show_render = stored.show_render and not binding.use_in_render
-
-
-def restore_rig(mesh_object: bpy.types.Object) -> None:
-    """Show the rig as if no model played, without changing the mode; `switch_modifiers` shows the model again."""
-    if mesh_object.fdda.is_playing:
-        _restore_visibility(mesh_object)
-    modifier = playback_modifier.find_modifier(mesh_object)
-    if modifier is not None:
-        modifier.show_viewport = modifier.show_render = False
 
 
 def _store_visibility(mesh_object: bpy.types.Object) -> None:

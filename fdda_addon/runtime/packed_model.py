@@ -13,14 +13,12 @@ import bpy
 from ..core.errors import ModelError
 from ..core.model import MAX_BYTES, check_model
 from .network import Network
+from .session import session
 
 PACKED_MODEL_KEY = "fdda_model"
 """Custom property of a text datablock that holds a model."""
 MAX_PROPERTY_BYTES = (1 << 31) - 1
 """Blender's limit for a custom property."""
-
-_networks: dict[int, Network] = {}
-"""The loaded models, by the session ids of their text datablocks."""
 
 
 def pack(name: str, data: bytes) -> bpy.types.Text:
@@ -67,17 +65,17 @@ def load(text: bpy.types.Text) -> Network:
     Raises:
         ModelError: the text holds no model, or an invalid one.
     """
-    if text.session_uid not in _networks:
+    if text.session_uid not in session.packed_networks:
         network = Network(Path(text.name), read(text))
         release_unused_networks({other_text.session_uid for other_text in bpy.data.texts})
-        _networks[text.session_uid] = network
-    return _networks[text.session_uid]
+        session.packed_networks[text.session_uid] = network
+    return session.packed_networks[text.session_uid]
 
 
 def release_unused_networks(used_text_uids: set[int]) -> None:
     """Free the loaded models of all texts except the texts with these session ids."""
-    for text_uid in _networks.keys() - used_text_uids:
-        del _networks[text_uid]
+    for text_uid in session.packed_networks.keys() - used_text_uids:
+        del session.packed_networks[text_uid]
 
 
 def remove_unused_texts() -> None:

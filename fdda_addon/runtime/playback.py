@@ -1,37 +1,35 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Playback: runs models during Blender's evaluation, and keeps the players up to date after it.
+"""Translates what Blender reports into events of the session (`transitions`).
 
 `on_evaluate` runs on the thread that evaluates and only writes to evaluated data. Original data are changed after the
 evaluation (`on_depsgraph_update`, `on_frame_change`).
 """
 
-from collections.abc import Container, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import bpy
 
-from . import modifier_switch, playback_modifier, registry, rig_signature
+from . import effects, evaluated_copies, modifier_switch, playback_modifier, player_batch
 from .depsgraph_changes import DepsgraphChanges, changed_meshes, has_edited_armature
-from .mode_override import overriding_mode
 from .model_files import network_of
-from .player import VIEWPORT_KEY, Player
-
-_is_switching = False
-"""Whether `_apply_animated_mode` is evaluating the dependency graph."""
+from .rig_signature import ARMATURE, MESH, OBJECT, STABLE_MODES
+from .session import Character, session
+from .transitions import SHOWS_MODEL, Event, State
 
 
 def on_evaluate(driven_object: bpy.types.Object) -> None:
     """Play the models of an evaluated position buffer or batch driver. Raises nothing."""
     driven_uid = driven_object.original.session_uid
-    player_or_batch = registry.players.get(driven_uid) or registry.batches.by_driver.get(driven_uid)
+    player_or_batch = session.players.get(driven_uid) or session.batches.get(driven_uid)
     if player_or_batch is not None:
         player_or_batch.play(driven_object)
 
 
 def on_frame_change(depsgraph: bpy.types.Depsgraph) -> None:
-    """Keep the players up to date after a frame was evaluated.
+    """Dispatch what the evaluation of a frame has changed, and check the rigs that have changed.
 
-    If only poses and shape keys have changed, nothing is checked.
+    If only poses and shape keys have changed, nothing is read.
     """
     updated = depsgraph.id_type_updated
     if (
@@ -39,212 +37,228 @@ def on_frame_change(depsgraph: bpy.types.Depsgraph) -> None:
         or (updated("ARMATURE") and has_edited_armature(depsgraph))
         or (updated("MESH") and changed_meshes(depsgraph))
     ):
-        _check_changes(depsgraph)
-    _update_players(depsgraph)
-    registry.update_batches(frame_changed=True)
+        _dispatch_changes(depsgraph)
+    session.dispatch(Event.CHECK)
+    _update(depsgraph)
+    player_batch.update(frame_changed=True)
 
 
 def on_depsgraph_update(depsgraph: bpy.types.Depsgraph) -> None:
-    """Keep the players up to date after an evaluation without a frame change."""
-    _check_changes(depsgraph)
-    _update_players(depsgraph)
-    registry.update_batches(frame_changed=False)
+    """Dispatch what an evaluation without a frame change has changed."""
+    _dispatch_changes(depsgraph)
+    if bpy.app.background:
+        # Timers do not run there.
+        session.dispatch(Event.CHECK)
+    _update(depsgraph)
+    player_batch.update(frame_changed=False)
 
 
-def _update_players(depsgraph: bpy.types.Depsgraph) -> None:
-    """Create missing players, remove outdated ones, report warnings, and show the rig where playback failed."""
-    for uid, player in list(registry.players.items()):
-        if player.needs_recreation:
-            registry.remove_player(uid)
-    registry.scan()
-    _tag_new_depsgraph(depsgraph)
-    _record_viewport_copies(depsgraph)
-    for player in list(registry.players.values()):
-        mesh_object = player.find_object() if player.error or player.has_new_warning else None
-        if mesh_object is None:
+def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
+    """Dispatch the changes of bound objects, their meshes and their armatures."""
+    changes = DepsgraphChanges.read(depsgraph)
+    for mesh_object, geometry_changed in changes.mesh_objects:
+        if mesh_object.fdda.is_bound:
+            character = session.character_of(mesh_object)
+            with session.isolated_errors(character):
+                _dispatch_object_changes(character, mesh_object, geometry_changed)
+    # The graph of a render reports all datablocks as changed.
+    is_render = depsgraph.mode == "RENDER"
+    for character in [c for c in session.characters.values() if c.player is not None]:
+        player = character.player
+        if player.mesh_uid in changes.meshes and player.mask is not None and (mesh_object := character.find_object()):
+            with session.isolated_errors(character):
+                _update_mask(character, mesh_object, weights_changed=True)
+        if is_render:
             continue
-        with registry.isolated_errors(mesh_object):
-            if player.error:
-                raise player.error
-            mesh_object.fdda.status = player.pop_warning()
-    if any(registry.animated_settings.values()) and not _is_switching:
-        for mesh_object in [o for o in bpy.data.objects if registry.animated_settings.get(o.session_uid)]:
-            with registry.isolated_errors(mesh_object):
-                _apply_animated_mode(mesh_object, depsgraph)
+        if player.armature_uid in changes.armatures:
+            session.report_change(character, ARMATURE)
+        if player.mesh_uid in changes.meshes:
+            session.report_change(character, MESH)
+    for mesh_uid in [] if is_render else [uid for uid, is_edited in changes.meshes.items() if is_edited]:
+        for object_uid in [uid for uid, (uid_of_mesh, *_) in session.passed_checks.items() if uid_of_mesh == mesh_uid]:
+            del session.passed_checks[object_uid]
+    _dispatch_edit_modes(changes)
 
 
-def _tag_new_depsgraph(depsgraph: bpy.types.Depsgraph) -> None:
-    """Tag the position buffers of new players, so that a dependency graph evaluates them once more.
+def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object, geometry_changed: bool) -> None:
+    """Dispatch the changes of a bound object that an evaluation has reported."""
+    _update_mask(character, mesh_object)
+    character.animated = modifier_switch.animated_settings(mesh_object)
+    if geometry_changed:
+        modifier_switch.apply_visibility(mesh_object, character.animated)
+        modifier_switch.disconnect_visible(mesh_object, character.animated)
+    player = character.player
+    if player is None:
+        if character.state in SHOWS_MODEL or mesh_object.fdda.is_playing:
+            session.scanned_count = -1
+    elif geometry_changed and not (player.fits_object(mesh_object) and _reads_buffer(mesh_object, character)):
+        session.dispatch(Event.OUTDATE, character)
+    else:
+        session.report_change(character, OBJECT)
 
-    The first evaluation of a graph leaves out the objects that it did not need while the modifier was off.
-    """
-    # A graph has no id, and Blender reuses the address of a graph for another one.
-    depsgraph_key = depsgraph.mode, depsgraph.scene.session_uid, depsgraph.view_layer.name
-    new_uids = {uid for uid, player in registry.players.items() if depsgraph_key not in player.depsgraph_keys}
-    if new_uids:
-        for buffer in [o for o in bpy.data.objects if o.session_uid in new_uids]:
-            registry.players[buffer.session_uid].depsgraph_keys.add(depsgraph_key)
-            buffer.data.update_tag()
+
+def _dispatch_edit_modes(changes: DepsgraphChanges) -> None:
+    """Dispatch the edit modes that the meshes of playing characters have entered or left."""
+    reported_uids = {mesh_object.session_uid for mesh_object, _ in changes.mesh_objects}
+    for character in [c for c in session.characters.values() if c.player is not None]:
+        is_reported = character.object_uid in reported_uids or character.reported
+        if not is_reported and character.state != State.EDITED:
+            continue
+        mesh_object = character.find_object()
+        if mesh_object is not None:
+            session.dispatch(
+                Event.LEAVE_EDIT if mesh_object.mode in STABLE_MODES else Event.EDIT,
+                character,
+            )
 
 
-def _record_viewport_copies(depsgraph: bpy.types.Depsgraph) -> None:
-    """Mark the evaluated objects of a viewport for players with shape keys, because a getter cannot find its graph."""
-    if depsgraph.mode != "VIEWPORT":
+def _reads_buffer(mesh_object: bpy.types.Object, character: Character) -> bool:
+    """Return whether the FDDA modifier of a mesh object reads the position buffer of its player."""
+    buffer = playback_modifier.buffer_of_object(mesh_object)
+    return buffer is not None and buffer.session_uid == character.buffer_uid
+
+
+def _update(depsgraph: bpy.types.Depsgraph) -> None:
+    """Follow added and removed objects, restart outdated players, report warnings, and apply animated modes."""
+    for character in list(session.characters.values()):
+        if character.player is not None and character.player.needs_recreation:
+            session.dispatch(Event.OUTDATE, character)
+    scan()
+    evaluated_copies.tag_new_depsgraph(depsgraph)
+    evaluated_copies.mark_viewport_copies(depsgraph)
+    for character in list(session.characters.values()):
+        player = character.player
+        if player is None or not (player.error or player.warning != player.reported_warning):
+            continue
+        if player.error:
+            session.dispatch(Event.FAIL, character, player.error)
+        elif mesh_object := character.find_object():
+            mesh_object.fdda.status = player.reported_warning = player.warning
+    if not session.is_switching:
+        for character in [c for c in session.characters.values() if c.animated]:
+            if mesh_object := character.find_object():
+                with session.isolated_errors(character):
+                    _apply_animated_mode(character, mesh_object, depsgraph)
+
+
+def scan() -> None:
+    """Follow the bound objects of the file if objects were added or removed, or if a player was removed."""
+    if session.scanned_count == len(bpy.data.objects):
         return
-    for player in [player for player in registry.players.values() if player.needs_viewport_record]:
-        mesh_object = player.find_object()
-        if mesh_object is not None and (evaluated := mesh_object.evaluated_get(depsgraph)).is_evaluated:
-            evaluated[VIEWPORT_KEY], player.needs_viewport_record = True, False
+    session.batches.clear()
+    session.moved_buffers.clear()
+    bound_objects = {o.session_uid: o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound}
+    for character in [c for c in session.characters.values() if c.object_uid not in bound_objects]:
+        session.dispatch(Event.UNBIND, character)
+    for mesh_object in bound_objects.values():
+        character = session.character_of(mesh_object)
+        with session.isolated_errors(character):
+            _scan_object(character, mesh_object)
+    effects.remove_unused_objects()
+    session.scanned_count = len(bpy.data.objects)
 
 
-def _apply_animated_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    """Switch the modifiers of an object whose animated or driven mode now differs from what it shows."""
-    global _is_switching
+def _scan_object(character: Character, mesh_object: bpy.types.Object) -> None:
+    """Dispatch whether a bound object shows its model."""
+    character.animated = modifier_switch.animated_settings(mesh_object)
+    modifier_switch.apply_visibility(mesh_object, character.animated)
+    # Saved files show the rig, so linked, appended and reloaded objects do not play yet.
+    shows_model = mesh_object.fdda.is_playing if character.animated else session.uses_model(mesh_object)
+    if not shows_model:
+        if character.state in SHOWS_MODEL:
+            session.dispatch(Event.SHOW_RIG, character)
+        modifier_switch.disconnect_visible(mesh_object, character.animated)
+    elif character.player is None:
+        session.dispatch(Event.CHOOSE_MODEL, character)
+    elif not (mesh_object.fdda.is_playing and _reads_buffer(mesh_object, character)):
+        session.dispatch(Event.OUTDATE, character)
+    else:
+        # Blender redirects the driver when an object that it reads gets a library override.
+        character.player.update_driver(mesh_object, playback_modifier.buffer_of_object(mesh_object))
+
+
+def _apply_animated_mode(character: Character, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
+    """Dispatch the animated or driven mode of an object if it differs from what the object shows."""
     evaluated, binding = mesh_object.evaluated_get(depsgraph), mesh_object.fdda
-    animated = registry.animated_settings[mesh_object.session_uid]
-    modifier_switch.disconnect_visible(mesh_object, animated)
+    modifier_switch.disconnect_visible(mesh_object, character.animated)
     if not evaluated.is_evaluated or (depsgraph.mode == "RENDER" and not binding.use_in_render):
         return
-    if overriding_mode(mesh_object.session_uid):
+    if session.overriding_mode(mesh_object.session_uid):
         return
-    uses_model = modifier_switch.evaluated_uses_model(evaluated, depsgraph, animated)
-    # A model that cannot play stays off until the user acts: the status says how.
-    if uses_model != binding.is_playing and not (uses_model and binding.status):
-        modifier_switch.switch_modifiers(mesh_object, uses_model)
+    uses_model = modifier_switch.evaluated_uses_model(evaluated, depsgraph, character.animated)
+    if uses_model == (character.state in SHOWS_MODEL):
+        return
+    session.dispatch(Event.ANIMATE_MODEL if uses_model else Event.SHOW_RIG, character)
+    if uses_model == (character.state in SHOWS_MODEL):
         binding.status = ""
-        registry.recreate_player(mesh_object)
         # The first evaluation only finds that the position buffer is needed; the next one evaluates it.
-        _is_switching = True
+        session.is_switching = True
         try:
             depsgraph.update()
         finally:
-            _is_switching = False
-        registry.recreate_player(mesh_object)
-        registry.scan()
+            session.is_switching = False
+        session.dispatch(Event.OUTDATE, character)
+        scan()
 
 
-def _check_changes(depsgraph: bpy.types.Depsgraph) -> None:
-    """Check the bound objects and the rigs that an evaluation has changed."""
-    changes = DepsgraphChanges.read(depsgraph)
-    for mesh_object, geometry_changed, changed_beyond_pose in changes.mesh_objects:
-        if mesh_object.fdda.is_bound:
-            with registry.isolated_errors(mesh_object):
-                _check_object(mesh_object, geometry_changed, changed_beyond_pose)
-    _update_masks(changes.meshes)
-    # The graph of a render reports all datablocks as changed.
-    if depsgraph.mode != "RENDER":
-        _check_rigs(changes)
-
-
-def _check_object(mesh_object: bpy.types.Object, geometry_changed: bool, changed_beyond_pose: bool) -> None:
-    """Check a bound object that an evaluation has changed (`DepsgraphChanges.mesh_objects`)."""
-    update_mask(mesh_object)
-    if mesh_object.session_uid not in registry.animated_settings:
-        registry.request_rescan()
-        return
-    animated = registry.animated_settings[mesh_object.session_uid] = modifier_switch.animated_settings(mesh_object)
-    if geometry_changed:
-        modifier_switch.apply_visibility(mesh_object, animated)
-        modifier_switch.disconnect_visible(mesh_object, animated)
-    uid, player = registry.find_player(mesh_object)
-    if player is None:
-        return
-    if (geometry_changed and not (player.fits_object(mesh_object) and _modifier_reads_buffer(mesh_object, uid))) or (
-        changed_beyond_pose and not player.has_same_skin(mesh_object)
-    ):
-        registry.remove_player(uid)
-    elif mesh_object.mode not in rig_signature.STABLE_MODES:
-        registry.edited_objects.add(mesh_object.session_uid)
-
-
-def _check_rigs(changes: DepsgraphChanges) -> None:
-    """Check the rigs whose armature or mesh has changed, and the rigs whose mesh has left an edit mode."""
-    for mesh_uid, changed_beyond_positions in changes.meshes.items():
-        if changed_beyond_positions:
-            rig_signature.invalidate(mesh_uid)
-    edited_uids = registry.edited_objects
-    for uid, player in list(registry.players.items()):
-        parents_changed = changes.armatures.get(player.signature.armature_uid)
-        changed_beyond_positions = changes.meshes.get(player.signature.mesh_uid)
-        is_edited = player.object_uid in edited_uids
-        if parents_changed is None and changed_beyond_positions is None and not is_edited:
-            continue
-        mesh_object = player.find_object()
-        if mesh_object is None:
-            continue
-        with registry.isolated_errors(mesh_object):
-            if parents_changed is not None and not player.has_same_bones(mesh_object, compare_parents=parents_changed):
-                registry.remove_player(uid)
-            elif mesh_object.mode not in rig_signature.STABLE_MODES:
-                edited_uids.add(player.object_uid)
-            elif (
-                changed_beyond_positions
-                or is_edited
-                or (changed_beyond_positions is False and not player.has_same_rest_positions(mesh_object))
-            ):
-                if is_edited:
-                    edited_uids.discard(player.object_uid)
-                    rig_signature.invalidate(player.signature.mesh_uid)
-                player.signature = rig_signature.RigSignature.read(player.scene_rig(mesh_object))
-                player.check_rig(mesh_object)
-
-
-def update_mask(mesh_object: bpy.types.Object, *, weights_changed: bool = False) -> None:
+def on_mask_update(mesh_object: bpy.types.Object) -> None:
     """Play the pose of a bound object again if its mask has changed."""
-    buffer_uid, player = registry.find_player(mesh_object)
+    _update_mask(session.character_of(mesh_object), mesh_object)
+
+
+def _update_mask(character: Character, mesh_object: bpy.types.Object, *, weights_changed: bool = False) -> None:
+    player = character.player
     if player is not None and player.update_mask(mesh_object, weights_changed):
-        for buffer in [o for o in bpy.data.objects if o.session_uid == buffer_uid]:
+        for buffer in [o for o in bpy.data.objects if o.session_uid == character.buffer_uid]:
             buffer.data.update_tag()
-
-
-def _update_masks(mesh_uids: Container[int]) -> None:
-    """Read the masks of the meshes with these session ids again, because their weights may have been painted."""
-    for player in [p for p in registry.players.values() if p.has_mask and p.signature.mesh_uid in mesh_uids]:
-        mesh_object = player.find_object()
-        if mesh_object is not None:
-            with registry.isolated_errors(mesh_object):
-                update_mask(mesh_object, weights_changed=True)
-
-
-def _modifier_reads_buffer(mesh_object: bpy.types.Object, buffer_uid: int) -> bool:
-    """Return whether the modifier of a mesh object reads a position buffer."""
-    modifier = playback_modifier.find_modifier(mesh_object)
-    buffer = modifier and playback_modifier.buffer_of(modifier)
-    return buffer is not None and buffer.session_uid == buffer_uid
 
 
 def has_outdated_model(mesh_object: bpy.types.Object) -> bool:
     """Return whether an object plays a model whose file has been replaced since it was loaded."""
-    player = registry.find_player(mesh_object)[1]
+    player = session.player_of(mesh_object)
     return player is not None and player.network is not network_of(mesh_object)
 
 
-def playing_objects() -> list[bpy.types.Object]:
-    """Return the objects of the open file that a model deforms."""
-    return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_playing]
+def reload_model(mesh_object: bpy.types.Object) -> None:
+    """Play an object with the model that it is bound to now."""
+    session.dispatch(Event.OUTDATE, session.character_of(mesh_object))
 
 
-def restore_rigs() -> None:
-    """Show all rigs of the open file as if no model played; `resume` starts playback again."""
-    for mesh_object in playing_objects():
-        # Linked objects are restored too, because Blender saves the differences of a library override from them.
-        modifier_switch.restore_rig(mesh_object)
+def suspend() -> None:
+    """Show all rigs of the open file as if no model played; `resume` starts playback again.
+
+    Linked objects are restored too, because Blender saves the differences of a library override from them.
+    """
+    scan()
+    session.dispatch(Event.SUSPEND)
 
 
 def resume() -> None:
-    """Create all players of the open file again, and play its models."""
-    registry.reset_players()
-    registry.scan()
+    """Play the models of the open file again."""
+    session.dispatch(Event.RESUME)
+    session.scanned_count = -1
+    scan()
+
+
+def begin_undo() -> None:
+    """Remove our objects, so that no undo step refers to one."""
+    session.reset(keep_checks=True)
+    effects.remove_buffers()
+
+
+def end_undo() -> None:
+    """Play the models of the undo step; it may have restored position buffers whose evaluated copies are outdated."""
+    begin_undo()
+    scan()
 
 
 @contextmanager
 def suspended_playback() -> Iterator[None]:
     """Show the rigs of the open file and remove our data in the block, so that parts of the file can be written."""
-    restore_rigs()
-    registry.remove_buffers()
+    suspend()
+    effects.remove_buffers()
     try:
-        with registry.suspended_scans():
-            yield
+        yield
     finally:
         resume()
 
@@ -252,8 +266,8 @@ def suspended_playback() -> Iterator[None]:
 @contextmanager
 def without_model_runs() -> Iterator[None]:
     """Play without running models in the block, to measure the rest of a frame: the last positions are kept."""
-    Player.skips_models = True
+    session.skips_models = True
     try:
         yield
     finally:
-        Player.skips_models = False
+        session.skips_models = False

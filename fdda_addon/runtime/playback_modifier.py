@@ -61,6 +61,12 @@ def buffer_of(modifier: bpy.types.NodesModifier) -> bpy.types.Object | None:
     return node_input(modifier, _buffer_socket(modifier.node_group))
 
 
+def buffer_of_object(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
+    """Return the position buffer of the FDDA modifier of a mesh object; None without modifier or buffer."""
+    modifier = find_modifier(mesh_object)
+    return modifier and buffer_of(modifier)
+
+
 def set_buffer(modifier: bpy.types.NodesModifier, buffer: bpy.types.Object | None) -> None:
     """Set the position buffer of an FDDA modifier; None to disconnect it."""
     set_node_input(modifier, _buffer_socket(modifier.node_group), buffer)

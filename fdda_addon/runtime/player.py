@@ -2,7 +2,7 @@
 """The player of a bound object: reads its evaluated pose, runs its model and writes the positions."""
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,20 +12,17 @@ import numpy as np
 
 from ..core.errors import FDDAError, ModelError, RigError
 from ..core.mask import SkinningBlend
+from ..core.pose_repair import repair_pose
 from ..core.rig import STATIC_JOINT
 from ..rig.reading import PoseReader, read_model_rig
-from ..scene.arrays import MUTE_ELEMENT, write
 from ..scene.control_reader import ControlReader
 from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
-from . import driver, rig_signature
-from .mode_override import overriding_mode
+from . import driver, evaluated_copies, rig_signature
 from .model_files import network_of
 from .network import Execution
-
-VIEWPORT_KEY = "fdda_viewport"
-"""Custom property that marks the evaluated mesh objects of a viewport. Blender removes it with the evaluated copy."""
+from .session import session
 
 
 class ModelInputs(NamedTuple):
@@ -48,19 +45,19 @@ class Player:
     Attributes:
         object_uid: session id of the object.
         network: the model of the object.
-        signature: signature of the rig at its last check.
+        armature_uid, mesh_uid: session ids of the armature data and of the mesh.
+        signature: signature of the rig at its last check (`rig_signature`).
         error: the exception that stopped playback during an evaluation; None if there was none.
+        warning, reported_warning: the current warning and the one in the status of the object; empty for none.
+        mask: limits the model to a part of the mesh; None for none.
         needs_recreation: whether the armature has other bones than those that the player reads.
         new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
         has_moved: whether there were new inputs since the last update of the batches, which resets it.
         execution: the execution whose arrays hold the positions.
-        depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer (`playback`).
-        needs_viewport_record: whether an evaluated object has shape keys and is not marked by `VIEWPORT_KEY`.
+        depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer (`evaluated_copies`).
+        needs_viewport_record: whether an evaluated object has shape keys and is not marked (`evaluated_copies`).
         lock: the lock that is held from `read_pose` to `write_positions`.
     """
-
-    skips_models = False
-    """Whether players keep their last positions instead of running models (`playback.without_model_runs`)."""
 
     def __init__(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object):
         """Create the player of a bound object.
@@ -72,19 +69,20 @@ class Player:
         Raises:
             FDDAError: the model cannot be loaded, or no longer fits the object.
         """
-        self._name, self.object_uid = mesh_object.name, mesh_object.session_uid
+        self.object_uid = mesh_object.session_uid
         self.network = network_of(mesh_object)
         self.error: FDDAError | None = None
         self.needs_recreation = False
         info = self.network.info
         scene_rig = self.scene_rig(mesh_object)
-        self._armature_uid = scene_rig.armature_object.session_uid
+        self._armature_object_uid = scene_rig.armature_object.session_uid
+        self.armature_uid, self.mesh_uid = scene_rig.armature_object.data.session_uid, mesh_object.data.session_uid
         self._check_vertex_count(mesh_object)
-        self.signature = rig_signature.RigSignature.read(scene_rig)
-        self.check_rig(mesh_object)
+        self.signature = rig_signature.read_signature(scene_rig)
+        rig_signature.check(scene_rig, self.network, self.signature)
         self._pose_reader = self._create_pose_reader(scene_rig)
         self._control_reader = ControlReader(scene_rig, info.controls)
-        self._mask_key, self._mask = mask_key(mesh_object), read_mask(mesh_object)
+        self._mask_key, self.mask = mask_key(mesh_object), read_mask(mesh_object)
         self._blend: SkinningBlend | None = None
         self.execution = self._single_execution = Execution(self.network, 1)
         self.new_inputs: ModelInputs | None = None
@@ -95,10 +93,9 @@ class Player:
         self.lock = threading.Lock()
         self._shown_inputs: tuple | None = None
         self._positions: np.ndarray | None = None
-        self._reported_warning = self._warning = ""
+        self.warning = self.reported_warning = ""
         self.execution.poses[0] = info.rest_matrices
-        # The first pose is played after the handlers have run, so check the output of the model here.
-        self._check_finite(self.execution.run())
+        self._check_finite(self.execution.run())  # The first pose is played after the handlers have run.
         self.update_driver(mesh_object, buffer)
 
     def update_driver(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> None:
@@ -108,7 +105,7 @@ class Player:
 
     @property
     def pose_input_count(self) -> int:
-        """Return the number of `pose_inputs`."""
+        """The number of `pose_inputs`."""
         return 3 + len(self._control_reader.sources)
 
     def pose_inputs(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> list[driver.DriverInput]:
@@ -119,18 +116,8 @@ class Player:
         """Return the driver variables that only add dependencies."""
         return driver.dependency_inputs(self.scene_rig(mesh_object), self.network.info.joint_names)
 
-    def find_object(self) -> bpy.types.Object | None:
-        """Find the object, even if it was renamed; return None if it was removed or is no longer bound."""
-        mesh_object = bpy.data.objects.get(self._name)
-        if mesh_object is None or mesh_object.session_uid != self.object_uid:
-            mesh_object = next((o for o in bpy.data.objects if o.session_uid == self.object_uid), None)
-            if mesh_object is None:
-                return None
-            self._name = mesh_object.name
-        return mesh_object if mesh_object.fdda.is_bound else None
-
     def fits_object(self, mesh_object: bpy.types.Object) -> bool:
-        """Return whether the object has the same armature, mesh, vertex count and Armature modifier settings."""
+        """Return whether the object has the same armature, mesh and number of vertices."""
         try:
             self._check_vertex_count(mesh_object)
         except ModelError:
@@ -138,41 +125,21 @@ class Player:
         armature_object = armature_of(mesh_object)
         return (
             armature_object is not None
-            and armature_object.session_uid == self._armature_uid
-            and mesh_object.data.session_uid == self.signature.mesh_uid
-            and self.signature.skin[0] == rig_signature.armature_modifier_settings(mesh_object)
+            and armature_object.session_uid == self._armature_object_uid
+            and mesh_object.data.session_uid == self.mesh_uid
         )
 
-    def has_same_skin(self, mesh_object: bpy.types.Object) -> bool:
-        """Return whether the object has the same vertex groups and Armature modifier settings."""
-        return self.signature.skin == rig_signature.skin_signature(mesh_object)
-
-    def has_same_bones(self, mesh_object: bpy.types.Object, compare_parents: bool) -> bool:
-        """Return whether the armature of the object has the same bones in the same order, with the same rest pose."""
-        armature_object = armature_of(mesh_object)
-        if armature_object is None:
-            return False
-        armature = armature_object.data
-        return rig_signature.bone_signature(armature) == self.signature.bones and not (
-            compare_parents and rig_signature.parent_names(armature) != self.signature.parents
-        )
-
-    def has_same_rest_positions(self, mesh_object: bpy.types.Object) -> bool:
-        """Return whether the vertices of the object have the same rest positions."""
-        return rig_signature.rest_digest(mesh_object.data) == self.signature.rest_digest
-
-    def check_rig(self, mesh_object: bpy.types.Object) -> None:
-        """Check that the rig is the one that the model was trained for.
+    def check_rig(self, mesh_object: bpy.types.Object, parts: Iterable[str]) -> bool:
+        """Return whether parts of the rig have the same signature; if so, check the whole rig if its mesh has changed.
 
         Raises:
-            FDDAError: as `rig_signature.check`.
+            FDDAError: as `rig_signature.check`, or the armature was removed.
         """
-        rig_signature.check(self.scene_rig(mesh_object), self.network, self.signature)
-
-    @property
-    def has_mask(self) -> bool:
-        """Return whether a mask limits the model to a part of the mesh."""
-        return self._mask is not None
+        scene_rig = self.scene_rig(mesh_object)
+        if not rig_signature.read_signature(scene_rig, parts).items() <= self.signature.items():
+            return False
+        rig_signature.check(scene_rig, self.network, self.signature)
+        return True
 
     def update_mask(self, mesh_object: bpy.types.Object, weights_changed: bool) -> bool:
         """Read the mask of the object again if it may have changed.
@@ -185,27 +152,17 @@ class Player:
             Whether the mask has changed, so that the pose has to be played again.
         """
         new_key = mask_key(mesh_object)
-        if new_key == self._mask_key and not (weights_changed and self._mask is not None):
+        if new_key == self._mask_key and not (weights_changed and self.mask is not None):
             return False
         new_mask = read_mask(mesh_object)
         with self.lock:
-            self._mask_key, previous_mask, self._mask = new_key, self._mask, new_mask
+            self._mask_key, previous_mask, self.mask = new_key, self.mask, new_mask
             if new_mask == previous_mask:
                 return False
             self._blend = None if self._blend is None else self._blend.with_mask(new_mask)
             # The shown positions have the previous mask.
             self._shown_inputs = None
         return True
-
-    @property
-    def has_new_warning(self) -> bool:
-        """Return whether the warning has changed since the last `pop_warning`."""
-        return self._warning != self._reported_warning
-
-    def pop_warning(self) -> str:
-        """Return the current warning of the playback, empty for none, and mark it as reported."""
-        self._reported_warning = self._warning
-        return self._warning
 
     def play(self, buffer: bpy.types.Object) -> None:
         """Write the positions of the evaluated pose to an evaluated position buffer; store exceptions in `error`."""
@@ -257,13 +214,17 @@ class Player:
             return False
         controls = self._control_reader.values(owners)
         # In mode RIG the modifiers are about to be switched, so the strength does not matter.
-        strength = 0.0 if (overriding_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
+        strength = 0.0 if (session.overriding_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
         inputs = pose_matrices.tobytes(), controls.tobytes(), strength
-        if inputs != self._shown_inputs and not (Player.skips_models and self._positions is not None):
-            self._warning = ""
+        if inputs != self._shown_inputs and not (session.skips_models and self._positions is not None):
+            self.warning = ""
             if not np.isfinite(pose_matrices).all():
-                pose_matrices = self._repair_pose(pose_matrices, armature_object.name)
-            if self._blend is None and (strength < 1 or self._mask is not None):
+                pose_matrices, first_name = repair_pose(pose_matrices, self.network.info)
+                self.warning = (
+                    f"The pose of the joint '{first_name}' of '{armature_object.name}' is not a number; what it moves "
+                    "follows the joint above."
+                )
+            if self._blend is None and (strength < 1 or self.mask is not None):
                 self._blend = self._create_blend(SceneRig(mesh_object.original, armature_object.original))
             self._shown_inputs = inputs
             self.new_inputs = ModelInputs(pose_matrices, controls, strength)
@@ -287,7 +248,7 @@ class Player:
         self.execution, self._positions = execution, execution.positions[pose_index]
         self._check_finite(self._positions)
         strength = self.new_inputs.strength
-        if strength < 1 or self._mask is not None:
+        if strength < 1 or self.mask is not None:
             model_positions = execution.positions[pose_index : pose_index + 1]
             pose_matrices, strengths = self.new_inputs.pose_matrices[None], np.array([strength], np.float32)
             self._positions = self._blend.apply(model_positions, pose_matrices, strengths)[0]
@@ -295,47 +256,18 @@ class Player:
     def write_positions(self, buffer: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
         """Write the positions to an evaluated position buffer, even unchanged: an evaluation may have reset them."""
         set_mesh_positions(buffer.data, self._positions)
-        # A bake may evaluate the buffer while renders show the rig, and then needs the shape keys.
         if mesh_object.data.shape_keys is not None:
-            if VIEWPORT_KEY in mesh_object:
-                _mute_shape_keys(mesh_object)
-            else:
-                self.needs_viewport_record = True
-
-    def _repair_pose(self, pose_matrices: np.ndarray, armature_name: str) -> np.ndarray:
-        """Replace joint matrices that are not finite: such a joint moves with its parent.
-
-        Args:
-            pose_matrices: (J, 4, 4) float32, mesh-object space.
-            armature_name: name of the armature object, for the warning.
-
-        Returns:
-            (J, 4, 4) float32, mesh-object space.
-        """
-        info = self.network.info
-        skin_matrices = pose_matrices @ np.linalg.inv(info.rest_matrices)
-        is_finite = np.isfinite(skin_matrices).all(axis=(1, 2))
-        for joint in np.flatnonzero(~is_finite):
-            parent = info.joints[joint].parent  # Already repaired, because parents come before their children.
-            skin_matrices[joint] = skin_matrices[parent] if parent >= 0 else np.eye(4)
-        first_joint_name = info.joints[int(np.argmin(is_finite))].name
-        self._warning = (
-            f"The pose of the joint '{first_joint_name}' of '{armature_name}' is not a number; what it moves follows "
-            "the joint above."
-        )
-        return (skin_matrices @ info.rest_matrices).astype(np.float32)
+            self.needs_viewport_record |= not evaluated_copies.mute_shape_keys(mesh_object)
 
     def _create_blend(self, scene_rig: SceneRig) -> SkinningBlend:
         """Create the blend of the model with linear skinning."""
         rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
         # The objects may have moved since training; pose matrices refer to the rest pose of the model.
-        return SkinningBlend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
+        return SkinningBlend(replace(rig, rest_matrices=self.network.info.rest_matrices), self.mask)
 
     def _check_finite(self, positions: np.ndarray) -> None:
         if not np.isfinite(positions).all():
-            self._warning = (
-                f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
-            )
+            self.warning = f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
 
     def _check_vertex_count(self, mesh_object: bpy.types.Object) -> None:
         count, expected = len(mesh_object.data.vertices), self.network.info.vertex_count
@@ -365,15 +297,3 @@ class Player:
                 f"'{self.network.path.name}'; name it as before, or bind a model of this rig."
             )
         return PoseReader(scene_rig, info.joint_names, info.rest_matrices)
-
-
-def _mute_shape_keys(mesh_object: bpy.types.Object) -> None:
-    """Mute the shape keys of an evaluated object, because Blender mixes them even if no modifier reads the result.
-
-    This is only done in viewports that show the model; everything that shows the rig needs its shape keys. The user's
-    settings are restored when Blender copies the shape keys again. Shape keys that another object shares stay unmuted.
-    """
-    shape_keys = mesh_object.data.shape_keys
-    # If the first key is muted, all keys were muted since Blender copied them, or the user muted it.
-    if shape_keys is not None and not shape_keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
-        write(shape_keys.key_blocks, MUTE_ELEMENT, np.ones(len(shape_keys.key_blocks), bool))

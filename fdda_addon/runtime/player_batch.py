@@ -17,6 +17,7 @@ from ..core.errors import FDDAError
 from . import driver
 from .network import Execution, Network
 from .player import Player
+from .session import session
 
 MIN_BATCH_SIZE = 4
 """Smallest number of players in a batch."""
@@ -24,11 +25,6 @@ MAX_EXECUTIONS_IN_USE = 4
 """Largest number of executions that a batch keeps because members still show their positions."""
 BATCH_DRIVER_KEY = "fdda_batch_driver"
 """Custom property that marks batch drivers."""
-
-
-def is_batch_driver(scene_object: bpy.types.Object) -> bool:
-    """Return whether an object is a batch driver of this session."""
-    return scene_object.is_runtime_data and BATCH_DRIVER_KEY in scene_object
 
 
 class PlayerBatch:
@@ -49,7 +45,7 @@ class PlayerBatch:
         batch_driver = bpy.data.objects.new("FDDA batch", None)
         # A fake user protects the batch driver from Purge Unused Data.
         batch_driver.is_runtime_data, batch_driver.use_fake_user, batch_driver[BATCH_DRIVER_KEY] = True, True, True
-        members = [(player, player.find_object(), objects[uid]) for uid, player in self.members.items()]
+        members = [(player, objects[player.object_uid], objects[uid]) for uid, player in self.members.items()]
         pose_inputs = [
             pose_input
             for player, mesh_object, buffer in members
@@ -67,7 +63,7 @@ class PlayerBatch:
         """Give each member a driver of its own again."""
         objects = {o.session_uid: o for o in bpy.data.objects}
         for uid, player in self.members.items():
-            mesh_object = player.find_object()
+            mesh_object = objects.get(player.object_uid)
             if mesh_object is not None and uid in objects:
                 try:
                     player.update_driver(mesh_object, objects[uid])
@@ -127,58 +123,48 @@ class PlayerBatch:
         return self._executions[-1]
 
 
-class PlayerBatches:
-    """The batches of the open file.
+def update(*, frame_changed: bool) -> None:
+    """Batch the players that moved in this frame and in the frame before, and unbatch all others.
 
-    Attributes:
-        by_driver: the batches, by the session ids of their batch drivers.
+    Args:
+        frame_changed: whether another frame was evaluated.
     """
+    previous_count = len(session.batches)
+    moved_players: dict[Network, dict[int, Player]] = {}
+    for uid, player in session.players.items():
+        if player.has_moved:
+            player.has_moved = False
+            moved_players.setdefault(player.network, {})[uid] = player
+    for driver_uid, player_batch in list(session.batches.items()):
+        moved_members = moved_players.get(player_batch.network, {})
+        if moved_members and not (frame_changed and moved_members.keys() == player_batch.members.keys()):
+            _remove_batch(driver_uid)
+    for network, members in moved_players.items():
+        if not frame_changed or len(members) < MIN_BATCH_SIZE:
+            session.moved_buffers.pop(network, None)
+        elif session.moved_buffers.get(network) != members.keys():
+            session.moved_buffers[network] = set(members)
+        elif not any(player_batch.network is network for player_batch in session.batches.values()):
+            player_batch = PlayerBatch(network, members)
+            session.batches[player_batch.batch().session_uid] = player_batch
+    # A new or removed batch driver is no reason to scan.
+    session.scanned_count += len(session.batches) - previous_count
 
-    def __init__(self) -> None:
-        self.by_driver: dict[int, PlayerBatch] = {}
-        self._previous_moved_uids: dict[Network, set[int]] = {}
 
-    def clear(self) -> None:
-        """Clear the table of batches; the next scan removes their batch drivers."""
-        self.by_driver.clear()
-        self._previous_moved_uids.clear()
+def unbatch(buffer_uid: int) -> None:
+    """End the batch that plays a position buffer, given by its session id, if there is such a batch."""
+    for driver_uid in [uid for uid, player_batch in session.batches.items() if buffer_uid in player_batch.members]:
+        _remove_batch(driver_uid)
 
-    def update(self, players: Mapping[int, Player], frame_changed: bool) -> int:
-        """Batch the players that moved in this frame and in the frame before, and unbatch all others.
 
-        Args:
-            players: all players, by the session ids of their position buffers.
-            frame_changed: whether another frame was evaluated.
+def remove_unused_drivers() -> None:
+    """Remove the batch drivers that play no batch."""
+    batch_drivers = [o for o in bpy.data.objects if o.is_runtime_data and BATCH_DRIVER_KEY in o]
+    for batch_driver in [o for o in batch_drivers if o.session_uid not in session.batches]:
+        bpy.data.objects.remove(batch_driver)
 
-        Returns:
-            The change in the number of objects in the file.
-        """
-        previous_count = len(self.by_driver)
-        moved_players: dict[Network, dict[int, Player]] = {}
-        for uid, player in players.items():
-            if player.has_moved:
-                player.has_moved = False
-                moved_players.setdefault(player.network, {})[uid] = player
-        for driver_uid, player_batch in list(self.by_driver.items()):
-            moved_members = moved_players.get(player_batch.network, {})
-            if moved_members and not (frame_changed and moved_members.keys() == player_batch.members.keys()):
-                self._unbatch(driver_uid)
-        for network, members in moved_players.items():
-            if not frame_changed or len(members) < MIN_BATCH_SIZE:
-                self._previous_moved_uids.pop(network, None)
-            elif self._previous_moved_uids.get(network) != members.keys():
-                self._previous_moved_uids[network] = set(members)
-            elif not any(player_batch.network is network for player_batch in self.by_driver.values()):
-                player_batch = PlayerBatch(network, members)
-                self.by_driver[player_batch.batch().session_uid] = player_batch
-        return len(self.by_driver) - previous_count
 
-    def unbatch(self, buffer_uid: int) -> None:
-        """End the batch that plays a position buffer, given by its session id, if there is such a batch."""
-        for driver_uid in [uid for uid, player_batch in self.by_driver.items() if buffer_uid in player_batch.members]:
-            self._unbatch(driver_uid)
-
-    def _unbatch(self, driver_uid: int) -> None:
-        self.by_driver.pop(driver_uid).unbatch()
-        for batch_driver in [o for o in bpy.data.objects if o.session_uid == driver_uid]:
-            bpy.data.objects.remove(batch_driver)
+def _remove_batch(driver_uid: int) -> None:
+    session.batches.pop(driver_uid).unbatch()
+    for batch_driver in [o for o in bpy.data.objects if o.session_uid == driver_uid]:
+        bpy.data.objects.remove(batch_driver)

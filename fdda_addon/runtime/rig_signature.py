@@ -2,22 +2,24 @@
 """Checks that a model was trained for the current state of its rig.
 
 The rig is read when a model starts to play, and again when Blender reports a changed armature or mesh. Reading all skin
-weights takes long, so a `RigSignature` is compared first, which is quick to read.
+weights takes long, so a signature is compared first, which is quick to read (`read_signature`).
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 
 import bpy
 import numpy as np
 
 from ..core.errors import ModelError
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
-from ..rig.deformation import read_b_bones, read_deformation
+from ..rig.deformation import read_b_bones, read_modifiers_and_drivers
 from ..rig.reading import read_model_rig
 from ..scene.arrays import ElementProperty, read
 from ..scene.mesh import rest_positions
-from ..scene.scene_rig import SceneRig, armature_modifier
+from ..scene.scene_rig import SceneRig
 from .network import Network
+from .session import session
 
 STABLE_MODES = ("OBJECT", "POSE")
 """Modes of an object in which its mesh does not change; in the other modes the user is editing the mesh."""
@@ -33,79 +35,46 @@ _BONE_PROPERTIES = (
     ElementProperty("bbone_segments", np.int32),
 )
 _SEGMENTS_INDEX = len(_BONE_PROPERTIES) - 1
-_ARMATURE_MODIFIER_PROPERTIES = ("use_vertex_groups", "use_bone_envelopes", "vertex_group", "invert_vertex_group")
-"""The properties of an Armature modifier that skin weights depend on."""
 
-_passed_checks: dict[int, tuple] = {}
-"""By the session id of a mesh object: the rig that its model requires, and the signature of the rig that passed."""
+ARMATURE, OBJECT, MESH = PARTS = ("armature", "object", "mesh")
+"""Parts of a rig that Blender reports separately: the armature data, the mesh object, and the mesh."""
 
 
-@dataclass(frozen=True)
-class RigSignature:
-    """The parts of a rig that are quick to read. If they and the mesh are unchanged, the whole rig is unchanged.
+def read_signature(scene_rig: SceneRig, parts: Iterable[str] = PARTS) -> dict[str, tuple]:
+    """Read the signature of a rig: what is quick to read. If it and the mesh are unchanged, the whole rig is unchanged.
 
-    Attributes:
-        armature_uid, mesh_uid: session ids of the armature data and of the mesh.
-        bones: names of the bones in their order, rest matrices, and the bone properties that skinning depends on.
-        parents: name of the parent of each bone.
-        skin: settings of the Armature modifier, and names of the vertex groups.
-        rest_digest: digest of the rest positions.
-        deformation: everything besides the armature that deforms the mesh (`rig.deformation`).
+    Args:
+        scene_rig: the rig.
+        parts: which parts to read.
+
+    Returns:
+        By part. Of the armature: names, parents, rest matrices and skinning properties of all bones. Of the object: its
+        vertex groups, modifiers and drivers (`rig.deformation`). Of the mesh: a digest of the rest positions.
     """
-
-    armature_uid: int
-    mesh_uid: int
-    bones: tuple
-    parents: tuple
-    skin: tuple
-    rest_digest: str
-    deformation: dict
-
-    @staticmethod
-    def read(scene_rig: SceneRig) -> "RigSignature":
-        """Read the signature of a rig."""
-        mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
-        return RigSignature(
-            armature.session_uid,
-            mesh_object.data.session_uid,
-            bone_signature(armature),
-            parent_names(armature),
-            skin_signature(mesh_object),
-            rest_digest(mesh_object.data),
-            read_deformation(scene_rig),
-        )
+    mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
+    readers = {
+        ARMATURE: lambda: bone_signature(armature),
+        OBJECT: lambda: (*mesh_object.vertex_groups.keys(), str(read_modifiers_and_drivers(scene_rig))),
+        MESH: lambda: (rest_digest(mesh_object.data),),
+    }
+    return {part: readers[part]() for part in parts}
 
 
 def bone_signature(armature: bpy.types.Armature) -> tuple:
-    """Read `RigSignature.bones`."""
+    """Read names, parents, rest matrices and skinning properties of all bones."""
     values = [read(armature.bones, element) for element in _BONE_PROPERTIES]
     # The settings of B-Bones are slow to read, and most armatures have no B-Bones.
     b_bones = str(read_b_bones(armature)) if (values[_SEGMENTS_INDEX] > 1).any() else ""
-    return (*armature.bones.keys(), *(value.tobytes() for value in values), b_bones)
-
-
-def parent_names(armature: bpy.types.Armature) -> tuple:
-    """Read `RigSignature.parents`."""
-    return tuple(bone.parent.name if bone.parent else "" for bone in armature.bones)
-
-
-def skin_signature(mesh_object: bpy.types.Object) -> tuple:
-    """Read `RigSignature.skin`."""
-    return armature_modifier_settings(mesh_object), *mesh_object.vertex_groups.keys()
-
-
-def armature_modifier_settings(mesh_object: bpy.types.Object) -> tuple:
-    """Read the settings of the Armature modifier that skin weights depend on, the first item of `RigSignature.skin`."""
-    modifier = armature_modifier(mesh_object)
-    return () if modifier is None else tuple(getattr(modifier, name) for name in _ARMATURE_MODIFIER_PROPERTIES)
+    parents = (bone.parent.name if bone.parent else "" for bone in armature.bones)
+    return (*armature.bones.keys(), *parents, *(value.tobytes() for value in values), b_bones)
 
 
 def rest_digest(mesh: bpy.types.Mesh) -> str:
-    """Read `RigSignature.rest_digest`."""
+    """Compute a digest of the rest positions of a mesh."""
     return Fingerprint.digest(rest_positions(mesh))
 
 
-def check(scene_rig: SceneRig, network: Network, signature: RigSignature) -> None:
+def check(scene_rig: SceneRig, network: Network, signature: dict[str, tuple]) -> None:
     """Check that a model was trained for a rig.
 
     Args:
@@ -120,8 +89,12 @@ def check(scene_rig: SceneRig, network: Network, signature: RigSignature) -> Non
     mesh_object, info = scene_rig.mesh_object, network.info
     if mesh_object.mode not in STABLE_MODES:
         return
-    required = (info.joints, info.rest_matrices.tobytes(), info.fingerprint, signature)
-    if _passed_checks.get(mesh_object.session_uid) == required:
+    passed_check = (
+        mesh_object.data.session_uid,
+        signature,
+        (info.joints, info.rest_matrices.tobytes(), info.fingerprint),
+    )
+    if session.passed_checks.get(mesh_object.session_uid) == passed_check:
         return
     rig = read_model_rig(scene_rig, info)
     rig = replace(rig, rest_matrices=_align_rest_matrices(rig, info.joint_names, info.rest_matrices))
@@ -131,18 +104,7 @@ def check(scene_rig: SceneRig, network: Network, signature: RigSignature) -> Non
             f"The rig of '{mesh_object.name}' is not the one that its model '{network.path.name}' was trained for: "
             f"{'; '.join(differences)}; undo the change, or record and train again."
         )
-    _passed_checks[mesh_object.session_uid] = required
-
-
-def invalidate(mesh_uid: int) -> None:
-    """Discard the passed checks of a mesh, given by its session id, so that the next check reads the whole rig."""
-    for uid in [uid for uid, (*_, signature) in _passed_checks.items() if signature.mesh_uid == mesh_uid]:
-        del _passed_checks[uid]
-
-
-def invalidate_all() -> None:
-    """Discard all passed checks, so that the next check of each rig reads the whole rig."""
-    _passed_checks.clear()
+    session.passed_checks[mesh_object.session_uid] = passed_check
 
 
 def _align_rest_matrices(rig: Rig, joint_names: tuple[str, ...], rest_matrices: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ import pytest
 
 import fdda_addon
 from fdda_addon.models import model_list
-from fdda_addon.runtime import model_files, playback_modifier
+from fdda_addon.runtime import playback_modifier
+from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 from fdda_addon.scene.stored_paths import stored_path
 
@@ -51,7 +52,7 @@ def save_character(source: Path, path: Path) -> None:
 
 def make_library(elbow_files: ElbowFiles, folder: Path) -> Library:
     """Save the bound elbow as a library in one folder; then open an empty shot in another folder."""
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     files = Library(folder / "characters" / "elbow.blend", folder / "characters" / "elbow.onnx")
     files.path.parent.mkdir()
     shutil.copy(elbow_files.model, files.model)

@@ -109,6 +109,7 @@ SCRIPT_CHANGES = {
     ),
     "an inverted group": (lambda: set_armature_modifier(vertex_group="upper"), NO_BONE_FOLLOWED),
     "no groups": (lambda: set_armature_modifier(use_vertex_groups=False, use_bone_envelopes=True), WEIGHTS_DIFFER),
+    "preserve volume": (lambda: set_armature_modifier(use_deform_preserve_volume=True), "the modifier 'Armature'"),
     "bone name": (rename_bone, "the armature lacks the joint 'lower'"),
 }
 

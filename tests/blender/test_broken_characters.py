@@ -13,9 +13,9 @@ import pytest
 from onnx import TensorProto, helper
 
 from fdda_addon.core.model import CONTROLS_INPUT, METADATA_KEY
-from fdda_addon.runtime import registry
 from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.player import Player
+from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, write_edited
@@ -72,7 +72,7 @@ def test_an_unexpected_error_stops_one_character_only(bound_elbow, elbow_files, 
 
     monkeypatch.setattr(owner, name, fail)
     if event == "created":
-        registry.reset_players()
+        session.reset()
     for mesh_object in crowd:
         mesh_object.data.update()
         mesh_object.update_tag()
@@ -121,7 +121,7 @@ def rename_property() -> None:
 
 def rename_object() -> None:
     bpy.data.objects["dials"].name = "others"
-    registry.reset_players()
+    session.reset()
 
 
 SHAPE_KEY_CONTROL = ("shape_keys", 'key_blocks["smile"].value')

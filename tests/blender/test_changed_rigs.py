@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Changes of a rig while its model plays: the model keeps playing if it still fits; otherwise the rig shows."""
 
+from collections.abc import Callable
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
 
 from fdda_addon.rig.reading import read_model_rig
-from fdda_addon.runtime import rig_signature
+from fdda_addon.runtime import playback, rig_signature
+from fdda_addon.runtime import session as session_module
 from fdda_addon.runtime.model_files import network_of
+from fdda_addon.runtime.session import session
+from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
@@ -153,7 +159,7 @@ def test_a_moved_armature_object_keeps_the_model_playing(bound_elbow, elbow_file
     bpy.data.objects[ELBOW_RIG].rotation_euler = (0.2, 0.1, 0.4)
     bpy.context.view_layer.update()
     bound_elbow.data.update()
-    rig_signature.invalidate_all()
+    session.passed_checks.clear()
     pose(angle=1.1)
     assert_plays(bound_elbow, elbow_files.model)
 
@@ -309,3 +315,60 @@ def test_added_bones_do_not_change_the_order_of_joints(bound_elbow):
     change_in_edit_mode(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
     info = network_of(bound_elbow).info
     assert read_model_rig(find_rig(), info).joints == info.joints
+
+
+@pytest.fixture
+def window(monkeypatch) -> SimpleNamespace:
+    """A stand-in for what the session asks of Blender: a window, in which timers run."""
+    timers: list[Callable[[], float | None]] = []
+    registered = SimpleNamespace(is_registered=timers.__contains__, register=lambda timer, **_: timers.append(timer))
+    app = SimpleNamespace(background=False, timers=registered)
+    for module in (session_module, playback):
+        monkeypatch.setattr(module, "bpy", Proxy(bpy, app=app))
+    return SimpleNamespace(timers=timers)
+
+
+class Proxy:
+    """A module with some attributes replaced."""
+
+    def __init__(self, module: object, **replaced: object):
+        self._module = module
+        vars(self).update(replaced)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._module, name)
+
+
+def test_in_a_window_posing_reads_no_bones_until_it_pauses(bound_elbow, elbow_files, window, monkeypatch, capsys):
+    drive_b_bone()
+    read_parts, read_signature = [], rig_signature.read_signature
+    monkeypatch.setattr(
+        rig_signature,
+        "read_signature",
+        lambda rig, *parts: read_parts.append(set(*parts)) or read_signature(rig, *parts),
+    )
+    for angle in (0.2, 0.4, 0.6):
+        pose(angle=angle)
+        assert_plays(bound_elbow, elbow_files.model)
+    assert not read_parts and window.timers == [session.check_timer]
+    assert session.check_timer() > 0, "posing has not paused long enough"
+    assert not read_parts
+    monkeypatch.setattr(session_module, "CHECK_DELAY_S", 0)
+    assert session.check_timer() is None
+    assert read_parts == [{"armature", "object"}] and not bound_elbow.fdda.status
+    assert session.characters[bound_elbow.session_uid].state == State.PLAYING
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].use_deform = False
+    pose(angle=0.8)
+    assert bound_elbow.fdda.mode == "FDDA"
+    assert session.check_timer() is None
+    bpy.context.view_layer.update()
+    assert_rig_shown(bound_elbow, "some vertices follow no bone", capsys)
+
+
+def test_in_a_window_a_frame_checks_what_has_changed_before(bound_elbow, window, capsys):
+    pose(angle=1.0)
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].use_deform = False
+    bpy.context.view_layer.update()
+    assert bound_elbow.fdda.mode == "FDDA"
+    bpy.context.scene.frame_set(7)
+    assert_rig_shown(bound_elbow, "some vertices follow no bone", capsys)

@@ -16,7 +16,7 @@ from fdda_addon.cli.main import VERBS
 from fdda_addon.cli.progress import ProgressPrinter
 from fdda_addon.core.errors import TRY_AGAIN, OutputError
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.runtime import model_files, registry
+from fdda_addon.runtime.session import session
 from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
 
@@ -171,8 +171,8 @@ def test_the_option_object_selects_a_mesh(elbow_files, tmp_path, capfd):
 
 def open_in_new_session(path) -> bpy.types.Object:
     """Open a file without the models that a user has selected in this session, and return its elbow."""
-    registry.reset_players()
-    model_files._chosen_paths.clear()
+    session.reset()
+    session.chosen_paths.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return bpy.data.objects["elbow"]
 

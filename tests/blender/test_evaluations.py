@@ -9,10 +9,10 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import registry
 from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.evaluated_copies import VIEWPORT_KEY
 from fdda_addon.runtime.model_files import model_path
-from fdda_addon.runtime.player import VIEWPORT_KEY
+from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from .conftest import (
@@ -283,6 +283,6 @@ def test_depsgraphs_are_identified_by_mode_scene_and_view_layer(bound_elbow, tmp
             still(tmp_path / "still.png")
             bpy.context.scene.frame_set(frame)
     assert set(seen_graphs) == {("RENDER", False), ("VIEWPORT", True)}
-    (player,) = registry.players.values()
+    (player,) = session.players.values()
     uid, name = bpy.context.scene.session_uid, bpy.context.view_layer.name
     assert player.depsgraph_keys == {("RENDER", uid, name), ("VIEWPORT", uid, name)}

@@ -8,7 +8,7 @@ import numpy as np
 
 import fdda_addon
 from fdda_addon.models import model_list
-from fdda_addon.runtime import model_files
+from fdda_addon.runtime.session import session
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions
 from .linked import (
@@ -132,7 +132,7 @@ def test_a_model_outside_the_library_s_folder_is_not_loaded(library, tmp_path):
     outside_path = library.model.rename(tmp_path / "shots" / "elbow.onnx")
     bpy.data.objects[ELBOW].fdda.model = f"//../shots/{outside_path.name}"
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     save_new_shot(tmp_path)
     mesh_object = override_character(link_character(library.path), 0.5)
     bpy.context.view_layer.update()

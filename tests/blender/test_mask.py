@@ -9,10 +9,10 @@ from fdda_addon.evaluation import last_evaluation, pictures
 from fdda_addon.evaluation.run import evaluate_action
 from fdda_addon.panels.playback import mask_problem
 from fdda_addon.rig.reading import read_model_rig
-from fdda_addon.runtime import registry
 from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.runtime.network import Network
 from fdda_addon.runtime.player import Player
+from fdda_addon.runtime.session import session
 from fdda_addon.scene import mask as masks
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
@@ -218,7 +218,7 @@ def test_characters_of_a_crowd_have_separate_masks(bound_elbow):
     scene = bpy.context.scene
     for frame in (1, 2, 3, 4):
         scene.frame_set(frame)
-    assert registry.batches.by_driver, "they play together"
+    assert session.batches, "they play together"
     shown = [evaluated_positions(mesh_object) for mesh_object in crowd]
     ramps = ramp(bound_elbow)[:, None]
     for mesh_object, positions, weights in zip(crowd, shown, (1, ramps, 1 - ramps, 0.5 * ramps, 1, 1), strict=True):

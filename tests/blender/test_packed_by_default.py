@@ -10,6 +10,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.operators import playback
 from fdda_addon.properties import character
 from fdda_addon.runtime import model_files, packed_model
+from fdda_addon.runtime.session import session
 from fdda_addon.scene import folder_trust
 
 from .. import systems
@@ -29,7 +30,7 @@ def save_elsewhere(tmp_path):
     path = tmp_path / "elsewhere" / "shot.blend"
     path.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return bpy.data.objects[ELBOW]
 
@@ -55,7 +56,7 @@ def test_a_bound_model_is_appended_with_its_object(rig, elbow_files, model, tmp_
     path.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     before = set(bpy.context.scene.objects.keys())
     with bpy.data.libraries.load(str(path)) as (_, wanted):
         wanted.objects = [ELBOW, ELBOW_RIG]
@@ -97,7 +98,7 @@ def test_a_packed_model_that_is_trained_again_is_packed_again(rig, elbow_files, 
 
 def test_models_are_loaded_from_trusted_folders_only(bound_elbow, elbow_files, model, tmp_path, monkeypatch):
     bound_elbow.fdda.model = bound_elbow.fdda.models[0].path = str(model)
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     with pytest.raises(ModelError, match="or add its folder in the preferences"):
         model_files.model_path(bound_elbow)
     monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [(tmp_path / "other").resolve()])
@@ -112,7 +113,7 @@ def test_a_link_out_of_the_folder_of_the_file_is_not_followed(bound_elbow, elbow
     (tmp_path / "shots").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shots" / "shot.blend"))
     (tmp_path / "shots" / "way_out.onnx").symlink_to(model)
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     bound_elbow.fdda.model = "//way_out.onnx"
     with pytest.raises(ModelError, match="lies outside the folder of"):
         model_files.model_path(bound_elbow)

@@ -10,6 +10,7 @@ import pytest
 
 from fdda_addon.runtime import playback_modifier
 from fdda_addon.runtime.binding import bind, unbind
+from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
@@ -195,9 +196,8 @@ def test_path_out_of_the_folder_is_not_followed(bound_elbow, elbow_files, tmp_pa
     bound_elbow.fdda.model = str(elbow_files.model)
     path = tmp_path / "elsewhere.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    from fdda_addon.runtime import model_files
 
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     bpy.context.view_layer.update()
     assert "outside the folder of 'elsewhere.blend'" in bpy.data.objects[ELBOW].fdda.status

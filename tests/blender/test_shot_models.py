@@ -12,6 +12,7 @@ from fdda_addon.core.errors import ModelError, RigError
 from fdda_addon.models import model_list
 from fdda_addon.runtime import model_files
 from fdda_addon.runtime.binding import bind, unbind
+from fdda_addon.runtime.session import session
 
 from .conftest import assert_plays, evaluated_positions
 from .linked import (
@@ -38,7 +39,7 @@ def test_binding_to_an_override(elbow_files, tmp_path):
     bpy.context.view_layer.update()
     true = evaluated_positions(mesh_object)
     model_list.bind_entry(rig_of(mesh_object), model_list.add_model(mesh_object, model))
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     for _ in range(2):
         mesh_object = overridden_meshes()[0]
         assert_plays(mesh_object, model)
@@ -85,7 +86,7 @@ def test_another_model_in_the_shot(pair, library, elbow_files, tmp_path):
     first, second = overridden_meshes()
     assert not first.fdda.is_bound and second.fdda.is_bound
     model_list.bind_entry(rig_of(first), model_list.add_model(first, model))
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     assert sum(m.type == "NODES" for m in first.modifiers) == 1
     assert model_files.model_path(first) == model
     library.model.unlink()
@@ -99,7 +100,7 @@ def test_another_model_in_the_shot(pair, library, elbow_files, tmp_path):
 def test_an_override_keeps_the_name_of_the_librarys_model(pair, library, tmp_path):
     model_list.add_bound_model(pair[0])
     model_list.bind_entry(rig_of(pair[0]), pair[0].fdda.models[0])
-    model_files._chosen_paths.clear()
+    session.chosen_paths.clear()
     assert pair[0].fdda.model == "//elbow.onnx"
     save_and_reopen_shot(tmp_path)
     assert_overrides_play(library)

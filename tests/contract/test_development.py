@@ -3,6 +3,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -107,3 +109,9 @@ def _handler_names(text: str) -> Iterator[str]:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).startswith("HANDLERS"):
             keys = node.value.keys if isinstance(node.value, ast.Dict) else [node.targets[0].slice]
             yield from (key.value for key in keys)
+
+
+def test_the_state_diagram_is_drawn_from_the_table():
+    command = [sys.executable, str(ROOT / "docs" / "pictures" / "make_states.py")]
+    drawn = subprocess.run([*command, "-"], input=DEVELOPMENT, capture_output=True, text=True, check=True).stdout
+    assert drawn == DEVELOPMENT, "The state diagram is outdated; draw it with `make map`."

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Draw the states of a character for docs/development.md again, from the table of transitions: `make map`.
+
+    python docs/pictures/make_states.py docs/development.md
+
+With - as the page, it reads the standard input and writes to the standard output. The diagram is text that GitHub and
+GitLab draw (Mermaid).
+"""
+
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from fdda_addon.runtime.transitions import SHOWS_MODEL, TABLE, Event, State
+
+DIAGRAM = re.compile(r"```mermaid\nstateDiagram-v2\n.*?```\n", re.DOTALL)
+GROUP = "MODEL_SHOWN"
+"""Name of the box around the states that show the model."""
+
+
+def state_diagram() -> str:
+    """Return the diagram: an arrow for each pair of states, with the names of its events.
+
+    What all states of the box do is one arrow that starts at the box. Events that change nothing are not drawn.
+    """
+    arrows: dict[tuple[str, str], list[str]] = {}
+    for event in Event:
+        common_states = {TABLE[state][event].state if event in TABLE[state] else None for state in SHOWS_MODEL}
+        is_common = len(common_states) == 1 and not common_states & {None, *SHOWS_MODEL}
+        for state, row in TABLE.items():
+            if event not in row or (row[event].state == state and not row[event].effects):
+                continue
+            start = GROUP if is_common and state in SHOWS_MODEL else state.name
+            events = arrows.setdefault((start, row[event].state.name), [])
+            if event.name not in events:
+                events.append(event.name)
+    lines = ["```mermaid", "stateDiagram-v2", "    [*] --> UNBOUND", f"    state {GROUP} {{"]
+    lines += [f"        {state.name}" for state in State if state in SHOWS_MODEL]
+    lines.append("    }")
+    lines += [f"    {start} --> {end}: {', '.join(events)}" for (start, end), events in arrows.items()]
+    return "\n".join([*lines, "```"]) + "\n"
+
+
+def with_diagram(page: str) -> str:
+    """Return a page with the current diagram.
+
+    Raises:
+        ValueError: the page has no diagram.
+    """
+    if not DIAGRAM.search(page):
+        raise ValueError("the page has no state diagram")
+    return DIAGRAM.sub(lambda _: state_diagram(), page, count=1)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "-":
+        sys.stdout.write(with_diagram(sys.stdin.read()))
+    else:
+        path = Path(sys.argv[1])
+        path.write_text(with_diagram(path.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Applies the effects of transitions to the data of Blender and to the session."""
+
+from collections.abc import Callable
+
+import bpy
+
+from ..core.errors import FDDAError, ModelError
+from . import modifier_switch, playback_modifier, player_batch, position_buffer, rig_signature
+from .player import Player
+from .session import Character, session
+from .transitions import Effect, Event
+
+STABLE_MODES = rig_signature.STABLE_MODES
+
+
+def apply(effect: Effect, character: Character, error: FDDAError | None) -> None:
+    """Apply an effect.
+
+    Args:
+        effect: the effect.
+        character: the character.
+        error: the reason of `Effect.REPORT`.
+
+    Raises:
+        FDDAError: the model cannot be loaded, or does not fit the rig.
+    """
+    if effect == Effect.REMOVE_PLAYER:
+        _remove_player(character)
+    elif effect == Effect.FORGET_CHECK:
+        session.passed_checks.pop(character.object_uid, None)
+    elif effect == Effect.SCHEDULE_CHECK:
+        session.schedule_check()
+    elif mesh_object := character.find_object():
+        if effect == Effect.REPORT:
+            _report(mesh_object, error)
+        else:
+            _EFFECTS[effect](character, mesh_object)
+
+
+def _show_model(_character: Character, mesh_object: bpy.types.Object) -> None:
+    modifier_switch.switch_modifiers(mesh_object, True)
+
+
+def _show_rig(_character: Character, mesh_object: bpy.types.Object) -> None:
+    modifier_switch.switch_modifiers(mesh_object, False)
+
+
+def _create_player(character: Character, mesh_object: bpy.types.Object) -> None:
+    buffer = _ensure_buffer(character, mesh_object)
+    character.buffer_uid = buffer.session_uid
+    character.reported.clear()
+    character.player = session.players[buffer.session_uid] = Player(mesh_object, buffer)
+    if mesh_object.mode not in STABLE_MODES:
+        session.dispatch(Event.EDIT, character)
+
+
+def _remove_player(character: Character) -> None:
+    player_batch.unbatch(character.buffer_uid)
+    session.players.pop(character.buffer_uid, None)
+    character.player, character.buffer_uid = None, 0
+    session.scanned_count = -1
+
+
+def _check_rig(character: Character, mesh_object: bpy.types.Object) -> None:
+    reported = set(character.reported)
+    character.reported.clear()
+    if not character.player.check_rig(mesh_object, reported):
+        session.dispatch(Event.OUTDATE, character)
+
+
+def _report(mesh_object: bpy.types.Object, error: FDDAError | None) -> None:
+    mesh_object.fdda.mode = "RIG"
+    mesh_object.fdda.status = str(error)
+    print(f"FDDA is switched off for '{mesh_object.name}': {error}")
+
+
+_EFFECTS: dict[Effect, Callable[[Character, bpy.types.Object], None]] = {
+    Effect.SHOW_MODEL: _show_model,
+    Effect.SHOW_RIG: _show_rig,
+    Effect.CREATE_PLAYER: _create_player,
+    Effect.CHECK_RIG: _check_rig,
+}
+
+
+def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.types.Object:
+    """Return the position buffer of a mesh object; create one if it has no buffer of its own."""
+    modifier = playback_modifier.find_modifier(mesh_object)
+    if modifier is None:
+        raise ModelError(f"The FDDA modifier of '{mesh_object.name}' was removed; bind the model again.")
+    buffer = playback_modifier.buffer_of(modifier)
+    if (
+        buffer is None
+        or not position_buffer.is_buffer(buffer)
+        or len(buffer.data.vertices) != len(mesh_object.data.vertices)
+        # A duplicate still points to the buffer of its original, and an override to the buffer of the linked object.
+        or any(c.buffer_uid == buffer.session_uid for c in session.characters.values() if c is not character)
+    ):
+        buffer = position_buffer.create_buffer(mesh_object)
+        playback_modifier.set_buffer(modifier, buffer)
+    return buffer
+
+
+def remove_unused_objects() -> None:
+    """Remove the position buffers that no modifier reads, and the batch drivers that play no batch."""
+    used_buffers = playback_modifier.used_buffers()
+    for buffer in [o for o in bpy.data.objects if position_buffer.is_buffer(o) and o not in used_buffers]:
+        session.players.pop(buffer.session_uid, None)
+        position_buffer.remove_buffer(buffer)
+    player_batch.remove_unused_drivers()
+
+
+def remove_buffers() -> None:
+    """Remove all position buffers; a player that is created connects a new one.
+
+    An undo keeps datablocks in memory that are equal in two undo steps. If such a datablock points to an object that
+    was created outside of an undo step, it points to freed memory after the undo.
+    """
+    for mesh_object in [o for o in bpy.data.objects if o.type == "MESH"]:
+        modifier = playback_modifier.find_modifier(mesh_object)
+        if modifier is not None:
+            playback_modifier.set_buffer(modifier, None)
+    remove_unused_objects()
+
+
+session.apply_effect = apply
