@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The position buffer of a bound mesh object: an object whose evaluated mesh holds the vertex positions of the model.
 
-Object and mesh are local runtime data and in no scene. Blender never saves them. `registry.scan` creates missing
+Object and mesh are local runtime data and in no scene. Blender never saves them. `playback.scan` creates missing
 buffers.
 """
 
