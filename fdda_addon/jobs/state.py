@@ -19,9 +19,15 @@ STAGE_UNITS = {
     "evaluation": "poses compared",
     "benchmark": "measurements",
     "film": "frames rendered",
+    "full rig": "poses of the full rig",
+    "repeated poses": "poses repeated",
+    "fast rig": "poses of the fast rig",
 }
 """Labels of the steps of a stage, where they differ from the name of the stage."""
-PREPARING_STAGES = {"influences", "starting", "partitions prepared", "poses to fit", "fit", "target", "probes"}
+PREPARING_STAGES = {
+    *("influences", "starting", "partitions prepared", "poses to fit", "fit", "target", "probes"),
+    *("full rig", "repeated poses", "fast rig"),
+}
 """Stages that are always followed by another stage of the same job."""
 
 

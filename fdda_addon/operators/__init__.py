@@ -15,6 +15,7 @@ MODULES: tuple[str, ...] = (
     "playback",
     "build_model",
     "baking",
+    "fast_rig",
     "evaluation",
     "film",
     "worst_poses",

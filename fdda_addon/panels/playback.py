@@ -50,7 +50,7 @@ _confidence_value = TimedValue(_read_confidence, 0.2)
 class FDDA_PT_playback(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_playback"
     bl_label = "Model"
-    verbs = ("measure_model", "bake")
+    verbs = ("measure_model", "bake", "fast_rig")
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
@@ -72,6 +72,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             self._draw_times(context, mesh_object)
             self._draw_confidence(context, mesh_object)
             self._draw_bake(context)
+            _draw_fast_rig(layout, context, mesh_object)
         draw_button(layout, context, "fdda.unbind", "Unbind", "UNLINKED")
         if not mesh_object.fdda.status and (advanced := draw_advanced(layout, "fdda_model_advanced")) is not None:
             _draw_mask(advanced, mesh_object)
@@ -216,6 +217,14 @@ def _draw_mask(column: bpy.types.UILayout, mesh_object: bpy.types.Object) -> Non
     invert = mask.row(align=True)
     invert.active = bool(binding.mask)
     invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
+
+
+def _draw_fast_rig(layout: bpy.types.UILayout, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
+    if mesh_object.fdda.is_fast_rig:
+        text = "This is a fast rig: for rendering, relocate the library to the file of the full rig."
+        draw_wrapped(layout, context, text, "INFO")
+    elif not draw_job(layout, context, "fast_rig"):
+        layout.operator("fdda.fast_rig", text="Fast Rig…", icon="ARMATURE_DATA")
 
 
 CLASSES = (FDDA_PT_playback,)

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operator that makes a fast rig of the saved file, in another Blender."""
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import FDDAError, OutputError, RigError
+from ..scene.scene_rig import SceneRig
+from .confirm import ConfirmFirst
+from .playback import ModelOperator
+
+
+class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
+    bl_idname = "fdda.fast_rig"
+    bl_label = "Fast Rig"
+    bl_description = (
+        "Write a file for animators with the same names, without the bones and objects that the model and the controls "
+        "do not need. Relocate the library to this file for rendering"
+    )
+    bl_options = {"REGISTER"}
+    verb, title = "fast_rig", "Fast Rig"
+    changes_scene = False
+
+    filepath: bpy.props.StringProperty(
+        name="File", description="File to write, .blend", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    filter_glob: bpy.props.StringProperty(default="*.blend", options={"HIDDEN"})
+    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+    visible: bpy.props.BoolProperty(name="Visible Bones", description="Keep the bones that are visible", default=True)
+    keyed: bpy.props.BoolProperty(
+        name="Keyed Bones", description="Keep the bones that an action of this file keys", default=True
+    )
+    collection: bpy.props.StringProperty(
+        name="Bone Collection", description="Keep the bones of this bone collection", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_idle() and cls.has_bound_model(context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if self.filepath:
+            return ConfirmFirst.invoke(self, context, event)
+        try:
+            self._check_saved(self.bound_rig(context))
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.filepath = bpy.path.abspath(f"//{Path(bpy.data.filepath).stem}_fast.blend")
+        self._is_confirming = True
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    execute = ConfirmFirst.execute
+
+    def confirmed_properties(self) -> dict[str, object]:
+        return {name: getattr(self, name) for name in ("object", "filepath", "visible", "keyed", "collection")}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        self.layout.label(text="Controls to Keep:")
+        self.layout.prop(self, "visible")
+        self.layout.prop(self, "keyed")
+        self.layout.prop_search(
+            self, "collection", self.bound_rig(context).armature_object.data, "collections_all", text="Bone Collection"
+        )
+
+    def subject(self, context: bpy.types.Context) -> int:
+        return self.bound_rig(context).mesh_object.session_uid
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        from ..fast_rig.process import FastRigProcess
+
+        scene_rig = self.bound_rig(context)
+        self._check_saved(scene_rig)
+        choices = [*(["visible"] if self.visible else []), *(["keyed"] if self.keyed else [])]
+        if self.collection:
+            choices.append(f"collection:{self.collection}")
+        if not choices:
+            raise RigError("No controls were chosen; keep the visible or keyed bones, or those of a bone collection.")
+        if not self.filepath:
+            raise OutputError("No file was chosen; give the name of a .blend file.")
+        out = Path(bpy.path.abspath(self.filepath)).with_suffix(".blend")
+        mesh_objects = [
+            o
+            for o in context.scene.objects
+            if o.type == "MESH" and o.fdda.is_bound and _uses_armature(o, scene_rig.armature_object)
+        ]
+        with tempfile.TemporaryDirectory(prefix="fdda-") as folder:
+            model = _write_models(mesh_objects, Path(folder))
+            names = ["--object", mesh_objects[0].name] if len(mesh_objects) == 1 else []
+            arguments = [bpy.data.filepath, str(model), str(out), *names, "--controls", *choices]
+            with FastRigProcess(arguments) as process:
+                yield from process.steps()
+
+    def finish(self, _context: bpy.types.Context, result: object) -> str:
+        lines = [line.strip() for line in str(result).splitlines()]
+        # The first and the last line begin with the path of the file.
+        path, _, summary = lines[0].partition(".blend: ")
+        texts = [line.rpartition(".blend: ")[2] for line in lines[1:]]
+        sentences = [f"{Path(path).name}.blend: {summary}.", *(f"{text[:1].upper()}{text[1:]}." for text in texts)]
+        return " ".join(sentences)
+
+    def _check_saved(self, scene_rig: SceneRig) -> None:
+        """Check that the saved file is the one that is shown.
+
+        Raises:
+            RigError: the file has no path, or unsaved changes; or the rig is a fast rig or linked.
+        """
+        mesh_object = scene_rig.mesh_object
+        if mesh_object.fdda.is_fast_rig:
+            raise RigError(f"'{mesh_object.name}' is a fast rig already; open the file of the full rig.")
+        if mesh_object.library is not None or mesh_object.override_library is not None:
+            raise RigError(f"'{mesh_object.name}' comes from a library; open the file of the character.")
+        if not bpy.data.filepath:
+            raise RigError("Save the .blend file first: the fast rig is made from the saved file.")
+        if bpy.data.is_dirty:
+            raise RigError("The file has unsaved changes, which the fast rig would lack; save it first.")
+
+
+def _uses_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
+    from ..scene.scene_rig import armature_of
+
+    return armature_of(mesh_object) == armature_object
+
+
+def _write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
+    """Return the file of the only model, or write the models of several meshes into a folder and return it.
+
+    A packed model has no file that could be read.
+    """
+    from ..runtime import packed_model
+    from ..runtime.model_files import model_path
+
+    for mesh_object in mesh_objects:
+        binding = mesh_object.fdda
+        data = packed_model.read(binding.packed) if binding.packed else model_path(mesh_object).read_bytes()
+        file = folder / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
+        file.write_bytes(data)
+    return file if len(mesh_objects) == 1 else folder
+
+
+CLASSES = (FDDA_OT_fast_rig,)

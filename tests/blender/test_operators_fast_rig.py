@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The button that makes a fast rig: another Blender works on the saved file."""
+
+import time
+
+import bpy
+import pytest
+
+from fdda_addon.core.progress import Progress
+from fdda_addon.fast_rig.process import FastRigProcess
+from fdda_addon.jobs import job
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
+from .test_operators_playback import refused
+
+
+@pytest.fixture
+def saved(bound_elbow, tmp_path):
+    """Save the bound elbow, with its model packed, into a folder without the model's file."""
+    bpy.context.view_layer.objects.active = bound_elbow
+    bpy.ops.fdda.pack_model()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elbow.blend"))
+    return tmp_path
+
+
+def test_a_fast_rig_is_written_and_the_open_file_stays(saved, elbow_files):
+    content = (saved / "elbow.blend").read_bytes()
+    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.blend")) == {"FINISHED"}
+    assert "fast.blend: 'elbow_rig' has 2 of 2 bones; the model reads 2" in job.state_of("fast_rig").outcome
+    assert "times as fast" in job.state_of("fast_rig").outcome
+    assert bpy.data.filepath == str(saved / "elbow.blend") and (saved / "elbow.blend").read_bytes() == content
+    assert not bpy.data.objects[ELBOW].fdda.is_fast_rig
+    bpy.ops.wm.open_mainfile(filepath=str(saved / "fast.blend"))
+    mesh_object = bpy.data.objects[ELBOW]
+    assert mesh_object.fdda.is_fast_rig and "CorrectiveSmooth" not in mesh_object.modifiers
+    pose(angle=0.7)
+    assert_plays(mesh_object, elbow_files.model)
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(saved / "again.blend")), "'elbow' is a fast rig already")
+
+
+def test_the_sentence_of_the_verb_is_the_report(saved):
+    """The other Blender refuses an armature that another object uses."""
+    other = bpy.data.objects.new("other", bpy.data.objects[ELBOW_RIG].data)
+    bpy.context.scene.collection.objects.link(other)
+    bpy.ops.wm.save_mainfile()
+    out = saved / "fast.blend"
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(out)), "'other' uses the armature of 'elbow_rig' too")
+    assert not out.exists()
+
+
+def test_a_canceled_job_ends_the_other_blender_and_writes_nothing(saved, elbow_files):
+    before = sorted(path.name for path in saved.iterdir())
+    arguments = [str(saved / "elbow.blend"), str(elbow_files.model), str(saved / "fast.blend"), "--frames", "100000"]
+    with FastRigProcess(arguments) as process:
+        steps = process.steps()
+        while not isinstance(next(steps), Progress):
+            time.sleep(0.01)
+        assert process.is_running
+    assert not process.is_running
+    assert sorted(path.name for path in saved.iterdir()) == before
+
+
+def test_unsaved_files_and_missing_choices_are_refused(saved):
+    out = str(saved / "fast.blend")
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, visible=False, keyed=False), "No controls were chosen")
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, collection="Faces"), "has no bone collection 'Faces'")
+    refused(bpy.ops.fdda.fast_rig, "No file was chosen; give the name of a .blend file.")
