@@ -108,6 +108,9 @@ map: .venv  ## draw the diagrams of the code's layers and of a character's state
 	.venv/bin/python docs/pictures/make_map.py docs/pictures/map.svg
 	.venv/bin/python docs/pictures/make_states.py docs/development.md
 
+third-party: .venv  ## take characters that others made through the whole path, into out/third_party (FOLDER=/path/to/characters; half an hour)
+	.venv/bin/python benchmarks/third_party.py out/third_party $(FOLDER)
+
 fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test
 	@$(MAKE) .venv-line LINE=4.5
 	.venv-4.5/bin/python blend_fixtures/make_fixtures.py
