@@ -7,21 +7,19 @@ of the skinned surface at increasing amounts of smoothing. For a rig that smooth
 remainder.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
 
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
-from fdda_addon.core.surface import adjacent_corners
 
 from ..data.split import Split
 from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
 from ..fits.least_squares import solve_ridge
 from ..process import Cancelled
+from .smoothed_surface import SmoothedSurface, find_face_corners
 from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
 MAX_POSES = 400
@@ -30,20 +28,12 @@ MAX_CANDIDATES_PER_PARTITION, MEAN_CANDIDATES_PER_PARTITION = 8, 3
 CORNER_COUNT_QUANTILE, MAX_CORNERS = 0.75, 16
 """A vertex is no candidate if it has more face corners than this quantile of the vertices, or than the maximum,
 because all selected vertices are padded to the largest corner count."""
-SMOOTHING_ITERATIONS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64)
-SMOOTHING_FACTOR = 0.5
-"""Factor of each smoothing iteration. One iteration at twice the factor smooths about as much as two iterations."""
 MIN_EXPLAINED_VARIANCE, MIN_BEST_EXPLAINED_VARIANCE = 0.8, 0.95
 """Minimum fractions of the squared residual that surface frames explain, after the joints. The first limit applies to
 each selected vertex and to the median candidate, the second to the best candidate. Bulges that follow joint angles
 reach 0.94 by chance."""
-EPSILON_RATIO = 0.01
-"""Ratio of `SurfaceFrames.epsilons` to the length of the corner's longer tangent in the rest pose. For the
-normal it is the ratio to the square of this length. Vectors whose direction is mostly a rounding error fade out."""
 MAX_PROBED_CANDIDATES = 24
 """Maximum number of candidates that determine the number of smoothing iterations."""
-MIN_EPSILON = 1e-18
-"""Minimum epsilon, mesh units. It applies to corners whose edges have no length."""
 RIDGE_RADIANS = 0.03
 """Ridge of the fit. It suppresses tangents, normals and sums of them that rotate by less than this against the joints.
 Their coefficients would be so large that rounding errors matter."""
@@ -65,20 +55,6 @@ class _Candidate:
     joint: int
     mean_square: float
     residual: np.ndarray
-
-
-@dataclass(frozen=True)
-class _FaceCorners:
-    """The face corners of each vertex.
-
-    Attributes:
-        starts: (V + 1,) index of the first corner of each vertex.
-        predecessors, successors: (C,) preceding and following vertex of each corner in its face.
-    """
-
-    starts: np.ndarray
-    predecessors: np.ndarray
-    successors: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -118,7 +94,7 @@ def select_surface_frames(
     if not len(rig.face_starts):
         return NO_SURFACE_FRAMES
     training = split.training[np.unique(np.linspace(0, len(split.training) - 1, MAX_POSES).astype(np.int64))]
-    matrices, face_corners = np.array(recording.pose_matrices[training]), _find_face_corners(rig)
+    matrices, face_corners = np.array(recording.pose_matrices[training]), find_face_corners(rig)
     skin = skin_matrices(matrices, rig.rest_matrices)
     corner_counts = np.diff(face_corners.starts)
     max_corners = min(np.quantile(corner_counts[corner_counts > 0], CORNER_COUNT_QUANTILE), MAX_CORNERS)
@@ -142,11 +118,13 @@ def select_surface_frames(
     ]
     if not candidates:
         return NO_SURFACE_FRAMES
-    smoothed_surface = _SmoothedSurface(rig, face_corners)
+    smoothed_surface = SmoothedSurface(rig, face_corners)
     iteration_count = _best_iteration_count(smoothed_surface, candidates[:MAX_PROBED_CANDIDATES], poses)
     candidates.sort(key=lambda candidate: (candidate.partition, candidate.vertex))
     surface_frames = next(
-        frames for iterations, frames in smoothed_surface.surface_frames(candidates) if iterations == iteration_count
+        frames
+        for iterations, frames in smoothed_surface.surface_frames(*_vertices_and_joints(candidates))
+        if iterations == iteration_count
     )
     lengths, explained_fractions = _fit_lengths(surface_frames, candidates, poses)
     # The condition is not inverted, because a comparison with NaN is False.
@@ -156,13 +134,6 @@ def select_surface_frames(
     ):
         return NO_SURFACE_FRAMES
     return replace(surface_frames, lengths=lengths).subset(explained_fractions >= MIN_EXPLAINED_VARIANCE)
-
-
-def _find_face_corners(rig: Rig) -> _FaceCorners:
-    corner_order = np.argsort(rig.face_vertices, kind="stable")
-    starts = np.searchsorted(rig.face_vertices[corner_order], np.arange(rig.vertex_count + 1))
-    adjacent_corner_indices = adjacent_corners(rig.face_starts, rig.face_vertices)
-    return _FaceCorners(starts, *(rig.face_vertices[corners[corner_order]] for corners in adjacent_corner_indices))
 
 
 def _remove_projection(column_space: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -209,78 +180,13 @@ def _select_candidates(
     return candidates
 
 
-class _SmoothedSurface:
-    """The linearly skinned surface, smoothed as by Corrective Smooth in its simple mode."""
-
-    def __init__(self, rig: Rig, face_corners: _FaceCorners):
-        self._face_corners, vertex_count = face_corners, rig.vertex_count
-        corner_vertices = np.repeat(np.arange(vertex_count), np.diff(face_corners.starts))
-        edges = (
-            np.concatenate([corner_vertices] * 2),
-            np.concatenate([face_corners.predecessors, face_corners.successors]),
-        )
-        adjacency = sparse.coo_array((np.ones(len(edges[0])), edges), (vertex_count, vertex_count)).tocsr()
-        adjacency.data[:] = 1
-        neighbor_counts = np.asarray(adjacency.sum(axis=1)).ravel()
-        isolated_vertices = sparse.diags_array((neighbor_counts == 0).astype(float))
-        neighbor_mean = sparse.diags_array(1 / np.maximum(neighbor_counts, 1)) @ adjacency + isolated_vertices
-        self._smoothing_step = (
-            (1 - SMOOTHING_FACTOR) * sparse.eye_array(vertex_count) + SMOOTHING_FACTOR * neighbor_mean
-        ).tocsr()
-        vertices = np.repeat(np.arange(vertex_count), rig.skin_joints.shape[1])
-        weights, joints = rig.skin_weights.ravel().astype(np.float64), rig.skin_joints.ravel()
-        rest = np.append(rig.rest_positions.astype(np.float64), np.ones((vertex_count, 1)), axis=1)
-        weighted_rest = weights[:, None] * rest[vertices]
-        coordinates = np.repeat(vertices, 4), (4 * joints[:, None] + np.arange(4)).ravel()
-        self._weighted_rest = sparse.coo_array(
-            (weighted_rest.ravel(), coordinates), (vertex_count, 4 * len(rig.joints))
-        ).tocsr()
-        self._inverse_rest = np.linalg.inv(rig.rest_matrices.astype(np.float64))
-
-    def surface_frames(self, candidates: Sequence[_Candidate]) -> Iterator[tuple[int, SurfaceFrames]]:
-        """Compute the surface frames of the candidates for each of `SMOOTHING_ITERATIONS`, with all lengths 1.
-
-        Yields:
-            The number of iterations, and the surface frames.
-        """
-        vertices, joints = np.array([(candidate.vertex, candidate.joint) for candidate in candidates], np.int64).T
-        starts, corner_counts = self._face_corners.starts[vertices], np.diff(self._face_corners.starts)[vertices]
-        corner_slots = np.arange(corner_counts.max())
-        is_corner, corners = (
-            corner_slots < corner_counts[:, None],
-            starts[:, None] + np.minimum(corner_slots, corner_counts[:, None] - 1),
-        )
-        # Both edges of a padded corner have length 0.
-        edge_ends = np.where(
-            is_corner,
-            (self._face_corners.predecessors[corners], self._face_corners.successors[corners]),
-            vertices[:, None],
-        )
-        nearby_vertices, row_indices = np.unique(np.append(edge_ends.ravel(), vertices), return_inverse=True)
-        shape, completed_iterations = (len(nearby_vertices), self._smoothing_step.shape[0]), 0
-        smoothing_rows = sparse.csr_array(
-            (np.ones(len(nearby_vertices)), (np.arange(len(nearby_vertices)), nearby_vertices)), shape
-        )
-        for iterations in SMOOTHING_ITERATIONS:
-            for _ in range(iterations - completed_iterations):
-                smoothing_rows = smoothing_rows @ self._smoothing_step
-            completed_iterations = iterations
-            smoothed = (smoothing_rows @ self._weighted_rest).toarray()[row_indices]
-            predecessor_edges, successor_edges = (
-                smoothed[: edge_ends.size].reshape(*edge_ends.shape, -1) - smoothed[edge_ends.size :, None]
-            )
-            tangents = np.stack([predecessor_edges + successor_edges, successor_edges - predecessor_edges])
-            by_joint = tangents.reshape(*tangents.shape[:3], -1, 4)
-            # In the rest pose skin matrices are the identity, so the sum over the joints is the tangent.
-            extents = np.linalg.norm(by_joint[..., :3].sum(axis=3), axis=3).max(axis=0)
-            epsilons = np.maximum(EPSILON_RATIO * np.stack([extents, extents, extents**2]), MIN_EPSILON)
-            posed_tangents = np.einsum("jab,fdkjb->fdkja", self._inverse_rest, by_joint).reshape(tangents.shape)
-            lengths = np.tile(is_corner, (3, 1, 1)).astype(np.float64)
-            yield iterations, SurfaceFrames(vertices, joints, posed_tangents, epsilons, lengths)
+def _vertices_and_joints(candidates: Sequence[_Candidate]) -> np.ndarray:
+    """Return (2, D) int64 vertices and main joints of candidates."""
+    return np.array([(candidate.vertex, candidate.joint) for candidate in candidates], np.int64).T
 
 
 def _best_iteration_count(
-    smoothed_surface: _SmoothedSurface, candidates: Sequence[_Candidate], poses: _EvaluatedPoses
+    smoothed_surface: SmoothedSurface, candidates: Sequence[_Candidate], poses: _EvaluatedPoses
 ) -> int:
     """Return the number of smoothing iterations at which the corners explain most of the candidates' residuals."""
     squared_residuals = np.array([candidate.residual @ candidate.residual for candidate in candidates])
@@ -288,7 +194,7 @@ def _best_iteration_count(
         iterations: float(
             _fit_lengths(surface_frames, candidates, poses)[1] @ squared_residuals / squared_residuals.sum()
         )
-        for iterations, surface_frames in smoothed_surface.surface_frames(candidates)
+        for iterations, surface_frames in smoothed_surface.surface_frames(*_vertices_and_joints(candidates))
     }
     return max(explained_by_iterations, key=explained_by_iterations.__getitem__)
 

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The linearly skinned surface at increasing amounts of smoothing, and its surface frames."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.surface import adjacent_corners
+
+from .surface_frame_vectors import SurfaceFrames
+
+SMOOTHING_ITERATIONS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64)
+SMOOTHING_FACTOR = 0.5
+"""Factor of each smoothing iteration. One iteration at twice the factor smooths about as much as two iterations."""
+EPSILON_RATIO = 0.01
+"""Ratio of `SurfaceFrames.epsilons` to the length of the corner's longer tangent in the rest pose. For the
+normal it is the ratio to the square of this length. Vectors whose direction is mostly a rounding error fade out."""
+MIN_EPSILON = 1e-18
+"""Minimum epsilon, mesh units. It applies to corners whose edges have no length."""
+
+
+@dataclass(frozen=True)
+class FaceCorners:
+    """The face corners of each vertex.
+
+    Attributes:
+        starts: (V + 1,) index of the first corner of each vertex.
+        predecessors, successors: (C,) preceding and following vertex of each corner in its face.
+    """
+
+    starts: np.ndarray
+    predecessors: np.ndarray
+    successors: np.ndarray
+
+
+def find_face_corners(rig: Rig) -> FaceCorners:
+    """Find the face corners of each vertex of a rig's mesh."""
+    corner_order = np.argsort(rig.face_vertices, kind="stable")
+    starts = np.searchsorted(rig.face_vertices[corner_order], np.arange(rig.vertex_count + 1))
+    adjacent_corner_indices = adjacent_corners(rig.face_starts, rig.face_vertices)
+    return FaceCorners(starts, *(rig.face_vertices[corners[corner_order]] for corners in adjacent_corner_indices))
+
+
+class SmoothedSurface:
+    """The linearly skinned surface, smoothed as by Corrective Smooth in its simple mode."""
+
+    def __init__(self, rig: Rig, face_corners: FaceCorners):
+        """Compute one step of smoothing, and the skin weights as a matrix."""
+        self._face_corners, vertex_count = face_corners, rig.vertex_count
+        corner_vertices = np.repeat(np.arange(vertex_count), np.diff(face_corners.starts))
+        edges = (
+            np.concatenate([corner_vertices] * 2),
+            np.concatenate([face_corners.predecessors, face_corners.successors]),
+        )
+        adjacency = sparse.coo_array((np.ones(len(edges[0])), edges), (vertex_count, vertex_count)).tocsr()
+        adjacency.data[:] = 1
+        neighbor_counts = np.asarray(adjacency.sum(axis=1)).ravel()
+        isolated_vertices = sparse.diags_array((neighbor_counts == 0).astype(float))
+        neighbor_mean = sparse.diags_array(1 / np.maximum(neighbor_counts, 1)) @ adjacency + isolated_vertices
+        self._smoothing_step = (
+            (1 - SMOOTHING_FACTOR) * sparse.eye_array(vertex_count) + SMOOTHING_FACTOR * neighbor_mean
+        ).tocsr()
+        vertices = np.repeat(np.arange(vertex_count), rig.skin_joints.shape[1])
+        weights, joints = rig.skin_weights.ravel().astype(np.float64), rig.skin_joints.ravel()
+        rest = np.append(rig.rest_positions.astype(np.float64), np.ones((vertex_count, 1)), axis=1)
+        weighted_rest = weights[:, None] * rest[vertices]
+        coordinates = np.repeat(vertices, 4), (4 * joints[:, None] + np.arange(4)).ravel()
+        self._weighted_rest = sparse.coo_array(
+            (weighted_rest.ravel(), coordinates), (vertex_count, 4 * len(rig.joints))
+        ).tocsr()
+        self._inverse_rest = np.linalg.inv(rig.rest_matrices.astype(np.float64))
+
+    def surface_frames(self, vertices: np.ndarray, joints: np.ndarray) -> Iterator[tuple[int, SurfaceFrames]]:
+        """Compute surface frames with all lengths 1 for each of `SMOOTHING_ITERATIONS`.
+
+        Args:
+            vertices, joints: (D,) vertices, and the main joints of their partitions.
+
+        Yields:
+            The number of iterations, and the surface frames.
+        """
+        starts, corner_counts = self._face_corners.starts[vertices], np.diff(self._face_corners.starts)[vertices]
+        corner_slots = np.arange(corner_counts.max())
+        is_corner, corners = (
+            corner_slots < corner_counts[:, None],
+            starts[:, None] + np.minimum(corner_slots, corner_counts[:, None] - 1),
+        )
+        # Both edges of a padded corner have length 0.
+        edge_ends = np.where(
+            is_corner,
+            (self._face_corners.predecessors[corners], self._face_corners.successors[corners]),
+            vertices[:, None],
+        )
+        nearby_vertices, row_indices = np.unique(np.append(edge_ends.ravel(), vertices), return_inverse=True)
+        shape, completed_iterations = (len(nearby_vertices), self._smoothing_step.shape[0]), 0
+        smoothing_rows = sparse.csr_array(
+            (np.ones(len(nearby_vertices)), (np.arange(len(nearby_vertices)), nearby_vertices)), shape
+        )
+        for iterations in SMOOTHING_ITERATIONS:
+            for _ in range(iterations - completed_iterations):
+                smoothing_rows = smoothing_rows @ self._smoothing_step
+            completed_iterations = iterations
+            smoothed = (smoothing_rows @ self._weighted_rest).toarray()[row_indices]
+            predecessor_edges, successor_edges = (
+                smoothed[: edge_ends.size].reshape(*edge_ends.shape, -1) - smoothed[edge_ends.size :, None]
+            )
+            tangents = np.stack([predecessor_edges + successor_edges, successor_edges - predecessor_edges])
+            by_joint = tangents.reshape(*tangents.shape[:3], -1, 4)
+            # In the rest pose skin matrices are the identity, so the sum over the joints is the tangent.
+            extents = np.linalg.norm(by_joint[..., :3].sum(axis=3), axis=3).max(axis=0)
+            epsilons = np.maximum(EPSILON_RATIO * np.stack([extents, extents, extents**2]), MIN_EPSILON)
+            posed_tangents = np.einsum("jab,fdkjb->fdkja", self._inverse_rest, by_joint).reshape(tangents.shape)
+            lengths = np.tile(is_corner, (3, 1, 1)).astype(np.float64)
+            yield iterations, SurfaceFrames(vertices, joints, posed_tangents, epsilons, lengths)
