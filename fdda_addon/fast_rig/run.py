@@ -119,7 +119,7 @@ def make_fast_rig(
         removed.objects,
         removed.modifiers,
         removed.drivers,
-        _lost_channels(armature_object, removed.bones),
+        _lost_channels(poses, removed.bones),
         len(before),
         max(differing_joints(poses, before, after, -1.0).values(), default=0.0),
     )
@@ -231,11 +231,11 @@ def _named_bones(differences: dict[str, float]) -> str:
     return f"{len(names)} bones ({shown}{more})"
 
 
-def _lost_channels(armature_object: bpy.types.Object, removed_bones: set[str]) -> dict[str, dict[str, int]]:
+def _lost_channels(poses: JointPoses, removed_bones: set[str]) -> dict[str, dict[str, int]]:
     """Count the keyed channels whose bones were removed, by action and bone."""
     lost: dict[str, dict[str, int]] = {}
-    for action in bpy.data.actions:
-        keyed = keyed_bones(armature_object, action)
+    for action in poses.actions:
+        keyed = keyed_bones(poses.armature_object, action)
         if counts := {name: count for name, count in keyed.items() if name in removed_bones}:
             lost[action.name] = counts
     return lost
