@@ -2,18 +2,21 @@
 """The frame profile: the parts of a frame, the bones with the slowest constraints, and the restored scene."""
 
 import json
+from types import SimpleNamespace
 
 import bpy
 import pytest
 
 from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.operators.frame_profile import last_profile
+from fdda_addon.panels.frame_profile import draw_profile
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, mutables_by_bone
 from fdda_addon.timing.durations import ARMATURE_SCENE_NAME, Duration, temporary_armature_scene
 from fdda_addon.timing.frame_profile import BONES, MODIFIER, REST, FrameProfile, profile_frame
 
 from .conftest import run
+from .drawing import Layout
 from .scene_state import assert_same_state, scene_state
 
 
@@ -140,3 +143,14 @@ def test_a_bound_model_does_not_play_while_its_rig_is_profiled(bound_elbow):
     assert bound_elbow.fdda.mode == "FDDA" and not bound_elbow.fdda.status
     parts = {part.name for part in last_profile(bound_elbow).parts if part.kind == MODIFIER}
     assert parts == {"Armature", "CorrectiveSmooth"}
+
+
+def test_the_sidebar_draws_a_bar_for_each_part(slow_rig):
+    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
+    profile, drawn = last_profile(slow_rig.mesh_object), []
+    context = SimpleNamespace(region=SimpleNamespace(width=300), preferences=bpy.context.preferences)
+    draw_profile(Layout(drawn), context, slow_rig)
+    texts = [element.text for element in drawn]
+    assert f"Frame Profile ({profile.frame.median:.1f} ms)" in texts
+    assert f"{profile.parts[0].title}" in texts and f"{profile.parts[0].duration} ms" in texts
+    assert profile.savings_sentences()[0].split(" ms")[0] in " ".join(texts)
