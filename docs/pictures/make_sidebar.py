@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Make the pictures of the sidebar from those of `make test-gui`: `python docs/pictures/make_sidebar.py out/gui`."""
+"""Make the pictures of the sidebar from those of `make test-gui`: `python docs/pictures/make_sidebar.py out/gui`.
+
+The pictures of the errors are of a well-trained model: `tests/gui/run.py out/gui --story film`, with the arm that
+`make demo` has bound as out/gui/work/arm.blend, beside its model.
+"""
 
 import sys
 from pathlib import Path
@@ -22,8 +26,8 @@ SECTION_PICTURES = {
 }
 """Steps of the test whose sections are shown side by side, by the name of the picture."""
 WINDOW_PICTURES = {
-    "sidebar_evaluation": "17_mark_the_worst_frames",
-    "manual_heat_map": "16_show_the_heat_map",
+    "sidebar_evaluation": "04_mark_the_worst_frames",
+    "manual_heat_map": "03_show_the_heat_map",
     "simulation_settling": "settling",
     "simulation_plays": "flesh_plays",
 }

@@ -21,6 +21,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 import cast_story
 import endure_story
+import film_story
 import flesh_story
 import leave_story
 import path_story
@@ -41,6 +42,7 @@ STEPS = {
     "flesh": flesh_story.STEPS,
     "session": session_story.STEPS,
     "update": update_story.STEPS,
+    "film": film_story.STEPS,
     "endure": endure_story.STEPS,
     "leave": leave_story.STEPS_BEFORE_CLOSING,
     "back": leave_story.STEPS_AFTER_REOPENING,
