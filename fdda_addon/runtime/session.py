@@ -16,7 +16,7 @@ from typing import Any
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from .transitions import SHOWS_MODEL, Effect, Event, State, transition
+from .transitions import SHOWS_MODEL, TABLE, Effect, Event, State, transition
 
 CHECK_DELAY_S = 0.25
 """How long updates have to pause before changed rigs are checked. In the background they are checked at once."""
@@ -144,6 +144,8 @@ class PlaybackSession:
             error: the reason of `Event.FAIL`.
         """
         for each in [character] if character else list(self.characters.values()):
+            if event not in TABLE[each.state]:
+                continue  # Most frames dispatch to characters for which nothing changes.
             state, effect_list = transition(each.state, event)
             each.state = state
             with self.isolated_errors(each):
