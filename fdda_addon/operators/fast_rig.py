@@ -60,6 +60,7 @@ class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
         return {name: getattr(self, name) for name in ("object", "filepath", "visible", "keyed", "collection")}
 
     def draw(self, context: bpy.types.Context) -> None:
+        self.layout.label(text="Made from the saved file", icon="INFO")
         self.layout.label(text="Controls to Keep:")
         self.layout.prop(self, "visible")
         self.layout.prop(self, "keyed")
@@ -104,10 +105,12 @@ class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
         return " ".join(sentences)
 
     def _check_saved(self, scene_rig: SceneRig) -> None:
-        """Check that the saved file is the one that is shown.
+        """Check that there is a saved file of a full rig.
+
+        Unsaved changes are allowed, because Blender 4.5 counts what playback restores after a save as a change.
 
         Raises:
-            RigError: the file has no path, or unsaved changes; or the rig is a fast rig or linked.
+            RigError: the file has no path, or the rig is a fast rig or linked.
         """
         mesh_object = scene_rig.mesh_object
         if mesh_object.fdda.is_fast_rig:
@@ -116,8 +119,6 @@ class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
             raise RigError(f"'{mesh_object.name}' comes from a library; open the file of the character.")
         if not bpy.data.filepath:
             raise RigError("Save the .blend file first: the fast rig is made from the saved file.")
-        if bpy.data.is_dirty:
-            raise RigError("The file has unsaved changes, which the fast rig would lack; save it first.")
 
 
 def _uses_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
