@@ -205,8 +205,14 @@ class PlaybackSession:
         return mode_stack[-1] if mode_stack else ""
 
     def uses_model(self, mesh_object: bpy.types.Object) -> bool:
-        """Return whether a bound object shows its model, according to its overriding mode or else its own mode."""
-        return (self.overriding_mode(mesh_object.session_uid) or mesh_object.fdda.mode) != "RIG"
+        """Return whether a bound object shows its model, according to its overriding mode or else its own mode.
+
+        Only its own mode plays a model again that has failed: the failure has set it to RIG.
+        """
+        character = self.characters.get(mesh_object.session_uid)
+        has_failed = character is not None and character.state == State.FAILED
+        overriding_mode = "" if has_failed else self.overriding_mode(mesh_object.session_uid)
+        return (overriding_mode or mesh_object.fdda.mode) != "RIG"
 
 
 session = PlaybackSession()

@@ -7,7 +7,9 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime.binding import model_disabled
+from fdda_addon.core.errors import ModelError
+from fdda_addon.runtime.binding import model_disabled, temporary_mode
+from fdda_addon.runtime.player import Player
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, run
@@ -180,3 +182,26 @@ def test_only_mode_and_strength_can_be_animated(bound_elbow):
     assert animatable == {"fdda.mode", "fdda.strength"}
     with pytest.raises(TypeError, match="not animatable"):
         bound_elbow.fdda.keyframe_insert("use_in_render")
+
+
+def test_a_model_that_fails_in_an_overriding_mode_is_created_once(bound_elbow, elbow_files, monkeypatch):
+    """The failure sets the mode RIG, and the overriding mode must not start the model again and again."""
+    create, attempts = Player.__init__, []
+
+    def fail(*_: object) -> None:
+        attempts.append(1)
+        raise ModelError("The model is gone.")
+
+    bound_elbow.fdda.mode = "RIG"
+    pose(angle=1.0)
+    expected = evaluated_positions(bound_elbow)
+    monkeypatch.setattr(Player, "__init__", fail)
+    with temporary_mode(bound_elbow, "FDDA"):
+        for _ in range(3):
+            pose(angle=1.0)
+            assert np.array_equal(evaluated_positions(bound_elbow), expected)
+    assert len(attempts) == 1 and bound_elbow.fdda.status == "The model is gone."
+    monkeypatch.setattr(Player, "__init__", create)
+    with temporary_mode(bound_elbow, "FDDA"):
+        pose(angle=0.7)
+        assert_plays(bound_elbow, elbow_files.model)
