@@ -225,16 +225,20 @@ def reload_model(mesh_object: bpy.types.Object) -> None:
 
 
 def suspend() -> None:
-    """Show all rigs of the open file as if no model played; `resume` starts playback again.
+    """Show all rigs of the open file as if no model played; as many calls of `resume` start playback again.
 
     Linked objects are restored too, because Blender saves the differences of a library override from them.
     """
     scan()
     session.dispatch(Event.SUSPEND)
+    session.suspension_count += 1
 
 
 def resume() -> None:
-    """Play the models of the open file again."""
+    """Play the models of the open file again, unless another save has suspended them too."""
+    session.suspension_count = max(session.suspension_count - 1, 0)
+    if session.suspension_count:
+        return
     session.dispatch(Event.RESUME)
     session.scanned_count = -1
     scan()
@@ -256,8 +260,8 @@ def end_undo() -> None:
 def suspended_playback() -> Iterator[None]:
     """Show the rigs of the open file and remove our data in the block, so that parts of the file can be written."""
     suspend()
-    effects.remove_buffers()
     try:
+        effects.remove_buffers()
         yield
     finally:
         resume()

@@ -70,6 +70,8 @@ class PlaybackSession:
         packed_networks: the loaded packed models, by the session ids of their text datablocks.
         chosen_paths: paths of the models that the user chose since Blender started.
         scanned_count: number of objects in the file at the last scan; -1 to scan after the next evaluation.
+        suspension_count: number of saves that have begun and not ended. A handler of another add-on may save a copy
+            before Blender writes the file itself.
         skips_models: whether players keep their last positions instead of running models.
         is_switching: whether an animated mode is being applied.
         apply_effect: applies an effect to a character; `effects` sets it when it is imported.
@@ -88,6 +90,7 @@ class PlaybackSession:
         self.packed_networks: dict[int, Any] = {}
         self.chosen_paths: set[Path] = set()
         self.scanned_count = -1
+        self.suspension_count = 0
         self.skips_models = self.is_switching = False
         self.confidence: tuple | None = None
         self.apply_effect: Callable[[Effect, Character, FDDAError | None], None]
@@ -115,6 +118,7 @@ class PlaybackSession:
             keep_checks: keep the passed checks, because names still refer to the same datablocks.
         """
         self.confidence = None
+        self.suspension_count = 0
         for table in (self.characters, self.players, self.batches, self.moved_buffers):
             table.clear()
         self.scanned_count = self._count_without_bound = -1

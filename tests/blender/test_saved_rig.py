@@ -68,6 +68,28 @@ def test_saving_does_not_stop_the_playback(keyed, elbow_files):
     assert [m.show_viewport for m in keyed.modifiers] == [True, True, False]
 
 
+def test_a_handler_that_saves_a_backup_during_a_save(bound_elbow, elbow_files, tmp_path):
+    """Such a handler of another add-on runs after ours, so both files must get the rig."""
+
+    def back_up(*_: object) -> None:
+        bpy.app.handlers.save_pre.remove(back_up)
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "backup.blend"), copy=True)
+
+    bpy.app.handlers.save_pre.append(back_up)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"), copy=True)
+    pose(angle=0.8)
+    assert_plays(bound_elbow, elbow_files.model)
+    # The next save suspends and resumes too.
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "next.blend"), copy=True)
+    pose(angle=0.9)
+    assert_plays(bound_elbow, elbow_files.model)
+    fdda_addon.unregister()
+    for name in ("backup", "saved", "next"):
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / f"{name}.blend"))
+        shown = state(bpy.data.objects[ELBOW])[0]
+        assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}, name
+
+
 def test_a_save_that_fails_does_not_stop_the_playback(bound_elbow, elbow_files, tmp_path):
     folder = tmp_path / "taken.blend"
     folder.mkdir()
