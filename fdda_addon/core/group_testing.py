@@ -15,6 +15,12 @@ part have a known influence, which hides another one."""
 SECOND_NEARBY_WEIGHT = 0.01
 """Weight of a conflict between inputs that are near the same parts only through another input, relative to a conflict
 between nearby inputs."""
+CLEAR_TRIALS = 2
+"""Number of trials, or all if there are fewer, in which each pair of input and part is tested without a known influence
+on the part. An input may influence the part in one pose and not in another."""
+MIN_MARGINAL_CHANGE = 0.5
+"""Smallest change of a part, relative to the threshold, that may be above the threshold in another group: the changes
+of the members of a group add up or cancel each other."""
 SPLIT_GROUPS = 3
 """Smallest number of groups into which the members of a group are split."""
 
@@ -33,7 +39,7 @@ class GroupTesting:
 
     In a trial each input changes from the same state to the same value, in every group. The groups are the classes of a
     coloring of the graph that connects inputs which are likely to influence the same part. Each pair of input and part
-    is tested in at least one trial without a known influence on the part.
+    is tested in `CLEAR_TRIALS` trials without a known influence on the part.
 
     Attributes:
         influences: (N, P) bool, the influences found so far.
@@ -52,6 +58,8 @@ class GroupTesting:
         self._second_nearby = _count_shared_parts(nearby, nearby) @ nearby > 0
         # Each group of an input changed the part, in this trial.
         self._candidates = np.ones((trial_count, *nearby.shape), bool)
+        # A group of an input did not change the part, but each changed it by more than `MIN_MARGINAL_CHANGE`.
+        self._marginal = np.zeros_like(self._candidates)
         self._unexplained: list[_Answer] = []
         self._separation_counts = [0] * trial_count
         # A fixed seed: each run finds the same influences.
@@ -67,13 +75,17 @@ class GroupTesting:
         conflicts += SECOND_NEARBY_WEIGHT * _count_shared_parts(self._second_nearby, self._second_nearby)
         return self._color(np.ones(input_count, bool), conflicts, group_count)
 
-    def add_answers(self, trial: int, groups: list[np.ndarray], answers: np.ndarray) -> None:
-        """Add the answers to groups of a trial: (G, P) bool, whether changing a group changed a part."""
-        for group, parts in zip(groups, answers, strict=True):
-            candidates = self._candidates[trial][group]
-            # Small changes may add up in a group, so the last candidate is a cause only after a test without others.
-            self.influences[group] |= candidates & parts & (candidates.sum(axis=0) == 1)
+    def add_changes(self, trial: int, groups: list[np.ndarray], changes: np.ndarray) -> None:
+        """Add what groups of a trial changed: (G, P) float, change of each part relative to the threshold."""
+        for group, part_changes in zip(groups, changes, strict=True):
+            parts, candidates = part_changes > 1, self._candidates[trial][group]
+            # Small changes may add up in a group, so the last candidate is a cause only after a test without others. A
+            # marginal member may be the cause, although it was ruled out.
+            is_clear = candidates.sum(axis=0) + self._marginal[trial][group].sum(axis=0) == 1
+            self.influences[group] |= candidates & parts & is_clear
+            possible = (candidates | self._marginal[trial][group]) & (part_changes > MIN_MARGINAL_CHANGE)
             self._candidates[trial][group] = candidates & parts
+            self._marginal[trial][group] = possible & ~(candidates & parts)
             self._unexplained.append(_Answer(trial, group, parts))
 
     def next_groups(self) -> tuple[int, list[np.ndarray]] | None:
@@ -87,8 +99,7 @@ class GroupTesting:
             open_counts[answer.trial] += self._suspects(answer).any(axis=0).sum()
         trial = int(open_counts.argmax())
         if not open_counts[trial]:
-            hidden = self._candidates.all(axis=0) & ~self.influences
-            return (0, self._separate(hidden, SPLIT_GROUPS)) if hidden.any() else None
+            return self._next_groups_of_hidden()
         self._separation_counts[trial] += 1
         suspects, likely_causes = np.zeros_like(self._nearby), np.zeros_like(self._nearby)
         scores = (
@@ -101,23 +112,38 @@ class GroupTesting:
                 ranks = np.where(suspects_in_group, scores[answer.group], 0)
                 likely_causes[answer.group] |= suspects_in_group & (ranks == ranks.max(axis=0))
         if self._separation_counts[trial] % 2:
-            return trial, self._separate(likely_causes, 1, likely_causes)
-        return trial, self._separate(suspects, SPLIT_GROUPS)
+            return trial, self._separate(trial, likely_causes, 1, likely_causes)
+        return trial, self._separate(trial, suspects, SPLIT_GROUPS)
+
+    def _next_groups_of_hidden(self) -> tuple[int, list[np.ndarray]] | None:
+        """Return groups for inputs that known influences hide in too many trials; None without such inputs."""
+        trial_count = len(self._candidates)
+        hidden = self._candidates.sum(axis=0) > trial_count - min(CLEAR_TRIALS, trial_count)
+        hidden_in_trials = self._candidates & hidden & ~self.influences
+        trial = int(hidden_in_trials.sum(axis=(1, 2)).argmax())
+        if not hidden_in_trials[trial].any():
+            return None
+        return trial, self._separate(trial, hidden_in_trials[trial], SPLIT_GROUPS)
 
     def _suspects(self, answer: _Answer) -> np.ndarray:
         """Return (G, P) bool: members of a group that may have changed a part that no known influence has changed."""
         candidates = self._candidates[answer.trial][answer.group]
         return candidates & answer.parts & ~(candidates & self.influences[answer.group]).any(axis=0)
 
-    def _separate(self, tested: np.ndarray, group_count: int, apart: np.ndarray | None = None) -> list[np.ndarray]:
+    def _separate(
+        self, trial: int, tested: np.ndarray, group_count: int, apart: np.ndarray | None = None
+    ) -> list[np.ndarray]:
         """Divide the inputs of (N, P) tested pairs into groups without influences on the parts of the pairs.
 
         Args:
+            trial: the trial of the groups, whose marginal inputs are kept apart, too.
             tested: (N, P) bool.
             group_count: smallest number of groups.
             apart: (N, P) bool, more inputs that are not in one group with a tested input of the same part.
         """
-        others = self.influences if apart is None else self.influences | apart
+        others = self.influences | self._marginal[trial]
+        if apart is not None:
+            others |= apart
         conflicts = _count_shared_parts(tested, others)
         return self._color(tested.any(axis=1), conflicts + conflicts.T, group_count, is_strict=True)
 

@@ -73,10 +73,10 @@ def _test_groups(
     divisions = [testing.divide_inputs() for _ in range(trial_count)]
     evaluation.expect(trial_count + sum(map(len, divisions)))
     for trial, groups in enumerate(divisions):
-        testing.add_answers(trial, groups, (yield from evaluation.evaluate(trial, groups)))
+        testing.add_changes(trial, groups, (yield from evaluation.evaluate(trial, groups)))
     while (test := testing.next_groups()) is not None:
         evaluation.expect(len(test[1]))
-        testing.add_answers(*test, (yield from evaluation.evaluate(*test)))
+        testing.add_changes(*test, (yield from evaluation.evaluate(*test)))
     return testing.influences
 
 
@@ -107,7 +107,7 @@ class _GroupEvaluation:
         self._total += count
 
     def evaluate(self, trial: int, groups: list[np.ndarray]) -> Generator[Progress, None, np.ndarray]:
-        """Evaluate groups in a trial, and return which patches each group changed, (G, Q) bool."""
+        """Evaluate groups in a trial; return the change of each patch relative to the threshold, (G, Q) float32."""
         if trial not in self._base_residuals:
             self._trials.show(trial, ())
             self._base_residuals[trial] = self._residuals([self._evaluator.evaluate()[:2]])
@@ -121,7 +121,7 @@ class _GroupEvaluation:
                 changes.append(self._patches.max_changes(residuals, self._base_residuals[trial]))
                 evaluated_poses = []
             yield self._progress()
-        return np.concatenate(changes) > self._threshold
+        return np.concatenate(changes) / self._threshold
 
     def _progress(self) -> Progress:
         self._done += 1
