@@ -9,6 +9,7 @@ import pytest
 from fdda_addon.runtime.transitions import SHOWS_MODEL, TABLE, Effect, Event, State, transition
 
 ALL_PAIRS = [(state, event) for state in State for event in Event]
+BOUND_STATES = set(State) - {State.UNBOUND}
 WALKS, WALK_LENGTH = 300, 200
 
 
@@ -98,10 +99,11 @@ def test_each_pair_leads_to_a_state_that_its_effects_prepare(state: State, event
 def walk_to(state: State) -> Walk:
     """Return a character in a state, reached by events from the start."""
     paths: dict[State, list[Event]] = {State.UNBOUND: []}
-    while state not in paths:
+    for _ in State:
         for each, path in list(paths.items()):
             for event in Event:
                 paths.setdefault(transition(each, event).state, [*path, event])
+    assert state in paths, f"no events lead to {state.name}"
     walk = Walk()
     for event in paths[state]:
         walk.dispatch(event)
@@ -118,30 +120,48 @@ def test_random_walks_keep_state_and_scene_together():
 
 def test_every_state_is_reachable_and_every_bound_character_can_play_again():
     assert reachable(State.UNBOUND) == set(State)
-    for state in set(State) - {State.UNBOUND}:
+    for state in BOUND_STATES:
         assert State.PLAYING in reachable(state), f"a character is frozen in {state.name}"
         assert State.UNBOUND in reachable(state)
 
 
-def test_what_users_expect():
-    """The mode decides, a written file shows rigs, and a failure stays until the user acts."""
-    expected = {
-        (State.BOUND, Event.CHOOSE_MODEL): State.PLAYING,
-        (State.BOUND, Event.ANIMATE_MODEL): State.PLAYING,
-        (State.BOUND, Event.RESUME): State.BOUND,
-        (State.PLAYING, Event.SUSPEND): State.SUSPENDED,
-        (State.EDITED, Event.SUSPEND): State.SUSPENDED,
-        (State.SUSPENDED, Event.RESUME): State.PLAYING,
-        (State.SUSPENDED, Event.CHOOSE_MODEL): State.SUSPENDED,
-        (State.FAILED, Event.ANIMATE_MODEL): State.FAILED,
-        (State.FAILED, Event.RESUME): State.FAILED,
-        (State.FAILED, Event.CHECK): State.FAILED,
-        (State.FAILED, Event.CHOOSE_MODEL): State.PLAYING,
-    }
+NEXT_STATES = {
+    Event.BIND: {State.BOUND: {State.UNBOUND}},
+    Event.UNBIND: {State.UNBOUND: BOUND_STATES},
+    Event.CHOOSE_MODEL: {State.PLAYING: {State.BOUND, State.FAILED}},
+    Event.ANIMATE_MODEL: {State.PLAYING: {State.BOUND}},
+    Event.SHOW_RIG: {State.BOUND: SHOWS_MODEL | {State.SUSPENDED}},
+    Event.SUSPEND: {State.SUSPENDED: SHOWS_MODEL},
+    Event.RESUME: {State.PLAYING: {State.SUSPENDED}},
+    Event.CHANGE: {State.CHANGED: {State.PLAYING}},
+    Event.CHECK: {State.PLAYING: {State.CHANGED}},
+    Event.EDIT: {State.EDITED: {State.PLAYING, State.CHANGED}},
+    Event.LEAVE_EDIT: {State.PLAYING: {State.EDITED}},
+    Event.OUTDATE: {State.PLAYING: SHOWS_MODEL},
+    Event.FAIL: {State.FAILED: BOUND_STATES},
+}
+"""What users expect: the mode decides, a written file shows rigs, and a failure stays until the user acts.
+
+By event: the next states, each with the former states that the event changes to it. All other states stay.
+"""
+
+
+@pytest.mark.parametrize("event", Event, ids=lambda event: event.name.lower())
+def test_what_users_expect(event: Event):
+    expected = {state: state for state in State}
+    for following, former_states in NEXT_STATES[event].items():
+        expected |= dict.fromkeys(former_states, following)
+    assert {state: transition(state, event).state for state in State} == expected
+
+
+def test_changes_are_checked_later_outdated_players_are_created_again_and_failures_show_the_rig():
+    for state in (State.PLAYING, State.CHANGED):
+        assert Effect.SCHEDULE_CHECK in transition(state, Event.CHANGE).effects, state
     for state in SHOWS_MODEL:
-        expected[state, Event.SHOW_RIG] = State.BOUND
-        expected[state, Event.FAIL] = State.FAILED
-    assert {pair: transition(*pair).state for pair in expected} == expected
+        assert Effect.CREATE_PLAYER in transition(state, Event.OUTDATE).effects, state
+    # A suspended character shows its rig already, and the modifiers of a bound one may be half switched.
+    for state in SHOWS_MODEL | {State.BOUND}:
+        assert Effect.SHOW_RIG in transition(state, Event.FAIL).effects, state
 
 
 def test_a_changed_or_edited_rig_is_checked_before_the_model_counts_as_checked():
