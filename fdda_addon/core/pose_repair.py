@@ -16,9 +16,12 @@ def repair_pose(pose_matrices: np.ndarray, info: ModelInfo) -> tuple[np.ndarray,
     Returns:
         (J, 4, 4) float32, mesh-object space; and the name of the first joint that was replaced.
     """
-    skin_matrices = pose_matrices @ np.linalg.inv(info.rest_matrices)
+    rest_matrices = info.rest_matrices.astype(np.float64)
+    skin_matrices = pose_matrices @ np.linalg.inv(rest_matrices)
     is_finite = np.isfinite(skin_matrices).all(axis=(1, 2))
     for joint in np.flatnonzero(~is_finite):
         parent = info.joints[joint].parent  # Already repaired, because parents come before their children.
         skin_matrices[joint] = skin_matrices[parent] if parent >= 0 else np.eye(4)
-    return (skin_matrices @ info.rest_matrices).astype(np.float32), info.joints[int(np.argmin(is_finite))].name
+    repaired = pose_matrices.copy()
+    repaired[~is_finite] = (skin_matrices @ rest_matrices)[~is_finite]
+    return repaired, info.joints[int(np.argmin(is_finite))].name
