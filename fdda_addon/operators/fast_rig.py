@@ -7,7 +7,8 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import FDDAError, OutputError, RigError
+from ..core.errors import FDDAError, OutputError, RigError, os_error_text
+from ..core.model import read_model
 from ..scene.scene_rig import SceneRig
 from .confirm import ConfirmFirst
 from .playback import ModelOperator
@@ -83,7 +84,7 @@ class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
             raise RigError("No controls were chosen; keep the visible or keyed bones, or those of a bone collection.")
         if not self.filepath:
             raise OutputError("No file was chosen; give the name of a .blend file.")
-        out = Path(bpy.path.abspath(self.filepath)).with_suffix(".blend")
+        out = bpy.path.ensure_ext(bpy.path.abspath(self.filepath), ".blend")
         mesh_objects = [
             o
             for o in context.scene.objects
@@ -91,8 +92,8 @@ class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
         ]
         with tempfile.TemporaryDirectory(prefix="fdda-") as folder:
             model = _write_models(mesh_objects, Path(folder))
-            names = ["--object", mesh_objects[0].name] if len(mesh_objects) == 1 else []
-            arguments = [bpy.data.filepath, str(model), str(out), *names, "--controls", *choices]
+            names = [f"--object={mesh_objects[0].name}"] if len(mesh_objects) == 1 else []
+            arguments = [bpy.data.filepath, str(model), out, *names, "--controls", *choices]
             with FastRigProcess(arguments) as process:
                 yield from process.steps()
 
@@ -131,15 +132,24 @@ def _write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
     """Return the file of the only model, or write the models of several meshes into a folder and return it.
 
     A packed model has no file that could be read.
+
+    Raises:
+        ModelError: a model cannot be read.
+        OutputError: a file cannot be written.
     """
     from ..runtime import packed_model
     from ..runtime.model_files import model_path
 
-    for mesh_object in mesh_objects:
+    for index, mesh_object in enumerate(mesh_objects):
         binding = mesh_object.fdda
-        data = packed_model.read(binding.packed) if binding.packed else model_path(mesh_object).read_bytes()
-        file = folder / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
-        file.write_bytes(data)
+        data = packed_model.read(binding.packed) if binding.packed else read_model(model_path(mesh_object))[1]
+        # Clean names of different objects may be equal.
+        file = folder / str(index) / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
+        try:
+            file.parent.mkdir()
+            file.write_bytes(data)
+        except OSError as error:
+            raise OutputError(f"Cannot write '{file}': {os_error_text(error)}.") from error
     return file if len(mesh_objects) == 1 else folder
 
 

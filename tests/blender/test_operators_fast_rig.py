@@ -9,6 +9,7 @@ import pytest
 from fdda_addon.core.progress import Progress
 from fdda_addon.fast_rig.process import FastRigProcess
 from fdda_addon.jobs import job
+from fdda_addon.operators.fast_rig import _write_models
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
 from .test_operators_playback import refused
@@ -65,3 +66,18 @@ def test_unsaved_files_and_missing_choices_are_refused(saved):
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, visible=False, keyed=False), "No controls were chosen")
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, collection="Faces"), "has no bone collection 'Faces'")
     refused(bpy.ops.fdda.fast_rig, "No file was chosen; give the name of a .blend file.")
+
+
+def test_a_point_in_the_name_of_the_file_is_kept(saved):
+    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.v2")) == {"FINISHED"}
+    assert (saved / "fast.v2.blend").is_file() and not (saved / "fast.blend").exists()
+
+
+def test_meshes_whose_clean_names_are_equal_keep_their_models(saved, tmp_path_factory):
+    mesh_object = bpy.data.objects[ELBOW]
+    other = mesh_object.copy()
+    bpy.context.scene.collection.objects.link(other)
+    mesh_object.name, other.name = "left arm", "left_arm"
+    folder = tmp_path_factory.mktemp("models")
+    assert _write_models([mesh_object, other], folder) == folder
+    assert len(list(folder.glob("*/*.onnx"))) == 2
