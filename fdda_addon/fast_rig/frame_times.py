@@ -2,6 +2,7 @@
 """Times the frames of a full rig and of its fast rig, by opening both files in turns."""
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,42 +72,56 @@ def measure_frames(
     """
     times: dict[Path, list[float]] = {full: [], fast: []}
     frames_per_round = max(1, -(-frames // ROUNDS))
+    action_name = None
     for round_index in range(ROUNDS):
-        for index, path in enumerate((full, fast)):
-            times[path] += _time_file(path, object_name, controls, size, frames_per_round, round_index, path == full)
+        # The fast rig first: the full rig may have further actions, which key only removed bones.
+        for index, path in enumerate((fast, full)):
+            calls_range = range(round_index * frames_per_round - WARM_UP_FRAMES, (round_index + 1) * frames_per_round)
+            armature_object = _open_rig(path, object_name)
+            if action_name is None:
+                action_name = _action_name(armature_object)
+            calls = _frame_calls(armature_object, action_name, controls, size, calls_range)
+            times[path] += _time_calls(calls, shows_rig=path == full)
             yield Progress("frames", 2 * round_index + index + 1, 2 * ROUNDS)
     yield RigTimes(tuple(times[full]), tuple(times[fast]))
 
 
-def _time_file(
-    path: Path,
-    object_name: str,
-    controls: tuple[str, ...],
-    size: float,
-    count: int,
-    round_index: int,
-    shows_rig: bool,
-) -> list[float]:
+def _open_rig(path: Path, object_name: str) -> bpy.types.Object:
+    """Open a file, and return the armature object of its rig."""
     try:
         with silenced_stdout():
             bpy.ops.wm.open_mainfile(filepath=blender_path(path), load_ui=False)
     except RuntimeError as error:
         raise FDDAError(f"Blender cannot open '{path}' ({report_message(error)}).") from error
-    scene_rig = find_rig(object_name)
-    armature_object = scene_rig.armature_object
+    return find_rig(object_name).armature_object
+
+
+def _action_name(armature_object: bpy.types.Object) -> str:
+    """Return the name of the action to play: the assigned one, or the first that keys bones; empty if there is none."""
     animation = armature_object.animation_data
     actions = animating_actions(armature_object)
     action = animation.action if animation and animation.action in actions else next(iter(actions), None)
-    indices = range(round_index * count - WARM_UP_FRAMES, (round_index + 1) * count)
-    if action is not None:
-        assign_action(armature_object, action)
-        frames = action_frames(action)
-        calls = [_frame_setter(frames[index % len(frames)]) for index in indices]
-    else:
-        calls = [_pose_setter(armature_object, controls, size, index + WARM_UP_FRAMES) for index in indices]
-    if not shows_rig:
-        return time_calls(calls)[WARM_UP_FRAMES:]
-    with model_disabled(scene_rig.mesh_object):
+    return action.name if action else ""
+
+
+def _frame_calls(
+    armature_object: bpy.types.Object, action_name: str, controls: tuple[str, ...], size: float, indices: range
+) -> list[Callable[[], None]]:
+    """Return functions that show frames of an action, or random poses if its name is empty; one for each index."""
+    if not action_name:
+        return [_pose_setter(armature_object, controls, size, index + WARM_UP_FRAMES) for index in indices]
+    action = bpy.data.actions[action_name]
+    assign_action(armature_object, action)
+    frames = action_frames(action)
+    return [_frame_setter(frames[index % len(frames)]) for index in indices]
+
+
+def _time_calls(calls: list[Callable[[], None]], shows_rig: bool) -> list[float]:
+    """Time the calls after those that warm up, in milliseconds, with all models or with all rigs in their place."""
+    with ExitStack() as exit_stack:
+        for scene_object in bpy.context.scene.objects if shows_rig else ():
+            if scene_object.type == "MESH" and scene_object.fdda.is_bound:
+                exit_stack.enter_context(model_disabled(scene_object))
         return time_calls(calls)[WARM_UP_FRAMES:]
 
 

@@ -34,6 +34,8 @@ def read_graph(scene_rigs: list[SceneRig], replaced_modifiers: dict[str, set[str
     for datablock, used in _used_datablocks().items():
         node = datablock_node(datablock)
         if isinstance(datablock, _UNFOLLOWED_TYPES):
+            # A driven property of a scene counts where another driver reads it.
+            add_drivers(graph, datablock, ("",))
             continue
         if datablock in mesh_objects:
             replaced = replaced_modifiers[datablock.name]

@@ -10,6 +10,7 @@ import pytest
 
 from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
+from fdda_addon.fast_rig import frame_times
 from fdda_addon.fast_rig import run as fast_rig_run
 from fdda_addon.fast_rig.bone_reader import bone_node
 from fdda_addon.fast_rig.controls import control_bones
@@ -17,8 +18,11 @@ from fdda_addon.fast_rig.dependency_graph import Node
 from fdda_addon.fast_rig.graph_reader import read_graph
 from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, evaluate_joints
 from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
+from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.scene.temporary_state import assign_action
+from fdda_addon.timing.benchmark import time_calls
 
 from .command_output import output_of
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, run, train
@@ -175,6 +179,46 @@ def test_keyed_controls_lose_no_channels(folder):
     assert len(lines) == 3
     bpy.ops.wm.open_mainfile(filepath=str(folder / "fast.blend"))
     assert UNUSED in bpy.data.objects[ELBOW_RIG].data.bones
+
+
+def test_both_rigs_play_the_same_action_without_the_models_of_the_full_rig(folder, monkeypatch):
+    """The full rig has an action more, which keys only removed bones, and a second bound mesh."""
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
+    wave(bpy.data.objects[ELBOW_RIG], UNUSED).name = "a first action"
+    bind(find_rig(ELBOW), folder / "model.onnx")
+    bpy.data.collections[CHARACTER].objects.link(bpy.data.objects[ELBOW].copy())
+    bpy.ops.wm.save_mainfile()
+    played, models = [], []
+
+    def assign(armature_object, action):
+        played.append(action.name)
+        assign_action(armature_object, action)
+
+    def count_models(calls):
+        bpy.context.view_layer.update()
+        models.append(sum(m.type == "NODES" and m.show_viewport for o in bpy.data.objects for m in o.modifiers))
+        return time_calls(calls)
+
+    monkeypatch.setattr(frame_times, "assign_action", assign)
+    monkeypatch.setattr(frame_times, "time_calls", count_models)
+    assert run(*fast_rig_arguments(folder, "--controls", "visible", "--frames", 3)) == 0
+    assert set(played) == {f"{ACTION} control"}
+    assert sorted(set(models)) == [0, 2]
+
+
+def test_a_driven_property_of_the_scene_is_followed():
+    scene_rig = SceneRig(*studio_arm("target"))
+    armature_object, scene = scene_rig.armature_object, bpy.context.scene
+    scene["bend"] = 0.0
+    for owner, target_id, path in (
+        (scene.driver_add('["bend"]'), armature_object, f'pose.bones["{UNUSED}"].location[0]'),
+        (armature_object.pose.bones["lower"].driver_add("rotation_euler", 0), scene, '["bend"]'),
+    ):
+        owner.driver.type = "SUM"
+        target = owner.driver.variables.new().targets[0]
+        target.id_type = target_id.id_type
+        target.id, target.data_path = target_id, path
+    assert bone_node(armature_object, UNUSED) in kept_for_joints(scene_rig)[1]
 
 
 def test_bones_that_differ_are_named_and_nothing_is_written(folder, monkeypatch, capsys):
