@@ -137,8 +137,10 @@ def describe_control_bones(
     armature_object: bpy.types.Object, names: Iterable[str], controls: tuple[Control, ...]
 ) -> str:
     """Return a sentence with the number of inputs of control bones, and one that names locations without a range."""
-    bones = {control.path.partition("]")[0] for control in controls}
-    sentence = f"{len(bones)} control bones with {len(controls)} inputs."
+    names = frozenset(names)
+    bone_paths = [armature_object.pose.bones[name].path_from_id() for name in names]
+    moving_count = sum(any(control.path.startswith(path) for control in controls) for path in bone_paths)
+    sentence = f"{moving_count} control bones with {len(controls)} inputs."
     unlimited = bones_without_location_range(armature_object, names, controls)
     if not unlimited:
         return sentence

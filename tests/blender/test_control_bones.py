@@ -13,7 +13,11 @@ from blend_fixtures.characters.targets import TARGET
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.poses.control_bones import bones_without_location_range, rotation_elements
+from fdda_addon.poses.control_bones import (
+    bones_without_location_range,
+    describe_control_bones,
+    rotation_elements,
+)
 from fdda_addon.recording.plan import RecordingSettings, listed_controls, read_sampled_rig
 from fdda_addon.runtime import driver
 from fdda_addon.scene.blend_file import save_copy
@@ -231,3 +235,11 @@ def test_sixty_control_bones_are_read_through_sixty_dependencies():
 def test_a_collection_takes_no_range(face):
     with pytest.raises(RigError, match="has no bone collection 'Face=0:1'"):
         listed_controls(face, RecordingSettings(controls=(f"{FACE}=0:1",)))
+
+
+def test_control_bones_with_brackets_in_their_names_are_counted_one_by_one(face):
+    bones = face.armature_object.pose.bones
+    bones["eye"].name, bones["lid"].name = "upper]eye", "upper]lid"
+    controls = listed_controls(face, RecordingSettings(controls=("bone:upper]eye", "bone:upper]lid")))
+    sentence = describe_control_bones(face.armature_object, ["upper]eye", "upper]lid"], controls)
+    assert sentence.startswith("2 control bones with 8 inputs.")
