@@ -166,8 +166,10 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER)
     parser.add_argument("--poses", type=int, default=1000)
     parser.add_argument("--epochs", type=int, default=200)
-    parser.add_argument("--only", nargs="+", help="names of characters, without their extension")
-    parser.add_argument("--write", action="store_true", help="write the table to docs/characters.md")
+    # The table of some characters must not replace that of all.
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--only", nargs="+", help="names of characters, without their extension")
+    group.add_argument("--write", action="store_true", help="write the table to docs/characters.md")
     options = parser.parse_args()
     sources = sorted(path for path in options.folder.glob("*") if path.suffix in {".glb", ".gltf", ".blend"})
     if options.only:
