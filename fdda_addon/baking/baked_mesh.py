@@ -53,6 +53,8 @@ def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
     object_copy = mesh_object.copy().make_local()
     unbind(object_copy)
     object_copy.fdda.models.clear()
+    # Blender forgets the active object if it is replaced while the view layer is outdated.
+    bpy.context.view_layer.update()
     # With a fake user the original object would be saved too.
     with temporary_attributes(mesh_object, use_fake_user=False), _packed_models_unused(mesh_object):
         mesh_object.user_remap(object_copy)

@@ -50,7 +50,7 @@ class Patches:
             np.arange(len(self.starts)), np.diff(np.append(self.starts, len(self.vertices)))
         )
         next_corners = np.arange(1, len(rig.face_vertices) + 1)
-        next_corners[np.append(rig.face_starts[1:], len(rig.face_vertices)) - 1] = rig.face_starts
+        next_corners[np.roll(rig.face_starts, -1) - 1] = rig.face_starts  # After the last corner comes the first one.
         first, second = rig.face_vertices, rig.face_vertices[next_corners]
         every = np.arange(rig.vertex_count)
         weighted, near = np.concatenate([every, first, second]), np.concatenate([every, second, first])

@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import model_files
+from fdda_addon.runtime.session import session
 
 from ..systems import WINDOWS
 from .conftest import assert_plays, pose
@@ -196,7 +196,7 @@ def test_the_zip_is_small_and_declares_its_permissions(package: Path):
 def test_a_bound_file_shows_its_rig_without_onnx_runtime(elbow_files, monkeypatch: pytest.MonkeyPatch):
     """No wheel of the extension may fit the Python of a Blender."""
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.setattr(model_files, "_networks", {})
+    monkeypatch.setattr(session, "networks", {})
     bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
     mesh_object = bpy.data.objects["elbow"]
     pose(angle=1.0)
