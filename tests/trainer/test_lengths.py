@@ -33,6 +33,8 @@ UNITS_AND_DISTANCES = {
     "100 meters away": (1.0, 100.0),
     "millimeters, 100 meters away": (1000.0, 100.0),
 }
+STABLE_OPTIONS = ("--epochs", "80", "--learning-rate", "0.003")
+"""At the default learning rate, short trainings multiply rounding errors: equal errors then differ by a tenth."""
 OTHER_UNITS = [name for name in UNITS_AND_DISTANCES if name != METER]
 
 
@@ -65,7 +67,7 @@ def results_by_unit(tmp_path_factory) -> dict:
         path.mkdir()
         write_recording(path / "recording", *unit_and_distance)
         model = path / "m.onnx"
-        assert main([str(path / "recording"), str(model), *QUICK_OPTIONS]) == 0, name
+        assert main([str(path / "recording"), str(model), *QUICK_OPTIONS, *STABLE_OPTIONS]) == 0, name
         report = json.loads(report_path(model).read_text())
         results[name] = read_recording(path / "recording"), report, read_model_info(model)
     return results
@@ -108,10 +110,7 @@ def test_models_have_the_same_errors(results_by_unit, name):
     step = 1000 * float(np.spacing(np.float32(UNITS_AND_DISTANCES[name][1])))
     for method in ("fdda", "linear"):
         for statistic, value in reference[method]["held_out"].items():
-            assert report[method]["held_out"][statistic] == pytest.approx(value, rel=0.15, abs=step), (
-                method,
-                statistic,
-            )
+            assert report[method]["held_out"][statistic] == pytest.approx(value, rel=0.1, abs=step), (method, statistic)
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)

@@ -27,7 +27,6 @@ READ_ERRORS = (
     *(RuntimeError, IndexError, *NPY_HEADER_ERRORS),
 )
 """Errors that numpy and zipfile raise for a damaged file. RuntimeError is for an encrypted archive."""
-OTHER_PARTITIONS_SENTENCE = "The checkpoint is of other partitions; train without --warm-start."
 CONTRADICTION_CLAUSE = "its arrays contradict each other"
 NOT_FINITE_CLAUSE = "its arrays hold values that are not numbers"
 
@@ -59,7 +58,7 @@ class Checkpoint:
     Attributes:
         fingerprint: fingerprint of the rig.
         controls: names of the rig's controls.
-        holdout: fingerprint of the held-out and validation poses (`splitting.holdout_fingerprint`).
+        holdout: fingerprint of the held-out and validation poses (`data.split.holdout_fingerprint`).
         hidden, activation: layers and activation of the networks, as in `TrainingConfig`.
         history: pose count and held-out error of this training and its predecessors, oldest first:
             `{"poses", "p999"}`, mm.

@@ -17,7 +17,7 @@ from fdda_addon.core.report import checkpoint_path
 from ..config import TrainingConfig
 from ..inputs.network_inputs import check_states
 from ..preparation import PreparedPartition
-from .checkpoint import OTHER_PARTITIONS_SENTENCE, Checkpoint, PartitionCheckpoint, read_checkpoint
+from .checkpoint import Checkpoint, PartitionCheckpoint, read_checkpoint
 from .networks import Network
 
 WARM_START_EPOCHS_RATIO, WARM_START_RATE_RATIO = 0.5, 0.3
@@ -87,7 +87,7 @@ def initial_networks(
     """
     sizes = [3 * partition.vertex_count for partition in prepared]
     if sizes != [len(partition.basis_mean) for partition in checkpoint.partitions]:
-        raise TrainingError(OTHER_PARTITIONS_SENTENCE)
+        raise TrainingError("The checkpoint is of other partitions; train without --warm-start.")
     return [_convert_network(*arguments) for arguments in zip(checkpoint.partitions, prepared, columns, strict=True)]
 
 
