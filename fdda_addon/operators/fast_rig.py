@@ -8,7 +8,6 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, OutputError, RigError, os_error_text
-from ..core.model import read_model
 from ..scene.scene_rig import SceneRig
 from .confirm import ConfirmFirst
 from .playback import ModelOperator
@@ -137,6 +136,7 @@ def _write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
         ModelError: a model cannot be read.
         OutputError: a file cannot be written.
     """
+    from ..core.model import read_model
     from ..runtime import packed_model
     from ..runtime.model_files import model_path
 

@@ -6,6 +6,7 @@ Blender then remaps the paths of its own data, but not the paths that an add-on 
 
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
@@ -14,9 +15,22 @@ from bpy.app.handlers import persistent
 RELATIVE_PREFIX = "//"
 """Start of a path that is relative to the folder of the .blend file."""
 
-_remapped_paths: list[tuple[bpy.types.PropertyGroup, str, str]] = []
-"""Property groups, property names and previous values of the paths that are remapped during a save."""
-_path_before_save = ""
+
+@dataclass
+class _RunningSave:
+    """A save between `save_pre` and `save_post`.
+
+    Attributes:
+        path_before: path of the open file before the save.
+        paths: property group, property name, previous value and remapped value of each remapped path.
+    """
+
+    path_before: str
+    paths: list[tuple[bpy.types.PropertyGroup, str, str, str]] = field(default_factory=list)
+
+
+_running_saves: list[_RunningSave] = []
+"""The running save; more than one if a handler of another add-on saves a copy during a save."""
 
 
 def resolve_path(stored: str, library: bpy.types.Library | None = None) -> Path:
@@ -99,28 +113,35 @@ def _relative(path: Path, folder: Path) -> str:
 
 @persistent
 def _on_save_pre(file_path: str = "", *_: object) -> None:
-    global _path_before_save
-    _remapped_paths.clear()
-    _path_before_save = bpy.data.filepath
+    if _running_saves:
+        # A handler of another add-on saves a backup: its paths are computed from the paths before the outer save.
+        for owner, name, stored, _remapped in _running_saves[-1].paths:
+            setattr(owner, name, stored)
+    save = _RunningSave(bpy.data.filepath)
+    _running_saves.append(save)
     folder = Path(os.path.abspath(file_path)).parent
-    if not file_path or (_path_before_save and folder == Path(os.path.normpath(_path_before_save)).parent):
+    if not file_path or (save.path_before and folder == Path(os.path.normpath(save.path_before)).parent):
         return
     for mesh_object, owner, name in _own_paths():
         stored = getattr(owner, name)
         path = Path(os.path.normpath(resolve_path(stored)))
         # Absolute paths stay absolute, except paths into the folder into which the file is saved.
-        if (stored.startswith(RELATIVE_PREFIX) and _path_before_save) or path.is_relative_to(folder):
-            _remapped_paths.append((owner, name, stored))
-            setattr(owner, name, _distinct_from_inherited(mesh_object, _relative(path, folder)))
+        if (stored.startswith(RELATIVE_PREFIX) and save.path_before) or path.is_relative_to(folder):
+            remapped = _distinct_from_inherited(mesh_object, _relative(path, folder))
+            save.paths.append((owner, name, stored, remapped))
+            setattr(owner, name, remapped)
 
 
 @persistent
 def _on_save_post(*_: object) -> None:
+    save = _running_saves.pop()
     # If a copy was saved or the save failed, the open file still has its previous path.
-    if bpy.data.filepath == _path_before_save:
-        for owner, name, stored in _remapped_paths:
+    if bpy.data.filepath == save.path_before:
+        for owner, name, stored, _remapped in save.paths:
             setattr(owner, name, stored)
-    _remapped_paths.clear()
+    if _running_saves:
+        for owner, name, _stored, remapped in _running_saves[-1].paths:
+            setattr(owner, name, remapped)
 
 
 HANDLERS = {"save_pre": _on_save_pre, "save_post": _on_save_post, "save_post_fail": _on_save_post}
