@@ -59,9 +59,9 @@ def test_the_obj_file_has_the_faces_of_the_recording(chain: Character, tmp_path:
 
 
 def test_the_confidence_is_printed_and_falls_outside_the_trained_range(chain: Character, tmp_path: Path):
-    inside, outside = (
-        run_example(tmp_path, chain.model, "a.obj", "--turn", "bone_1", angle, 0, 0) for angle in (20, 170)
-    )
+    inside = run_example(tmp_path, chain.model, "a.obj", "--turn", "bone_1", 20, 0, 0)
+    turns = [option for bone in ("bone_1", "bone_2") for option in ("--turn", bone, 170, 0, 0)]
+    outside = run_example(tmp_path, chain.model, "a.obj", *turns)
     assert inside.stdout == "a.obj: 90 vertices, confidence 1.00\n"
     assert float(outside.stdout.removeprefix("a.obj: 90 vertices, confidence ")) < 0.9
 
