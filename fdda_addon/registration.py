@@ -68,10 +68,10 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
     from .operators import training
     from .panels import checks
     from .runtime import handlers
-    from .scene import stored_paths, undo
+    from .scene import stored_paths, undo, unkeyed_changes
 
     # Paths must be restored before models are loaded, so `stored_paths` is the first module.
-    modules = (stored_paths, undo, job, checks, handlers, reopening, side_by_side, training)
+    modules = (stored_paths, undo, unkeyed_changes, job, checks, handlers, reopening, side_by_side, training)
     return [entry for module in modules for entry in module.HANDLERS.items()]
 
 

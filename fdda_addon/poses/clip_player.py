@@ -9,12 +9,13 @@ import bpy
 import numpy as np
 
 from ..core.recording.index import ACTION
+from ..scene.animated_values import animated_values, driving_actions, read_value, set_value
 from ..scene.armature import clear_pose
 from ..scene.arrays import POSE_CHANNELS, read, write
 from ..scene.compatibility import curves_of
 from ..scene.controls import can_be_set, owner_of, set_control
 from ..scene.scene_rig import SceneRig
-from ..scene.temporary_state import animated_values, assign_action, driving_actions, read_value, set_value
+from ..scene.temporary_state import assign_action
 from .clip import Clip
 from .mirror import Mirror
 

@@ -8,8 +8,8 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
+from ..scene.animated_values import set_value
 from ..scene.arrays import POSE_CHANNELS, read, write
-from ..scene.temporary_state import set_value
 from ..scene.unit import metres_per_unit
 
 MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE = 1e-3, 1e-3

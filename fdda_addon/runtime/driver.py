@@ -13,6 +13,7 @@ import bpy
 from ..core.controls import Control
 from ..scene.controls import owner_of
 from ..scene.scene_rig import SceneRig
+from ..scene.unkeyed_changes import keep_unkeyed_changes
 
 PLAYBACK_PROPERTY = "fdda_playback"
 """The property of `bpy.types.Object` whose getter runs the model."""
@@ -69,6 +70,7 @@ def set_driver_inputs(driven_object: bpy.types.Object, inputs: list[DriverInput]
     driver_curve.driver.type = "SUM"
     for index, driver_input in enumerate(inputs):
         _write_variable(driver_curve.driver.variables.new(), f"v{index}", driver_input)
+    keep_unkeyed_changes()
 
 
 def evaluated_inputs(driven_object: bpy.types.Object, input_count: int) -> list[bpy.types.ID | None]:

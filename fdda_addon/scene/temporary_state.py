@@ -6,8 +6,10 @@ from contextlib import ExitStack, contextmanager
 
 import bpy
 
+from .animated_values import animated_values, driving_actions, set_value
 from .arrays import POSE_CHANNELS, read, write
 from .compatibility import animation_curves, slot_of
+from .unkeyed_changes import discard_requests, keep_unkeyed_changes
 
 
 @contextmanager
@@ -22,6 +24,7 @@ def temporary_pose(
             restored too, such as transforms of the object and custom properties.
         keep_animation: keep the action and the NLA of the armature object.
     """
+    discard_requests()
     scene = bpy.context.scene
     bones = armature_object.pose.bones
     frame, subframe = scene.frame_current, scene.frame_subframe
@@ -55,12 +58,7 @@ def temporary_pose(
             write(bones, channel, values)
         armature_object.update_tag(refresh={"DATA"})
         bpy.context.view_layer.update()
-
-
-def driving_actions(animation: bpy.types.AnimData) -> list[bpy.types.Action]:
-    """Return the action of a datablock and those of its NLA strips."""
-    strips = (strip for track in animation.nla_tracks for strip in track.strips)
-    return [action for action in (animation.action, *(strip.action for strip in strips)) if action is not None]
+        keep_unkeyed_changes()
 
 
 def animated_paths(datablock: bpy.types.ID) -> set[str]:
@@ -70,37 +68,6 @@ def animated_paths(datablock: bpy.types.ID) -> set[str]:
         return set()
     curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
     return {curve.data_path for curve in (*curves, *animation.drivers)}
-
-
-def animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> dict[str, object]:
-    """Read the values, by RNA path, of everything that actions animate in a datablock."""
-    values = {}
-    for path in {curve.data_path for action in actions for curve in animation_curves(action)}:
-        try:
-            values[path] = read_value(owner, path)
-        except ValueError:
-            # The F-curve refers to a property that does not exist, or to the slot of another datablock.
-            continue
-    return values
-
-
-def read_value(owner: bpy.types.ID, path: str) -> object:
-    """Return the number at an RNA path, or a copy of an array.
-
-    Raises:
-        ValueError: the path does not exist.
-    """
-    value = owner.path_resolve(path)
-    return value[:] if hasattr(value, "__len__") else value
-
-
-def set_value(owner: bpy.types.ID, path: str, value: object) -> None:
-    """Set the value that `read_value` reads."""
-    struct = owner.path_resolve(path, False).data
-    if path.endswith('"]'):
-        struct[bpy.utils.unescape_identifier(path[path.rindex('["') + 2 : -2])] = value
-    else:
-        setattr(struct, path.rpartition(".")[2], value)
 
 
 @contextmanager

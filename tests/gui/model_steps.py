@@ -14,6 +14,7 @@ from arm import (
     BLEND_FILE_NAME,
     arm_object,
     arm_positions,
+    armature_object,
     check_model_plays,
     extension_module,
     mean_distance_mm,
@@ -31,6 +32,7 @@ from window import (
     wait_until,
 )
 
+POSED_BONE, POSED_ANGLE = "wrist", 0.4
 MODIFIERS = ["ARMATURE", "CORRECTIVE_SMOOTH"]
 PLAY_SECONDS, EXTRA_PLAY_SECONDS = 4, 30
 """How long the action plays, and how much longer at most where the CPU renders the viewport."""
@@ -42,6 +44,20 @@ _model_positions: np.ndarray | None = None
 def modifier_visibility() -> list[tuple[str, bool, bool]]:
     """Return type, visibility in the viewport and visibility in renders of the rig's modifiers."""
     return [(m.type, m.show_viewport, m.show_render) for m in arm_object().modifiers if m.type in MODIFIERS]
+
+
+def pose_without_keyframe() -> None:
+    """Rotate a keyed bone at `BENT_FRAME`, without a keyframe."""
+    bpy.context.scene.frame_set(BENT_FRAME)
+    rotation = armature_object().pose.bones[POSED_BONE].rotation_euler
+    require(abs(rotation[0] - POSED_ANGLE) > 0.1, f"the keyframes rotate the bone by {rotation[0]:.3f} rad, too")
+    rotation[0] = POSED_ANGLE
+
+
+def require_unkeyed_pose(deed: str) -> None:
+    """Check that the bone has the angle that `pose_without_keyframe` has set."""
+    difference = abs(armature_object().pose.bones[POSED_BONE].rotation_euler[0] - POSED_ANGLE)
+    require(difference < 1e-6, f"{deed} rotates the bone without a keyframe by {difference:.3f} rad")
 
 
 def check_the_trainer(_folder: Path) -> Iterator[float]:
@@ -84,13 +100,16 @@ def train(folder: Path) -> Iterator[float]:
 
 
 def bind(_folder: Path) -> Iterator[float]:
-    """Press Bind in the section Model: the model deforms the mesh, and the rig's modifiers are off."""
+    """Press Bind in the section Model: the model deforms the mesh in its pose, and the rig's modifiers are off."""
     global _rig_positions, _model_positions
     _rig_positions = arm_positions()
     yield from sidebar.open_section("playback")
+    pose_without_keyframe()
     yield from sidebar.press_button("fdda.bind")
     yield from wait_until(lambda: arm_object().fdda.is_bound, 20, "the button binds nothing")
+    yield 0.3
     check_model_plays()
+    require_unkeyed_pose("Bind")
     require(
         not any(viewport for _, viewport, _ in modifier_visibility()),
         f"the rig's modifiers are still on: {modifier_visibility()}",
@@ -117,11 +136,14 @@ def switch_the_deformation(folder: Path) -> Iterator[float]:
 
 
 def measure_the_model(_folder: Path) -> Iterator[float]:
-    """Press Measure Speed in the section Model."""
+    """Press Measure Speed in the section Model; the pose stays."""
+    pose_without_keyframe()
     yield from sidebar.press_button("fdda.measure_model")
     yield from wait_until(
         lambda: extension_module("timing.frame_times").get(arm_object()) is not None, 60, "nothing is measured"
     )
+    yield 0.3
+    require_unkeyed_pose("the measurement")
     times = extension_module("timing.frame_times").get(arm_object())
     require(min(times.rig, times.linear, times.fdda) > 0, f"there are times of 0: {times}")
 
@@ -186,6 +208,23 @@ def undo(_folder: Path) -> Iterator[float]:
     yield 0.3
     distance = mean_distance_mm(arm_positions(), _model_positions)
     require(distance < 1e-3, f"after the undo the model is {distance:.4f} mm from where it was")
+
+
+def undo_while_posing(_folder: Path) -> Iterator[float]:
+    """Press Ctrl Z while a model is bound: a pose without a keyframe stays."""
+    pose_without_keyframe()
+    bpy.ops.ed.undo_push(message="before")
+    arm_object()["marker"] = 1
+    bpy.ops.ed.undo_push(message="after")
+    yield from park_mouse()
+    yield from press_keys("ctrl+z")
+    yield from wait_until(lambda: "marker" not in arm_object(), 5, "nothing is undone")
+    yield 0.3
+    check_model_plays()
+    require_unkeyed_pose("the undo")
+    bpy.context.scene.frame_set(BENT_FRAME)
+    keyed_angle = armature_object().pose.bones[POSED_BONE].rotation_euler[0]
+    require(abs(keyed_angle - POSED_ANGLE) > 0.1, "setting the frame does not remove the pose")
 
 
 def save_and_open_again(folder: Path) -> Iterator[float]:

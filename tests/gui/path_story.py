@@ -30,5 +30,6 @@ STEPS = (
     model_steps.unpack_and_pack_the_model,
     model_steps.unbind,
     model_steps.undo,
+    model_steps.undo_while_posing,
     model_steps.save_and_open_again,
 )

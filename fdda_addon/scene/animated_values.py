@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads and writes the properties of a datablock that actions animate."""
+
+from collections.abc import Iterable
+
+import bpy
+
+from .compatibility import animation_curves
+
+
+def driving_actions(animation: bpy.types.AnimData) -> list[bpy.types.Action]:
+    """Return the action of a datablock and those of its NLA strips."""
+    strips = (strip for track in animation.nla_tracks for strip in track.strips)
+    return [action for action in (animation.action, *(strip.action for strip in strips)) if action is not None]
+
+
+def animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> dict[str, object]:
+    """Read the values, by RNA path, of everything that actions animate in a datablock."""
+    values = {}
+    for path in {curve.data_path for action in actions for curve in animation_curves(action)}:
+        try:
+            values[path] = read_value(owner, path)
+        except ValueError:
+            # The F-curve refers to a property that does not exist, or to the slot of another datablock.
+            continue
+    return values
+
+
+def read_value(owner: bpy.types.ID, path: str) -> object:
+    """Return the number at an RNA path, or a copy of an array.
+
+    Raises:
+        ValueError: the path does not exist.
+    """
+    value = owner.path_resolve(path)
+    return value[:] if hasattr(value, "__len__") else value
+
+
+def set_value(owner: bpy.types.ID, path: str, value: object) -> None:
+    """Set the value that `read_value` reads."""
+    struct = owner.path_resolve(path, False).data
+    if path.endswith('"]'):
+        struct[bpy.utils.unescape_identifier(path[path.rindex('["') + 2 : -2])] = value
+    else:
+        setattr(struct, path.rpartition(".")[2], value)
