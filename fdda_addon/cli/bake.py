@@ -5,6 +5,7 @@ import argparse
 from pathlib import Path
 
 from ..baking.run import BakeSettings, bake, output_files
+from ..core.counts import format_count
 from ..core.progress import Progress
 from .files import add_rig_options, open_rig
 from .outputs import add_overwrite_option
@@ -49,4 +50,5 @@ def run(options: argparse.Namespace) -> None:
     animation_name = settings.action or "the scene"
     for path in step.files[1:]:
         print(f"{path}: the positions, to be kept beside {options.out.name}")
-    print(f"{options.out}: {len(step.frames)} frames of {animation_name} ({step.frames[0]} to {step.frames[-1]})")
+    frame_text = format_count(len(step.frames), "frame")
+    print(f"{options.out}: {frame_text} of {animation_name} ({step.frames[0]} to {step.frames[-1]})")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.errors import FDDAError, OutputError
 from .confirm import ConfirmFirst
 from .playback import ModelOperator
@@ -90,7 +91,7 @@ class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
 
     def finish(self, _context: bpy.types.Context, result: object) -> str:
         names = " and ".join(path.name for path in result.files)
-        return f"Baked {len(result.frames)} frames to {names}."
+        return f"Baked {format_count(len(result.frames), 'frame')} to {names}."
 
 
 CLASSES = (FDDA_OT_bake,)

@@ -5,16 +5,12 @@ import math
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.errors import RigError
 from ..scene.compatibility import is_selected
 from .pose_operator import LimitsOperator
 
 AXES = "XYZ"
-
-
-def _count_bones(count: int) -> str:
-    """Return a number of bones as text: "1 bone", "4 bones"."""
-    return "1 bone" if count == 1 else f"{count} bones"
 
 
 class _SelectedBonesOperator(LimitsOperator):
@@ -96,7 +92,7 @@ class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
         for bone in bones:
             for axis in (axis for axis in range(3) if self.axes[axis]):
                 set_rotation_range(bone, axis, self.low[axis], self.high[axis])
-        return f"Set the limits of {_count_bones(len(bones))}."
+        return f"Set the limits of {format_count(len(bones), 'bone')}."
 
 
 class FDDA_OT_copy_limits(_SelectedBonesOperator, bpy.types.Operator):
@@ -118,7 +114,7 @@ class FDDA_OT_copy_limits(_SelectedBonesOperator, bpy.types.Operator):
         targets = [bone for bone in self.selected_bones(context) if bone != source]
         for target in targets:
             _copy_limits(source, target)
-        return f"Copied the limits of '{source.name}' to {_count_bones(len(targets))}."
+        return f"Copied the limits of '{source.name}' to {format_count(len(targets), 'bone')}."
 
 
 class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
@@ -143,7 +139,7 @@ class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
             )
         for bone, opposite_bone in pairs:
             _copy_limits(bone, opposite_bone, is_mirrored=True)
-        return f"Mirrored the limits of {_count_bones(len(pairs))}."
+        return f"Mirrored the limits of {format_count(len(pairs), 'bone')}."
 
 
 class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
@@ -182,7 +178,7 @@ class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
                 f"No bone of '{armature_object.name}' without limits has the name of a body part; set the limits by "
                 "hand, or from actions."
             )
-        return f"Set human limits for {_count_bones(count)}."
+        return f"Set human limits for {format_count(count, 'bone')}."
 
 
 class FDDA_OT_clear_limits(_SelectedBonesOperator, bpy.types.Operator):
@@ -198,7 +194,7 @@ class FDDA_OT_clear_limits(_SelectedBonesOperator, bpy.types.Operator):
         for bone in bones:
             for axis in range(3):
                 clear_rotation_range(bone, axis)
-        return f"Removed the limits of {_count_bones(len(bones))}."
+        return f"Removed the limits of {format_count(len(bones), 'bone')}."
 
 
 CLASSES = (

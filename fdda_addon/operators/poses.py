@@ -5,6 +5,7 @@ import math
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.errors import RigError
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
 from .pose_operator import LimitsOperator, PoseOperator
@@ -146,7 +147,7 @@ class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
                 f"; {len(wide_bones)} bones ('{wide_bones[0]}') rotate near gimbal lock, so their limits are too wide: "
                 "choose Bones in the Checked Actions instead"
             )
-        return f"Set the limits of {len(limited_bones)} bones from {', '.join(names)}{remarks}."
+        return f"Set the limits of {format_count(len(limited_bones), 'bone')} from {', '.join(names)}{remarks}."
 
 
 CLASSES = (

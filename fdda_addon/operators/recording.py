@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import FDDAError
 from ..jobs.job import current
@@ -173,7 +174,8 @@ class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
         except FDDAError as error:
             return str(error)
         size = sum(file.stat().st_size for file in path.glob("*.npy"))
-        return f"{count:,} poses, {format_file_size(size)}, in '{path}'. This cannot be undone. Models are kept."
+        size_text = f"{format_count(count, 'pose')}, {format_file_size(size)}"
+        return f"{size_text}, in '{path}'. This cannot be undone. Models are kept."
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         from ..core.recording.folder import remove_recording

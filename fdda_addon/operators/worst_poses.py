@@ -3,6 +3,7 @@
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.defaults import MARKERS
 from ..core.errors import ModelError
 from ..evaluation import markers
@@ -46,7 +47,9 @@ class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
             raise ModelError("Random poses have no frames to mark; evaluate the active action.")
         worst = [(last.first_frame + index, error_mm) for index, error_mm in poses]
         markers.place(context.scene, worst)
-        return f"Added {len(worst)} markers. The worst frame is {worst[0][0]}, with {worst[0][1]:.2f} mm."
+        return (
+            f"Added {format_count(len(worst), 'marker')}. The worst frame is {worst[0][0]}, with {worst[0][1]:.2f} mm."
+        )
 
 
 class FDDA_OT_remove_markers(ModelOperator, bpy.types.Operator):

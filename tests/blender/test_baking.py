@@ -41,6 +41,8 @@ def test_bake_prints_its_files_and_frames(elbow_files, tmp_path, capfd):
     assert captured.err.splitlines()[-1].startswith("frames: 5 of 5, ")
     assert run("bake", elbow_files.rig, elbow_files.model, tmp_path / "b.pc2") == 0
     assert capfd.readouterr().out == f"{tmp_path / 'b.pc2'}: 30 frames of the scene (1 to 30)\n"
+    assert run("bake", elbow_files.rig, elbow_files.model, tmp_path / "c.pc2", "--frames", 4, 4) == 0
+    assert capfd.readouterr().out == f"{tmp_path / 'c.pc2'}: 1 frame of the scene (4 to 4)\n"
 
 
 def add_other_animation(rig) -> None:
