@@ -21,12 +21,10 @@ class Mechanism:
 
     Attributes:
         replacements: values by dotted name of what they replace in the trainer.
-        settings: training settings that differ from the defaults.
         is_export: whether the networks stay the same, and only the graph differs.
     """
 
     replacements: dict[str, object] = field(default_factory=dict)
-    settings: dict[str, object] = field(default_factory=dict)
     is_export: bool = False
 
     @contextmanager

@@ -7,12 +7,12 @@ from pathlib import Path
 import bpy
 
 from ..core.counts import format_count
-from ..core.errors import FDDAError, OutputError
-from .confirm import ConfirmFirst
+from ..core.errors import OutputError
+from .confirm import ChooseFileFirst
 from .playback import ModelOperator
 
 
-class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
+class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):
     bl_idname = "fdda.bake"
     bl_label = "Bake"
     bl_description = (
@@ -26,7 +26,6 @@ class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
         name="File", description="File to write, .pc2 or .blend", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_glob: bpy.props.StringProperty(default="*.pc2;*.blend", options={"HIDDEN"})
-    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     action: bpy.props.StringProperty(
         name="Action",
         description="Action to bake. Empty for the animation of the scene",
@@ -52,21 +51,12 @@ class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_bound_model(context)
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if self.filepath:
-            return ConfirmFirst.invoke(self, context, event)
-        try:
-            name = bpy.path.clean_name(self.bound_rig(context).mesh_object.name)
-        except FDDAError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+    def suggested_path(self, context: bpy.types.Context) -> str:
+        name = bpy.path.clean_name(self.bound_rig(context).mesh_object.name)
         file = Path(bpy.data.filepath).stem or "character"
-        self.filepath = bpy.path.abspath(f"//{file}_{name}_baked{'.pc2' if self.point_cache else '.blend'}")
-        self._is_confirming = True
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return f"//{file}_{name}_baked{'.pc2' if self.point_cache else '.blend'}"
 
-    execute = ConfirmFirst.execute
+    invoke, execute = ChooseFileFirst.invoke, ChooseFileFirst.execute
 
     def confirmed_properties(self) -> dict[str, object]:
         names = ("object", "filepath", "action", "shape_keys", "use_frames", "frame_start", "frame_end")

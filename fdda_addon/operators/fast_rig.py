@@ -7,13 +7,13 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import FDDAError, OutputError, RigError, os_error_text
+from ..core.errors import OutputError, RigError, os_error_text
 from ..scene.scene_rig import SceneRig
-from .confirm import ConfirmFirst
+from .confirm import ChooseFileFirst
 from .playback import ModelOperator
 
 
-class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
+class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
     bl_idname = "fdda.fast_rig"
     bl_label = "Fast Rig"
     bl_description = (
@@ -28,7 +28,6 @@ class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
         name="File", description="File to write, .blend", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_glob: bpy.props.StringProperty(default="*.blend", options={"HIDDEN"})
-    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     visible: bpy.props.BoolProperty(name="Visible Bones", description="Keep the bones that are visible", default=True)
     keyed: bpy.props.BoolProperty(
         name="Keyed Bones", description="Keep the bones that an action of this file keys", default=True
@@ -41,20 +40,11 @@ class FDDA_OT_fast_rig(ModelOperator, ConfirmFirst, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_bound_model(context)
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if self.filepath:
-            return ConfirmFirst.invoke(self, context, event)
-        try:
-            self._check_saved(self.bound_rig(context))
-        except FDDAError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.filepath = bpy.path.abspath(f"//{Path(bpy.data.filepath).stem}_fast.blend")
-        self._is_confirming = True
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+    def suggested_path(self, context: bpy.types.Context) -> str:
+        self._check_saved(self.bound_rig(context))
+        return f"//{Path(bpy.data.filepath).stem}_fast.blend"
 
-    execute = ConfirmFirst.execute
+    invoke, execute = ChooseFileFirst.invoke, ChooseFileFirst.execute
 
     def confirmed_properties(self) -> dict[str, object]:
         return {name: getattr(self, name) for name in ("object", "filepath", "visible", "keyed", "collection")}

@@ -7,13 +7,13 @@ from pathlib import Path
 import bpy
 
 from ..core.defaults import FILM_TIMED_FRAMES
-from ..core.errors import FDDAError, RigError
+from ..core.errors import RigError
 from ..core.progress import Progress
-from .confirm import ConfirmFirst
+from .confirm import ChooseFileFirst
 from .playback import ModelOperator
 
 
-class FDDA_OT_render_comparison(ModelOperator, ConfirmFirst, bpy.types.Operator):
+class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operator):
     bl_idname = "fdda.render_comparison"
     bl_label = "Render Comparison"
     bl_description = (
@@ -26,7 +26,6 @@ class FDDA_OT_render_comparison(ModelOperator, ConfirmFirst, bpy.types.Operator)
         name="File", description="Video to write, .mp4 or .webm", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_glob: bpy.props.StringProperty(default="*.mp4;*.webm", options={"HIDDEN"})
-    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     action: bpy.props.StringProperty(
         name="Action",
         description="Action to show. Empty for the active action of the armature",
@@ -42,25 +41,15 @@ class FDDA_OT_render_comparison(ModelOperator, ConfirmFirst, bpy.types.Operator)
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_bound_model(context)
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if self.filepath:
-            return ConfirmFirst.invoke(self, context, event)
-        try:
-            scene_rig = self.bound_rig(context)
-            self.action = self._action_name(scene_rig.armature_object)
-        except FDDAError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+    def suggested_path(self, context: bpy.types.Context) -> str:
+        scene_rig = self.bound_rig(context)
+        self.action = self._action_name(scene_rig.armature_object)
         if context.region_data is not None:
             self.direction = context.region_data.view_matrix.inverted().to_3x3().col[2]
         file = Path(bpy.data.filepath).stem or "character"
-        name = bpy.path.clean_name(f"{file}_{scene_rig.mesh_object.name}_{self.action}")
-        self.filepath = bpy.path.abspath(f"//{name}.mp4")
-        self._is_confirming = True
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return f"//{bpy.path.clean_name(f'{file}_{scene_rig.mesh_object.name}_{self.action}')}.mp4"
 
-    execute = ConfirmFirst.execute
+    invoke, execute = ChooseFileFirst.invoke, ChooseFileFirst.execute
 
     def confirmed_properties(self) -> dict[str, object]:
         return {name: getattr(self, name) for name in ("object", "filepath", "action", "direction")}

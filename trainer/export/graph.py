@@ -5,8 +5,8 @@ In each frame of an animation the graph evaluates one pose. Each node then takes
 computes little, and all constants are read once. So the graph has few nodes and little padding, and multiplies by
 matrices of ones and zeros in place of gathering. docs/experiments.md has the measurements.
 
-Dimensions in the modules of the graph: N poses, J joints, C controls, Q pairs of joints, F features, D surface frames,
-P partitions, K components, V vertices.
+Dimensions in the modules of the graph: N poses, J joints, C controls, F features, D surface frames, P partitions,
+K components, V vertices.
 """
 
 import onnx

@@ -39,7 +39,7 @@ class Features:
     """The features in the graph.
 
     Attributes:
-        name: name of the (N, B, 3) vectors, in this order: controls, joints, a zero vector, pairs, surface frames.
+        name: name of the (N, B, 3) vectors, in this order: controls, joints, a zero vector, surface frames.
         direct_count: B', the number of vectors of controls and joints, including the zero vector. The other vectors
             are functions of these.
         element_count: 3 B.
