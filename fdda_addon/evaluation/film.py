@@ -142,7 +142,7 @@ def render_frames(
     """
     check_can_render()
     source = _FrameSource(scene_rig, model, errors, settings.columns)
-    picture = _FilmPicture(scene_rig.mesh_object.data, source, settings)
+    picture = _FilmPicture(scene_rig.mesh_object, source, settings)
     try:
         for index in range(0, len(errors.positions), step):
             picture.show(index, f"{errors.name}, frame {first_frame + index}")
@@ -193,10 +193,10 @@ def round_up(meters: float) -> float:
 class _FilmPicture(Picture):
     """A picture with a row of meshes that move from frame to frame."""
 
-    def __init__(self, mesh: bpy.types.Mesh, source: _FrameSource, settings: FilmSettings):
-        super().__init__(settings.view)
+    def __init__(self, mesh_object: bpy.types.Object, source: _FrameSource, settings: FilmSettings):
+        super().__init__(settings.view, mesh_object)
         self._source, self._settings = source, settings
-        self._centers, cell_size = _centers_and_size(source.errors.positions, self.axes)
+        self._centers, cell_size = _centers_and_size(source.errors.positions, self.projection)
         self._cells: list[tuple[str, bpy.types.Mesh, bpy.types.TextCurve]] = []
         gap = cell_size[0] * CELL_MARGIN_RATIO
         # A tall character gets wider margins, so that texts fit above it.
@@ -204,6 +204,7 @@ class _FilmPicture(Picture):
         self.width = len(settings.columns) * cell_width + gap
         size = self.width * TEXT_WIDTH_RATIO * settings.text_scale
         self._title = self.add_text("", (gap, -2.2 * size), 1.3 * size)
+        mesh = mesh_object.data
         factory, count = MeshFactory(mesh), len(mesh.vertices)
         top = (3.4 + LABEL_LINES) * size
         for column, name in enumerate(settings.columns):
@@ -237,7 +238,7 @@ class _FilmPicture(Picture):
         positions_by_column = source.positions(index)
         for name, mesh, curve in self._cells:
             positions = positions_by_column[name]
-            projected = (positions @ self.axes.T - self._centers[index]).astype(np.float32)
+            projected = (positions @ self.projection.T - self._centers[index]).astype(np.float32)
             set_mesh_positions(mesh, np.ascontiguousarray(projected))
             errors = source.distances(positions, index)
             if name in {LINEAR_ERROR, FDDA_ERROR}:
@@ -251,19 +252,19 @@ class _FilmPicture(Picture):
             curve.body = label
 
 
-def _centers_and_size(positions: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _centers_and_size(positions: np.ndarray, projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the view looks in each frame, and the size of a cell.
 
     The view stands still; if the character walks more than its own size, the view follows it.
 
     Args:
         positions: (N, V, 3) float32, mesh-object space, mesh units.
-        axes: directions of the view (`View.axes`).
+        projection: (3, 3) float64 (`Picture.projection`).
 
     Returns:
-        (N, 3) float64 centers and (2,) float64 width and height, along `axes`, mesh units.
+        (N, 3) float64 centers along the directions of the view, and (2,) float64 width and height.
     """
-    bounds = np.array([[(p @ axes.T).min(axis=0), (p @ axes.T).max(axis=0)] for p in positions])
+    bounds = np.array([[(p @ projection.T).min(axis=0), (p @ projection.T).max(axis=0)] for p in positions])
     lowest, highest = bounds[:, 0], bounds[:, 1]
     whole_size, largest_size = highest.max(axis=0) - lowest.min(axis=0), (highest - lowest).max(axis=0)
     if (whole_size <= 2 * largest_size)[:2].all():

@@ -18,6 +18,7 @@ from ..core.errors import OutputError
 from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
 from ..core.output import atomic_write
 from ..scene.blend_file import blender_path
+from ..scene.mesh import mesh_positions
 from .colored_mesh import MeshFactory, set_colors, srgb_to_linear
 
 WIDTH_PIXELS = 1440
@@ -75,7 +76,7 @@ class View:
 
 
 def draw(
-    mesh: bpy.types.Mesh,
+    mesh_object: bpy.types.Object,
     rows: list[list[Cell]],
     path: Path,
     title: str,
@@ -86,7 +87,7 @@ def draw(
     """Render deformations of one mesh into a PNG file.
 
     Args:
-        mesh: the mesh with the faces.
+        mesh_object: the object with the faces; the picture shows it upright as it stands in the world.
         rows: the cells, row by row.
         path: path of the file.
         title: a line of text above all cells.
@@ -98,9 +99,9 @@ def draw(
         OutputError: the file cannot be written, or the machine lacks a library that Workbench needs.
     """
     check_can_render()
-    picture = Picture(view)
+    picture = Picture(view, mesh_object)
     try:
-        picture.compose(mesh, rows, title, has_heat_scale)
+        picture.compose(mesh_object.data, rows, title, has_heat_scale)
         picture.set_up_render(is_sculpted)
         with atomic_write(path) as temporary_path:
             picture.render(temporary_path)
@@ -119,24 +120,30 @@ def check_can_render() -> None:
 
 
 class Picture:
-    """The scene of a picture. Positions in it are relative to the camera: x to the right, y up, Blender units.
+    """The scene of a picture. Positions in it are relative to the camera: x to the right, y up, in sizes of the
+    undeformed mesh.
 
     Attributes:
-        axes: directions of the view (`View.axes`).
+        projection: (3, 3) float64, takes positions in mesh-object space to the directions of the view (`View.axes`).
+            The undeformed mesh has size 1.
         scene: the scene.
-        width, height: size of the picture, Blender units.
+        width, height: size of the picture.
     """
 
-    def __init__(self, view: View):
-        self.axes = view.axes()
-        self._view_to_world = Matrix(self.axes.tolist()).transposed().to_4x4()
+    def __init__(self, view: View, mesh_object: bpy.types.Object):
+        axes = view.axes()
+        # Importers turn and scale objects: without their matrix a character may lie on its back.
+        self.projection = axes @ np.array(mesh_object.matrix_world.to_3x3())
+        # Shading depends on distances, so all characters get the same size.
+        self.projection /= max(np.ptp(mesh_positions(mesh_object.data) @ self.projection.T, axis=0).max(), 1e-12)
+        self._view_to_world = Matrix(axes.tolist()).transposed().to_4x4()
         self.scene = bpy.data.scenes.new("FDDA picture")
         self._datablocks: list[bpy.types.ID] = []
         self.width = self.height = 0.0
 
     def compose(self, mesh: bpy.types.Mesh, rows: list[list[Cell]], title: str, has_heat_scale: bool) -> None:
         """Lay out the cells from the top left, with the title above and the color scale below the cells."""
-        projections = [cell.positions @ self.axes.T for row in rows for cell in row]
+        projections = [cell.positions @ self.projection.T for row in rows for cell in row]
         cell_size = np.max([np.ptp(projected[:, :2], axis=0) for projected in projections], axis=0)
         column_count = max(len(row) for row in rows)
         gap = cell_size[0] * CELL_MARGIN_RATIO
@@ -170,7 +177,7 @@ class Picture:
         return scene_object
 
     def _add_cell(self, factory: MeshFactory, cell: Cell, center: tuple[float, float]) -> None:
-        projected = (cell.positions @ self.axes.T).astype(np.float32)
+        projected = (cell.positions @ self.projection.T).astype(np.float32)
         center_of_bounds = (projected.max(axis=0) + projected.min(axis=0)) / 2
         self.move(self.add_object("cell", factory.create(projected - center_of_bounds, cell.colors)), *center)
 

@@ -70,7 +70,7 @@ def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> Non
     partitions = make_merged_partitions(rig)
     colors = partition_colors(partitions, rig.vertex_count)
     cell = Cell(rig.rest_positions, colors, f"{len(partitions)} partitions, {rig.vertex_count} vertices")
-    draw(scene_rig.mesh_object.data, [[cell]], path, "Partitions by main joint", view)
+    draw(scene_rig.mesh_object, [[cell]], path, "Partitions by main joint", view)
 
 
 def draw_comparison(
@@ -117,7 +117,7 @@ def draw_comparison(
     if not title:
         capitalized = f"{reference_label[0].upper()}{reference_label[1:]}"
         title = f"Distance from the {reference_label}" if is_heat_map else f"{capitalized}, linear skinning and FDDA"
-    draw(scene_rig.mesh_object.data, rows, path, title, view, has_heat_scale=is_heat_map, is_sculpted=not is_heat_map)
+    draw(scene_rig.mesh_object, rows, path, title, view, has_heat_scale=is_heat_map, is_sculpted=not is_heat_map)
 
 
 def _cell(positions: np.ndarray, reference: np.ndarray, label: str, is_heat_map: bool, metres_per_unit: float) -> Cell:

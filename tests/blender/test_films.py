@@ -6,6 +6,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from blend_fixtures.elbow import ACTION
 from fdda_addon.core.errors import OutputError
@@ -22,7 +23,7 @@ from fdda_addon.evaluation.film import (
     render_frames,
     round_up,
 )
-from fdda_addon.evaluation.picture import View
+from fdda_addon.evaluation.picture import Cell, View, draw
 from fdda_addon.evaluation.run import PoseErrors, evaluate_action
 from fdda_addon.scene.scene_rig import SceneRig
 
@@ -153,6 +154,27 @@ def test_a_view_has_the_direction_of_the_viewport():
     for view in (View(15, 50), View(-120, -30), View(0, 0)):
         result = View.from_direction(view.axes()[2])
         assert (result.azimuth, result.elevation) == pytest.approx((view.azimuth, view.elevation))
+
+
+@pytest.mark.parametrize("scale", [0.01, 20000.0])
+def test_a_character_stands_upright_as_in_the_world(rig: SceneRig, tmp_path: Path, scale: float):
+    """Importers turn objects, in any unit: the picture is that of the same mesh, not turned."""
+    mesh_object = rig.mesh_object
+    positions = np.array([vertex.co for vertex in mesh_object.data.vertices], np.float32)
+    colors = np.full((len(positions), 3), 0.7, np.float32)
+    mesh_object.parent, mesh_object.matrix_world = None, Matrix()
+    bpy.context.view_layer.update()
+    draw(mesh_object, [[Cell(positions, colors, "arm")]], tmp_path / "as_is.png", "", View())
+    as_is = read_picture(tmp_path / "as_is.png")
+    assert np.ptp(as_is) > 0.3
+    turned = Matrix.Rotation(0.5 * np.pi, 4, "X") @ Matrix.Diagonal((scale, 2 * scale, scale, 1))
+    mesh_object.data.transform(turned.inverted() @ Matrix.Scale(scale, 4))
+    mesh_object.matrix_world = turned
+    bpy.context.view_layer.update()
+    positions = np.array([vertex.co for vertex in mesh_object.data.vertices], np.float32)
+    draw(mesh_object, [[Cell(positions, colors, "arm")]], tmp_path / "turned.png", "", View())
+    picture = read_picture(tmp_path / "turned.png")
+    assert picture.shape == as_is.shape and np.abs(picture - as_is).mean() < 0.002
 
 
 def test_the_picture_shows_the_frame_in_its_column(errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path):
