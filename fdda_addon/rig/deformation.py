@@ -47,11 +47,18 @@ def read_modifiers_and_drivers(scene_rig: SceneRig) -> dict:
 
 
 def read_b_bones(armature: bpy.types.Armature) -> dict:
-    """Read the settings of the deforming bones that have B-Bone segments, by the names of the bones."""
+    """Read the settings of the deforming bones that have B-Bone segments, by name; animated settings are None."""
     property_names = [prop.identifier for prop in bpy.types.Bone.bl_rna.properties]
     setting_names = [name for name in property_names if name.startswith("bbone_") and name not in _DISPLAY_PROPERTIES]
+    # Rigify drives the easing: Blender writes the value of the current pose into the bone.
+    animated = animated_paths(armature)
     return {
-        bone.name: {name.removeprefix("bbone_"): _json_property(None, bone, name) for name in setting_names}
+        bone.name: {
+            name.removeprefix("bbone_"): None
+            if f"{bone.path_from_id()}.{name}" in animated
+            else _json_property(None, bone, name)
+            for name in setting_names
+        }
         for bone in armature.bones
         if bone.use_deform and bone.bbone_segments > 1
     }

@@ -13,7 +13,7 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, with_deformation
-from .test_changed_rigs import trigger_check
+from .test_changed_rigs import drive_b_bone, trigger_check
 
 
 def add(kind: str, place: int | None, **settings: object) -> Callable[[bpy.types.Object], None]:
@@ -236,3 +236,20 @@ def test_a_copied_character_with_copied_drivers_plays(rig, elbow_files):
     pose(angle=0.7)
     pose(armature_object.name, 0.4)
     assert not mesh_object.fdda.status and mesh_object.fdda.mode == "FDDA"
+
+
+def test_a_driven_setting_of_a_b_bone_follows_the_pose(rig, elbow_files):
+    """Rigify drives the easing of its B-Bones: the value in the file is that of the last pose."""
+    bone = rig.armature_object.data.bones["lower"]
+    bone.bbone_segments = 4
+    drive_b_bone()
+    bind(rig, with_deformation(elbow_files.model, read_deformation(rig)))
+    before = bone.bbone_easein
+    bpy.context.scene.frame_set(25)
+    assert abs(bone.bbone_easein - before) > 0.1
+    bone.bbone_easeout = 1.0  # as before, but the armature is checked
+    trigger_check("view layer")
+    assert rig.mesh_object.fdda.mode == "FDDA" and not rig.mesh_object.fdda.status
+    bone.bbone_easeout = 0.5
+    trigger_check("view layer")
+    assert_shows_rig(rig.mesh_object, "'easeout' of the bone 'lower' was 1.0 and is 0.5")
