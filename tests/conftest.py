@@ -19,10 +19,10 @@ TRAINER_PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
 PACKAGES_OF_TIERS = {
     "core": ("numpy", "onnx"),
     "contract": ("numpy",),
-    "trainer": ("torch", "onnx", "onnxruntime", "matplotlib", "scipy"),
+    "trainer": ("torch", "onnx", "onnxruntime", "scipy"),
     "blender": ("bpy", "onnxruntime", "onnx"),
     "farm": ("distributed", "openjd", "bpy", "torch", "onnxruntime"),
-    "examples": ("bpy", "torch", "onnx", "onnxruntime"),
+    "examples": ("bpy", "torch", "onnx", "onnxruntime", "matplotlib"),
 }
 """Packages that the tests of a tier import, by the name of its folder."""
 
