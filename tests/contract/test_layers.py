@@ -47,7 +47,7 @@ def test_the_addon_uses_only_packages_of_blender_and_of_the_extension():
 
 
 def test_the_trainer_does_not_import_blender():
-    allowed = {"numpy", "torch", "onnx", "onnxruntime", "scipy", "trainer", "fdda_addon"}
+    allowed = {"numpy", "torch", "onnx", "onnxruntime", "scipy", "jinja2", "trainer", "fdda_addon"}
     assert forbidden_imports("trainer", allowed) == []
 
 

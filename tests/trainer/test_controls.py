@@ -127,7 +127,7 @@ def test_the_report_names_controls(model):
     assert report["controls"] == [c.name for c in (BULGE, PUFF, LOCKED)]
     assert [p["controls"] for p in report["partitions"]] == [[PUFF.name], [BULGE.name], [BULGE.name]]
     page = model.with_name("report.html").read_text()
-    assert "<th>controls</th>" in page and '<td title="armature_object/[&quot;puff&quot;]">1</td>' in page
+    assert "<th>controls</th>" in page and '<td title="armature_object/[&#34;puff&#34;]">1</td>' in page
 
 
 def confidence_of_control(network: Network, control: int, values: np.ndarray) -> np.ndarray:
