@@ -21,8 +21,8 @@ INTERFACE_FILES = [
     *(ADDON / "panels").glob("*.py"),
     *(ADDON / "operators").glob("*.py"),
     *sorted((ADDON / "properties").glob("*.py")),
-    ROOT / "trainer" / "report" / "page.py",
 ]
+REPORT_TEMPLATE = ROOT / "trainer" / "report" / "page.html"
 MESSAGE_FILES = list(ADDON.rglob("*.py"))
 EXAMPLES_OF_BOLD_TEXT = {"bold"}
 """Bold words of the manual that explain its notation and are no labels."""
@@ -76,7 +76,8 @@ def anchor(heading: str) -> str:
 
 def label_patterns() -> list[re.Pattern]:
     """Return patterns of all texts that the interface and the training report may show."""
-    texts = (re.sub(r"<h2>(.*?)</h2>.*", r"\1", text, flags=re.DOTALL) for text in text_templates(INTERFACE_FILES))
+    report_headings = re.findall(r"<h2>(.*?)</h2>", REPORT_TEMPLATE.read_text(encoding="utf-8"))
+    texts = [*text_templates(INTERFACE_FILES), *report_headings]
     # A template without words would match any text.
     return [template_pattern(text) for text in texts if re.search(r"\w\w", text)]
 
