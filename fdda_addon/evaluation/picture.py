@@ -17,7 +17,7 @@ from mathutils import Matrix
 from ..core.errors import OutputError
 from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
 from ..core.output import atomic_write
-from ..scene.blend_file import blender_path
+from ..scene.blend_file import blender_path, silenced_stdout
 from ..scene.mesh import mesh_positions
 from .colored_mesh import MeshFactory, set_colors, srgb_to_linear
 
@@ -267,7 +267,8 @@ class Picture:
         """
         self.scene.render.filepath = blender_path(path)
         try:
-            bpy.ops.render.render(write_still=True, scene=self.scene.name)
+            with silenced_stdout():
+                bpy.ops.render.render(write_still=True, scene=self.scene.name)
         except RuntimeError as error:
             raise OSError(str(error).strip()) from error
         # Blender does not check whether the whole file reached the disk.

@@ -82,12 +82,13 @@ def files_in(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_the_verb_writes_a_film_of_the_action(rig: SceneRig, elbow_files, tmp_path: Path):
+def test_the_verb_writes_a_film_of_the_action(rig: SceneRig, elbow_files, tmp_path: Path, capfd):
     shorten_action()
     bpy.context.scene.render.fps = 30
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elbow.blend"))
     out, options = tmp_path / "film.mp4", ["--json", tmp_path / "e.json", "--poses", 0, "--action", ACTION]
     assert run("evaluate", tmp_path / "elbow.blend", elbow_files.model, *options, "--video", out) == 0
+    assert "Saved:" not in capfd.readouterr().out, "stdout is for results"
     fps, frames = read_video(out, tmp_path)
     assert fps == pytest.approx(30) and len(frames) == LAST - FIRST + 1
     assert frames[0].shape[1] <= 1600 and not any(size % 2 for size in frames[0].shape[:2])
