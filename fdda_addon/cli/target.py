@@ -86,8 +86,8 @@ def requested_poses(scene_rig: "SceneRig", options: argparse.Namespace) -> int |
 
     A target that depends on the frame has no random poses by default if actions or strips are given.
     """
-    from ..core.recording.target import POSE
-    from ..rig.target import find_target
+    from ..recording.plan import RecordingSettings, depends_on_time, read_sample_selection
+    from ..rig.pose_setter import TargetSettings
 
     if (
         options.poses is not None
@@ -96,4 +96,11 @@ def requested_poses(scene_rig: "SceneRig", options: argparse.Namespace) -> int |
         or not (options.action or options.strip)
     ):
         return options.poses
-    return None if find_target(scene_rig, options.target).follows == POSE else 0
+    settings = RecordingSettings(
+        actions=tuple(options.action),
+        sample=tuple(options.sample),
+        controls=tuple(options.control),
+        target=TargetSettings(options.target),
+    )
+    selection, _ = read_sample_selection(scene_rig, settings)
+    return 0 if depends_on_time(scene_rig, settings, selection.controls) else None

@@ -194,8 +194,8 @@ def evaluate(
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     random_pose_count = settings.poses or len(settings.range_scales) or len(settings.named)
-    pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count)
     network, skinning = _prepare(scene_rig, model, is_rig_compared=not settings.target.name)
+    pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count, network.info.controls)
     rig = skinning.rig
     # A rig that is posed only by actions may have no channels to sample.
     channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.range_scales else ()

@@ -137,15 +137,15 @@ class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
         limits = set_limits_from_actions(rig, [bpy.data.actions[name] for name in names], self.margin)
         limited_bones = {limit.bone for limit in limits if not limit.reason_unset}
         unset_limits = [limit for limit in limits if limit.reason_unset]
-        remarks = (
-            f"; {len(unset_limits)} axes were not changed ('{unset_limits[0].bone}' {unset_limits[0].reason_unset})"
-            if unset_limits
-            else ""
-        )
+        remarks = ""
+        if unset_limits:
+            count, first = format_count(len(unset_limits), "axis", "axes"), unset_limits[0]
+            remarks = f"; {count} not changed ('{first.bone}' {first.reason_unset})"
         if wide_bones := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
+            count = format_count(len(wide_bones), "bone")
             remarks += (
-                f"; {len(wide_bones)} bones ('{wide_bones[0]}') rotate near gimbal lock, so their limits are too wide: "
-                "choose Bones in the Checked Actions instead"
+                f"; {count} near gimbal lock ('{wide_bones[0]}') with limits that are too wide: choose Bones in the Checked "
+                "Actions instead"
             )
         return f"Set the limits of {format_count(len(limited_bones), 'bone')} from {', '.join(names)}{remarks}."
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Defines the settings of a recording, and derives the rig, channels and sampling from them before any evaluation."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -91,7 +91,7 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
         RigError: the rig cannot be read, or has nothing to sample.
     """
     selection, extra_joints = read_sample_selection(scene_rig, settings)
-    rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings))
+    rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings, selection.controls))
     channels = sampled_channels(scene_rig, rig, selection) if settings.poses else ()
     return replace(rig, controls=selection.controls), channels
 
@@ -108,13 +108,14 @@ def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseS
     return PoseSampler(settings.seed, settings.spread, remix)
 
 
-def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
-    """Return whether the target of the settings depends on more than the pose, as a simulation does.
+def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings, controls: Iterable[Control]) -> bool:
+    """Return whether the target of the settings depends on more than pose and controls, as a simulation does.
 
     Raises:
         RigError: as `find_target`.
     """
-    return bool(settings.target.name) and find_target(scene_rig, settings.target.name).follows != POSE
+    name = settings.target.name
+    return bool(name) and find_target(scene_rig, name, controls).follows != POSE
 
 
 def read_sample_selection(

@@ -68,7 +68,7 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: Rig
                 check_time_inputs(scene_rig, selection.controls, stack, find_actions(settings))
             except RigError as error:
                 problems.append(str(error))
-        include_static_joint = depends_on_time(scene_rig, settings)
+        include_static_joint = depends_on_time(scene_rig, settings, selection.controls)
         # Bones with weights are joints in any case.
         group_names = {group.name for group in scene_rig.mesh_object.vertex_groups}
         ranged_channels = default_channels(scene_rig.armature_object, set())

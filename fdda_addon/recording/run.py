@@ -122,7 +122,8 @@ def _plan_recordings(
     meshes_with_channels = [
         (scene_rig, channels) for scene_rig, (_, channels) in zip(scene_rigs, rigs_with_channels, strict=True)
     ]
-    pose_setter = make_pose_setter(scene_rigs[0], settings.target, clips, settings.poses)
+    target_controls = rigs_with_channels[0][0].controls
+    pose_setter = make_pose_setter(scene_rigs[0], settings.target, clips, settings.poses, target_controls)
     plan = PosePlan(meshes_with_channels, settings, clips, pose_setter)
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")

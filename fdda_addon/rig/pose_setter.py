@@ -2,13 +2,14 @@
 """Sets poses of a rig and of a target that depends on time, with a pre-roll, or held until the target is at rest."""
 
 import time
-from collections.abc import Callable, Collection, Container, Iterator, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import bpy
 import numpy as np
 
+from ..core.controls import Control
 from ..core.defaults import REPEATABILITY_POSES, REST_THRESHOLD_MM
 from ..core.errors import RigError
 from ..core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
@@ -325,7 +326,11 @@ DIRECT_POSE_SETTER = PoseSetter()
 
 
 def make_pose_setter(
-    scene_rig: SceneRig, settings: TargetSettings, clips: Sequence[Clip], random_pose_count: int
+    scene_rig: SceneRig,
+    settings: TargetSettings,
+    clips: Sequence[Clip],
+    random_pose_count: int,
+    controls: Iterable[Control] = (),
 ) -> PoseSetter:
     """Make the pose setter for a target, and check that the target can be used.
 
@@ -334,6 +339,7 @@ def make_pose_setter(
         settings: settings of the target.
         clips: the clips whose frames are evaluated.
         random_pose_count: number of random poses.
+        controls: the controls of the recording or the model.
 
     Raises:
         RigError: as `find_target` and `check_clips`, or the target cannot be set to these poses.
@@ -342,7 +348,7 @@ def make_pose_setter(
         if settings.pre_roll or settings.max_settle_frames:
             raise RigError("A pre-roll and settling need a target; name one, or leave both out.")
         return DIRECT_POSE_SETTER
-    target = find_target(scene_rig, settings.name)
+    target = find_target(scene_rig, settings.name, controls)
     if random_pose_count and target.follows == FRAMES:
         raise RigError(
             f"The target '{target.name}' follows frames ({target.caches[0].description}), so it cannot show random "

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Target: an object with the same vertices as the mesh of a rig, whose surface a model learns instead of the rig's."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import bpy
 import numpy as np
 
+from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.recording.target import FRAMES, POSE, SIMULATION
 from ..poses.clip import Clip
@@ -114,8 +115,13 @@ class Target:
             yield
 
 
-def find_target(scene_rig: SceneRig, name: str) -> Target:
+def find_target(scene_rig: SceneRig, name: str, controls: Iterable[Control] = ()) -> Target:
     """Find the target of a rig by the name of its object.
+
+    Args:
+        scene_rig: the rig.
+        name: name of the target object.
+        controls: numbers that may change the target, because the model reads them.
 
     Raises:
         RigError: there is no such mesh, it is the mesh of the rig, plays a model, is hidden, has other vertices or
@@ -140,7 +146,7 @@ def find_target(scene_rig: SceneRig, name: str) -> Target:
         raise RigError(f"The target '{name}' is in edit mode; leave it first.")
     if is_flat(target_object):
         raise RigError(f"The target '{name}' has a scale of zero; give it another.")
-    target = Target(scene_rig, target_object, read_caches(scene_rig, target_object))
+    target = Target(scene_rig, target_object, read_caches(scene_rig, target_object, controls))
     if not target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).is_evaluated:
         raise RigError(f"The target '{name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
     with target.prepared():

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the simulations and caches on which a target depends, and their frame ranges, without an evaluation."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 
 from ..core.alembic import read_time_range
+from ..core.controls import Control
 from ..core.errors import PointCacheError, RigError, os_error_text
 from ..core.mesh_cache import read_frame_count
 from ..scene.node_groups import SIMULATION_NODES, find_time_node
@@ -15,7 +16,7 @@ from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import resolve_path
 from .modifier_stack import TIME_DEPENDENT_TYPES
 from .sources import Sources
-from .time_inputs import time_inputs
+from .time_inputs import control_keys, time_inputs
 
 ALEMBIC_SUFFIXES, USD_SUFFIXES = {".abc"}, {".usd", ".usda", ".usdc", ".usdz"}
 
@@ -38,15 +39,18 @@ class Cache:
     owner: "bpy.types.PointCache | bpy.types.Scene | None" = None
 
 
-def read_caches(scene_rig: SceneRig, target_object: bpy.types.Object) -> tuple[Cache, ...]:
-    """Find the simulations and caches of a target and of everything that it depends on, except the rig.
+def read_caches(
+    scene_rig: SceneRig, target_object: bpy.types.Object, controls: Iterable[Control] = ()
+) -> tuple[Cache, ...]:
+    """Find the simulations and caches of a target and of everything that it depends on, except the rig and controls.
 
     Raises:
         RigError: a file is missing or damaged.
     """
     sources = Sources(scene_rig, target_object, [modifier.name for modifier in target_object.modifiers])
+    inputs = time_inputs(sources, control_keys(scene_rig, controls))
     caches = [cache for scene_object in sources.objects for cache in _object_caches(scene_object)]
-    return tuple(dict.fromkeys([*caches, *(Cache(time_input.description) for time_input in time_inputs(sources))]))
+    return tuple(dict.fromkeys([*caches, *(Cache(time_input.description) for time_input in inputs)]))
 
 
 def _object_caches(scene_object: bpy.types.Object) -> Iterator[Cache]:

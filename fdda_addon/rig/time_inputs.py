@@ -60,14 +60,19 @@ def check_time_inputs(
         : stack.insert_index
     ]
     sources = Sources(scene_rig, mesh_object, followed_modifiers)
-    owners_and_paths = [(owner_of(scene_rig, control.owner), control.path) for control in controls]
-    control_keys = {fcurve_target(owner, path) for owner, path in owners_and_paths if owner is not None}
-    for time_input in (*_time_modifiers(sources), *time_inputs(sources, control_keys, actions)):
+    keys = control_keys(scene_rig, controls)
+    for time_input in (*_time_modifiers(sources), *time_inputs(sources, keys, actions)):
         raise RigError(
             f"The surface of '{mesh_object.name}' changes with time through {time_input.description}, so it does not "
             f"follow from the pose; {time_input.remedy}."
         )
-    check_other_armatures(scene_rig, sources, control_keys)
+    check_other_armatures(scene_rig, sources, keys)
+
+
+def control_keys(scene_rig: SceneRig, controls: Iterable[Control]) -> set[PropertyKey]:
+    """Return the numbers that controls read."""
+    owners_and_paths = [(owner_of(scene_rig, control.owner), control.path) for control in controls]
+    return {fcurve_target(owner, path) for owner, path in owners_and_paths if owner is not None}
 
 
 def time_inputs(

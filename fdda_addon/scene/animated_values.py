@@ -7,6 +7,9 @@ import bpy
 
 from .compatibility import animation_curves
 
+AnimatedValues = list[tuple[bpy.types.ID, dict[str, object]]]
+"""Datablocks with the values, by RNA path, of everything that their actions animate."""
+
 
 def driving_actions(animation: bpy.types.AnimData) -> list[bpy.types.Action]:
     """Return the action of a datablock and those of its NLA strips."""
@@ -43,3 +46,29 @@ def set_value(owner: bpy.types.ID, path: str, value: object) -> None:
         struct[bpy.utils.unescape_identifier(path[path.rindex('["') + 2 : -2])] = value
     else:
         setattr(struct, path.rpartition(".")[2], value)
+
+
+def read_scene_values(scene: bpy.types.Scene) -> AnimatedValues:
+    """Read what actions animate in the objects of a scene, their data and their shape keys, without linked ones."""
+    objects = list(scene.objects)
+    object_data = [scene_object.data for scene_object in objects if scene_object.data is not None]
+    shape_keys = [data.shape_keys for data in object_data if getattr(data, "shape_keys", None) is not None]
+    return [
+        (datablock, animated_values(datablock, driving_actions(datablock.animation_data)))
+        for datablock in {*objects, *object_data, *shape_keys}
+        if datablock.library is None and datablock.animation_data is not None
+    ]
+
+
+def restore_values(scene_values: AnimatedValues) -> None:
+    """Write values that have changed back to their datablocks, if these still exist."""
+    for datablock, values in scene_values:
+        try:
+            changed = {path: value for path, value in values.items() if read_value(datablock, path) != value}
+            for path, value in changed.items():
+                set_value(datablock, path, value)
+            if changed:
+                datablock.update_tag()
+        except (ReferenceError, ValueError):
+            # The datablock or the property was removed in the meantime.
+            continue

@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager
 
 import bpy
 
-from .animated_values import animated_values, driving_actions, set_value
+from .animated_values import animated_values, driving_actions, read_scene_values, restore_values, set_value
 from .arrays import POSE_CHANNELS, read, write
 from .compatibility import animation_curves, slot_of
 from .unkeyed_changes import discard_requests, keep_unkeyed_changes
@@ -23,15 +23,17 @@ def temporary_pose(
         actions: actions that will be assigned to the armature object. All other properties that they animate are
             restored too, such as transforms of the object and custom properties.
         keep_animation: keep the action and the NLA of the armature object.
+
+    Unkeyed changes of the scene's other objects are restored too, because setting the frame resets them.
     """
     discard_requests()
     scene = bpy.context.scene
     bones = armature_object.pose.bones
     frame, subframe = scene.frame_current, scene.frame_subframe
     pose_values = {channel: read(bones, channel) for channel in POSE_CHANNELS}
+    scene_values = read_scene_values(scene)
     animation = armature_object.animation_data
-    kept_actions = driving_actions(animation) if keep_animation and animation is not None else ()
-    animated_before = animated_values(armature_object, [*actions, *kept_actions])
+    animated_before = animated_values(armature_object, actions)
     if animation is not None:
         action, use_nla = animation.action, animation.use_nla
         slot = getattr(animation, "action_slot", None)
@@ -52,6 +54,7 @@ def temporary_pose(
             animation.use_nla = use_nla
         # Set the frame first: it sets animated channels, and the restored pose may differ from the keyframes.
         scene.frame_set(frame, subframe=subframe)
+        restore_values(scene_values)
         for path, value in animated_before.items():
             set_value(armature_object, path, value)
         for channel, values in pose_values.items():

@@ -8,14 +8,14 @@ operator or timer has ended. That evaluates all animation, and a bone that was p
 import bpy
 from bpy.app.handlers import persistent
 
-from .animated_values import animated_values, driving_actions, read_value, set_value
+from .animated_values import AnimatedValues, read_scene_values, restore_values
 
 _kept_frame: float | None = None
 """The frame that Blender will set again; None if nothing is to be kept."""
 _is_last_turn = False
 """Whether the request ends with the next run of the timer."""
-_values: list[tuple[bpy.types.ID, dict[str, object]]] = []
-"""While Blender sets that frame: datablocks with the values, by RNA path, of what actions animate in them."""
+_values: AnimatedValues = []
+"""Values to keep, while Blender sets that frame."""
 
 
 def keep_unkeyed_changes() -> None:
@@ -58,28 +58,13 @@ def _on_frame_change_pre(scene: bpy.types.Scene, *_: object) -> None:
     if scene.frame_current_final != _kept_frame:
         discard_requests()
         return
-    for datablock in _local_datablocks(scene):
-        if datablock.animation_data is not None:
-            _values.append((datablock, animated_values(datablock, driving_actions(datablock.animation_data))))
+    _values.extend(read_scene_values(scene))
 
 
 @persistent
 def _on_frame_change_post(*_: object) -> None:
-    for datablock, values in _values:
-        changed = {path: value for path, value in values.items() if read_value(datablock, path) != value}
-        for path, value in changed.items():
-            set_value(datablock, path, value)
-        if changed:
-            datablock.update_tag()
+    restore_values(_values)
     _values.clear()
-
-
-def _local_datablocks(scene: bpy.types.Scene) -> set[bpy.types.ID]:
-    """Return the objects of a scene, their data and their shape keys, without linked ones."""
-    objects = list(scene.objects)
-    object_data = [scene_object.data for scene_object in objects if scene_object.data is not None]
-    shape_keys = [data.shape_keys for data in object_data if getattr(data, "shape_keys", None) is not None]
-    return {datablock for datablock in (*objects, *object_data, *shape_keys) if datablock.library is None}
 
 
 HANDLERS = {"frame_change_pre": _on_frame_change_pre, "frame_change_post": _on_frame_change_post}

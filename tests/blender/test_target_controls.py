@@ -71,3 +71,40 @@ def test_a_control_of_a_bone_that_is_a_joint_is_an_input(tmp_path):
     recording = recorded(tmp_path, "--target", "flesh", "--poses", 20, "--control", bend)
     assert [partition.controls for partition in recording.partitions] == [(0,), (0,)]
     assert np.ptp(recording.controls) > 0.5
+
+
+SMILE = 'armature_object/["smile"]'
+
+
+def keyed_smile() -> None:
+    """The tube and its target, whose shape key follows a property of the armature that the action keys."""
+    flesh = targets.target_copy()
+    armature_object = bpy.data.objects["elbow_rig"]
+    armature_object["smile"] = 0.0
+    armature_object.id_properties_ui("smile").update(min=0.0, max=1.0)
+    flesh.shape_key_add(name="Basis")
+    key = flesh.shape_key_add(name="smile")
+    for point in key.data[: len(key.data) // 2]:
+        point.co.z += 0.05
+    variable = key.driver_add("value").driver.variables.new()
+    variable.name, variable.targets[0].id, variable.targets[0].data_path = "smile", armature_object, '["smile"]'
+    key.id_data.animation_data.drivers[0].driver.expression = "smile"
+    for frame, value in ((1, 0.0), (20, 1.0)):
+        armature_object["smile"] = value
+        armature_object.keyframe_insert('["smile"]', frame=frame)
+
+
+def test_a_keyed_property_that_is_a_control_does_not_bind_the_target_to_frames(tmp_path, capsys):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    keyed_smile()
+    save_copy(tmp_path / "rig.blend")
+    action = bpy.data.objects["elbow_rig"].animation_data.action.name
+    options = ("--object", "elbow", "--target", "flesh", "--poses", 20)
+    assert run("record", tmp_path / "rig.blend", tmp_path / "without", *options) == 1
+    assert "follows frames (the keys of '[\"smile\"]' of 'elbow_rig')" in capsys.readouterr().err
+    recording = recorded(tmp_path, "--target", "flesh", "--poses", 20, "--control", SMILE, "--action", action)
+    assert recording.info.target.follows == "pose"
+    assert np.ptp(np.array(recording.controls)[:20, 0]) > 0.5
+    # Half of the vertices move by 50 mm with the property.
+    residuals = np.linalg.norm(np.array(recording.residuals), axis=-1)
+    assert np.abs(np.corrcoef(recording.controls[:, 0], residuals.max(axis=1))[0, 1]) > 0.5

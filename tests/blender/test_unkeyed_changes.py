@@ -5,6 +5,7 @@ import bpy
 import pytest
 
 from fdda_addon.scene import unkeyed_changes
+from fdda_addon.scene.temporary_state import temporary_pose
 
 from .scene_state import fresh_elbow
 
@@ -57,3 +58,23 @@ def test_another_frame_ends_the_request(posed_rig):
     bpy.context.scene.frame_set(FRAME)
     rotation, location, wrinkle = posed_rig()
     assert abs(rotation - 1.25) > 0.1 and location == 0 and wrinkle == 0
+
+
+def test_a_job_keeps_unkeyed_changes_of_other_objects():
+    armature_object = fresh_elbow().armature_object
+    scene, other = bpy.context.scene, bpy.data.objects.new("other", bpy.data.cameras.new("other"))
+    removed = bpy.data.objects.new("removed", None)
+    for added in (other, removed):
+        scene.collection.objects.link(added)
+        for frame in (1, 30):
+            added.keyframe_insert("location", frame=frame)
+    other.data.keyframe_insert("lens", frame=1)
+    scene.frame_set(FRAME)
+    other.location[1], other.data.lens = 2.5, 80.0
+    with temporary_pose(armature_object):
+        scene.frame_set(FRAME + 5)
+        assert other.location[1] == 0
+        bpy.data.objects.remove(removed)
+    bpy.context.view_layer.update()
+    evaluated = other.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    assert (evaluated.location[1], evaluated.data.lens, scene.frame_current) == (2.5, 80.0, FRAME)

@@ -52,15 +52,15 @@ def bake_asks_each_time(folder: Path) -> Iterator[float]:
     baked_file = folder / "work" / "alone" / "first.pc2"
     bpy.context.scene.frame_end = 5
     yield from sidebar.open_section("playback")
-    yield from sidebar.open_subpanel("use_in_render", "fdda.bake", across_above=0.7)
-    yield from sidebar.press_button("fdda.bake")
+    yield from sidebar.open_subpanel("use_in_render", "fdda.bake(", across_above=0.7)
+    yield from sidebar.press_button("fdda.bake(")
     yield from wait_until(file_browser_count, 5, "Bake… opens no file browser")
     yield from save_screenshot(folder / "bake_dialog.png")
     yield from close_browser("Escape")
     bpy.ops.fdda.bake(filepath=str(baked_file))
     initial_content = baked_file.read_bytes()
     yield from redraw_window()
-    yield from sidebar.press_button("fdda.bake")
+    yield from sidebar.press_button("fdda.bake(")
     yield from wait_until(file_browser_count, 5, "Bake… opens no file browser the second time")
     yield from close_browser("Escape")
     require(baked_file.read_bytes() == initial_content, "the first bake was overwritten")
