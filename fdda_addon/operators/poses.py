@@ -144,8 +144,8 @@ class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
         if wide_bones := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
             count = format_count(len(wide_bones), "bone")
             remarks += (
-                f"; {count} near gimbal lock ('{wide_bones[0]}') with limits that are too wide: choose Bones in the Checked "
-                "Actions instead"
+                f"; {count} near gimbal lock ('{wide_bones[0]}') with limits that are too wide: choose Bones in the "
+                "Checked Actions instead"
             )
         return f"Set the limits of {format_count(len(limited_bones), 'bone')} from {', '.join(names)}{remarks}."
 

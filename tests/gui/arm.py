@@ -15,6 +15,8 @@ EXTENSION = "bl_ext.user_default.fdda"
 BENT_FRAME = 110
 """Frame of the action at which shapes are compared: elbow and fingers are bent."""
 BLEND_FILE_NAME = "arm.blend"
+POSED_BONE, POSED_ANGLE = "wrist", 0.4
+OTHER_OBJECT, OTHER_HEIGHT = "Camera", 3.25
 
 
 def extension_module(name: str) -> ModuleType:
@@ -78,6 +80,29 @@ def arm_positions(frame: int = BENT_FRAME) -> np.ndarray:
     """Return the evaluated vertex positions of the arm at a frame of its action: (V, 3) float32, meters."""
     bpy.context.scene.frame_set(frame)
     return evaluated_positions(arm_object())
+
+
+def pose_without_keyframe() -> None:
+    """At `BENT_FRAME`, rotate a keyed bone and move another keyed object, without keyframes."""
+    other = bpy.data.objects[OTHER_OBJECT]
+    if other.animation_data is None:
+        other.keyframe_insert("location", frame=1)
+    bpy.context.scene.frame_set(BENT_FRAME)
+    require(not has_unkeyed_pose(), "the keyframes have the pose, too")
+    armature_object().pose.bones[POSED_BONE].rotation_euler[0] = POSED_ANGLE
+    other.location[2] = OTHER_HEIGHT
+
+
+def has_unkeyed_pose() -> bool:
+    """Return whether the bone has the angle that `pose_without_keyframe` has set."""
+    return abs(armature_object().pose.bones[POSED_BONE].rotation_euler[0] - POSED_ANGLE) < 1e-6
+
+
+def require_unkeyed_pose(deed: str) -> None:
+    """Check that bone and object are where `pose_without_keyframe` has put them."""
+    require(has_unkeyed_pose(), f"{deed} rotates the bone without a keyframe")
+    height = bpy.data.objects[OTHER_OBJECT].location[2]
+    require(height == OTHER_HEIGHT, f"{deed} moves the object without a keyframe to {height}")
 
 
 def mean_distance_mm(first_positions: np.ndarray, second_positions: np.ndarray) -> float:

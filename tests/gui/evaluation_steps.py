@@ -10,6 +10,8 @@ from arm import (
     BENT_FRAME,
     arm_object,
     extension_module,
+    pose_without_keyframe,
+    require_unkeyed_pose,
 )
 from window import (
     colored_ratio,
@@ -27,11 +29,14 @@ MIN_COLORED_RATIO = 0.01
 
 def evaluate(_folder: Path) -> Iterator[float]:
     """Press Evaluate: the model is compared with the rig in each frame of the active action."""
-    bpy.context.scene.frame_set(BENT_FRAME)
     yield from sidebar.open_section("evaluation")
+    pose_without_keyframe()
     yield from sidebar.press_button("fdda.evaluate")
     evaluations = extension_module("evaluation.last_evaluation")
     yield from wait_until(lambda: evaluations.get(arm_object()) is not None, 90, "nothing is evaluated")
+    yield 0.3
+    require_unkeyed_pose("Evaluate")
+    bpy.context.scene.frame_set(BENT_FRAME)
     last = evaluations.get(arm_object())
     require(last.poses == FRAME_COUNT, f"{last.poses} frames are compared")
     fdda, linear = last.total["fdda"].mean, last.total["linear"].mean

@@ -14,10 +14,12 @@ from arm import (
     BLEND_FILE_NAME,
     arm_object,
     arm_positions,
-    armature_object,
     check_model_plays,
     extension_module,
+    has_unkeyed_pose,
     mean_distance_mm,
+    pose_without_keyframe,
+    require_unkeyed_pose,
     wait_for_job,
 )
 from window import (
@@ -32,7 +34,6 @@ from window import (
     wait_until,
 )
 
-POSED_BONE, POSED_ANGLE = "wrist", 0.4
 MODIFIERS = ["ARMATURE", "CORRECTIVE_SMOOTH"]
 PLAY_SECONDS, EXTRA_PLAY_SECONDS = 4, 30
 """How long the action plays, and how much longer at most where the CPU renders the viewport."""
@@ -44,20 +45,6 @@ _model_positions: np.ndarray | None = None
 def modifier_visibility() -> list[tuple[str, bool, bool]]:
     """Return type, visibility in the viewport and visibility in renders of the rig's modifiers."""
     return [(m.type, m.show_viewport, m.show_render) for m in arm_object().modifiers if m.type in MODIFIERS]
-
-
-def pose_without_keyframe() -> None:
-    """Rotate a keyed bone at `BENT_FRAME`, without a keyframe."""
-    bpy.context.scene.frame_set(BENT_FRAME)
-    rotation = armature_object().pose.bones[POSED_BONE].rotation_euler
-    require(abs(rotation[0] - POSED_ANGLE) > 0.1, f"the keyframes rotate the bone by {rotation[0]:.3f} rad, too")
-    rotation[0] = POSED_ANGLE
-
-
-def require_unkeyed_pose(deed: str) -> None:
-    """Check that the bone has the angle that `pose_without_keyframe` has set."""
-    difference = abs(armature_object().pose.bones[POSED_BONE].rotation_euler[0] - POSED_ANGLE)
-    require(difference < 1e-6, f"{deed} rotates the bone without a keyframe by {difference:.3f} rad")
 
 
 def check_the_trainer(_folder: Path) -> Iterator[float]:
@@ -223,8 +210,7 @@ def undo_while_posing(_folder: Path) -> Iterator[float]:
     check_model_plays()
     require_unkeyed_pose("the undo")
     bpy.context.scene.frame_set(BENT_FRAME)
-    keyed_angle = armature_object().pose.bones[POSED_BONE].rotation_euler[0]
-    require(abs(keyed_angle - POSED_ANGLE) > 0.1, "setting the frame does not remove the pose")
+    require(not has_unkeyed_pose(), "setting the frame does not remove the pose")
 
 
 def save_and_open_again(folder: Path) -> Iterator[float]:

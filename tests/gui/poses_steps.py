@@ -12,6 +12,8 @@ from arm import (
     arm_positions,
     extension_module,
     mean_distance_mm,
+    pose_without_keyframe,
+    require_unkeyed_pose,
     wait_for_job,
 )
 from window import (
@@ -78,6 +80,7 @@ def record(folder: Path) -> Iterator[float]:
     """Press Record, and wait for the end of the recording."""
     job = extension_module("jobs.job")
     yield from sidebar.open_section("recording")
+    pose_without_keyframe()
     yield from sidebar.press_button("fdda.record")
     yield from wait_until(lambda: job.state_of("record") and job.state_of("record").done, 30, "nothing is recorded")
     yield from save_screenshot(folder / "recording.png")
@@ -85,6 +88,7 @@ def record(folder: Path) -> Iterator[float]:
     require(sentence.startswith(("Step 1 of 2", "Step 2 of 2")), f"the progress is '{sentence}'")
     yield from wait_for_job("record", 90)
     yield from redraw_window()
+    require_unkeyed_pose("Record")
     # The next step is offered where this one ends.
     yield from sidebar.find_button("fdda.train")
     index = extension_module("core.recording.index").read_index(folder / "work" / "arm_recording")

@@ -21,6 +21,8 @@ from arm import (
     make_empty_folder,
     mean_distance_mm,
     open_copy_in,
+    pose_without_keyframe,
+    require_unkeyed_pose,
     wait_for_job,
 )
 from window import (
@@ -57,7 +59,11 @@ def bake_asks_each_time(folder: Path) -> Iterator[float]:
     yield from wait_until(file_browser_count, 5, "Bake… opens no file browser")
     yield from save_screenshot(folder / "bake_dialog.png")
     yield from close_browser("Escape")
-    bpy.ops.fdda.bake(filepath=str(baked_file))
+    pose_without_keyframe()
+    with region_override("UI"):
+        bpy.ops.fdda.bake("EXEC_DEFAULT", filepath=str(baked_file))
+    yield 0.3
+    require_unkeyed_pose("Bake")
     initial_content = baked_file.read_bytes()
     yield from redraw_window()
     yield from sidebar.press_button("fdda.bake(")
@@ -255,6 +261,7 @@ def record_train_and_bind(folder: Path) -> Iterator[float]:
     bpy.ops.wm.save_as_mainfile(filepath=str(folder_of_file / BLEND_FILE_NAME))
     yield from redraw_window()
     yield from sidebar.open_section("rig")
+    pose_without_keyframe()
     yield from sidebar.press_button("fdda.build_model")
     job = extension_module("jobs.job")
     yield from wait_until(
@@ -265,6 +272,8 @@ def record_train_and_bind(folder: Path) -> Iterator[float]:
     require(
         arm_object().fdda.is_bound and arm_object().fdda.mode == "FDDA", f"it is not bound: {arm_object().fdda.status}"
     )
+    yield 0.3
+    require_unkeyed_pose("Record, Train & Bind")
     require(arm_object().fdda.packed is not None, "the model is not packed")
     require(np.isfinite(arm_positions()).all(), "the arm has no shape")
     require(view_area() is not None, "the view is gone")
