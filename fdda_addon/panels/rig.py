@@ -12,6 +12,8 @@ from ..timing import frame_times
 from . import checks, curves
 from .frame_profile import draw_profile
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
+from .trained_file import find_trained_file
+from .training import read_assessment
 
 MAX_MESHES = 8
 MODIFIER_ICONS = {
@@ -102,6 +104,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
         if not state.changes_scene:
             curves.draw(layout, state.curves)
         return
+    _draw_verdict(layout, context, rig)
     row = layout.row()
     row.scale_y = 1.3
     problem = file_problem(rig.mesh_object)
@@ -109,6 +112,18 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
     draw_button(row, context, "fdda.build_model", "Record, Train & Bind", "PLAY")
     if problem:
         draw_wrapped(layout, context, problem, "INFO")
+
+
+def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    """Draw what the errors of the model mean that the job has trained."""
+    state, trained = job.state_of("build_model"), find_trained_file(rig)
+    if state is None or state.outcome_level != "INFO" or trained is None:
+        return
+    if (assessment := read_assessment(trained.path)) is None:
+        return
+    draw_wrapped(layout, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
+    if not assessment.is_good:
+        draw_wrapped(layout, context, "What to do is in the section Training.", "BLANK1")
 
 
 def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

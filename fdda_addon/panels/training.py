@@ -10,6 +10,7 @@ from ..core.assessment import Assessment, assess_training
 from ..core.errors import TrainingError
 from ..core.report import Verdict, checkpoint_path, read_report, report_path
 from ..jobs import job
+from ..jobs.state import JobState
 from ..properties.character import default_model
 from ..properties.preferences import MODULE, preferences
 from ..scene.scene_rig import SceneRig
@@ -21,6 +22,7 @@ from .section import Section, draw_advanced, draw_button, draw_job, draw_path, d
 from .trained_file import TrainedFile, find_trained_file
 
 SHOWN_PARTITIONS = 8
+TRAINING_VERBS = ("train", "build_model")
 
 _report_cache: dict[Path, tuple[int, dict | None]] = {}
 """Modification time and content of each training report, by path. The content is None if the report is invalid."""
@@ -48,7 +50,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
     def has_warning(cls, context: bpy.types.Context) -> bool:
         rig = panel_rig(context)[0]
         trained = find_trained_file(rig) if rig is not None else None
-        assessment = _assessment(trained.path) if trained is not None else None
+        assessment = read_assessment(trained.path) if trained is not None else None
         return assessment is not None and not assessment.is_good
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -73,8 +75,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         _draw_settings(layout, context, rig, trained, can_train)
         draw_job(layout, context, "refine")
         draw_job(layout, context, "train")
-        state = job.state_of("train")
-        if state is not None and state.subject == rig.mesh_object.session_uid:
+        if (state := _last_training(rig)) is not None:
             curves.draw(layout, state.curves)
         if trained is not None and not trained.mismatch:
             _draw_assessment(layout, context, trained.path)
@@ -87,11 +88,33 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             draw_path(advanced, settings, "model", default_model(rig.mesh_object))
 
 
+def _has_succeeded(state: JobState | None) -> bool:
+    return state is not None and not state.is_running and state.outcome_level == "INFO"
+
+
+def _last_training(rig: SceneRig) -> JobState | None:
+    """Return the state of the last job that has trained a model of a rig and has its curves; None without one."""
+    mesh_object, states = rig.mesh_object, [job.state_of(verb) for verb in TRAINING_VERBS]
+    states = [
+        state
+        for state in states
+        if state is not None
+        and not state.is_running
+        and (
+            state.current_object == mesh_object.name
+            or (not state.current_object and state.subject == mesh_object.session_uid)
+        )
+    ]
+    return max(states, key=lambda state: state.ended, default=None)
+
+
 def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
     """Draw the Python for training and the result of its check; return whether training may be tried."""
     result = session.check_result
     if result is not None and result.level == "INFO":
         draw_wrapped(layout, context, result.message, "CHECKMARK")
+        return True
+    if result is None and any(_has_succeeded(job.state_of(verb)) for verb in TRAINING_VERBS):
         return True
     box = layout.box()
     if (running_check := job.current(job.ENVIRONMENT)) is not None:
@@ -161,7 +184,7 @@ def _draw_next_buttons(
 
 def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, model: Path) -> None:
     """Draw what the errors of the training mean, and what to do next."""
-    report, assessment = _read_report(report_path(model)), _assessment(model)
+    report, assessment = _read_report(report_path(model)), read_assessment(model)
     if report is None or assessment is None:
         return
     box = layout.box()
@@ -179,7 +202,7 @@ def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, mod
             draw_wrapped(body, context, warning["text"], "DOT")
 
 
-def _assessment(model: Path) -> Assessment | None:
+def read_assessment(model: Path) -> Assessment | None:
     """Return what the report of a model means; None without a report. It is computed once for each report."""
     path = report_path(model)
     report = _read_report(path)

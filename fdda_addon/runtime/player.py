@@ -285,7 +285,10 @@ class Player:
         """
         armature_object = armature_of(mesh_object)
         if armature_object is None:
-            raise RigError(f"The armature of '{mesh_object.name}' is gone; give its Armature modifier an armature.")
+            raise RigError(
+                f"'{mesh_object.name}' has no Armature modifier with an armature any more; undo, or add one and choose "
+                "the armature."
+            )
         return SceneRig(mesh_object, armature_object)
 
     def _create_pose_reader(self, scene_rig: SceneRig) -> PoseReader:

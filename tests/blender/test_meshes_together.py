@@ -6,10 +6,14 @@ import pytest
 
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.jobs import job
+from fdda_addon.panels import checks
 from fdda_addon.scene.active_rig import rigs_of_active_armature
+from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from .conftest import ELBOW, ELBOW_RIG
+from .drawing import texts_of
 from .scene_state import fresh_elbow
+from .test_panel_drawing import draw_section
 
 
 @pytest.fixture
@@ -53,6 +57,11 @@ def test_one_button_records_trains_and_binds(two):
     assert bpy.ops.fdda.build_model() == {"FINISHED"}
     assert bpy.data.is_dirty, "Blender asks before it closes the file"
     assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
+    checks.check_now(SceneRig(two[0], armature_of(two[0])))
+    # The button says what the errors mean, and its training shows its curves and that the Python works.
+    assert any(text.startswith("Unseen poses: ") for text in texts_of(draw_section("rig")))
+    texts = texts_of(draw_section("training"))
+    assert "Error (mm) per Pass" in texts and not any("not checked yet" in text for text in texts)
     # Recorded already: it is trained again, and the new model plays.
     before = two[0].fdda.packed.session_uid
     two[0].fdda.settings.training_seed = 5

@@ -69,6 +69,21 @@ def test_a_section_of_a_bound_model_draws(bound_elbow: bpy.types.Object, name: s
     assert text in texts_of(draw_section(name))
 
 
+def test_a_removed_modifier_can_be_bound_again(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    bpy.context.view_layer.update()
+    bound_elbow.modifiers.remove(bound_elbow.modifiers["FDDA"])
+    bpy.context.view_layer.update()
+    assert "was removed; bind the model again" in bound_elbow.fdda.status
+    texts = texts_of(draw_section("playback"))
+    assert "Bind Again" in texts and "Try Again" not in texts
+    assert bpy.ops.fdda.bind(object=bound_elbow.name) == {"FINISHED"}
+    assert bound_elbow.fdda.mode == "FDDA" and not bound_elbow.fdda.status
+    bound_elbow.modifiers["FDDA"].show_viewport = False
+    bpy.context.view_layer.update()
+    assert "Try Again" in texts_of(draw_section("playback"))
+
+
 def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(bound_elbow: bpy.types.Object, capfd):
     bpy.context.view_layer.objects.active = bound_elbow
     bpy.ops.fdda.evaluate(source="RANDOM", poses=3)

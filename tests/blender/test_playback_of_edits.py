@@ -51,7 +51,7 @@ def test_deleting_the_armature(bound_elbow, capsys):
     bpy.context.scene.frame_set(7)
     bpy.context.scene.frame_set(8)
     assert bound_elbow.fdda.mode == "RIG"
-    assert "armature of 'elbow' is gone" in bound_elbow.fdda.status
+    assert "'elbow' has no Armature modifier with an armature any more" in bound_elbow.fdda.status
     assert capsys.readouterr().out.count("switched off") == 1
     assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True, False]
 
