@@ -2,7 +2,6 @@
 """Runs a verb in its own process, with a lock and a log file."""
 
 import contextlib
-import fcntl
 import os
 import resource
 import shlex
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError
+from fdda_addon.core.file_lock import wait_for_lock
 
 from .characters import Farm
 from .fingerprints import ROOT
@@ -59,7 +59,7 @@ def hold_lock(path: Path) -> Iterator[int]:
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        wait_for_lock(descriptor)
         yield descriptor
     finally:
         os.close(descriptor)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import BinaryIO, TextIO
 
 from ..core.errors import OutputError, os_error_text
+from ..core.file_lock import try_lock
 from ..core.output import write_json
 from .environment.folder import user_folder
 from .environment.subprocesses import popen_options
@@ -146,10 +147,8 @@ class _ProcessFiles:
         """
         file = self._new(self.messages)
         if sys.platform != "win32":
-            import fcntl
-
             with contextlib.suppress(OSError):
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                try_lock(file.fileno())
         return file
 
     def new_errors(self) -> TextIO:
@@ -199,16 +198,11 @@ class _ProcessFiles:
             except OSError:
                 return self.messages.exists()
             return False
-        import fcntl
-
         try:
             with self.messages.open("rb") as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
+                return not try_lock(file.fileno(), is_shared=True)
         except OSError:
-            pass
-        return False
+            return False
 
     def remove(self) -> None:
         for path in (self._path, self.messages, self.stop_file, self._errors):

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Lock file of a recording folder, which permits one writer at a time.
 
-As in the package `filelock`, the lock belongs to the operating system, which releases it when the process ends. The
-content of the file serves only to name the owner in messages.
+The content of the file serves only to name the owner in messages.
 """
 
 import contextlib
@@ -15,13 +14,12 @@ import sys
 from pathlib import Path
 
 from ..errors import BusyError
+from ..file_lock import try_lock
 
 LOCK_NAME = "recording.lock"
 MAX_OWNER_BYTES = 1000
 _OPTIONAL_FLAGS = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
 _OPEN_FLAGS = os.O_RDWR | os.O_CREAT | sum(_OPTIONAL_FLAGS)
-LOCKED_BYTE_OFFSET = 1 << 30
-"""Offset of the byte that is locked. It is past the end of the file, because Windows denies reading of locked bytes."""
 
 _held_lock_paths: set[Path] = set()
 
@@ -50,7 +48,7 @@ class RecordingLock:
             try:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
                     raise OSError(errno.EINVAL, f"'{LOCK_NAME}' is not a regular file")
-                if not _try_lock(handle):
+                if not try_lock(handle):
                     raise BusyError(
                         f"{self._owner(handle)} is recording into '{self._folder}'; wait for it, or choose another "
                         "folder."
@@ -101,25 +99,3 @@ class RecordingLock:
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return "Another process"
         return f"Another Blender (process {pid}{'' if host == socket.gethostname() else f' on {host!r}'})"
-
-
-def _try_lock(handle: int) -> bool:
-    """Lock an open file; return False where another process holds the lock."""
-    if sys.platform == "win32":
-        import msvcrt
-
-        os.lseek(handle, LOCKED_BYTE_OFFSET, os.SEEK_SET)
-        try:
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        except PermissionError:
-            return False
-        finally:
-            os.lseek(handle, 0, os.SEEK_SET)
-        return True
-    import fcntl
-
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

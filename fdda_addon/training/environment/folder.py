@@ -9,10 +9,11 @@ import enum
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ...core.errors import TrainerEnvironmentError, os_error_text
+from ...core.file_lock import try_lock
 from ...core.path_limits import MAX_WINDOWS_PATH_LENGTH
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
@@ -185,34 +186,21 @@ def creation_lock(folder: Path) -> Iterator[None]:
     Raises:
         TrainerEnvironmentError: another process holds the lock, or the folder cannot be written.
     """
-    lock = folder.with_name(folder.name + ".lock")
-    try:
-        lock.parent.mkdir(parents=True, exist_ok=True)
-        file = lock.open("a+b")
-    except OSError as error:
-        raise TrainerEnvironmentError(
-            f"The folder '{folder.parent}' cannot be written ({os_error_text(error)}); see to its permissions, or "
-            "choose an existing Python that has torch."
-        ) from error
-    with file:
+    path = folder.with_name(folder.name + ".lock")
+    with ExitStack() as stack:
         try:
-            _lock_file(file.fileno())
+            path.parent.mkdir(parents=True, exist_ok=True)
+            is_locked = try_lock(stack.enter_context(path.open("a+b")).fileno())
         except OSError as error:
             raise TrainerEnvironmentError(
-                "Another Blender is installing or removing the training environment; wait until it is done."
+                f"The folder '{folder.parent}' cannot be written ({os_error_text(error)}); see to its permissions, or "
+                "choose an existing Python that has torch."
             ) from error
+        if not is_locked:
+            raise TrainerEnvironmentError(
+                "Another Blender is installing or removing the training environment; wait until it is done."
+            )
         yield
-
-
-def _lock_file(descriptor: int) -> None:
-    if os.name == "nt":
-        import msvcrt
-
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _requirements_fingerprint(requirements: Path) -> str:

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Locks on open files. The operating system releases a lock when no process has the file open anymore.
+
+docs/development.md has the reasons against the package `filelock`.
+"""
+
+import os
+import sys
+import time
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+POLL_SECONDS = 0.05
+LOCKED_BYTE_OFFSET = 1 << 30
+"""Offset of the byte that Windows locks: past the end of the file, because Windows denies reading locked bytes."""
+
+
+def try_lock(descriptor: int, is_shared: bool = False) -> bool:
+    """Lock an open file without waiting; return False if another process holds a lock on it.
+
+    Args:
+        descriptor: descriptor of the file. A child process that inherits it also holds the lock, except on Windows.
+        is_shared: whether other processes may also hold shared locks; on Windows all locks are exclusive.
+
+    Raises:
+        OSError: the file system has no locks.
+    """
+    try:
+        if sys.platform == "win32":
+            offset = os.lseek(descriptor, 0, os.SEEK_CUR)
+            os.lseek(descriptor, LOCKED_BYTE_OFFSET, os.SEEK_SET)
+            try:
+                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+            finally:
+                os.lseek(descriptor, offset, os.SEEK_SET)
+        else:
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    return True
+
+
+def wait_for_lock(descriptor: int) -> None:
+    """Wait until `try_lock` locks an open file.
+
+    Raises:
+        OSError: the file system has no locks.
+    """
+    while not try_lock(descriptor):
+        time.sleep(POLL_SECONDS)
