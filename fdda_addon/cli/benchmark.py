@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """`benchmark RIG.blend MODEL.onnx --json OUT.json`: measures the time per frame of rig, linear skinning and model.
 
-`benchmark RIG.blend --profile --json OUT.json` needs no model: it measures the parts of a frame of the rig.
+`benchmark RIG.blend --profile --json OUT.json` needs no model: it measures the parts of a frame of the rig, and what a
+fast rig would save. `--fast-rig` measures the latter alone.
 """
 
 import argparse
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from ..core.errors import WrongUsageError
+from ..core.errors import RigError, WrongUsageError
 from ..core.file_kind import BENCHMARK
 from ..core.output import check_outputs, write_json
 from ..core.progress import Progress
+from ..fast_rig.saving import measure_saving
 from ..runtime.binding import model_disabled
 from ..timing.benchmark import benchmark
-from ..timing.frame_profile import profile_frame
+from ..timing.profiling import profile_frame
 from .files import add_rig_options, open_rig
 from .folders import open_rigs, to_json_by_object, with_heading
 from .outputs import add_overwrite_option
@@ -27,13 +32,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL.onnx",
         type=Path,
         nargs="?",
-        help="the model, or a folder of models; none with --profile",
+        help="the model, or a folder of models; none with --profile and --fast-rig",
     )
-    parser.add_argument(
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument(
         "--profile",
         action="store_true",
-        help="measure the parts of a frame of the rig: bones, each modifier, the rest; and the most expensive bones",
+        help="measure the parts of a frame of the rig: bones, each modifier, the rest; the most expensive bones; and "
+        "what a fast rig would save",
     )
+    group.add_argument("--fast-rig", action="store_true", help="measure only what a fast rig would save")
     parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="file to write the times to")
     parser.add_argument(
         "--frames", type=int, default=100, help="number of frames to measure with each deformation (default 100)"
@@ -44,20 +52,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     if options.frames < 1:
         raise WrongUsageError("--frames must be 1 or more.")
-    if (options.model is None) != options.profile:
-        raise WrongUsageError("Give a model to measure, or --profile without a model.")
-    inputs = [options.rig] if options.profile else [options.rig, options.model]
-    check_outputs({options.json: BENCHMARK}, inputs, options.overwrite)
+    needs_model = not (options.profile or options.fast_rig)
+    if (options.model is not None) != needs_model:
+        raise WrongUsageError("Give a model to measure, or --profile or --fast-rig without a model.")
+    check_outputs({options.json: BENCHMARK}, list(filter(None, (options.rig, options.model))), options.overwrite)
     if options.profile:
         _profile(options)
+        return
+    if options.fast_rig:
+        with ProgressPrinter() as progress:
+            saving = _last_step(measure_saving(open_rig(options), options.rig), progress)
+        write_json(options.json, saving.to_json() | {"unit": "ms"})
+        print(saving.sentence)
         return
     benchmarks = {}
     for name, (scene_rig, model) in open_rigs(options).items():
         with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
-            for step in benchmark(scene_rig, model, options.frames):
-                if isinstance(step, Progress):
-                    progress.show(step.stage, step.done, step.total)
-        benchmarks[name] = step
+            benchmarks[name] = _last_step(benchmark(scene_rig, model, options.frames), progress)
     write_json(options.json, to_json_by_object({name: result.to_json() for name, result in benchmarks.items()}))
     for name, result in benchmarks.items():
         print(with_heading(name, result.table()))
@@ -66,10 +77,18 @@ def run(options: argparse.Namespace) -> None:
 def _profile(options: argparse.Namespace) -> None:
     scene_rig = open_rig(options)
     with ProgressPrinter() as progress:
-        for step in profile_frame(scene_rig):
-            if isinstance(step, Progress):
-                progress.show(step.stage, step.done, step.total)
-            else:
-                write_json(options.json, step.to_json())
-                progress.end_line()
-                print(step.table())
+        profile = _last_step(profile_frame(scene_rig), progress)
+        try:
+            profile = replace(profile, fast_rig=_last_step(measure_saving(scene_rig, options.rig), progress))
+        except RigError as error:
+            profile = replace(profile, fast_rig_problem=str(error))
+    write_json(options.json, profile.to_json())
+    print(profile.table())
+
+
+def _last_step(steps: Iterator[Any], progress: ProgressPrinter) -> Any:
+    """Print the progress of a measurement, and return its result."""
+    for step in steps:
+        if isinstance(step, Progress):
+            progress.show(step.stage, step.done, step.total)
+    return step

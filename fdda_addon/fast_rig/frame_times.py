@@ -4,6 +4,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -22,6 +23,8 @@ from .joint_poses import set_random_pose
 
 ROUNDS = 3
 WARM_UP_FRAMES = 3
+FrameCall = tuple[Callable[[], object], Callable[[], object]]
+"""A function that prepares a frame, which takes time of its own, and one that shows it, which is timed."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,13 @@ class RigTimes:
 
 
 def measure_frames(
-    full: Path, fast: Path, object_name: str, controls: tuple[str, ...], frames: int, size: float
+    full: Path,
+    fast: Path,
+    object_name: str,
+    controls: tuple[str, ...],
+    frames: int,
+    size: float,
+    rounds: int = ROUNDS,
 ) -> Iterator[Progress | RigTimes]:
     """Time frames of both files in turns, as a generator that works while it is iterated; it leaves `fast` open.
 
@@ -63,6 +72,7 @@ def measure_frames(
         controls: names of the control bones that random poses move.
         frames: number of frames to time with each rig.
         size: size of the full rig, armature units.
+        rounds: number of rounds; each opens both files.
 
     Yields:
         Progress, and at the end the RigTimes.
@@ -71,9 +81,9 @@ def measure_frames(
         FDDAError: a file cannot be opened.
     """
     times: dict[Path, list[float]] = {full: [], fast: []}
-    frames_per_round = max(1, -(-frames // ROUNDS))
+    frames_per_round = max(1, -(-frames // rounds))
     action_name = None
-    for round_index in range(ROUNDS):
+    for round_index in range(rounds):
         # The fast rig first: the full rig may have further actions, which key only removed bones.
         for index, path in enumerate((fast, full)):
             calls_range = range(round_index * frames_per_round - WARM_UP_FRAMES, (round_index + 1) * frames_per_round)
@@ -82,7 +92,7 @@ def measure_frames(
                 action_name = _action_name(armature_object)
             calls = _frame_calls(armature_object, action_name, controls, size, calls_range)
             times[path] += _time_calls(calls, shows_rig=path == full)
-            yield Progress("frames", 2 * round_index + index + 1, 2 * ROUNDS)
+            yield Progress("frames", 2 * round_index + index + 1, 2 * rounds)
     yield RigTimes(tuple(times[full]), tuple(times[fast]))
 
 
@@ -106,34 +116,28 @@ def _action_name(armature_object: bpy.types.Object) -> str:
 
 def _frame_calls(
     armature_object: bpy.types.Object, action_name: str, controls: tuple[str, ...], size: float, indices: range
-) -> list[Callable[[], None]]:
+) -> list[FrameCall]:
     """Return functions that show frames of an action, or random poses if its name is empty; one for each index."""
     if not action_name:
-        return [_pose_setter(armature_object, controls, size, index + WARM_UP_FRAMES) for index in indices]
+        update = bpy.context.view_layer.update
+        return [
+            (partial(set_random_pose, armature_object, controls, size, index + WARM_UP_FRAMES), update)
+            for index in indices
+        ]
     action = bpy.data.actions[action_name]
     assign_action(armature_object, action)
     frames = action_frames(action)
-    return [_frame_setter(frames[index % len(frames)]) for index in indices]
+    return [(lambda: None, partial(bpy.context.scene.frame_set, frames[index % len(frames)])) for index in indices]
 
 
-def _time_calls(calls: list[Callable[[], None]], shows_rig: bool) -> list[float]:
+def _time_calls(calls: list[FrameCall], shows_rig: bool) -> list[float]:
     """Time the calls after those that warm up, in milliseconds, with all models or with all rigs in their place."""
+    times = []
     with ExitStack() as exit_stack:
         for scene_object in bpy.context.scene.objects if shows_rig else ():
             if scene_object.type == "MESH" and scene_object.fdda.is_bound:
                 exit_stack.enter_context(model_disabled(scene_object))
-        return time_calls(calls)[WARM_UP_FRAMES:]
-
-
-def _frame_setter(frame: int) -> Callable[[], None]:
-    return lambda: bpy.context.scene.frame_set(frame)
-
-
-def _pose_setter(
-    armature_object: bpy.types.Object, controls: tuple[str, ...], size: float, seed: int
-) -> Callable[[], None]:
-    def show_pose() -> None:
-        set_random_pose(armature_object, controls, size, seed)
-        bpy.context.view_layer.update()
-
-    return show_pose
+        for prepare, show in calls:
+            prepare()
+            times += time_calls([show])
+    return times[WARM_UP_FRAMES:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs the verb `fast-rig` in another Blender, so that the window stays usable and its file unchanged."""
+"""Runs a verb in another Blender, so that the open file stays unchanged and the window usable."""
 
 import os
 import queue
@@ -26,14 +26,15 @@ _PROGRESS_LINE = re.compile(r"(?P<stage>[a-z ]+): (?P<done>\d+) of (?P<total>\d+
 _ERROR_PREFIX = "Error: "
 
 
-class FastRigProcess:
-    """Context manager for a Blender without a window that runs `fast-rig`; it ends with the `with` block."""
+class VerbProcess:
+    """Context manager for a Blender without a window that runs a verb; it ends with the `with` block."""
 
-    def __init__(self, arguments: list[str]):
+    def __init__(self, verb: str, arguments: list[str]):
         """Start the process.
 
         Args:
-            arguments: the arguments of the verb.
+            verb: the verb.
+            arguments: its arguments.
 
         Raises:
             FDDAError: Blender cannot be started, or no temporary file can be written.
@@ -45,7 +46,7 @@ class FastRigProcess:
             raise temporary_folder_error(error) from error
         try:
             self._process = subprocess.Popen(
-                [*command, "fast-rig", *arguments],
+                [*command, verb, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=self._output,
                 stderr=subprocess.PIPE,
@@ -58,7 +59,7 @@ class FastRigProcess:
         except OSError as error:
             self._output.close()
             raise FDDAError(
-                f"'{command[0]}' cannot be started ({os_error_text(error)}); use the verb fast-rig in a terminal."
+                f"'{command[0]}' cannot be started ({os_error_text(error)}); use the verb {verb} in a terminal."
             ) from error
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         # In a thread, because reading a line blocks and Blender must not.
@@ -98,7 +99,7 @@ class FastRigProcess:
             yield None
         if self._process.returncode:
             status = self._process.returncode
-            raise FDDAError(error_text or f"The other Blender ended with status {status}, and no fast rig was written.")
+            raise FDDAError(error_text or f"The other Blender ended with status {status}, without a result.")
         self._output.seek(0)
         yield self._output.read()
 

@@ -17,12 +17,9 @@ from .driver_reader import bone_of_path, driven_node, driver_needs, drivers_of
 def remove_bones(armature_object: bpy.types.Object, kept: set[Node]) -> list[str]:
     """Remove the bones of an armature object that are not kept, with their drivers; return their names.
 
-    The kept bones keep their order, their transforms and their collections.
-
-    Raises:
-        RigError: the armature is linked, or other objects use it too.
+    The kept bones keep their order, their transforms and their collections. `check_armature` tells whether this can be
+    done.
     """
-    _check_armature(armature_object)
     names = [bone.name for bone in armature_object.data.bones if bone_node(armature_object, bone.name) not in kept]
     if not names:
         return []
@@ -85,7 +82,8 @@ def _remove_idle_constraints(armature_object: bpy.types.Object, removed_bones: s
             bone.constraints.remove(constraint)
 
 
-def _check_armature(armature_object: bpy.types.Object) -> None:
+def check_armature(armature_object: bpy.types.Object) -> None:
+    """Raise a RigError if bones of an armature cannot be removed: it is linked, or other objects use it too."""
     armature = armature_object.data
     if armature_object.library or armature.library or armature_object.override_library or armature.override_library:
         raise RigError(

@@ -4,7 +4,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import bpy
 
@@ -12,7 +11,7 @@ from ..core.errors import ModelError, RigError
 from ..core.model import read_model
 from ..core.progress import Progress
 from ..core.rig import STATIC_JOINT
-from ..rig.modifier_stack import check_evaluable, deforming_modifiers, recorded_modifiers
+from ..rig.modifier_stack import check_evaluable
 from ..runtime import packed_model
 from ..runtime.binding import bind, unbind
 from ..runtime.model_files import network_of
@@ -23,9 +22,8 @@ from .bone_reader import bone_node, datablock_node
 from .controls import animating_actions, control_bones, keyed_bones
 from .dependency_graph import Node
 from .driver_reader import bone_of_path, driven_node
-from .graph_reader import read_graph, shown_objects
 from .joint_poses import JointPoses, differing_joints, evaluate_joints, rig_size
-from .pruning import remove_bones, remove_drivers, remove_modifiers, remove_objects
+from .removal import remove_unneeded
 
 TOLERANCE = 1e-5
 """Largest accepted difference of a joint between full rig and fast rig, as a ratio of the size of the rig."""
@@ -100,7 +98,13 @@ def make_fast_rig(
             "again, so a fast rig cannot be compared; look for dependency cycles among their constraints and drivers."
         )
     bones_before = len(armature_object.data.bones)
-    removed = _prune(scene_rigs, _roots(scene_rigs, joint_names, controls))
+    for scene_rig in scene_rigs:
+        scene_rig.mesh_object.fdda.mode = "RIG"
+    removed = remove_unneeded(scene_rigs, joint_names, controls, _model_nodes(scene_rigs))
+    for scene_rig in scene_rigs:
+        scene_rig.mesh_object.fdda.is_fast_rig = True
+        scene_rig.mesh_object.fdda.mode = "FDDA"
+        _evaluate_model(scene_rig.mesh_object)
     after = yield from _evaluate(poses, "fast rig")
 
     if differences := differing_joints(poses, before, after, TOLERANCE):
@@ -123,33 +127,6 @@ def make_fast_rig(
         len(before),
         max(differing_joints(poses, before, after, -1.0).values(), default=0.0),
     )
-
-
-class _Removed(NamedTuple):
-    """What `_prune` has removed: the names, and the number of drivers."""
-
-    bones: set[str]
-    objects: tuple[str, ...]
-    modifiers: tuple[str, ...]
-    drivers: int
-
-
-def _prune(scene_rigs: list[SceneRig], roots: list[Node]) -> _Removed:
-    """Remove everything that neither the roots nor the models need, and play the models in the rest."""
-    replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
-    graph = read_graph(scene_rigs, replaced)
-    kept = graph.kept(roots)
-    for scene_rig in scene_rigs:
-        scene_rig.mesh_object.fdda.mode = "RIG"
-    drivers = remove_drivers(scene_rigs, graph.nodes, kept)
-    bones = set(remove_bones(scene_rigs[0].armature_object, kept))
-    modifiers = [name for rig in scene_rigs for name in _remove_replaced(rig, replaced[rig.mesh_object.name])]
-    objects = remove_objects(kept)
-    for scene_rig in scene_rigs:
-        scene_rig.mesh_object.fdda.is_fast_rig = True
-        scene_rig.mesh_object.fdda.mode = "FDDA"
-        _evaluate_model(scene_rig.mesh_object)
-    return _Removed(bones, tuple(objects), tuple(modifiers), drivers)
 
 
 def _shared_armature(scene_rigs: list[SceneRig]) -> bpy.types.Object:
@@ -187,32 +164,16 @@ def _evaluate_model(mesh_object: bpy.types.Object) -> None:
         raise ModelError(mesh_object.fdda.status)
 
 
-def _replaced_modifiers(mesh_object: bpy.types.Object) -> set[str]:
-    """Return the names of the modifiers that the model of a bound object replaces, on or off."""
-    return {m.name for m in (*deforming_modifiers(mesh_object), *recorded_modifiers(mesh_object))}
-
-
-def _remove_replaced(scene_rig: SceneRig, names: set[str]) -> list[str]:
-    """Remove the replaced modifiers, except the first Armature modifier, which tells which armature the mesh has."""
-    mesh_object = scene_rig.mesh_object
-    kept = next((m.name for m in mesh_object.modifiers if m.type == "ARMATURE" and m.name in names), None)
-    return remove_modifiers(mesh_object, [m.name for m in mesh_object.modifiers if m.name in names - {kept}])
-
-
-def _roots(scene_rigs: list[SceneRig], joint_names: tuple[str, ...], controls: tuple[str, ...]) -> list[Node]:
-    """Return what a fast rig shows, what its models read, and what animators pose."""
-    armature_object = scene_rigs[0].armature_object
-    roots = [datablock_node(armature_object)]
-    roots += [bone_node(armature_object, name) for name in (*joint_names, *controls)]
-    roots += [datablock_node(scene_object) for scene_object in shown_objects(scene_rigs)]
+def _model_nodes(scene_rigs: list[SceneRig]) -> list[Node]:
+    """Return the extra inputs that the models read."""
+    nodes = []
     for scene_rig in scene_rigs:
-        roots.append(datablock_node(scene_rig.mesh_object))
         for control in network_of(scene_rig.mesh_object).info.controls:
             owner = owner_of(scene_rig, control.owner)
-            roots += [datablock_node(owner), driven_node(owner, control.path)]
+            nodes += [datablock_node(owner), driven_node(owner, control.path)]
             if bone_name := bone_of_path(control.path):
-                roots.append(bone_node(armature_object, bone_name))
-    return roots
+                nodes.append(bone_node(scene_rig.armature_object, bone_name))
+    return nodes
 
 
 def _evaluate(poses: JointPoses, stage: str) -> Iterator[Progress]:

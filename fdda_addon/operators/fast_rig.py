@@ -62,7 +62,7 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         return self.bound_rig(context).mesh_object.session_uid
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..fast_rig.process import FastRigProcess
+        from ..fast_rig.process import VerbProcess
 
         scene_rig = self.bound_rig(context)
         self._check_saved(scene_rig)
@@ -83,7 +83,7 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
             model = _write_models(mesh_objects, Path(folder))
             names = [f"--object={mesh_objects[0].name}"] if len(mesh_objects) == 1 else []
             arguments = [bpy.data.filepath, str(model), out, *names, "--controls", *choices]
-            with FastRigProcess(arguments) as process:
+            with VerbProcess("fast-rig", arguments) as process:
                 yield from process.steps()
 
     def finish(self, _context: bpy.types.Context, result: object) -> str:

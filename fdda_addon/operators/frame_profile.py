@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operator of the section "Rig" that profiles a frame."""
 
+import json
+import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
 
+from ..core.errors import FDDAError
 from .job import JobOperator
 from .rig_operator import RigOperator
 
@@ -26,8 +31,8 @@ class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.profile_frame"
     bl_label = "Profile Frame"
     bl_description = (
-        "Measure how much time bones, each modifier, the rest of the evaluation and drawing take in a frame, and which "
-        "bones are the slowest"
+        "Measure how much time bones, each modifier, the rest of the evaluation and drawing take in a frame; which "
+        "bones are the slowest; and what a model and a fast rig would save"
     )
     bl_options = {"REGISTER"}
     verb, title = "profile_frame", "Profiling"
@@ -37,15 +42,41 @@ class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..timing.frame_profile import profile_frame
+        from ..timing.profiling import profile_frame
 
-        yield from profile_frame(self.rig(context))
+        scene_rig = self.rig(context)
+        for step in profile_frame(scene_rig):
+            yield step
+        yield from _with_fast_rig(step, scene_rig.mesh_object.name)
 
     def finish(self, context: bpy.types.Context, result: "FrameProfile") -> str:
         _profiles[self.rig(context).mesh_object.session_uid] = result
         largest_part = max(result.parts, key=lambda part: part.duration.median)
         share = largest_part.duration.median / max(result.total, 1e-9)
         return f"{result.frame.median:.2f} ms per frame; {largest_part.title} takes {share:.0%}."
+
+
+def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object]:
+    """Measure what a fast rig would save, in another Blender with a copy of the open file.
+
+    Yields:
+        Progress, None while there is none, and at the end the profile with the result.
+    """
+    from ..fast_rig.process import VerbProcess
+    from ..scene.blend_file import save_copy
+    from ..timing.fast_rig_saving import FastRigSaving
+
+    try:
+        with tempfile.TemporaryDirectory(prefix="fdda-") as folder:
+            file, result_file = Path(folder) / "rig.blend", Path(folder) / "saving.json"
+            save_copy(file)
+            arguments = [str(file), "--fast-rig", f"--object={object_name}", "--json", str(result_file)]
+            with VerbProcess("benchmark", arguments) as process:
+                yield from (step for step in process.steps() if not isinstance(step, str))
+            saving = FastRigSaving.from_json(json.loads(result_file.read_text(encoding="utf-8")))
+        yield replace(profile, fast_rig=saving)
+    except FDDAError as error:
+        yield replace(profile, fast_rig_problem=str(error))
 
 
 CLASSES = (FDDA_OT_profile_frame,)

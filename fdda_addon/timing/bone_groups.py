@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the bones whose constraints and drivers take the most time, by muting groups of them and restoring them.
+"""Finds the bones whose constraints and drivers take the most time, by removing groups of them from copies.
 
 Thousands of bones cannot be timed one by one. The group that takes the most time is divided, until the groups are
 single bones or too small to measure.
 """
 
 import statistics
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 
 import bpy
 
 from ..core.progress import Progress
 from ..rig.sources import split_bone_path
+from .armature_copy import RemovablePart, armature_copy
 from .durations import Duration, scene_times
 
 MAX_GROUPS = 10
@@ -65,17 +65,13 @@ class BoneGroup:
         }
 
 
-Mutable = bpy.types.Constraint | bpy.types.FCurve
-
-
 def find_expensive_groups(
-    armature_object: bpy.types.Object, scene: bpy.types.Scene, frames: range
+    armature_object: bpy.types.Object, frames: range
 ) -> Generator[Progress, None, tuple[BoneGroup, ...]]:
     """Find the bones of an armature whose constraints and drivers take the most time.
 
     Args:
         armature_object: the armature object.
-        scene: a scene with the armature object alone.
         frames: frames of its animation.
 
     Yields:
@@ -84,19 +80,29 @@ def find_expensive_groups(
     Returns:
         At most `MAX_GROUPS` groups, largest first.
     """
-    mutables = mutables_by_bone(armature_object)
-    if not mutables:
+    parts = parts_by_bone(armature_object)
+    if not parts:
         return ()
+    with armature_copy(armature_object) as full_scene:
+        groups = yield from _divide(armature_object, parts, full_scene, frames)
+    yield Progress("bones", MAX_MEASUREMENTS, MAX_MEASUREMENTS)
+    return tuple(sorted(groups, key=lambda group: -group.duration.median)[:MAX_GROUPS])
+
+
+def _divide(
+    armature_object: bpy.types.Object, parts: dict[str, list[RemovablePart]], full_scene: bpy.types.Scene, frames: range
+) -> Generator[Progress, None, list[BoneGroup]]:
+    """Divide the bones with `parts` into groups, the one that takes the most time first."""
     measured_count = 0
 
     def measure(names: Iterable[str]) -> Generator[Progress, None, BoneGroup]:
         nonlocal measured_count
-        group = _measure_group(mutables, names, scene, frames)
+        group = _measure_group(armature_object, parts, names, full_scene, frames)
         measured_count += 1
         yield Progress("bones", measured_count, MAX_MEASUREMENTS)
         return group
 
-    queue = [(yield from measure(mutables))]
+    queue = [(yield from measure(parts))]
     groups: list[BoneGroup] = []
     while queue:
         queue.sort(key=lambda group: group.duration.median)
@@ -111,48 +117,39 @@ def find_expensive_groups(
             queue += clear_halves
         elif group.duration.is_clear:
             groups.append(group)
-    yield Progress("bones", MAX_MEASUREMENTS, MAX_MEASUREMENTS)
-    return tuple(sorted(groups, key=lambda group: -group.duration.median)[:MAX_GROUPS])
+    return groups
 
 
-def mutables_by_bone(armature_object: bpy.types.Object) -> dict[str, list[Mutable]]:
+def parts_by_bone(armature_object: bpy.types.Object) -> dict[str, list[RemovablePart]]:
     """Return the enabled constraints and drivers of an armature by the name of the bone, in the order of the bones."""
-    mutables: dict[str, list[Mutable]] = {bone.name: [] for bone in armature_object.pose.bones}
+    parts: dict[str, list[RemovablePart]] = {bone.name: [] for bone in armature_object.pose.bones}
     for bone in armature_object.pose.bones:
-        mutables[bone.name] += [constraint for constraint in bone.constraints if not constraint.mute]
+        parts[bone.name] += [constraint for constraint in bone.constraints if not constraint.mute]
     for datablock in (armature_object, armature_object.data):
         animation = datablock.animation_data
         for curve in animation.drivers if animation else ():
             if not curve.mute:
                 bone_name, _ = split_bone_path(curve.data_path)
-                mutables.setdefault(bone_name if bone_name in mutables else NO_BONE, []).append(curve)
-    return {name: bone_mutables for name, bone_mutables in mutables.items() if bone_mutables}
+                parts.setdefault(bone_name if bone_name in parts else NO_BONE, []).append(curve)
+    return {name: bone_parts for name, bone_parts in parts.items() if bone_parts}
 
 
 def _measure_group(
-    mutables: dict[str, list[Mutable]], names: Iterable[str], scene: bpy.types.Scene, frames: range
+    armature_object: bpy.types.Object,
+    parts: dict[str, list[RemovablePart]],
+    names: Iterable[str],
+    full_scene: bpy.types.Scene,
+    frames: range,
 ) -> BoneGroup:
-    group = [mutable for name in names for mutable in mutables[name]]
+    group = [part for name in names for part in parts[name]]
     rounds, ratios = [], []
-    for round_index in range(ROUNDS):
-        first_index = round_index * FRAMES_PER_ROUND
-        rounds.append(scene_times(scene, frames, first_index, FRAMES_PER_ROUND))
-        with _muted(group):
+    with armature_copy(armature_object, group) as scene:
+        for round_index in range(ROUNDS):
+            first_index = round_index * FRAMES_PER_ROUND
+            rounds.append(scene_times(full_scene, frames, first_index, FRAMES_PER_ROUND))
             ratios.append(1 - scene_times(scene, frames, first_index, FRAMES_PER_ROUND) / rounds[-1])
     full_ms = statistics.median(rounds)
-    driver_count = sum(isinstance(mutable, bpy.types.FCurve) for mutable in group)
+    driver_count = sum(isinstance(part, bpy.types.FCurve) for part in group)
     return BoneGroup(
         tuple(names), len(group) - driver_count, driver_count, Duration.of([ratio * full_ms for ratio in ratios])
     )
-
-
-@contextmanager
-def _muted(mutables: list[Mutable]) -> Iterator[None]:
-    """Mute constraints and drivers in the block, and unmute them afterwards."""
-    try:
-        for mutable in mutables:
-            mutable.mute = True
-        yield
-    finally:
-        for mutable in mutables:
-            mutable.mute = False

@@ -11,7 +11,7 @@ import pytest
 from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
 from fdda_addon.fast_rig import frame_times
-from fdda_addon.fast_rig import run as fast_rig_run
+from fdda_addon.fast_rig import removal as fast_rig_removal
 from fdda_addon.fast_rig.bone_reader import bone_node
 from fdda_addon.fast_rig.controls import control_bones
 from fdda_addon.fast_rig.dependency_graph import Node
@@ -231,7 +231,7 @@ def test_bones_that_differ_are_named_and_nothing_is_written(folder, monkeypatch,
             needed.discard(bone_node(scene_rigs[0].armature_object, missing))
         return graph
 
-    monkeypatch.setattr(fast_rig_run, "read_graph", read_incomplete_graph)
+    monkeypatch.setattr(fast_rig_removal, "read_graph", read_incomplete_graph)
     assert run(*fast_rig_arguments(folder)) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert (

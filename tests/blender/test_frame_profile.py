@@ -11,9 +11,12 @@ from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.operators.frame_profile import last_profile
 from fdda_addon.panels.frame_profile import draw_profile
 from fdda_addon.scene.scene_rig import SceneRig
-from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, mutables_by_bone
-from fdda_addon.timing.durations import ARMATURE_SCENE_NAME, Duration, temporary_armature_scene
-from fdda_addon.timing.frame_profile import BONES, MODIFIER, REST, FrameProfile, profile_frame
+from fdda_addon.timing.armature_copy import armature_copy
+from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, parts_by_bone
+from fdda_addon.timing.durations import ARMATURE_SCENE_NAME, Duration
+from fdda_addon.timing.fast_rig_saving import FastRigSaving
+from fdda_addon.timing.frame_profile import BONES, MODIFIER, REST, FrameProfile
+from fdda_addon.timing.profiling import profile_frame
 
 from .conftest import run
 from .drawing import Layout
@@ -34,6 +37,16 @@ def slow_rig(saved: SceneRig) -> SceneRig:
     bpy.context.view_layer.objects.active = saved.mesh_object
     bpy.context.view_layer.update()
     return saved
+
+
+def hide_extra_bones(rig: SceneRig) -> None:
+    """Hide the bones with constraints, in a bone collection."""
+    armature = rig.armature_object.data
+    collection = armature.collections.new("extra")
+    for bone in armature.bones:
+        if bone.name.startswith("extra."):
+            collection.assign(bone)
+    collection.is_visible = False
 
 
 def profile_of(rig: SceneRig) -> FrameProfile:
@@ -61,20 +74,22 @@ def test_the_parts_add_up_to_the_frame_and_the_slow_modifier_is_the_largest(slow
     assert profile.model_saving < profile.model_limit
 
 
+def expensive_groups(armature_object: bpy.types.Object, frames: range) -> tuple[BoneGroup, ...]:
+    search = find_expensive_groups(armature_object, frames)
+    while True:
+        try:
+            next(search)
+        except StopIteration as stop:
+            return stop.value
+
+
 def test_the_bone_with_the_slow_constraints_is_found(slow_rig):
     frames = range(1, 30)
-    with temporary_armature_scene(slow_rig.armature_object) as scene:
-        bone = slow_rig.armature_object.pose.bones["lower"]
-        for frame in frames:
-            bone.rotation_euler[0] = frame / 20
-            bone.keyframe_insert("rotation_euler", frame=frame)
-        search = find_expensive_groups(slow_rig.armature_object, scene, frames)
-        while True:
-            try:
-                next(search)
-            except StopIteration as stop:
-                groups = stop.value
-                break
+    bone = slow_rig.armature_object.pose.bones["lower"]
+    for frame in frames:
+        bone.rotation_euler[0] = frame / 20
+        bone.keyframe_insert("rotation_euler", frame=frame)
+    groups = expensive_groups(slow_rig.armature_object, frames)
     assert groups[0].bones == ("extra.7",) and groups[0].constraints == 400
     assert groups[0].title == "extra.7: 400 constraints"
 
@@ -82,14 +97,68 @@ def test_the_bone_with_the_slow_constraints_is_found(slow_rig):
 def test_drivers_belong_to_their_bones_and_muted_constraints_are_left_out(slow_rig):
     slow_rig.armature_object.pose.bones["extra.3"].driver_add("location", 0)
     slow_rig.armature_object.driver_add("hide_render")
-    mutables = mutables_by_bone(slow_rig.armature_object)
-    assert {name: len(items) for name, items in mutables.items()} == {
+    parts = parts_by_bone(slow_rig.armature_object)
+    assert {name: len(items) for name, items in parts.items()} == {
         **dict.fromkeys(("upper", "lower"), 1),
         **{f"extra.{n}": 1 for n in range(12) if n not in (2, 7)},
         "extra.3": 2,
         "extra.7": 400,
         "": 1,
     }
+
+
+def test_a_copy_depends_on_itself_and_lacks_what_was_removed(slow_rig):
+    """The copy moves like the original, which is not in its scene; without a driver and a constraint it does not."""
+    armature_object = slow_rig.armature_object
+    curve = armature_object.pose.bones["lower"].driver_add("rotation_euler", 0)
+    curve.driver.type = "SUM"
+    target = curve.driver.variables.new().targets[0]
+    target.id, target.data_path = armature_object, 'pose.bones["upper"].location[0]'
+    armature_object.pose.bones["upper"].location[0] = 0.7
+    removed = [curve, armature_object.pose.bones["extra.4"].constraints[0]]
+    counts = {name: len(getattr(bpy.data, name)) for name in ("objects", "armatures", "scenes", "actions")}
+    expected = evaluated_matrices(bpy.context.scene, armature_object)
+    with armature_copy(armature_object) as full, armature_copy(armature_object, removed) as pruned:
+        assert [len(scene.collection.all_objects) for scene in (full, pruned)] == [1, 1]
+        copy = full.collection.all_objects[0]
+        assert armature_object not in {ID.original for ID in depsgraph_of(full).ids}
+        assert evaluated_matrices(full, copy) == expected
+        copy = pruned.collection.all_objects[0]
+        matrices = evaluated_matrices(pruned, copy)
+        assert matrices["extra.4"] != expected["extra.4"] and matrices["lower"] != expected["lower"]
+        assert matrices["upper"] == expected["upper"]
+        assert len(pruned.collection.all_objects[0].pose.bones["extra.7"].constraints) == 400
+    assert counts == {name: len(getattr(bpy.data, name)) for name in counts}
+    assert (
+        len(armature_object.pose.bones["extra.4"].constraints) == 1 and len(armature_object.animation_data.drivers) == 1
+    )
+
+
+def test_the_armature_of_a_library_is_copied(slow_rig, tmp_path):
+    """Constraints of a linked armature, overridden or not, can be removed from a copy."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    name = slow_rig.armature_object.name
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, linked):
+        linked.objects = [name]
+    linked_object = bpy.data.objects[name]
+    overridden = linked_object.override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    for armature_object in (linked_object, overridden):
+        removed = list(armature_object.pose.bones["extra.7"].constraints)
+        with armature_copy(armature_object, removed) as scene:
+            copy = scene.collection.all_objects[0]
+            assert not copy.pose.bones["extra.7"].constraints and len(copy.pose.bones["extra.3"].constraints) == 1
+        assert len(armature_object.pose.bones["extra.7"].constraints) == 400
+
+
+def depsgraph_of(scene: bpy.types.Scene) -> bpy.types.Depsgraph:
+    scene.frame_set(1)
+    return scene.view_layers[0].depsgraph
+
+
+def evaluated_matrices(scene: bpy.types.Scene, armature_object: bpy.types.Object) -> dict[str, tuple]:
+    evaluated = armature_object.evaluated_get(depsgraph_of(scene))
+    return {bone.name: tuple(map(tuple, bone.matrix)) for bone in evaluated.pose.bones}
 
 
 @pytest.mark.parametrize(
@@ -115,20 +184,56 @@ def test_the_verb_writes_the_profile(elbow_files, tmp_path, capfd):
     profile = json.loads(path.read_text())["profile"]
     assert {part["kind"] for part in profile["parts"]} >= {"bones", "modifier", "rest"}
     assert profile["frame"]["median"] > 0 and profile["frame"]["spread"] >= 0
+    assert profile["fast_rig"]["kept_bones"] == profile["fast_rig"]["bones"] == 2 and not profile["fast_rig_problem"]
     output = capfd.readouterr().out
     assert "A frame takes" in output and "A model could save" in output
+    assert "A fast rig with all 2 visible controls and 2 joints would keep 2 of 2 bones" in output
 
 
-@pytest.mark.parametrize("arguments", [["m.onnx", "--profile"], []])
+def test_a_fast_rig_leaves_out_the_slow_bone_that_nothing_needs(slow_rig, tmp_path, capfd):
+    """Only the twelve hidden bones may go, and with them the 400 constraints that take nearly all time of the bones."""
+    hide_extra_bones(slow_rig)
+    slow_rig.mesh_object.modifiers["CorrectiveSmooth"].iterations = 1
+    file, path = tmp_path / "slow.blend", tmp_path / "saving.json"
+    bpy.ops.wm.save_as_mainfile(filepath=str(file))
+    content = file.read_bytes()
+    assert run("benchmark", file, "--fast-rig", "--json", path) == 0
+    saving = FastRigSaving.from_json(json.loads(path.read_text()))
+    assert (saving.bones, saving.kept_bones, saving.joints, saving.controls) == (14, 2, 2, 2)
+    assert saving.pruned.median < 0.5 * saving.full.median
+    assert saving.pruned.median < saving.fast == pytest.approx(json.loads(path.read_text())["fast"], abs=1e-4)
+    assert "would keep 2 of 14 bones" in capfd.readouterr().out
+    assert file.read_bytes() == content
+
+
+def test_the_profile_says_why_no_fast_rig_can_be_made(slow_rig, tmp_path, capfd):
+    """The bones of an armature that another object uses too cannot be removed."""
+    hide_extra_bones(slow_rig)
+    other = bpy.data.objects.new("other", slow_rig.armature_object.data)
+    bpy.context.scene.collection.objects.link(other)
+    file, path = tmp_path / "shared.blend", tmp_path / "profile.json"
+    bpy.ops.wm.save_as_mainfile(filepath=str(file))
+    assert run("benchmark", file, "--profile", "--json", path) == 0
+    profile = json.loads(path.read_text())["profile"]
+    assert profile["fast_rig"] is None and profile["fast_rig_problem"].startswith("'other' uses the armature of")
+    assert "A fast rig cannot be made: 'other' uses the armature of" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["m.onnx", "--profile"], ["m.onnx", "--fast-rig"], []])
 def test_a_model_or_the_profile_is_measured(elbow_files, tmp_path, capfd, arguments):
     assert run("benchmark", elbow_files.rig, *arguments, "--json", tmp_path / "p.json") == 2
-    assert "Give a model to measure, or --profile without a model." in capfd.readouterr().err
+    assert "Give a model to measure, or --profile or --fast-rig without a model." in capfd.readouterr().err
 
 
 def test_the_button_stores_the_profile(slow_rig):
+    hide_extra_bones(slow_rig)
     assert last_profile(slow_rig.mesh_object) is None
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    assert last_profile(slow_rig.mesh_object).vertices == len(slow_rig.mesh_object.data.vertices)
+    profile = last_profile(slow_rig.mesh_object)
+    assert profile.vertices == len(slow_rig.mesh_object.data.vertices)
+    assert (profile.fast_rig.bones, profile.fast_rig.kept_bones) == (14, 2) and not profile.fast_rig_problem
+    assert profile.fast_rig.full.median > profile.fast_rig.pruned.median
+    assert len(slow_rig.armature_object.data.bones) == 14, "only a copy was pruned"
 
 
 def test_an_armature_in_rest_position_is_not_profiled(saved):
@@ -153,4 +258,6 @@ def test_the_sidebar_draws_a_bar_for_each_part(slow_rig):
     texts = [element.text for element in drawn]
     assert f"Frame Profile ({profile.frame.median:.1f} ms)" in texts
     assert f"{profile.parts[0].title}" in texts and f"{profile.parts[0].duration} ms" in texts
-    assert profile.savings_sentences()[0].split(" ms")[0] in " ".join(texts)
+    sentences = profile.savings_sentences()
+    assert len(sentences) == 2
+    assert all(sentence.split(" ms")[0] in " ".join(texts) for sentence in sentences)

@@ -7,7 +7,7 @@ import bpy
 import pytest
 
 from fdda_addon.core.progress import Progress
-from fdda_addon.fast_rig.process import FastRigProcess
+from fdda_addon.fast_rig.process import VerbProcess
 from fdda_addon.jobs import job
 from fdda_addon.operators.fast_rig import _write_models
 
@@ -52,7 +52,7 @@ def test_the_sentence_of_the_verb_is_the_report(saved):
 def test_a_canceled_job_ends_the_other_blender_and_writes_nothing(saved, elbow_files):
     before = sorted(path.name for path in saved.iterdir())
     arguments = [str(saved / "elbow.blend"), str(elbow_files.model), str(saved / "fast.blend"), "--frames", "100000"]
-    with FastRigProcess(arguments) as process:
+    with VerbProcess("fast-rig", arguments) as process:
         steps = process.steps()
         while not isinstance(next(steps), Progress):
             time.sleep(0.01)

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Removes everything from the open file that chosen joints, controls and shown objects do not need."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import bpy
+
+from ..rig.modifier_stack import deforming_modifiers, recorded_modifiers
+from ..scene.scene_rig import SceneRig
+from .bone_reader import bone_node, datablock_node
+from .dependency_graph import Node
+from .graph_reader import read_graph, shown_objects
+from .pruning import check_armature, remove_bones, remove_drivers, remove_modifiers, remove_objects
+
+
+class Removed(NamedTuple):
+    """What was removed: the names, and the number of drivers."""
+
+    bones: set[str]
+    objects: tuple[str, ...]
+    modifiers: tuple[str, ...]
+    drivers: int
+
+
+def remove_unneeded(
+    scene_rigs: list[SceneRig], joint_names: Iterable[str], controls: Iterable[str], nodes: Iterable[Node] = ()
+) -> Removed:
+    """Remove everything that joints, controls, shown objects and other nodes do not need, and the replaced modifiers.
+
+    The first Armature modifier stays, because it tells which armature a mesh has.
+
+    Args:
+        scene_rigs: the rigs whose meshes models deform; they share one armature object.
+        joint_names: names of the joints that the models read.
+        controls: names of the control bones to keep.
+        nodes: further nodes to keep.
+
+    Raises:
+        RigError: as `deforming_modifiers` and `check_armature`.
+    """
+    armature_object = scene_rigs[0].armature_object
+    check_armature(armature_object)
+    shown = [*shown_objects(scene_rigs), armature_object, *(rig.mesh_object for rig in scene_rigs)]
+    roots = [*map(datablock_node, shown), *nodes]
+    roots += [bone_node(armature_object, name) for name in (*joint_names, *controls)]
+    replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
+    graph = read_graph(scene_rigs, replaced)
+    kept = graph.kept(roots)
+    drivers = remove_drivers(scene_rigs, graph.nodes, kept)
+    # Before the bones, whose loss Blender would report for each removed object that needs them.
+    objects = remove_objects(kept)
+    bones = set(remove_bones(armature_object, kept))
+    modifiers = [name for rig in scene_rigs for name in _remove_replaced(rig, replaced[rig.mesh_object.name])]
+    return Removed(bones, tuple(objects), tuple(modifiers), drivers)
+
+
+def _replaced_modifiers(mesh_object: bpy.types.Object) -> set[str]:
+    """Return the names of the modifiers that a model of an object replaces, on or off."""
+    return {m.name for m in (*deforming_modifiers(mesh_object), *recorded_modifiers(mesh_object))}
+
+
+def _remove_replaced(scene_rig: SceneRig, names: set[str]) -> list[str]:
+    """Remove the replaced modifiers, except the first Armature modifier."""
+    mesh_object = scene_rig.mesh_object
+    kept = next((m.name for m in mesh_object.modifiers if m.type == "ARMATURE" and m.name in names), None)
+    return remove_modifiers(mesh_object, [m.name for m in mesh_object.modifiers if m.name in names - {kept}])

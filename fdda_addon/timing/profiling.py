@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Profiles a frame: measures how much time its parts take.
+
+Each part is the difference of two measurements that follow each other, with and without the part, as a ratio of the
+whole frame, so that other work on the machine slows both. The median over several rounds counts, and the spread over
+the rounds tells how sure it is.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import bpy
+
+from ..core.errors import RigError
+from ..core.progress import Progress
+from ..rig.modifier_stack import check_posable, deforming_modifiers, is_fdda_modifier
+from ..runtime.binding import model_disabled
+from ..scene.scene_rig import SceneRig, armature_modifier
+from ..scene.temporary_state import temporary_attributes
+from .benchmark import temporary_animation
+from .bone_groups import find_expensive_groups
+from .durations import Duration, scene_times, temporary_armature_scene, time_redraws
+from .frame_profile import BONES, DRAWING, MODIFIER, REST, ROUNDS, SHAPE_KEYS, FramePart, FrameProfile
+from .rig_cost import estimate_playback_ms
+
+FRAMES_PER_ROUND = 8
+MIN_SHARE = 0.01
+"""Smallest share of an object in a frame that is divided into its modifiers."""
+
+
+def profile_frame(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]:
+    """Profile a frame of the scene, as a generator that works while it is iterated.
+
+    It plays the action of the armature, or random poses if there is none, and restores the scene afterwards. A bound
+    model does not play meanwhile. In a window, it also draws.
+
+    Yields:
+        Progress, and the FrameProfile at the end.
+
+    Raises:
+        RigError: as `check_posable`, or there is no action and no bone that random poses may move.
+    """
+    with model_disabled(scene_rig.mesh_object):
+        check_posable(scene_rig)
+        yield from _profile_shown_rig(scene_rig)
+
+
+def _profile_shown_rig(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]:
+    with temporary_animation(scene_rig) as frames:
+        measurement = _Measurement(scene_rig, frames)
+        with temporary_armature_scene(scene_rig.armature_object) as armature_scene:
+            yield from measurement.measure_objects(armature_scene)
+            yield from measurement.measure_parts()
+        groups = yield from find_expensive_groups(scene_rig.armature_object, frames)
+        redraw_rounds = yield from time_redraws(frames, ROUNDS, FRAMES_PER_ROUND)
+    parts = measurement.parts()
+    if redraw_rounds:
+        parts.append(FramePart(DRAWING, "", "", Duration.of(redraw_rounds)))
+    vertex_count, frame = len(scene_rig.mesh_object.data.vertices), Duration.of(measurement.frame_rounds)
+    yield FrameProfile(vertex_count, frame, tuple(parts), groups, *_model_savings(scene_rig, parts))
+
+
+class _Measurement:
+    """Times of the parts of a frame, each as a ratio of a whole frame that was measured just before.
+
+    Attributes:
+        frame_rounds: times of the whole evaluation, ms.
+    """
+
+    def __init__(self, scene_rig: SceneRig, frames: range):
+        self._scene_rig, self._frames = scene_rig, frames
+        self.frame_rounds: list[float] = []
+        self._bone_ratios: list[float] = []
+        self._object_ratios: dict[bpy.types.Object, list[float]] = {o: [] for o in _objects_with_modifiers()}
+        self._part_ratios: dict[tuple[str, str, str], list[float]] = {}
+
+    def _frame_ms(self, round_index: int, scene: bpy.types.Scene | None = None) -> float:
+        return scene_times(scene or bpy.context.scene, self._frames, round_index * FRAMES_PER_ROUND, FRAMES_PER_ROUND)
+
+    def _whole_frame_ms(self, round_index: int) -> float:
+        self.frame_rounds.append(self._frame_ms(round_index))
+        return self.frame_rounds[-1]
+
+    def measure_objects(self, armature_scene: bpy.types.Scene) -> Iterator[Progress]:
+        """Measure the bones, and all modifiers and shape keys of each object together."""
+        steps_per_round = 1 + len(self._object_ratios)
+        for round_index in range(ROUNDS):
+            frame_ms = self._whole_frame_ms(round_index)
+            self._bone_ratios.append(self._frame_ms(round_index, armature_scene) / frame_ms)
+            yield Progress("objects", round_index * steps_per_round + 1, ROUNDS * steps_per_round)
+            for index, (scene_object, ratios) in enumerate(self._object_ratios.items(), 2):
+                frame_ms = self._whole_frame_ms(round_index)
+                with ExitStack() as stack:
+                    for kind, name in _removable_parts(scene_object):
+                        _disable_part(stack, scene_object, kind, name)
+                    ratios.append(1 - self._frame_ms(round_index) / frame_ms)
+                yield Progress("objects", round_index * steps_per_round + index, ROUNDS * steps_per_round)
+
+    def measure_parts(self) -> Iterator[Progress]:
+        """Measure each modifier and the shape keys of the objects that take a clear share of the frame."""
+        objects = [o for o in self._object_ratios if self._is_clear(o) and len(_removable_parts(o)) > 1]
+        for round_index in range(ROUNDS):
+            for index, scene_object in enumerate(objects, 1):
+                with ExitStack() as stack:
+                    frame_ms = previous_ms = self._whole_frame_ms(round_index)
+                    # From the last modifier to the first, because the result of the first is the input of the next.
+                    for kind, name in _removable_parts(scene_object):
+                        _disable_part(stack, scene_object, kind, name)
+                        remaining_ms = self._frame_ms(round_index)
+                        ratios = self._part_ratios.setdefault((kind, scene_object.name, name), [])
+                        ratios.append((previous_ms - remaining_ms) / frame_ms)
+                        previous_ms = remaining_ms
+                yield Progress("modifiers", round_index * len(objects) + index, ROUNDS * len(objects))
+
+    def _is_clear(self, scene_object: bpy.types.Object) -> bool:
+        """Return whether the share of an object is larger than the noise; the mesh of the rig counts in any case."""
+        share = Duration.of(self._object_ratios[scene_object])
+        return share.median > max(share.spread, MIN_SHARE) or scene_object == self._scene_rig.mesh_object
+
+    def parts(self) -> list[FramePart]:
+        """Return the parts of the evaluation, largest first. Objects within the noise belong to the rest."""
+        clear_objects = [o for o in self._object_ratios if self._is_clear(o)]
+        ratios_by_part = {(BONES, self._scene_rig.armature_object.name, ""): self._bone_ratios, **self._part_ratios}
+        divided_objects = {name for _, name, _ in self._part_ratios}
+        for scene_object in clear_objects:
+            if scene_object.name not in divided_objects:
+                kind, name = _removable_parts(scene_object)[0]
+                ratios_by_part[kind, scene_object.name, name] = self._object_ratios[scene_object]
+        ratios_by_part[REST, "", ""] = [
+            1 - bones_ratio - sum(self._object_ratios[o][index] for o in clear_objects)
+            for index, bones_ratio in enumerate(self._bone_ratios)
+        ]
+        frame_ms = Duration.of(self.frame_rounds).median
+        parts = [
+            FramePart(*key, Duration.of([ratio * frame_ms for ratio in ratios]))
+            for key, ratios in ratios_by_part.items()
+        ]
+        return sorted(parts, key=lambda part: -part.duration.median)
+
+
+def _model_savings(scene_rig: SceneRig, parts: list[FramePart]) -> tuple[float | None, float | None]:
+    """Return what a model could save at most and what it will probably save, in ms; None if it cannot replace the rig.
+
+    Reading the pose and writing the positions takes as long as the Armature modifier alone and a small share for each
+    vertex (`estimate_playback_ms`).
+    """
+    mesh_object = scene_rig.mesh_object
+    try:
+        replaced_names = {modifier.name for modifier in deforming_modifiers(mesh_object)}
+    except RigError:
+        return None, None
+    replaced_parts = [
+        part
+        for part in parts
+        if part.object == mesh_object.name
+        and (part.kind == SHAPE_KEYS or (part.kind == MODIFIER and part.name in replaced_names))
+    ]
+    model_limit = sum(part.duration.median for part in replaced_parts)
+    skin_modifier = armature_modifier(mesh_object)
+    skinning_ms = sum(
+        part.duration.median for part in replaced_parts if skin_modifier and part.name == skin_modifier.name
+    )
+    return model_limit, model_limit - skinning_ms - estimate_playback_ms(len(mesh_object.data.vertices))
+
+
+def _objects_with_modifiers() -> list[bpy.types.Object]:
+    """Return the objects of the scene that Blender evaluates and that have modifiers or shape keys."""
+    objects = [
+        datablock.original
+        for datablock in bpy.context.evaluated_depsgraph_get().ids
+        if isinstance(datablock, bpy.types.Object) and datablock.original.type != "ARMATURE"
+    ]
+    return sorted({o.name: o for o in objects if _removable_parts(o)}.values(), key=lambda o: o.name)
+
+
+def _removable_parts(scene_object: bpy.types.Object) -> list[tuple[str, str]]:
+    """Return kind and name of the parts that can be disabled: modifiers from the last to the first, then shape keys."""
+    parts = [
+        (MODIFIER, modifier.name)
+        for modifier in reversed(scene_object.modifiers)
+        if modifier.show_viewport and not is_fdda_modifier(modifier)
+    ]
+    shape_keys = getattr(scene_object.data, "shape_keys", None)
+    if shape_keys is not None and len(shape_keys.key_blocks) > 1:
+        parts.append((SHAPE_KEYS, ""))
+    return parts
+
+
+def _disable_part(stack: ExitStack, scene_object: bpy.types.Object, kind: str, name: str) -> None:
+    """Disable a part of `_removable_parts` until the stack is closed."""
+    if kind == MODIFIER:
+        stack.enter_context(temporary_attributes(scene_object.modifiers[name], show_viewport=False))
+    else:
+        stack.enter_context(temporary_attributes(scene_object, show_only_shape_key=True, active_shape_key_index=0))
