@@ -136,9 +136,7 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
         is_sheared(recording.pose_matrices),
     )
     exported = build_model(recording, trained_model, split.validation, config.to_json())
-    held_out = measure(
-        exported.session, study_data.held_out, trained_model, np.arange(len(study_data.held_out.pose_matrices))
-    )
+    held_out = measure(exported.session, study_data.held_out, np.arange(len(study_data.held_out.pose_matrices)))
     with atomic_write(model_path) as temporary:
         write_model(temporary, exported.content)
     return {

@@ -220,8 +220,8 @@ class _Job:
     ) -> dict:
         """Measure the model on training and held-out poses; returns the content of the report."""
         training_sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
-        training_errors = measure(exported.session, recording, trained_model, training_sample)
-        surface = measure_surface(exported.session, recording, trained_model, split.held_out)
+        training_errors = measure(exported.session, recording, training_sample)
+        surface = measure_surface(exported.session, recording, split.held_out)
         analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
         return make_report(
             recording, trained_model, exported, training_errors, surface, result.curves, model_path.name, analyses

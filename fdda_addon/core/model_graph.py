@@ -144,5 +144,3 @@ def _check_cost(cost: GraphCost, budget: Budget, size: int, poses: int) -> None:
     # A constant is used once per pose and axis.
     if cost.products > COST_FACTOR * poses * (size + 64 * (budget.values + FREE_ELEMENTS)):
         raise ValueError(f"it multiplies {cost.products} numbers for {poses} poses, more than its size explains")
-    if cost.folded > 2 * size + FREE_ELEMENTS:
-        raise ValueError(f"it unpacks {cost.folded} numbers, more than its size explains")

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from .onnx_file import INT64, ITEM_BYTES, OnnxConstant, OnnxContents, OnnxNode
+from .onnx_file import OnnxConstant, OnnxContents, OnnxNode
 
 Shape = tuple[int, ...]
 MAX_ELEMENTS = 1 << 40
@@ -23,13 +23,11 @@ class GraphCost:
     Attributes:
         elements: number of elements of all outputs of nodes.
         products: number of multiplications in matrix products.
-        folded: number of elements that are computed from constants alone while the graph is loaded (constant folding).
         shapes: shapes of the values, by name.
     """
 
     elements: int
     products: int
-    folded: int
     shapes: dict[str, Shape]
 
 
@@ -86,12 +84,6 @@ def _same_shape(call: _NodeCall) -> list[Shape]:
 
 def _elementwise(call: _NodeCall) -> list[Shape]:
     return [_broadcast_shapes(call.shapes)]
-
-
-def _cast(call: _NodeCall) -> list[Shape]:
-    if call.attribute("to", 0) not in ITEM_BYTES:
-        raise ValueError("a Cast to what is no number")
-    return [call.shapes[0]]
 
 
 def _matmul(call: _NodeCall) -> list[Shape]:
@@ -173,16 +165,6 @@ def _gather(call: _NodeCall) -> list[Shape]:
     return [(*shape[:axis], *index_shape, *shape[axis + 1 :])]
 
 
-def _unsqueeze(call: _NodeCall) -> list[Shape]:
-    shape, axes = list(call.shapes[0]), call.integers(1)
-    new_axes = sorted({_normalize_axis(axis, len(shape) + len(axes)) for axis in axes})
-    if len(new_axes) != len(axes):
-        raise ValueError("an Unsqueeze that names an axis twice")
-    for axis in new_axes:
-        shape.insert(axis, 1)
-    return [tuple(shape)]
-
-
 def _reduce(call: _NodeCall) -> list[Shape]:
     shape = call.shapes[0]
     axes = {_normalize_axis(axis, len(shape)) for axis in call.integers(1)}
@@ -191,22 +173,13 @@ def _reduce(call: _NodeCall) -> list[Shape]:
     return [tuple(size for axis, size in enumerate(shape) if axis not in axes)]
 
 
-def _quantize(call: _NodeCall) -> list[Shape]:
-    return [call.shapes[0], (), ()]
-
-
 SHAPE_RULES: dict[str, Callable[[_NodeCall], list[Shape]]] = {
     **dict.fromkeys(("Add", "Sub", "Mul", "Div", "Max", "Min"), _elementwise),
     **dict.fromkeys(("Relu", "Sigmoid", "Tanh", "Erf", "Sqrt"), _same_shape),
-    **dict.fromkeys(("MatMul", "MatMulInteger"), _matmul),
-    **{"Gemm": _gemm, "Cast": _cast, "DequantizeLinear": _same_shape, "DynamicQuantizeLinear": _quantize},
-    **{"Transpose": _transpose, "Reshape": _reshape, "Concat": _concat, "Split": _split, "Slice": _slice},
-    **{"Gather": _gather, "Unsqueeze": _unsqueeze, "ReduceSum": _reduce},
+    **{"MatMul": _matmul, "Gemm": _gemm, "Transpose": _transpose, "Reshape": _reshape, "Concat": _concat},
+    **{"Split": _split, "Slice": _slice, "Gather": _gather, "ReduceSum": _reduce},
 }
 OPERATORS = tuple(SHAPE_RULES)
-MATRIX_PRODUCT_OPERATORS = ("MatMul", "MatMulInteger", "Gemm")
-CONSTANT_INPUT_OPERATORS = ("Cast", "DequantizeLinear")
-"""Operators whose inputs may all be constants. `train` stores the results of other operators as constants."""
 
 
 def compute_graph_cost(contents: OnnxContents, poses: int) -> GraphCost:
@@ -222,16 +195,15 @@ def compute_graph_cost(contents: OnnxContents, poses: int) -> GraphCost:
     """
     input_shapes = {name: (poses, *shape[1:]) for name, shape in contents.inputs.items()}
     constant_shapes = {name: constant.shape for name, constant in contents.constants.items()}
-    cost = GraphCost(0, 0, 0, {**input_shapes, **constant_shapes})
+    cost = GraphCost(0, 0, {**input_shapes, **constant_shapes})
     if len(cost.shapes) != len(input_shapes) + len(constant_shapes):
         raise ValueError("an input and a constant have one name")
-    constant_names = set(constant_shapes)
     for node in contents.nodes:
-        _add_node(node, contents.constants, constant_names, cost)
+        _add_node(node, contents.constants, cost)
     return cost
 
 
-def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], constant_names: set[str], cost: GraphCost) -> None:
+def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], cost: GraphCost) -> None:
     if node.operator not in SHAPE_RULES:
         raise ValueError(f"it has the operator {node.operator!r}, which train does not write")
     inputs = [name for name in node.inputs if name]
@@ -252,19 +224,12 @@ def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], constant_names
             f"a {node.operator} gives {elements} numbers, more than its joints, vertices and components explain"
         )
     cost.elements += elements
-    if node.operator in MATRIX_PRODUCT_OPERATORS:
+    if node.operator in ("MatMul", "Gemm"):
         cost.products += math.prod(output_shapes[0]) * call.shapes[0][-1 if not call.attribute("transA", 0) else -2]
-    if constant_names.issuperset(inputs):
-        if node.operator not in CONSTANT_INPUT_OPERATORS:
-            raise ValueError(f"a {node.operator} of constants alone")
-        cost.folded += elements
-        constant_names.update(node.outputs)
+    if None not in call.constants:
+        # ONNX Runtime would compute the outputs while it loads the graph; `train` stores them as constants.
+        raise ValueError(f"a {node.operator} of constants alone")
     for name, shape in zip(node.outputs, output_shapes, strict=False):
         if name in cost.shapes:
             raise ValueError(f"two values are called {name!r}")
         cost.shapes[name] = shape
-
-
-def constant_elements(contents: OnnxContents) -> int:
-    """Count the elements of the constants of a graph, except for integer constants such as indices and shapes."""
-    return sum(math.prod(constant.shape) for constant in contents.constants.values() if constant.type != INT64)

@@ -11,8 +11,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-ITEM_BYTES = {1: 4, 2: 1, 3: 1, 6: 4, 7: 8, 10: 2}
-"""Bytes per element, by the number of the ONNX data type: float, uint8, int8, int32, int64, float16."""
+ITEM_BYTES = {1: 4, 6: 4, 7: 8}
+"""Bytes per element, by the number of the ONNX data type: float, int32, int64."""
 INT64 = 7
 """Number of the ONNX data type int64."""
 MAX_DIMENSIONS = 8

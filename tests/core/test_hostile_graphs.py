@@ -68,6 +68,11 @@ FORBIDDEN_OPERATORS = (
     "Conv",
     "Scan",
     "SequenceEmpty",
+    "Cast",
+    "Unsqueeze",
+    "DequantizeLinear",
+    "DynamicQuantizeLinear",
+    "MatMulInteger",
     "x" * 500,
 )
 
@@ -170,6 +175,8 @@ def damaged_tensor(tensor: TensorProto, **changes) -> TensorProto:
         damaged_tensor(zeros_tensor("w"), raw_data=b""),
         damaged_tensor(zeros_tensor("w"), data_type=TensorProto.STRING),
         damaged_tensor(zeros_tensor("w"), data_type=TensorProto.DOUBLE),
+        damaged_tensor(zeros_tensor("w"), data_type=TensorProto.FLOAT16, raw_data=b""),
+        numpy_helper.from_array(np.zeros(4, np.float16), "w"),
         damaged_tensor(zeros_tensor("w"), data_type=999),
         helper.make_tensor("w", TensorProto.FLOAT, [2], [1.0, 2.0]),
         helper.make_tensor("w", TensorProto.STRING, [1], [b"x" * 100]),
@@ -224,12 +231,10 @@ def test_a_training_graph_and_unknown_versions_are_refused():
         make_node("Slice", "positions", "axes"),
         make_node("Slice", "positions", "axes", "axes", "axes", "zeros"),
         make_node("Gather", "positions", "axes", axis=7),
-        make_node("Unsqueeze", "positions", "shape"),
         make_node("ReduceSum", "positions", "axes"),
         make_node("MatMul", "positions", "positions"),
         make_node("MatMul", "positions"),
         make_node("Gemm", "positions", "positions"),
-        make_node("Cast", "positions", to=TensorProto.STRING),
         make_node("Add", "positions", "pose_matrices"),
     ],
 )  # fmt: skip
@@ -274,13 +279,9 @@ def test_computed_shapes_equal_those_of_onnx_runtime():
     tensors = {
         "w": rng.normal(size=(16, 5)).astype(np.float32),
         "b": np.zeros(5, np.float32),
-        "i8": rng.integers(-9, 9, (5, 7)).astype(np.int8),
-        "scale": np.float32(0.5),
-        "zero": np.int8(0),
-        "bytes_zero": np.uint8(0),
         **{name: np.array(v, np.int64) for name, v in {
             "flat": [0, JOINT_COUNT, 16], "rows": [-1, 16], "sizes": [3, 2], "start": [1], "end": [9], "axis": [2],
-            "step": [2], "picks": [[0, 2], [1, 1]], "last": [-1], "two": [0, 3],
+            "step": [2], "picks": [[0, 2], [1, 1]], "last": [-1],
         }.items()},
     }  # fmt: skip
     nodes = [
@@ -299,13 +300,8 @@ def test_computed_shapes_equal_those_of_onnx_runtime():
         helper.make_node("Slice", ["x", "start", "end", "axis", "step"], ["sl"]),
         helper.make_node("Slice", ["x", "start", "end"], ["sl0"]),
         helper.make_node("Gather", ["x", "picks"], ["ga"], axis=1),
-        helper.make_node("Unsqueeze", ["y", "two"], ["u"]),
         helper.make_node("ReduceSum", ["y", "last"], ["rs"], keepdims=0),
         helper.make_node("ReduceSum", ["y", "last"], ["rk"]),
-        helper.make_node("DequantizeLinear", ["i8", "scale", "zero"], ["dq"]),
-        helper.make_node("DynamicQuantizeLinear", ["y"], ["q", "qs", "qz"]),
-        helper.make_node("MatMulInteger", ["q", "i8", "qz"], ["mi"]),
-        helper.make_node("Cast", ["mi"], ["cast"], to=TensorProto.FLOAT),
     ]
     assert {n.op_type for n in nodes} == set(OPERATORS)
     outputs = [name for n in nodes for name in n.output]
@@ -321,7 +317,7 @@ def test_computed_shapes_equal_those_of_onnx_runtime():
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for poses in (1, 4):
         cost = compute_graph_cost(read_onnx(model.SerializeToString()), poses)
-        assert cost.products == poses * JOINT_COUNT * (3 * 16 * 5 + 5 * 7)
+        assert cost.products == poses * JOINT_COUNT * 3 * 16 * 5
         values = session.run(outputs, {"pose_matrices": rng.normal(size=(poses, JOINT_COUNT, 4, 4)).astype(np.float32)})
         assert [cost.shapes[name] for name in outputs] == [value.shape for value in values]
 

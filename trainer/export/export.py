@@ -109,40 +109,41 @@ def _inputs(recording: Recording, poses: np.ndarray) -> dict[str, np.ndarray]:
     return inputs
 
 
-def measure(
-    session: onnxruntime.InferenceSession, recording: Recording, trained_model: TrainedModel, poses: np.ndarray
-) -> PositionErrors:
+def _evaluate(
+    session: onnxruntime.InferenceSession, recording: Recording, skinning: LinearSkinning, poses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (n, V, 3) positions in poses of a recording: of the model, of linear skinning alone, and of the rig."""
+    inputs = _inputs(recording, poses)
+    matrices = inputs[POSE_INPUT]
+    (positions,) = session.run([POSITIONS_OUTPUT], inputs)
+    truth = skinning.complex_positions(matrices, np.array(recording.residuals[poses]))
+    return positions, skinning.positions(matrices), truth
+
+
+def measure(session: onnxruntime.InferenceSession, recording: Recording, poses: np.ndarray) -> PositionErrors:
     """Measure the errors of the exported model and of linear skinning on poses of the recording."""
-    vertices = recording.rig.vertex_count
-    fdda, linear = (np.empty((len(poses), vertices), np.float32) for _ in range(2))
-    skinning = LinearSkinning(recording.rig, recording.partitions)
-    for block in _blocks(len(poses), vertices):
-        inputs = _inputs(recording, poses[block])
-        matrices = inputs[POSE_INPUT]
-        truth = skinning.complex_positions(matrices, np.array(recording.residuals[poses[block]]))
-        (positions,) = session.run([POSITIONS_OUTPUT], inputs)
-        fdda[block] = distances(positions, truth, recording.rig.metres_per_unit)
-        linear[block] = distances(skinning.positions(matrices), truth, recording.rig.metres_per_unit)
+    rig = recording.rig
+    fdda, linear = (np.empty((len(poses), rig.vertex_count), np.float32) for _ in range(2))
+    skinning = LinearSkinning(rig, recording.partitions)
+    for block in _blocks(len(poses), rig.vertex_count):
+        positions, skinned, truth = _evaluate(session, recording, skinning, poses[block])
+        fdda[block] = distances(positions, truth, rig.metres_per_unit)
+        linear[block] = distances(skinned, truth, rig.metres_per_unit)
     return PositionErrors(fdda, linear)
 
 
-def measure_surface(
-    session: onnxruntime.InferenceSession, recording: Recording, trained_model: TrainedModel, poses: np.ndarray
-) -> dict:
+def measure_surface(session: onnxruntime.InferenceSession, recording: Recording, poses: np.ndarray) -> dict:
     """Measure normals and edge lengths on at most `MAX_SURFACE_POSES` poses; returns the JSON of `surface_json`."""
     rig, rows = recording.rig, []
     if not len(rig.face_starts):
         return surface_json(None, None)
     skinning = LinearSkinning(rig, recording.partitions)
     comparison = SurfaceComparison(
-        Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, trained_model.partitions
+        Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, recording.partitions
     )
     for pose in poses[:: -(-len(poses) // MAX_SURFACE_POSES)]:
-        inputs = _inputs(recording, np.array([pose]))
-        matrices = inputs[POSE_INPUT]
-        truth = skinning.complex_positions(matrices, np.array(recording.residuals[pose, None]))
-        (positions,) = session.run([POSITIONS_OUTPUT], inputs)
-        rows.append(comparison.compare(truth[0], (positions[0], skinning.positions(matrices)[0])))
+        (positions,), (skinned,), (truth,) = _evaluate(session, recording, skinning, np.array([pose]))
+        rows.append(comparison.compare(truth, (positions, skinned)))
     return surface_json(*(surface_errors(method_rows) for method_rows in zip(*rows, strict=True)))
 
 
@@ -157,27 +158,22 @@ def check_parity(
     Raises:
         TrainingError: the difference is too large, or the outputs are not finite.
     """
-    max_difference, metres_per_unit = 0.0, recording.rig.metres_per_unit
-    for block in _blocks(len(poses), recording.rig.vertex_count):
+    max_difference, rig = 0.0, recording.rig
+    for block in _blocks(len(poses), rig.vertex_count):
         inputs = _inputs(recording, poses[block])
         positions, confidence = session.run(None, inputs)
         controls = np.array(recording.controls[poses[block]])
         expected, expected_confidence = reference_positions(trained_model, inputs[POSE_INPUT], controls)
-        difference = max(float(distances(positions, expected, metres_per_unit).max()), 0.0)
         if not np.isfinite(positions).all() or not np.isfinite(confidence).all():
             raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
         if np.abs(confidence - expected_confidence).max(initial=0) > MAX_CONFIDENCE_DIFFERENCE:
             raise TrainingError(
                 "The confidence of the exported model differs from PyTorch; this is a defect, report it."
             )
-        max_difference = max(max_difference, difference)
-    max_coordinate = float(
-        np.abs(recording.rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max()
-    )
-    allowed = (
-        MAX_DIFFERENCE_METRES * max(1.0, recording.rig.size * metres_per_unit)
-        + 2 * FLOAT32_ROUNDING_RATIO * max_coordinate * metres_per_unit
-    )
+        max_difference = max(max_difference, float(distances(positions, expected, rig.metres_per_unit).max()))
+    max_coordinate = float(np.abs(rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max())
+    rounding = 2 * FLOAT32_ROUNDING_RATIO * max_coordinate * rig.metres_per_unit
+    allowed = MAX_DIFFERENCE_METRES * max(1.0, rig.size * rig.metres_per_unit) + rounding
     if max_difference > allowed:
         raise TrainingError(
             f"The exported model differs from PyTorch by {max_difference * 1000:.3g} mm, more than the allowed "
@@ -256,7 +252,7 @@ def build_model(
     onnx.checker.check_model(model)
     session = open_session(model.SerializeToString())
     parity = check_parity(session, recording, trained_model, held_out_poses)
-    held_out_errors = measure(session, recording, trained_model, held_out_poses)
+    held_out_errors = measure(session, recording, held_out_poses)
     info = replace(
         model_info(recording, trained_model, held_out_errors.fdda, training_info),
         parity_mm=parity * 1000,
