@@ -91,6 +91,8 @@ _REPORT_KEYS = {
     "goal?": {"goal": float, "p999": float, "verdict": Verdict},
 }
 """Keys of a report and the types of their values. `?` marks an optional key; further keys are permitted."""
+_EVALUATION_KEYS = {"poses": int, "fdda": _ERROR_STATISTICS, "linear": _ERROR_STATISTICS}
+"""Keys of the JSON that `evaluate` writes, as far as the page of a report shows them."""
 
 
 def report_path(model_path: Path) -> Path:
@@ -133,12 +135,7 @@ def read_report(path: Path) -> dict:
     Raises:
         TrainingError: the report cannot be read, is of another version, or is damaged.
     """
-    try:
-        report = json.loads(read_input(path, MAX_BYTES))
-    except OSError as error:
-        raise TrainingError(f"The report '{path}' cannot be read ({os_error_text(error)}); train again.") from error
-    except (ValueError, RecursionError) as error:
-        raise TrainingError(f"The report '{path}' cannot be read ({error}); train again.") from error
+    report = _read_json(path, f"The report '{path}'", "train again")
     if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):
         raise TrainingError(f"'{path}' is not a training report of this version; train again.")
     try:
@@ -146,6 +143,30 @@ def read_report(path: Path) -> dict:
     except ValueError as error:
         raise TrainingError(f"The report '{path}' is damaged: {error}; train again.") from error
     return report
+
+
+def read_evaluation(path: Path) -> dict:
+    """Read the JSON that `evaluate` wrote; returns at least `_EVALUATION_KEYS`.
+
+    Raises:
+        TrainingError: the file cannot be read, is damaged, or is of another kind.
+    """
+    evaluation = _read_json(path, f"The evaluation '{path}'", "evaluate again")
+    try:
+        _check_value(evaluation, _EVALUATION_KEYS, "")
+    except ValueError as error:
+        raise TrainingError(f"The evaluation '{path}' is damaged: {error}; evaluate again.") from error
+    return evaluation
+
+
+def _read_json(path: Path, file_text: str, advice: str) -> object:
+    """Read a JSON file; its errors start with `file_text` and end with `advice`."""
+    try:
+        return json.loads(read_input(path, MAX_BYTES))
+    except OSError as error:
+        raise TrainingError(f"{file_text} cannot be read ({os_error_text(error)}); {advice}.") from error
+    except (ValueError, RecursionError) as error:
+        raise TrainingError(f"{file_text} cannot be read ({error}); {advice}.") from error
 
 
 def _check_value(value: object, expected_type: object, key_path: str) -> None:

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from trainer.__main__ import main
-from trainer.report.error_analysis import _cause
-from trainer.report.error_causes import (
+from trainer.report.error_analysis import (
     EXTREME_POSES,
     HIGH_TRAINING_ERRORS,
     NO_CLEAR_CAUSE,
     REMEDY_BY_CAUSE,
     TOO_FEW_COMPONENTS,
     TOO_FEW_POSES,
+    _cause,
 )
 from trainer.report.page import render_html
 

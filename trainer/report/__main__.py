@@ -3,32 +3,17 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
-from fdda_addon.core.errors import FDDAError
+from jinja2 import TemplateError
+
+from fdda_addon.core.errors import FDDAError, TrainingError
 from fdda_addon.core.file_kind import PAGE
 from fdda_addon.core.output import check_outputs, write_text
-from fdda_addon.core.report import page_path, read_report
+from fdda_addon.core.report import page_path, read_evaluation, read_report
 from fdda_addon.core.terminal import escape_unencodable_output
 
 from .page import render_html
-from .validation import check_drawable, read_evaluation
-
-
-def write_html(report: dict, path: Path, pictures: Sequence[Path] = (), evaluation: dict | None = None) -> None:
-    """Write the page of a report, optionally with pictures and an evaluation.
-
-    Args:
-        report: content of `report.json`.
-        path: path of the page.
-        pictures: PNG or JPEG files to show.
-        evaluation: content of the JSON that `evaluate` wrote; None without one.
-
-    Raises:
-        OutputError: the page cannot be written.
-    """
-    write_text(path, render_html(report, pictures, evaluation))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,17 +24,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--pictures", type=Path, help="folder of PNG or JPEG files to show, in order of their names")
     parser.add_argument("--evaluation", type=Path, help="JSON that evaluate wrote")
     parser.add_argument("--overwrite", action="store_true", help="overwrite a page that is no report")
-    options = parser.parse_args(arguments)
     try:
-        page = page_path(options.report)
-        check_outputs({page: PAGE}, [options.report], options.overwrite)
-        report = read_report(options.report)
-        check_drawable(report, options.report)
-        pictures = []
-        if options.pictures:
-            pictures = sorted(p for p in options.pictures.glob("*") if p.suffix.lower() in (".png", ".jpg", ".jpeg"))
-        evaluation = read_evaluation(options.evaluation) if options.evaluation else None
-        write_html(report, page, pictures, evaluation)
+        _write_page(parser.parse_args(arguments))
     except FDDAError as error:
         print(error, file=sys.stderr)
         return 1
@@ -57,6 +33,23 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"A picture cannot be read: {error}.", file=sys.stderr)
         return 1
     return 0
+
+
+def _write_page(options: argparse.Namespace) -> None:
+    page = page_path(options.report)
+    check_outputs({page: PAGE}, [options.report], options.overwrite)
+    report = read_report(options.report)
+    pictures = []
+    if options.pictures:
+        pictures = sorted(p for p in options.pictures.glob("*") if p.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    evaluation = read_evaluation(options.evaluation) if options.evaluation else None
+    try:
+        html = render_html(report, pictures, evaluation)
+    except (ArithmeticError, IndexError, ValueError, TemplateError) as error:
+        raise TrainingError(
+            f"The report '{options.report}' is damaged: its figures contradict each other; train again."
+        ) from error
+    write_text(page, html)
 
 
 if __name__ == "__main__":

@@ -51,9 +51,15 @@ class HistogramChart:
     """
 
     def __init__(self, histogram: dict, left: float, right: float, top: float, bottom: float):
-        """Lay out `histogram` of a report between positions of the chart; bins that nobody uses are left out."""
+        """Lay out `histogram` of a report between positions of the chart, without empty bins at its ends.
+
+        Raises:
+            ArithmeticError, IndexError or ValueError: edges and counts contradict each other.
+        """
         methods, edges = ("linear", "fdda"), histogram["edges"]
         counts = np.array([histogram[method] for method in methods], float)
+        if (np.diff(edges) <= 0).any() or counts.min() < 0:
+            raise ValueError("the histogram is none")
         used_bins = np.flatnonzero(counts.sum(axis=0))
         first, end = used_bins[0], used_bins[-1] + 1
         # The first bin starts at zero, which has no logarithm; it is drawn as wide as the second bin.

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Analysis of the largest errors of each partition. The report shows what is likely to lower them."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,9 +15,24 @@ from fdda_addon.core.refinement import nearest_recorded_distances
 
 from ..data.split import Split
 from ..fits.half_rotations import regression_matrices
-from ..model import TrainedModel
 from ..preparation import PreparedPartition
-from .error_causes import EXTREME_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE, TOO_FEW_COMPONENTS, TOO_FEW_POSES
+
+if TYPE_CHECKING:  # The page of a report needs no torch.
+    from ..model import TrainedModel
+
+TOO_FEW_COMPONENTS, EXTREME_POSES, TOO_FEW_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE = (
+    *("components", "extremes", "poses", "steep", "none"),
+)
+REMEDY_BY_CAUSE = {
+    TOO_FEW_COMPONENTS: "more components: a smaller tolerance",
+    EXTREME_POSES: "more poses at the extremes: refinement, or a larger spread",
+    TOO_FEW_POSES: "more poses",
+    HIGH_TRAINING_ERRORS: (
+        "little: training poses have the same errors, so the rig flips there, or the networks are too small"
+    ),
+    NO_CLEAR_CAUSE: "no cause stands out",
+}
+"""For each probable cause of large errors, the change that is likely to lower them."""
 
 ANALYZED_FRACTION = 5e-3
 """Part of a partition's held-out errors that is analyzed. They are the largest errors, and at least one."""
@@ -45,7 +63,7 @@ class ErrorAnalysis:
         distance: ratio between the distance of these poses to the nearest training pose and the median distance of all
             held-out poses.
         generalization: ratio between the 99.9th percentiles of the held-out errors and of the training errors.
-        cause: key of `error_causes.REMEDY_BY_CAUSE`.
+        cause: key of `REMEDY_BY_CAUSE`.
     """
 
     poses: int

@@ -13,7 +13,7 @@ from fdda_addon.core.input_file import read_input
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
 from .charts import HistogramChart, LogAxis, curve_points
-from .error_causes import REMEDY_BY_CAUSE
+from .error_analysis import REMEDY_BY_CAUSE
 
 MAX_PICTURE_BYTES = 256 << 20
 STATISTIC_LABELS = {"mean": "mean", "rms": "rms", "p99": "99 %", "p999": "99.9 %", "max": "max"}
@@ -39,6 +39,7 @@ def render_html(report: dict, pictures: Sequence[Path] = (), evaluation: dict | 
 
     Raises:
         OSError: a picture cannot be read.
+        ArithmeticError, IndexError, ValueError or TemplateError: figures of the report contradict each other.
     """
     return _template().render(
         report=report,
