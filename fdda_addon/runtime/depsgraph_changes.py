@@ -5,6 +5,9 @@ Blender does not document these rules; they were observed on 4.5 and 5.2. Edited
 (`is_updated_transform`), although data have no transform. A mesh is not reported as transformed if its shape keys are
 driven, or if only positions were written. Posing reports the armature data as transformed; the armature object is
 reported only if it was edited or moved.
+
+Posing by hand copies the armature data, but not the mesh object; an edited datablock is always copied. So a mark on the
+evaluated copy tells whether Blender has copied the datablock since the last report.
 """
 
 from dataclasses import dataclass
@@ -12,50 +15,52 @@ from dataclasses import dataclass
 import bpy
 from bpy.types import Armature, Key, Mesh, Object
 
+SEEN_KEY = "fdda_seen"
+"""Custom property that marks evaluated objects and armatures whose changes were read. It goes with the copy."""
+
 
 @dataclass(frozen=True)
 class DepsgraphChanges:
     """Parts of rigs that an evaluation has changed.
 
     Attributes:
-        mesh_objects: the changed mesh objects, and whether their geometry changed.
-        armatures: session ids of the armatures that were posed or edited.
+        mesh_objects: the changed bound objects, whether their geometry changed, and whether more than their pose may
+            have changed.
+        armatures: by the session id of each armature that was posed or edited: whether it may have been edited.
         meshes: by the session id of each changed mesh: whether more than its rest positions may have changed.
     """
 
-    mesh_objects: list[tuple[bpy.types.Object, bool]]
-    armatures: set[int]
+    mesh_objects: list[tuple[bpy.types.Object, bool, bool]]
+    armatures: dict[int, bool]
     meshes: dict[int, bool]
 
     @staticmethod
     def read(depsgraph: bpy.types.Depsgraph) -> "DepsgraphChanges":
         """Read the changes of the evaluation that has just ended."""
-        changes = DepsgraphChanges([], set(), changed_meshes(depsgraph))
+        changes = DepsgraphChanges([], {}, changed_meshes(depsgraph))
         for update in depsgraph.updates:
             datablock = update.id
             if isinstance(datablock, Object):
-                original_object = datablock.original
-                if original_object.type == "MESH":
-                    changes.mesh_objects.append((original_object, update.is_updated_geometry))
-                elif original_object.type == "ARMATURE" and update.is_updated_geometry and update.is_updated_transform:
-                    changes.armatures.add(original_object.data.session_uid)
-            elif isinstance(datablock, Armature) and _is_edited(update):
-                changes.armatures.add(datablock.original.session_uid)
+                if datablock.type == "MESH" and datablock.fdda.is_bound:
+                    # Changed vertex groups may only change relations, which Blender reports as shading.
+                    is_edited = SEEN_KEY not in datablock or update.is_updated_shading
+                    changes.mesh_objects.append((datablock.original, update.is_updated_geometry, is_edited))
+                    datablock[SEEN_KEY] = True
+                elif datablock.type == "ARMATURE" and update.is_updated_geometry and update.is_updated_transform:
+                    changes.armatures[datablock.data.original.session_uid] = True
+            elif isinstance(datablock, Armature) and SEEN_KEY not in datablock:
+                is_posed = update.is_updated_geometry and update.is_updated_transform
+                changes.armatures.setdefault(datablock.original.session_uid, not is_posed)
+                datablock[SEEN_KEY] = True
         return changes
 
 
-def has_edited_armature(depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return whether armature data have changed by more than their drivers and keys."""
-    return any(_is_edited(update) for update in depsgraph.updates if isinstance(update.id, Armature))
+def has_copied_armature(depsgraph: bpy.types.Depsgraph) -> bool:
+    """Return whether armature data have changed by more than their drivers and keys.
 
-
-def _is_edited(update: bpy.types.DepsgraphUpdate) -> bool:
-    """Return whether armature data were posed or edited.
-
-    Rigs of Rigify drive the B-Bones, so that Blender reports their armature data in every frame, neither as transformed
-    nor with changed geometry. Edits and poses set by hand are reported with both.
+    Rigs of Rigify drive the B-Bones, so that Blender reports their armature data in every frame.
     """
-    return update.is_updated_geometry or update.is_updated_transform or update.id.original.animation_data is None
+    return any(isinstance(update.id, Armature) and SEEN_KEY not in update.id for update in depsgraph.updates)
 
 
 def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:

@@ -11,9 +11,9 @@ from contextlib import contextmanager
 import bpy
 
 from . import effects, evaluated_copies, modifier_switch, playback_modifier, player_batch
-from .depsgraph_changes import DepsgraphChanges, changed_meshes, has_edited_armature
+from .depsgraph_changes import DepsgraphChanges, changed_meshes, has_copied_armature
 from .model_files import network_of
-from .rig_signature import ARMATURE, MESH, OBJECT, STABLE_MODES
+from .rig_signature import BONES, MESH, OBJECT, PARENTS, STABLE_MODES
 from .session import Character, session
 from .transitions import SHOWS_MODEL, Event, State
 
@@ -34,11 +34,11 @@ def on_frame_change(depsgraph: bpy.types.Depsgraph) -> None:
     updated = depsgraph.id_type_updated
     if (
         updated("SCENE")
-        or (updated("ARMATURE") and has_edited_armature(depsgraph))
+        or (updated("ARMATURE") and has_copied_armature(depsgraph))
         or (updated("MESH") and changed_meshes(depsgraph))
     ):
         _dispatch_changes(depsgraph)
-    session.dispatch(Event.CHECK)
+    session.check_rigs()
     _update(depsgraph)
     player_batch.update(frame_changed=True)
 
@@ -48,7 +48,7 @@ def on_depsgraph_update(depsgraph: bpy.types.Depsgraph) -> None:
     _dispatch_changes(depsgraph)
     if bpy.app.background:
         # Timers do not run there.
-        session.dispatch(Event.CHECK)
+        session.check_rigs()
     _update(depsgraph)
     player_batch.update(frame_changed=False)
 
@@ -56,11 +56,10 @@ def on_depsgraph_update(depsgraph: bpy.types.Depsgraph) -> None:
 def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
     """Dispatch the changes of bound objects, their meshes and their armatures."""
     changes = DepsgraphChanges.read(depsgraph)
-    for mesh_object, geometry_changed in changes.mesh_objects:
-        if mesh_object.fdda.is_bound:
-            character = session.character_of(mesh_object)
-            with session.isolated_errors(character):
-                _dispatch_object_changes(character, mesh_object, geometry_changed)
+    for mesh_object, geometry_changed, is_edited in changes.mesh_objects:
+        character = session.character_of(mesh_object)
+        with session.isolated_errors(character):
+            _dispatch_object_changes(character, mesh_object, geometry_changed, is_edited)
     # The graph of a render reports all datablocks as changed.
     is_render = depsgraph.mode == "RENDER"
     for character in [c for c in session.characters.values() if c.player is not None]:
@@ -71,7 +70,9 @@ def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
         if is_render:
             continue
         if player.armature_uid in changes.armatures:
-            session.report_change(character, ARMATURE)
+            session.report_change(character, BONES)
+            if changes.armatures[player.armature_uid]:
+                session.report_change(character, PARENTS)
         if player.mesh_uid in changes.meshes:
             session.report_change(character, MESH)
     for mesh_uid in [] if is_render else [uid for uid, is_edited in changes.meshes.items() if is_edited]:
@@ -80,8 +81,10 @@ def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
     _dispatch_edit_modes(changes)
 
 
-def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object, geometry_changed: bool) -> None:
-    """Dispatch the changes of a bound object that an evaluation has reported."""
+def _dispatch_object_changes(
+    character: Character, mesh_object: bpy.types.Object, geometry_changed: bool, is_edited: bool
+) -> None:
+    """Dispatch the changes of a bound object that an evaluation has reported (`DepsgraphChanges.mesh_objects`)."""
     _update_mask(character, mesh_object)
     character.animated = modifier_switch.animated_settings(mesh_object)
     if geometry_changed:
@@ -93,13 +96,13 @@ def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object
             session.scanned_count = -1
     elif geometry_changed and not (player.fits_object(mesh_object) and _reads_buffer(mesh_object, character)):
         session.dispatch(Event.OUTDATE, character)
-    else:
+    elif is_edited:
         session.report_change(character, OBJECT)
 
 
 def _dispatch_edit_modes(changes: DepsgraphChanges) -> None:
     """Dispatch the edit modes that the meshes of playing characters have entered or left."""
-    reported_uids = {mesh_object.session_uid for mesh_object, _ in changes.mesh_objects}
+    reported_uids = {mesh_object.session_uid for mesh_object, *_ in changes.mesh_objects}
     for character in [c for c in session.characters.values() if c.player is not None]:
         is_reported = character.object_uid in reported_uids or character.reported
         if not is_reported and character.state != State.EDITED:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.errors import ModelError
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
-from ..rig.deformation import read_b_bones, read_modifiers_and_drivers
+from ..rig.deformation import b_bone_values, read_modifiers_and_drivers
 from ..rig.reading import read_model_rig
 from ..scene.arrays import ElementProperty, read
 from ..scene.mesh import rest_positions
@@ -36,8 +36,8 @@ _BONE_PROPERTIES = (
 )
 _SEGMENTS_INDEX = len(_BONE_PROPERTIES) - 1
 
-ARMATURE, OBJECT, MESH = PARTS = ("armature", "object", "mesh")
-"""Parts of a rig that Blender reports separately: the armature data, the mesh object, and the mesh."""
+BONES, PARENTS, OBJECT, MESH = PARTS = ("bones", "parents", "object", "mesh")
+"""Parts of a rig that Blender reports separately. Posing by hand is reported as a change of the bones."""
 
 
 def read_signature(scene_rig: SceneRig, parts: Iterable[str] = PARTS) -> dict[str, tuple]:
@@ -48,25 +48,33 @@ def read_signature(scene_rig: SceneRig, parts: Iterable[str] = PARTS) -> dict[st
         parts: which parts to read.
 
     Returns:
-        By part. Of the armature: names, parents, rest matrices and skinning properties of all bones. Of the object: its
-        vertex groups, modifiers and drivers (`rig.deformation`). Of the mesh: a digest of the rest positions.
+        By part. Names, rest matrices and skinning properties of all bones; their parents; the vertex groups, modifiers
+        and drivers of the object (`rig.deformation`); a digest of the rest positions of the mesh.
     """
     mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
     readers = {
-        ARMATURE: lambda: bone_signature(armature),
+        BONES: lambda: _read_bones_once(armature),
+        PARENTS: lambda: tuple(bone.parent.name if bone.parent else "" for bone in armature.bones),
         OBJECT: lambda: (*mesh_object.vertex_groups.keys(), str(read_modifiers_and_drivers(scene_rig))),
         MESH: lambda: (rest_digest(mesh_object.data),),
     }
     return {part: readers[part]() for part in parts}
 
 
+def _read_bones_once(armature: bpy.types.Armature) -> tuple:
+    """Read the bones; in a check of several characters that share the armature only once."""
+    read_bones = {} if session.read_bones is None else session.read_bones
+    if armature.session_uid not in read_bones:
+        read_bones[armature.session_uid] = bone_signature(armature)
+    return read_bones[armature.session_uid]
+
+
 def bone_signature(armature: bpy.types.Armature) -> tuple:
-    """Read names, parents, rest matrices and skinning properties of all bones."""
+    """Read names, rest matrices and skinning properties of all bones."""
     values = [read(armature.bones, element) for element in _BONE_PROPERTIES]
-    # The settings of B-Bones are slow to read, and most armatures have no B-Bones.
-    b_bones = str(read_b_bones(armature)) if (values[_SEGMENTS_INDEX] > 1).any() else ""
-    parents = (bone.parent.name if bone.parent else "" for bone in armature.bones)
-    return (*armature.bones.keys(), *parents, *(value.tobytes() for value in values), b_bones)
+    # Most armatures have no B-Bones, whose settings are slow to read.
+    b_bones = b_bone_values(armature) if (values[_SEGMENTS_INDEX] > 1).any() else {}
+    return (*armature.bones.keys(), *(value.tobytes() for value in values), b_bones)
 
 
 def rest_digest(mesh: bpy.types.Mesh) -> str:

@@ -65,6 +65,7 @@ class PlaybackSession:
         moved_buffers: by model: the position buffers of the players that moved in the last frame.
         passed_checks: by the session id of a mesh object: its mesh, the rig that its model requires, and the signature
             of the rig that passed (`rig_signature`).
+        read_bones: the bones that a check has read, by the session ids of armatures; None while nothing is checked.
         modes: stacks of overriding modes, by the session ids of objects. The last mode of a stack is in effect.
         networks: by the path of each loaded model: modification time and size of its file, and the model.
         packed_networks: the loaded packed models, by the session ids of their text datablocks.
@@ -95,6 +96,7 @@ class PlaybackSession:
         self.confidence: tuple | None = None
         self.apply_effect: Callable[[Effect, Character, FDDAError | None], None]
         self._count_without_bound = -1
+        self.read_bones: dict[int, tuple] | None = None
         self._last_change = 0.0
         # Blender compares timers by identity, and each access makes another bound method.
         self.check_timer = self._check_after_pause
@@ -176,6 +178,14 @@ class PlaybackSession:
             character.reported.add(part)
             self.dispatch(Event.CHANGE, character)
 
+    def check_rigs(self) -> None:
+        """Check the rigs that may have changed; an armature that characters share is read once."""
+        self.read_bones = {}
+        try:
+            self.dispatch(Event.CHECK)
+        finally:
+            self.read_bones = None
+
     def schedule_check(self) -> None:
         """Check the changed rigs when no update has changed them for a moment."""
         self._last_change = time.monotonic()
@@ -187,7 +197,7 @@ class PlaybackSession:
         remaining = CHECK_DELAY_S - (time.monotonic() - self._last_change)
         if remaining > 0:
             return remaining
-        self.dispatch(Event.CHECK)
+        self.check_rigs()
         return None
 
     @contextmanager

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Changes of a rig while its model plays: the model keeps playing if it still fits; otherwise the rig shows."""
 
+from collections import Counter
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -300,6 +301,24 @@ def test_playback_and_posing_do_not_check_the_rig(bound_elbow, elbow_files, monk
     assert_plays(bound_elbow, elbow_files.model)
 
 
+def test_posing_reads_the_bones_of_a_shared_armature_once_and_no_modifiers(bound_elbow, elbow_files, monkeypatch):
+    crowd = crowd_of(bound_elbow, 3)
+    bpy.context.view_layer.update()
+    counts = Counter()
+    for name in ("bone_signature", "read_modifiers_and_drivers"):
+        function = getattr(rig_signature, name)
+        monkeypatch.setattr(
+            rig_signature,
+            name,
+            lambda *arguments, name=name, function=function: counts.update([name]) or function(*arguments),
+        )
+    for angle in (0.2, 0.4):
+        pose(angle=angle)
+        for mesh_object in crowd:
+            assert_plays(mesh_object, elbow_files.model)
+    assert counts == {"bone_signature": 2}
+
+
 def test_a_frame_reads_no_bones_of_driven_armature_data(bound_elbow, elbow_files, monkeypatch):
     drive_b_bone()
     monkeypatch.setattr(rig_signature, "bone_signature", None)
@@ -355,7 +374,7 @@ def test_in_a_window_posing_reads_no_bones_until_it_pauses(bound_elbow, elbow_fi
     assert not read_parts
     monkeypatch.setattr(session_module, "CHECK_DELAY_S", 0)
     assert session.check_timer() is None
-    assert read_parts == [{"armature", "object"}] and not bound_elbow.fdda.status
+    assert read_parts == [{"bones", "object"}] and not bound_elbow.fdda.status
     assert session.characters[bound_elbow.session_uid].state == State.PLAYING
     bpy.data.objects[ELBOW_RIG].data.bones["lower"].use_deform = False
     pose(angle=0.8)
