@@ -23,7 +23,9 @@ def bone_node(armature_object: bpy.types.Object, bone_name: str) -> Node:
     return Node(datablock_node(armature_object).datablock, bone=bone_name)
 
 
-def add_bones(graph: DependencyGraph, armature_object: bpy.types.Object, animated_paths: set[str]) -> None:
+def add_bones(
+    graph: DependencyGraph, armature_object: bpy.types.Object, animated_paths: set[str], straight: frozenset[str]
+) -> None:
     """Add what each bone of an armature object needs, except for drivers.
 
     Args:
@@ -31,6 +33,7 @@ def add_bones(graph: DependencyGraph, armature_object: bpy.types.Object, animate
         armature_object: the armature object.
         animated_paths: RNA paths of the armature object that actions or drivers set. A muted constraint counts unless
             its mute state is constant.
+        straight: names of the bones that need no handles, because nothing reads their curve.
     """
     parents = {bone.name: bone.parent.name if bone.parent else "" for bone in armature_object.data.bones}
     for pose_bone in armature_object.pose.bones:
@@ -39,6 +42,8 @@ def add_bones(graph: DependencyGraph, armature_object: bpy.types.Object, animate
         if parents[pose_bone.name]:
             graph.add(node, bone_node(armature_object, parents[pose_bone.name]))
         graph.add(node, *_shape_needs(armature_object, pose_bone))
+        if pose_bone.name not in straight:
+            graph.add(node, *_handle_needs(armature_object, pose_bone.bone))
         for constraint in pose_bone.constraints:
             path = constraint.path_from_id()
             if constraint.mute and not {f"{path}.mute", f"{path}.enabled"} & animated_paths:
@@ -86,12 +91,15 @@ def deforming_bones(
 
 
 def _shape_needs(armature_object: bpy.types.Object, pose_bone: bpy.types.PoseBone) -> Iterator[Node]:
-    """Yield what the B-Bone segments and the custom shape of a bone need."""
-    bone = pose_bone.bone
+    """Yield what the custom shape of a bone needs."""
     if pose_bone.custom_shape is not None:
         yield datablock_node(pose_bone.custom_shape)
     if pose_bone.custom_shape_transform is not None:
         yield bone_node(armature_object, pose_bone.custom_shape_transform.name)
+
+
+def _handle_needs(armature_object: bpy.types.Object, bone: bpy.types.Bone) -> Iterator[Node]:
+    """Yield the bones that bend the B-Bone segments of a bone."""
     for handle in (bone.bbone_custom_handle_start, bone.bbone_custom_handle_end):
         if handle is not None:
             yield bone_node(armature_object, handle.name)

@@ -12,6 +12,7 @@ from .dependency_graph import DependencyGraph, Node
 _BONE_PATH = re.compile(r'(?:^|\.)bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]')
 _OBJECT_PATH = re.compile(r'objects\["(?P<name>(?:[^"\\]|\\.)*)"\]')
 _QUOTED_TEXT = re.compile(r"""(["'])(?P<text>(?:(?!\1).)+)\1""")
+_SEGMENT_PATH = re.compile(r"bones\[.*\]\.bbone_\w+$")
 _ELEMENT_INDEX = re.compile(r"\[\d+\]$")
 
 
@@ -37,7 +38,17 @@ def bone_of_path(path: str) -> str:
     return bpy.utils.unescape_identifier(match["bone"]) if match else ""
 
 
-def add_drivers(graph: DependencyGraph, datablock: bpy.types.ID, optional_paths: tuple[str, ...] = ()) -> None:
+def is_segment_path(path: str, bone_names: frozenset[str]) -> bool:
+    """Return whether a path of an armature object or of an armature is a B-Bone property of one of some bones."""
+    return bool(_SEGMENT_PATH.search(path)) and bone_of_path(path) in bone_names
+
+
+def add_drivers(
+    graph: DependencyGraph,
+    datablock: bpy.types.ID,
+    optional_paths: tuple[str, ...] = (),
+    straight: frozenset[str] = frozenset(),
+) -> None:
     """Add what the drivers of a datablock need, and what needs them.
 
     A driver of a custom property is needed only where another driver reads the property.
@@ -46,13 +57,20 @@ def add_drivers(graph: DependencyGraph, datablock: bpy.types.ID, optional_paths:
         graph: the graph.
         datablock: the datablock.
         optional_paths: prefixes of further paths whose drivers the datablock does not need.
+        straight: names of bones that do not need the drivers of their B-Bone properties.
     """
-    for owner, curve in drivers_of(datablock):
+    drivers = drivers_of(datablock)
+    nodes = [(driven_node(owner, curve.data_path), bone_of_path(curve.data_path)) for owner, curve in drivers]
+    for owner, curve in drivers:
         path = curve.data_path
         node = driven_node(owner, path)
         graph.add(node, *driver_needs(curve.driver))
-        bone_name = bone_of_path(path)
-        if bone_name:
+        if curve.driver.use_self:
+            # An expression with `self` may read all properties of the bone and of the datablock.
+            graph.add(node, *(other for other, bone in nodes if bone in {"", bone_of_path(path)} and other != node))
+        if is_segment_path(path, straight):
+            continue
+        if bone_name := bone_of_path(path):
             for armature_object in _armature_objects(datablock):
                 graph.add(bone_node(armature_object, bone_name), node)
         elif not path.startswith(('["', *optional_paths)):

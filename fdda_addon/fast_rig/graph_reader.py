@@ -20,16 +20,20 @@ _UNFOLLOWED_TYPES = (bpy.types.Scene, bpy.types.WindowManager, bpy.types.Screen,
 """Datablocks that use all objects, and need none of them."""
 
 
-def read_graph(scene_rigs: list[SceneRig], replaced_modifiers: dict[str, set[str]]) -> DependencyGraph:
+def read_graph(
+    scene_rigs: list[SceneRig], replaced_modifiers: dict[str, set[str]], straight: frozenset[str] = frozenset()
+) -> DependencyGraph:
     """Read the dependency graph of the open file.
 
     Args:
         scene_rigs: the rigs whose meshes models deform; they share one armature object.
         replaced_modifiers: names of the modifiers that a model replaces, by name of the mesh object.
+        straight: names of the bones whose B-Bone segments are removed, as from `unread_curves`.
     """
     graph = DependencyGraph()
     armature_object = scene_rigs[0].armature_object
     mesh_objects = {rig.mesh_object for rig in scene_rigs}
+    armatures, none = {armature_object, armature_object.data}, frozenset()
     shape_keys = {mesh_object.data.shape_keys for mesh_object in mesh_objects} - {None}
     for datablock, used in _used_datablocks().items():
         node = datablock_node(datablock)
@@ -46,7 +50,8 @@ def read_graph(scene_rigs: list[SceneRig], replaced_modifiers: dict[str, set[str
             add_drivers(graph, datablock, tuple(datablock.modifiers[name].path_from_id() for name in replaced))
             continue
         # The model replaces the shape keys, so only those that it reads need their drivers.
-        add_drivers(graph, datablock, ("key_blocks[", "eval_time") if datablock in shape_keys else ())
+        optional_paths = ("key_blocks[", "eval_time") if datablock in shape_keys else ()
+        add_drivers(graph, datablock, optional_paths, straight if datablock in armatures else none)
         if datablock in shape_keys:
             continue
         if not isinstance(datablock, bpy.types.Object):
@@ -54,7 +59,7 @@ def read_graph(scene_rigs: list[SceneRig], replaced_modifiers: dict[str, set[str
             continue
         graph.add(node, *_object_needs(datablock, datablock.modifiers))
         if is_armature(datablock):
-            add_bones(graph, datablock, animated_paths(datablock))
+            add_bones(graph, datablock, animated_paths(datablock), straight if datablock == armature_object else none)
             if datablock != armature_object:
                 graph.add(node, *(Node(node.datablock, bone=bone.name) for bone in datablock.data.bones))
         else:

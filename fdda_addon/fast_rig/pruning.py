@@ -11,7 +11,7 @@ from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import temporary_attributes
 from .bone_reader import bone_node, constraint_needs, datablock_node
 from .dependency_graph import Node
-from .driver_reader import bone_of_path, driven_node, driver_needs, drivers_of
+from .driver_reader import bone_of_path, driven_node, driver_needs, drivers_of, is_segment_path
 
 
 def remove_bones(armature_object: bpy.types.Object, kept: set[Node]) -> list[str]:
@@ -31,16 +31,20 @@ def remove_bones(armature_object: bpy.types.Object, kept: set[Node]) -> list[str
     return names
 
 
-def remove_drivers(scene_rigs: Iterable[SceneRig], graph_nodes: set[Node], kept: set[Node]) -> int:
+def remove_drivers(
+    scene_rigs: list[SceneRig], graph_nodes: set[Node], kept: set[Node], straight: frozenset[str]
+) -> int:
     """Remove the drivers that set or read something that is not kept; return their number.
 
-    Of the shape keys and modifiers that a model replaces, all drivers are removed that nothing needs.
+    Of the shape keys, modifiers and B-Bone segments that a model replaces, all drivers are removed that nothing needs.
 
     Args:
         scene_rigs: the rigs of the models.
         graph_nodes: all nodes of the dependency graph.
         kept: the kept nodes.
+        straight: names of the bones whose segments are removed.
     """
+    armature_object = scene_rigs[0].armature_object
     removed = graph_nodes - kept
     shape_keys = {rig.mesh_object.data.shape_keys for rig in scene_rigs}
     mesh_objects = {rig.mesh_object for rig in scene_rigs}
@@ -50,6 +54,8 @@ def remove_drivers(scene_rigs: Iterable[SceneRig], graph_nodes: set[Node], kept:
             node = driven_node(owner, curve.data_path)
             bone_name = bone_of_path(curve.data_path)
             is_replaced = datablock in shape_keys or (datablock in mesh_objects and "modifiers[" in curve.data_path)
+            if datablock in {armature_object, armature_object.data}:
+                is_replaced = is_segment_path(curve.data_path, straight)
             sets_removed = bone_name and Node(datablock_node(datablock).datablock, bone=bone_name) in removed
             reads_removed = any(not needed.driven_path and needed in removed for needed in driver_needs(curve.driver))
             if sets_removed or (node not in kept and (is_replaced or reads_removed)):

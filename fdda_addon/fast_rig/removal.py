@@ -8,6 +8,7 @@ import bpy
 
 from ..rig.modifier_stack import deforming_modifiers, recorded_modifiers
 from ..scene.scene_rig import SceneRig
+from .bendy_bones import unread_curves
 from .bone_reader import bone_node, datablock_node
 from .dependency_graph import Node
 from .graph_reader import read_graph, shown_objects
@@ -42,12 +43,16 @@ def remove_unneeded(
     armature_object = scene_rigs[0].armature_object
     check_armature(armature_object)
     shown = [*shown_objects(scene_rigs), armature_object, *(rig.mesh_object for rig in scene_rigs)]
-    roots = [*map(datablock_node, shown), *nodes]
+    worlds = [scene.world for scene in bpy.data.scenes if scene.world is not None]
+    roots = [*map(datablock_node, (*shown, *worlds)), *nodes]
     roots += [bone_node(armature_object, name) for name in (*joint_names, *controls)]
     replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
-    graph = read_graph(scene_rigs, replaced)
+    straight = unread_curves(armature_object, [rig.mesh_object for rig in scene_rigs], controls)
+    graph = read_graph(scene_rigs, replaced, straight)
     kept = graph.kept(roots)
-    drivers = remove_drivers(scene_rigs, graph.nodes, kept)
+    drivers = remove_drivers(scene_rigs, graph.nodes, kept, straight)
+    for name in straight:
+        armature_object.data.bones[name].bbone_segments = 1
     # Before the bones, whose loss Blender would report for each removed object that needs them.
     objects = remove_objects(kept)
     bones = set(remove_bones(armature_object, kept))

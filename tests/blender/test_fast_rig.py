@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fast rigs: what they keep, what they refuse, and what a shot with one shows and renders."""
+"""Fast rigs: the files that the verb writes or refuses, and what a shot with one shows and renders."""
 
 import shutil
 from pathlib import Path
@@ -8,110 +8,23 @@ import bpy
 import numpy as np
 import pytest
 
-from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
-from fdda_addon.core.errors import RigError
+from blend_fixtures.characters.dependencies import DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.fast_rig import frame_times
 from fdda_addon.fast_rig import removal as fast_rig_removal
 from fdda_addon.fast_rig.bone_reader import bone_node
-from fdda_addon.fast_rig.controls import control_bones
-from fdda_addon.fast_rig.dependency_graph import Node
 from fdda_addon.fast_rig.graph_reader import read_graph
-from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, evaluate_joints
-from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
-from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.scene.temporary_state import assign_action
 from fdda_addon.timing.benchmark import time_calls
 
 from .command_output import output_of
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, run, train
 from .test_renders import set_camera, still
+from .waves import ACTION, wave
 
-REPLACED = {ELBOW: {"Armature", "Mush", "Lattice"}}
-CHARACTER, ACTION = "Character", "wave"
-POSE_COUNT = 12
-SIZE = 0.5
-"""Length of the arm, meters."""
-
-
-def kept_for_joints(scene_rig: SceneRig) -> tuple[set[Node], set[Node]]:
-    """Return all nodes of the dependency graph, and those that `lower` needs."""
-    graph = read_graph([scene_rig], REPLACED)
-    return graph.nodes, graph.kept([bone_node(scene_rig.armature_object, "lower")])
-
-
-def joint_matrices(scene_rig: SceneRig, *control_names: str) -> tuple[JointPoses, np.ndarray]:
-    """Evaluate `lower` in some random poses of control bones."""
-    poses = JointPoses(scene_rig.armature_object, ("lower",), control_names, (), SIZE, POSE_COUNT)
-    *_, matrices = evaluate_joints(poses, "poses")
-    return poses, matrices
-
-
-@pytest.mark.parametrize("name", DEPENDENCIES)
-def test_a_joint_keeps_the_bones_that_it_depends_on(name):
-    scene_rig = SceneRig(*studio_arm(name))
-    armature_object, source = scene_rig.armature_object, f"{SOURCE}.{name}"
-    nodes, kept = kept_for_joints(scene_rig)
-    poses, full = joint_matrices(scene_rig, "control", source)
-
-    remove_drivers([scene_rig], nodes, kept)
-    assert set(remove_bones(armature_object, kept)) == {UNUSED, f"{UNUSED}_child"}
-    _, fast = joint_matrices(scene_rig, "control", source)
-    assert differing_joints(poses, full, fast, 0.0) == {}
-
-    # The same comparison finds the difference if the bone is missing.
-    missing = kept - {bone_node(armature_object, source)}
-    remove_drivers([scene_rig], nodes, missing)
-    assert remove_bones(armature_object, missing) == [source]
-    _, broken = joint_matrices(scene_rig, "control")
-    assert differing_joints(poses, full, broken, 1e-3).keys() == {"lower"}
-
-
-def test_a_bone_keeps_the_bone_at_which_its_custom_shape_is_drawn():
-    scene_rig = SceneRig(*studio_arm())
-    armature_object = scene_rig.armature_object
-    bone = armature_object.pose.bones["control"]
-    bone.custom_shape, bone.custom_shape_transform = scene_rig.mesh_object, armature_object.pose.bones[UNUSED]
-    kept = read_graph([scene_rig], REPLACED).kept([bone_node(armature_object, "control")])
-    assert bone_node(armature_object, UNUSED) in kept
-
-
-def test_muted_constraints_count_only_if_animation_unmutes_them():
-    scene_rig = SceneRig(*studio_arm("target"))
-    armature_object, source = scene_rig.armature_object, f"{SOURCE}.target"
-    constraint = armature_object.pose.bones["lower"].constraints[source]
-    constraint.mute = True
-    assert bone_node(armature_object, source) not in kept_for_joints(scene_rig)[1]
-    constraint.driver_add("mute")
-    assert bone_node(armature_object, source) in kept_for_joints(scene_rig)[1]
-
-
-def test_control_bones_are_visible_or_keyed_or_in_a_collection():
-    armature_object = studio_arm("action")[1]
-    wave(armature_object, UNUSED)
-    assert control_bones(armature_object, ["visible"]) == {"control"}
-    # The action that only a constraint plays keys no controls.
-    assert control_bones(armature_object, ["keyed"]) == {UNUSED}
-    assert control_bones(armature_object, ["visible", "keyed"]) == {"control", UNUSED}
-    assert control_bones(armature_object, [f"collection:{CONTROLS}"]) == {"control"}
-    with pytest.raises(RigError, match=r"has no bone collection 'Faces'; its collections: 'Controls', 'Mechanism'\."):
-        control_bones(armature_object, ["collection:Faces"])
-
-
-def wave(armature_object: bpy.types.Object, bone_name: str) -> bpy.types.Action:
-    """Key a rotation of a bone in a new action, which the armature object then no longer has."""
-    bone = armature_object.pose.bones[bone_name]
-    bone.rotation_mode = "XYZ"
-    animation = armature_object.animation_data_create()
-    animation.action = bpy.data.actions.new(f"{ACTION} {bone_name}")
-    animation.action.use_fake_user = True
-    for frame, angle in ((1, -0.4), (20, 0.6)):
-        bone.rotation_euler = (angle, 0.3 * angle, 0.0)
-        bone.keyframe_insert("rotation_euler", frame=frame)
-    action, animation.action = animation.action, None
-    bone.rotation_euler = (0, 0, 0)
-    return action
+CHARACTER = "Character"
 
 
 @pytest.fixture(scope="module")
@@ -206,29 +119,14 @@ def test_both_rigs_play_the_same_action_without_the_models_of_the_full_rig(folde
     assert sorted(set(models)) == [0, 2]
 
 
-def test_a_driven_property_of_the_scene_is_followed():
-    scene_rig = SceneRig(*studio_arm("target"))
-    armature_object, scene = scene_rig.armature_object, bpy.context.scene
-    scene["bend"] = 0.0
-    for owner, target_id, path in (
-        (scene.driver_add('["bend"]'), armature_object, f'pose.bones["{UNUSED}"].location[0]'),
-        (armature_object.pose.bones["lower"].driver_add("rotation_euler", 0), scene, '["bend"]'),
-    ):
-        owner.driver.type = "SUM"
-        target = owner.driver.variables.new().targets[0]
-        target.id_type = target_id.id_type
-        target.id, target.data_path = target_id, path
-    assert bone_node(armature_object, UNUSED) in kept_for_joints(scene_rig)[1]
-
-
 def test_bones_that_differ_are_named_and_nothing_is_written(folder, monkeypatch, capsys):
     """Without one dependency, the comparison refuses the fast rig."""
     missing = f"{SOURCE}.distance"
 
-    def read_incomplete_graph(scene_rigs, replaced_modifiers):
-        graph = read_graph(scene_rigs, replaced_modifiers)
+    def read_incomplete_graph(*arguments):
+        graph = read_graph(*arguments)
         for needed in graph.needs.values():
-            needed.discard(bone_node(scene_rigs[0].armature_object, missing))
+            needed.discard(bone_node(arguments[0][0].armature_object, missing))
         return graph
 
     monkeypatch.setattr(fast_rig_removal, "read_graph", read_incomplete_graph)
@@ -344,7 +242,7 @@ def test_a_shot_that_is_relocated_to_the_full_rig_renders_as_the_full_rig(folder
             next(o for o in bpy.data.objects if o.type == kind and o.override_library and o.name.startswith(ELBOW))
             for kind in ("MESH", "ARMATURE")
         )
-        assert {m.name for m in mesh_object.modifiers if m.show_viewport} == REPLACED[ELBOW]
+        assert {m.name for m in mesh_object.modifiers if m.show_viewport} == {"Armature", "Mush", "Lattice"}
         matrix, rendered = shown(armature_object, folder / "rendered.png")
         assert np.array_equal(matrix, expected_matrix)
         assert np.array_equal(rendered, expected)
