@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.joint_option import ALL, parse_joints
 from fdda_addon.core.poses import MAX_MARGIN
 from fdda_addon.core.skin_fit import FIT_KINDS
 
@@ -60,8 +61,8 @@ class Character:
         output: folder of the bound file, its models and their reports.
         objects: names of the mesh objects; empty where the file has only one.
         depends: files that the rig's file links. A change of them outdates the tasks of the character.
-        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, min_partition_vertices:
-            options of `record`.
+        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, joints,
+            min_partition_vertices: options of `record`.
         shards: number of tasks that the poses are divided among.
         train: options of `train` by name.
         goal_mm: accuracy goal for 99.9 % of the vertices of held-out poses, mm; 0 for no goal.
@@ -86,6 +87,7 @@ class Character:
     sample: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     fit_linear: str = ""
+    joints: str = ALL
     min_partition_vertices: int | None = None
     shards: int = 4
     train: dict[str, Any] = field(default_factory=dict, hash=False)
@@ -176,6 +178,10 @@ def _check_character(character: Character, section: str) -> None:
     if character.fit_linear not in ("", *FIT_KINDS):
         kinds = " or ".join(FIT_KINDS)
         raise PlanError(f"{section}: fit_linear is {kinds}, and not {character.fit_linear!r}.")
+    try:
+        parse_joints(character.joints)
+    except ValueError as error:
+        raise PlanError(f"{section}: {error}.") from error
     for key, value in character.train.items():
         if not TRAIN_SETTING.fullmatch(key) or key in ("messages", "warm_start", "goal_mm"):
             raise PlanError(

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from fdda_addon.core.joint_option import ALL
 from fdda_addon.core.report import CHECKPOINT_SUFFIX, REPORT_HTML, REPORT_JSON
 
 from .characters import Character, Farm, Plan, folder_of_mesh
@@ -161,6 +162,7 @@ class _TaskBuilder:
             *("--spread", repr(float(character.spread)), *(("--mirror",) if character.mirror else ()), *min_vertices),
             *(("--margin", repr(float(character.margin))) if character.margin != 1 else ()),
             *(("--fit-linear", character.fit_linear) if character.fit_linear else ()),
+            *(("--joints", character.joints) if character.joints != ALL else ()),
             *(f"{option}={value}" for option, values in values_by_option.items() for value in values),
             *options,
         )

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.defaults import MARGIN, MIN_PARTITION_VERTICES, POSES, REFINEMENT_POSES, SPREAD
+from ..core.joint_option import ALL, parse_joints
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -99,6 +100,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="fit the skin weights of linear skinning to the poses: one bone per vertex, or at most four (smooth)",
     )
     parser.add_argument(
+        "--joints",
+        type=_parse_joints,
+        default=ALL,
+        metavar="auto|N|all",
+        help="bones that the model reads: the fewest from which the other bones follow (auto), their number, or all "
+        f"(default {ALL}); skin weights are fitted to these bones, and the model learns the rest",
+    )
+    parser.add_argument(
         "--min-partition-vertices",
         type=int,
         default=MIN_PARTITION_VERTICES,
@@ -145,6 +154,14 @@ def _parse_shard(text: str) -> tuple[int, int]:
     return int(number), int(count)
 
 
+def _parse_joints(text: str) -> str:
+    """Check the option `--joints`; raise argparse.ArgumentTypeError if it is invalid."""
+    try:
+        return parse_joints(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def run(options: argparse.Namespace) -> None:
     from ..core.checks.recording import merges_sentence
     from ..core.checks.target import unsettled_sentence
@@ -171,6 +188,7 @@ def run(options: argparse.Namespace) -> None:
         options.sample,
         options.control,
         options.fit_linear,
+        options.joints != ALL,
         options.shard,
         options.detect_influences,
         options.influences,
@@ -179,7 +197,7 @@ def run(options: argparse.Namespace) -> None:
     if options.refine and (any(new_recording_options) or options.poses == 0):
         raise WrongUsageError(
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
-            "--control, --fit-linear, --shard, --influences and --target out."
+            "--control, --fit-linear, --joints, --shard, --influences and --target out."
         )
     if options.detect_influences and (options.shard or options.influences):
         raise WrongUsageError(
@@ -208,8 +226,8 @@ def run(options: argparse.Namespace) -> None:
     for _, recording in rigs:
         if not options.refine:
             index = read_index(recording)
-            if options.fit_linear:
-                print(read_info(index).fit.sentence())
+            if fit := read_info(index).fit:
+                print(fit.sentence())
             for line in (merges_sentence(index, options.min_partition_vertices), unsettled_sentence(index)):
                 if line:
                     print(line)
@@ -267,6 +285,7 @@ def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) 
         sample=tuple(options.sample),
         controls=tuple(options.control),
         fit_linear=options.fit_linear,
+        joints=options.joints,
         min_partition_vertices=options.min_partition_vertices,
         strips=tuple(options.strip),
         mirror=options.mirror,

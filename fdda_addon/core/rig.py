@@ -17,6 +17,8 @@ STATIC_JOINT_LABEL = "no bone"
 """Label of the static joint in messages."""
 
 MAX_HASH_LENGTH = 128
+KEY_JOINTS_PREFIX = "key-joints-"
+"""Start of `Fingerprint.skin_weights` if a model reads fewer joints than those with skin weights."""
 REST_MATRIX_TOLERANCE = 1e-4
 """Largest difference of an element between two rest matrices that count as equal; meters for translations.
 
@@ -66,7 +68,7 @@ class Fingerprint:
     """Hashes and settings of a rig, from which the differences between two rigs are found.
 
     Attributes:
-        topology, rest_positions, skin_weights: hashes.
+        topology, rest_positions, skin_weights: hashes; that of skin weights may start with `KEY_JOINTS_PREFIX`.
         deformation: what deforms the mesh beside skin weights (`core.deformation`); empty where unknown.
     """
 
@@ -74,6 +76,11 @@ class Fingerprint:
     rest_positions: str
     skin_weights: str
     deformation: dict = field(default_factory=dict)
+
+    @property
+    def has_key_joints(self) -> bool:
+        """Return whether the model reads fewer joints than those with skin weights."""
+        return self.skin_weights.startswith(KEY_JOINTS_PREFIX)
 
     @staticmethod
     def from_json(value: dict) -> "Fingerprint":

@@ -11,8 +11,12 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from .key_joints import KeyJointReport
+
 FIT_KINDS = ("hard", "smooth")
 """Kinds of fits: one joint per vertex, or at most `INFLUENCES` joints per vertex."""
+DEFAULT_KIND = "smooth"
+"""Kind of the fit for key joints, if no other is chosen."""
 INFLUENCES = 4
 """Number of fitted skin weights of a vertex."""
 MAX_INFLUENCES = 64
@@ -44,16 +48,19 @@ class SkinFit:
         poses: number of evaluated poses.
         held_out: errors on half of the poses, which were held out.
         training: errors on the other half.
+        key_joints: how the joints with weights were chosen; None if they are all joints.
     """
 
     kind: str
     poses: int
     held_out: FitReport
     training: FitReport
+    key_joints: KeyJointReport | None = None
 
     def to_json(self) -> dict:
         """Return the JSON for `recording.json` and messages."""
-        return {"kind": self.kind, "poses": self.poses, **asdict(self.held_out), "training": asdict(self.training)}
+        value = {"kind": self.kind, "poses": self.poses, **asdict(self.held_out), "training": asdict(self.training)}
+        return value | ({"key_joints": self.key_joints.to_json()} if self.key_joints else {})
 
     @staticmethod
     def from_json(value: dict) -> "SkinFit":
@@ -64,17 +71,34 @@ class SkinFit:
         """
         if value["kind"] not in FIT_KINDS or type(value["poses"]) is not int or value["poses"] < 0:
             raise ValueError(f"skin weights were fitted {value['kind']!r} to {value['poses']!r} poses")
-        return SkinFit(value["kind"], value["poses"], _read_fit_report(value), _read_fit_report(value["training"]))
+        key_joints = KeyJointReport.from_json(value["key_joints"]) if "key_joints" in value else None
+        reports = _read_fit_report(value), _read_fit_report(value["training"])
+        return SkinFit(value["kind"], value["poses"], *reports, key_joints)
 
     def sentence(self) -> str:
-        """Describe the errors before and after the fit."""
+        """Describe the key joints, and the errors before and after the fit."""
         held_out, training = self.poses // 2, self.poses - self.poses // 2
+        key_joints = f"{self.key_joints.sentence()} " if self.key_joints else ""
         return (
-            f"Linear skinning with fitted weights ({self.kind}), mm: {self.held_out.format_errors('fitted')} on "
-            f"{held_out} held-out poses, {self.held_out.format_errors('rig')} with the rig's own weights; "
+            f"{key_joints}Linear skinning with fitted weights ({self.kind}), mm: "
+            f"{self.held_out.format_errors('fitted')} on {held_out} held-out poses, "
+            f"{self.held_out.format_errors('rig')} with the rig's own weights; "
             f"{self.training.format_errors('fitted')} on the {training} poses of the fit, "
             f"{self.training.format_errors('rig')} with the rig's own."
         )
+
+
+def weights_match(fit: SkinFit | None, kind: str, joints: str) -> bool:
+    """Return whether a recording has the weights that options of `record` ask for.
+
+    Args:
+        fit: the fit of the recording; None if it has the weights of the rig.
+        kind: one of `FIT_KINDS`; empty for the weights of the rig, and for `DEFAULT_KIND` with key joints.
+        joints: the option `joints`. A recording with all joints may be the result of a choice.
+    """
+    if fit is None or fit.key_joints is None:
+        return kind == (fit.kind if fit else "")
+    return fit.kind == (kind or DEFAULT_KIND) and fit.key_joints.requested == joints
 
 
 def _read_fit_report(value: dict) -> FitReport:

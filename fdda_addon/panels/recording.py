@@ -53,7 +53,8 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
             # Converted to JSON and back, so that it equals the sampling that is read from a recording.
             sampling = json.loads(json.dumps(make_sampling(rig, settings, check.channels).to_json()))
             current_rig = check.rig
-        _content_cache[uid] = (cache_key, read_folder(path, current_rig, sampling, settings.fit_linear))
+        weights = settings.fit_linear, settings.joints
+        _content_cache[uid] = (cache_key, read_folder(path, current_rig, sampling, weights))
     return _content_cache[uid][1]
 
 
@@ -132,7 +133,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 def _draw_settings(column: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
     # The labels are above the fields, because a narrow sidebar would cut them off beside the fields.
-    for name in ("target", "fit_linear"):
+    for name in ("target", "fit_linear", "joints"):
         field = column.column(align=True)
         field.use_property_split = False
         field.label(text=settings.bl_rna.properties[name].name)
@@ -140,6 +141,8 @@ def _draw_settings(column: bpy.types.UILayout, context: bpy.types.Context, setti
             field.prop_search(settings, name, context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
         else:
             field.prop(settings, name, text="")
+    if settings.joints == "NUMBER":
+        column.prop(settings, "joint_count")
     if settings.target:
         column.prop(settings, "pre_roll")
         column.prop(settings, "max_settle_frames")

@@ -134,6 +134,19 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         ),
         default="RIG",
     )
+    joints: EnumProperty(
+        name="Bones to Read",
+        description="The bones that the model reads; what the others do is learnt, where it follows from these",
+        items=(
+            ("ALL", "All", "All bones that move the mesh"),
+            ("AUTO", "Fewest", "The fewest bones from which the others follow in random poses"),
+            ("NUMBER", "Number", "A number of bones. Others that move independently are lost"),
+        ),
+        default="ALL",
+    )
+    joint_count: IntProperty(
+        name="Number of Bones", description="How many bones the model reads", default=50, min=1, soft_max=500
+    )
     target: StringProperty(
         name="Learn from Object",
         description="Learn the shape of another mesh object with the same vertices, for example a simulated or cached "
@@ -210,6 +223,11 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
 def fit_kind(settings: FDDA_PG_character) -> str:
     """Return the kind of fitted skin weights (`core.skin_fit.FIT_KINDS`); empty for the weights of the rig."""
     return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
+
+
+def joint_option(settings: FDDA_PG_character) -> str:
+    """Return the joints that the model reads, as the option `joints` of a recording (`core.joint_option`)."""
+    return str(settings.joint_count) if settings.joints == "NUMBER" else settings.joints.lower()
 
 
 @not_animatable

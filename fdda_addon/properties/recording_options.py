@@ -8,7 +8,7 @@ import bpy
 from ..core.errors import RigError
 from ..scene.active_rig import cached_active_rig
 from ..scene.scene_rig import SceneRig
-from .character import FDDA_PG_character, fit_kind
+from .character import FDDA_PG_character, fit_kind, joint_option
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.plan import RecordingSettings
@@ -42,6 +42,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         min_partition_vertices=settings.min_partition_vertices,
         mirror=settings.mirror and bool(actions),
         target=target_settings(settings),
+        joints=joint_option(settings),
     )
 
 
@@ -72,6 +73,8 @@ def copy_sampling_settings(settings: FDDA_PG_character, source: FDDA_PG_characte
         "sample",
         "bone_collection",
         "fit_linear",
+        "joints",
+        "joint_count",
         "mirror",
         "min_partition_vertices",
     ):

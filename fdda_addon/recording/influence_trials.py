@@ -43,7 +43,8 @@ class InfluenceSearch:
         draw_values: returns random values of the channels, (C,), for an index from 0.
         show_pose: sets a recorded pose for an index from 0; used without channels.
         stop_playback: ends the playback of `show_pose`.
-        has_target: the surface is that of a target, which bones other than the joints may deform.
+        has_other_bones: bones other than the joints may deform the surface, because it is that of a target, or because
+            the joints are key joints.
         poses: number of times that each joint is moved.
         tolerance: a joint influences a partition when it changes a local residual by more than this ratio of the
             rig's size.
@@ -55,7 +56,7 @@ class InfluenceSearch:
     stop_playback: Callable[[], None]
     poses: int = INFLUENCE_POSES
     tolerance: float = INFLUENCE_TOLERANCE
-    has_target: bool = False
+    has_other_bones: bool = False
 
 
 class Trials(Protocol):
@@ -81,7 +82,7 @@ def prepared_trials(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch) -> I
     else:
         states = _sample_states(scene_rig, rig, search, 2 * search.poses)
         clear_pose(scene_rig.armature_object)
-        with override_joints(scene_rig, rig.joints, search.has_target) as override:
+        with override_joints(scene_rig, rig.joints, search.has_other_bones) as override:
             yield _OverrideTrials(scene_rig, rig, states, override)
     clear_pose(scene_rig.armature_object)
 

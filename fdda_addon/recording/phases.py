@@ -87,11 +87,13 @@ class WeightsFitted:
         planned: the state after the previous phase.
         rig: the rig with the skin weights of linear skinning.
         fit: result of the fit; None if the weights are the rig's own.
+        needed_inputs: as in `weight_fitting.FittedWeights`.
     """
 
     planned: MeshPlanned
     rig: Rig
     fit: SkinFit | None
+    needed_inputs: np.ndarray | None = None
 
     @property
     def name(self) -> str:

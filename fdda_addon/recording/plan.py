@@ -9,6 +9,7 @@ import bpy
 
 from ..core.controls import Control
 from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD
+from ..core.joint_option import ALL
 from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.poses import Channel, Margin, make_margin
 from ..core.recording.index import RANDOM, Sampling, Source
@@ -61,6 +62,8 @@ class RecordingSettings:
         influences: folder of a recording that was made with `detect_influences` and the same settings; None to detect
             the influences. For several meshes it has a subfolder for each mesh.
         target: settings of the target whose surface is recorded.
+        joints: the joints that the model reads: "all", "auto" for the fewest from which the others follow, or their
+            number.
     """
 
     poses: int = POSES
@@ -82,6 +85,12 @@ class RecordingSettings:
     influences: Path | None = None
     target: TargetSettings = NO_TARGET
     overwrite: bool = False
+    joints: str = ALL
+
+    @property
+    def fits_weights(self) -> bool:
+        """Return whether skin weights are fitted to poses of the rig."""
+        return bool(self.fit_linear) or self.joints != ALL
 
 
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:

@@ -10,34 +10,47 @@ from ..core.recording.index import RecordingInfo, read_index, read_info
 from ..core.recording.reader import read_partitions, read_recorded_skin
 from ..core.recording.writer import find_different_keys
 from ..core.rig import Fingerprint, Rig, read_joints, rig_differences
-from ..core.skin_fit import SkinFit
+from ..core.skin_fit import DEFAULT_KIND, SkinFit, weights_match
+from ..rig.reading import read_key_joints_rig
+from ..scene.scene_rig import SceneRig
+from .plan import RecordingSettings
+from .weight_fitting import FittedWeights
 
 
-def read_previous_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit | None]:
-    """Return the rig with the skin weights of a recording, complete or not.
+def read_previous_weights(path: Path, scene_rig: SceneRig, rig: Rig, settings: RecordingSettings) -> FittedWeights:
+    """Return the rig with the joints and skin weights of a recording, complete or not.
 
     Args:
         path: folder of the recording.
-        rig: the rig with its own skin weights.
-        kind: requested kind of fitted weights; empty for the rig's own weights.
+        scene_rig, rig: the rig with its own skin weights.
+        settings: settings of the recording; `joints` and `fit_linear` have to be those of the recording at `path`.
 
     Raises:
         RecordingError: there is no recording, or its weights are of another kind or damaged.
     """
     index = read_index(path)
     fit = read_info(index).fit
-    recorded_kind = fit.kind if fit else ""
-    if recorded_kind != kind:
-        recorded_weights = f"--fit-linear {recorded_kind}" if recorded_kind else "the rig's own weights"
+    if not weights_match(fit, settings.fit_linear, settings.joints):
         raise RecordingError(
-            f"Cannot resume '{path}': it was recorded with {recorded_weights}; give that, or record into "
+            f"Cannot resume '{path}': it was recorded with {_describe_weights(fit)}; give that, or record into "
             "another folder."
         )
+    if fit is not None and fit.key_joints:
+        rig = read_key_joints_rig(scene_rig, rig, [joint.name for joint in read_joints(index["joints"])])
     if fit is None or (index["vertices"], len(index["joints"])) != (rig.vertex_count, len(rig.joints)):
         # If the recording is of another rig, the writer raises an error that names the differences.
-        return rig, fit
+        return FittedWeights(rig, fit)
     joints, weights = read_recorded_skin(path, index)
-    return replace(rig, skin_joints=joints, skin_weights=weights), fit
+    return FittedWeights(replace(rig, skin_joints=joints, skin_weights=weights), fit)
+
+
+def _describe_weights(fit: SkinFit | None) -> str:
+    """Return the options of `record` with which weights were fitted."""
+    if fit is None:
+        return "the rig's own weights"
+    joints = f"--joints {fit.key_joints.requested}" if fit.key_joints else ""
+    kind = "" if joints and fit.kind == DEFAULT_KIND else f"--fit-linear {fit.kind}"
+    return " ".join(filter(None, (joints, kind)))
 
 
 def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Partition, ...] | None:

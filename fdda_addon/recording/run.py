@@ -10,6 +10,7 @@ from typing import TypeVar
 import bpy
 
 from ..core.errors import RecordingError
+from ..core.key_joints import add_influences
 from ..core.partition import GOLDEN_RATIO, assume_nearby_influences, make_merged_partitions
 from ..core.progress import Progress
 from ..core.recording.estimate import check_disk_space, recording_bytes
@@ -37,7 +38,7 @@ from .previous_recording import check_influences_match, read_previous_partitions
 from .repeatability import measure_repeatability
 from .target_check import check_target_moves
 from .time_check import check_follows_pose
-from .weight_fitting import check_has_weights, choose_fit_poses, fit_weights
+from .weight_fitting import check_has_weights, fit_weights, make_fit_request
 
 PreviousState, NextState = TypeVar("PreviousState", MeshPlanned, WeightsFitted), TypeVar("NextState")
 INFLUENCE_SEED_OFFSET = 1 << 32
@@ -87,7 +88,7 @@ def _record_planned(
     planned: list[MeshPlanned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
 ) -> Iterator[Progress]:
     scene_rigs, posed_rigs = [mesh.scene_rig for mesh in planned], [mesh.posed_rig for mesh in planned]
-    with temporary_rig_states(posed_rigs, clips) if settings.fit_linear else nullcontext() as player:
+    with temporary_rig_states(posed_rigs, clips) if settings.fits_weights else nullcontext() as player:
         fitted_meshes = yield from _run_phase(planned, lambda mesh: _fit_mesh_weights(mesh, settings, plan, player))
     for mesh_indices in group_into_passes(scene_rigs):
         meshes_in_pass = [fitted_meshes[index] for index in mesh_indices]
@@ -178,15 +179,15 @@ def _fit_mesh_weights(
 ) -> Generator[Progress, None, WeightsFitted]:
     """Fit the skin weights of a mesh, read previously fitted weights, or keep the weights of the rig."""
     if mesh.previous_path:
-        return WeightsFitted(mesh, *read_previous_weights(mesh.previous_path, mesh.rig, settings.fit_linear))
-    if not settings.fit_linear:
+        weights = read_previous_weights(mesh.previous_path, mesh.scene_rig, mesh.rig, settings)
+        return WeightsFitted(mesh, weights.rig, weights.fit)
+    if not settings.fits_weights:
         check_has_weights(mesh.scene_rig, mesh.rig)
         return WeightsFitted(mesh, mesh.rig, None)
-    fit_poses = choose_fit_poses(plan.total, mesh.rig.vertex_count)
-    shown_poses = plan.show_poses(player, frozenset(fit_poses))
-    evaluator = mesh.evaluator(mesh.rig)
-    rig_and_fit = yield from fit_weights(mesh.rig, settings.fit_linear, shown_poses, len(fit_poses), evaluator)
-    return WeightsFitted(mesh, *rig_and_fit)
+    request = make_fit_request(mesh.scene_rig, mesh.rig, settings, mesh.channels, plan.total)
+    shown_poses = plan.show_poses(player, frozenset(request.poses))
+    weights = yield from fit_weights(mesh.scene_rig, mesh.rig, request, shown_poses, mesh.evaluator(mesh.rig))
+    return WeightsFitted(mesh, weights.rig, weights.fit, weights.needed_inputs)
 
 
 def _find_influences(
@@ -202,7 +203,7 @@ def _find_influences(
         player.stop,
         settings.influence_poses,
         settings.influence_tolerance,
-        mesh.planned.target is not None,
+        mesh.planned.target is not None or mesh.needed_inputs is not None,
     )
     evaluator = TimedEvaluator(mesh.planned.evaluator(mesh.rig))
     previous_path = mesh.planned.previous_path
@@ -219,8 +220,11 @@ def _find_influences(
     target = mesh.planned.target
     if target and target.follows != POSE:
         # A target that depends on time does not follow a moved joint immediately, so influences cannot be detected.
-        return InfluencesReady(mesh, assume_nearby_influences(mesh.rig, partitions_without_influences), evaluator)
-    partitions = yield from detect_influences(scene_rig, mesh.rig, partitions_without_influences, evaluator, search)
+        partitions = assume_nearby_influences(mesh.rig, partitions_without_influences)
+    else:
+        partitions = yield from detect_influences(scene_rig, mesh.rig, partitions_without_influences, evaluator, search)
+    if mesh.needed_inputs is not None:
+        partitions = add_influences(partitions, mesh.needed_inputs, len(mesh.rig.joints))
     return InfluencesReady(mesh, partitions, evaluator)
 
 

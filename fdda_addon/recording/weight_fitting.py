@@ -1,28 +1,35 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fits skin weights to poses of a rig, in the trainer's Python."""
+"""Fits skin weights to poses of a rig, and chooses key joints, in the trainer's Python."""
 
 import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..core.errors import RecordingError, RigError, TrainingError
+from ..core.joint_option import ALL
+from ..core.key_joints import KeyJointReport
 from ..core.messages import MessageType
+from ..core.poses import CONTROL, Channel
 from ..core.progress import Progress
-from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted_weights
+from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted_weights, read_key_joints
 from ..core.rig import STATIC_JOINT, Rig
-from ..core.skin_fit import SkinFit
+from ..core.skin_fit import DEFAULT_KIND, SkinFit
 from ..core.temporary import temporary_folder_error
-from ..rig.reading import PoseEvaluator
+from ..rig.dependencies import read_dependencies
+from ..rig.reading import PoseEvaluator, read_key_joints_rig
 from ..scene.scene_rig import SceneRig
 from ..training.process import TrainerProcess
+from .plan import RecordingSettings
 
 MAX_FIT_POSES = 300
 MAX_FIT_BYTES = 256 << 20
 """Largest number of poses to which weights are fitted, and largest size of their positions."""
+MIN_RANDOM_POSES = 40
+"""Smallest number of random poses by which key joints are chosen."""
 WAIT_SECONDS = 0.02
 """Pause while waiting for the process, during which the sidebar stays responsive."""
 
@@ -35,8 +42,14 @@ class SkinFitting(TrainerProcess):
     loss_advice = "no skin weights were fitted, record again"
 
 
-def choose_fit_poses(pose_count: int, vertex_count: int) -> list[int]:
-    """Choose evenly spaced poses of a recording to fit weights to, and return their indices.
+def choose_fit_poses(pose_count: int, vertex_count: int, random_count: int = 0) -> list[int]:
+    """Choose evenly spaced poses of a recording to fit weights to, and return their ascending indices.
+
+    Args:
+        pose_count: number of poses of the recording.
+        vertex_count: number of vertices.
+        random_count: number of random poses, the first of the recording, if key joints are chosen: two thirds of the
+            chosen poses are random. 0 to choose among all poses.
 
     Raises:
         RecordingError: there are too few poses.
@@ -47,25 +60,102 @@ def choose_fit_poses(pose_count: int, vertex_count: int) -> list[int]:
             "--fit-linear out."
         )
     fit_pose_count = min(pose_count, MAX_FIT_POSES, max(MIN_POSES, MAX_FIT_BYTES // (12 * vertex_count)))
-    return np.linspace(0, pose_count - 1, fit_pose_count).round().astype(int).tolist()
+    chosen_random_count = min(random_count, max(2 * fit_pose_count // 3, fit_pose_count - (pose_count - random_count)))
+    parts = ((0, random_count, chosen_random_count), (random_count, pose_count, fit_pose_count - chosen_random_count))
+    return [
+        index
+        for start, end, count in parts
+        for index in np.linspace(start, end - 1, min(count, end - start)).round().astype(int).tolist()
+    ]
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """What is fitted.
+
+    Attributes:
+        kind: one of `core.skin_fit.FIT_KINDS`; empty to fit weights only if joints are removed.
+        joints: the option `joints`.
+        poses: indices of the poses of the fit in the recording, ascending.
+        random_count: number of these poses that are random; key joints are chosen by these.
+        dependencies: names of joints that move the mesh otherwise than by skin weights.
+        sampled: names of bones that random poses move.
+    """
+
+    kind: str
+    joints: str
+    poses: list[int]
+    random_count: int = 0
+    dependencies: frozenset[str] = frozenset()
+    sampled: frozenset[str] = frozenset()
+
+    @property
+    def has_key_joints(self) -> bool:
+        """Return whether key joints are chosen."""
+        return self.joints != ALL
+
+
+def make_fit_request(
+    scene_rig: SceneRig, rig: Rig, settings: RecordingSettings, channels: tuple[Channel, ...], pose_count: int
+) -> FitRequest:
+    """Make the request of a fit with the settings of a recording.
+
+    Args:
+        scene_rig, rig: the rig.
+        settings: settings of the recording.
+        channels: channels of the random poses.
+        pose_count: number of poses of the recording.
+
+    Raises:
+        RecordingError: there are too few poses.
+    """
+    if settings.joints == ALL:
+        return FitRequest(settings.fit_linear, ALL, choose_fit_poses(pose_count, rig.vertex_count))
+    # Frames of actions do not show which joints can move independently.
+    if settings.poses < MIN_RANDOM_POSES:
+        raise RecordingError(
+            f"Key joints are chosen by at least {MIN_RANDOM_POSES} random poses, and these are {settings.poses}; "
+            "record more (--poses), or leave --joints out."
+        )
+    poses = choose_fit_poses(pose_count, rig.vertex_count, settings.poses)
+    random_count = sum(index < settings.poses for index in poses)
+    dependencies = frozenset(rig.joint_names) if settings.target.name else read_dependencies(scene_rig).bones
+    sampled = frozenset(channel.name for channel in channels if channel.kind != CONTROL)
+    return FitRequest(settings.fit_linear, settings.joints, poses, random_count, dependencies, sampled)
+
+
+@dataclass(frozen=True)
+class FittedWeights:
+    """The skin weights of linear skinning.
+
+    Attributes:
+        rig: the rig with these weights, and with key joints alone if joints were removed.
+        fit: result of the fit; None if the weights are the rig's own.
+        needed_inputs: (V, J + C) bool, key joints and controls from which the motion of removed joints at each vertex
+            follows; None if no joints were removed.
+    """
+
+    rig: Rig
+    fit: SkinFit | None
+    needed_inputs: np.ndarray | None = None
 
 
 def fit_weights(
-    rig: Rig, kind: str, poses: Iterator[None], pose_count: int, evaluator: PoseEvaluator
-) -> Iterator[Progress]:
+    scene_rig: SceneRig, rig: Rig, request: FitRequest, poses: Iterator[object], evaluator: PoseEvaluator
+) -> Generator[Progress, None, FittedWeights]:
     """Fit the weights of a rig to poses.
 
     Args:
-        rig: the rig with its own skin weights.
-        kind: one of `core.skin_fit.FIT_KINDS`.
+        scene_rig, rig: the rig with its own skin weights.
+        request: what is fitted.
         poses: iterator that sets one pose per iteration.
-        pose_count: number of poses.
         evaluator: evaluator of the poses.
 
-    Returns:
-        The rig with the fitted weights and its unchanged fingerprint, and the SkinFit.
+    Yields:
+        Progress of the stages "poses to fit" and "fit". It has a note if no joint can be removed.
 
     Raises:
+        RigError: the weights of the rig are needed, and there are none.
         TrainingError: the trainer's Python cannot fit the weights.
         OutputError: the poses cannot be written.
     """
@@ -76,29 +166,51 @@ def fit_weights(
         raise temporary_folder_error(error) from error
     with temporary_folder as folder_name:
         folder = Path(folder_name)
-        with FitPosesWriter(folder, rig, pose_count) as writer:
+        with FitPosesWriter(folder, rig, len(request.poses), request.dependencies, request.sampled) as writer:
             for pose_number, _ in enumerate(poses, 1):
-                pose_matrices, positions, *_ = evaluator.evaluate()
-                writer.append(pose_matrices, positions)
-                yield Progress("poses to fit", pose_number, pose_count)
-        fit = yield from _run_fit(folder, kind, rig)
+                writer.append(*evaluator.evaluate())
+                yield Progress("poses to fit", pose_number, len(request.poses))
+        result = yield from _run_fit(folder, rig, request)
+        if isinstance(result, KeyJointReport):
+            yield Progress("fit", rig.vertex_count, rig.vertex_count, result.sentence())
+            if not request.kind:
+                check_has_weights(scene_rig, rig)
+                return FittedWeights(rig, None)
+            result = yield from _run_fit(folder, rig, replace(request, joints=ALL))
         joints, weights = read_fitted_weights(folder, rig)
-    return replace(rig, skin_joints=joints, skin_weights=weights), fit
+        if not result.key_joints:
+            return FittedWeights(replace(rig, skin_joints=joints, skin_weights=weights), result)
+        key_joints, needed_inputs = read_key_joints(folder, rig)
+    indices = np.zeros(len(rig.joints), np.int32)
+    indices[key_joints] = np.arange(len(key_joints))
+    key_rig = read_key_joints_rig(scene_rig, rig, [rig.joint_names[joint] for joint in key_joints])
+    fitted_rig = replace(key_rig, skin_joints=indices[joints], skin_weights=weights)
+    return FittedWeights(fitted_rig, result, needed_inputs)
 
 
-def _run_fit(folder: Path, kind: str, rig: Rig) -> Iterator[Progress]:
-    """Run the process, yield its progress, and return the SkinFit."""
+def _run_fit(folder: Path, rig: Rig, request: FitRequest) -> Generator[Progress, None, SkinFit | KeyJointReport]:
+    """Run the process, yield its progress, and return its result: a report if no joint can be removed."""
     progress, vertex_count = Progress("fit", 0, rig.vertex_count), rig.vertex_count
-    with SkinFitting([str(folder), kind, "--metres-per-unit", repr(rig.metres_per_unit)]) as fitting:
+    arguments = [str(folder), request.kind or DEFAULT_KIND, "--metres-per-unit", repr(rig.metres_per_unit)]
+    if request.has_key_joints:
+        static_joint = rig.joint_names.index(STATIC_JOINT) if STATIC_JOINT in rig.joint_names else -1
+        arguments += ["--joints", request.joints, "--random-poses", str(request.random_count)]
+        arguments += [f"--static-joint={static_joint}"]
+    with SkinFitting(arguments) as fitting:
         for message in fitting.messages(wait=False):
             if message is None:
                 time.sleep(WAIT_SECONDS)
             elif message.type is MessageType.PROGRESS:
                 progress = Progress("fit", int(message.values["done"]), vertex_count)
             elif message.type is MessageType.FINISHED:
-                return SkinFit.from_json(message.values["fit"])
+                values = message.values
+                return SkinFit.from_json(values["fit"]) if values["fit"] else _read_report(values)
             yield progress
     raise TrainingError("The fit of the skin weights was ended from outside; record again.")
+
+
+def _read_report(values: dict) -> KeyJointReport:
+    return KeyJointReport.from_json(values["key_joints"])
 
 
 def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:

@@ -10,6 +10,7 @@ from mathutils import Matrix
 
 from ..core.errors import RigError
 from ..core.features import FLOAT32_ROUNDING_RATIO
+from ..core.key_joints import select_joints
 from ..core.model import ModelInfo
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig
 from ..poses.sampling import model_channels, sampled_channels
@@ -120,16 +121,29 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
     """Read a rig with the joints, controls and unit of a model, so that `core.model.check_rig` can compare them.
 
     A fast rig lacks modifiers and bones of the rig that the model was trained for, so skin weights and deformation
-    count as those of the model.
+    count as those of the model. If the model reads key joints, the rig has these alone.
 
     Raises:
         RigError: as `read_rig`.
     """
     rig = read_rig(scene_rig, info.joint_names)
+    if info.fingerprint.has_key_joints:
+        rig = read_key_joints_rig(scene_rig, rig, info.joint_names)
     if scene_rig.mesh_object.fdda.is_fast_rig:
         skin_weights, deformation = info.fingerprint.skin_weights, info.fingerprint.deformation
         rig = replace(rig, fingerprint=replace(rig.fingerprint, skin_weights=skin_weights, deformation=deformation))
     return replace(rig, controls=info.controls, metres_per_unit=info.metres_per_unit)
+
+
+def read_key_joints_rig(scene_rig: SceneRig, rig: Rig, names: Iterable[str]) -> Rig:
+    """Read a rig with some of its joints (`core.key_joints.select_joints`).
+
+    Args:
+        scene_rig, rig: the rig with its own skin weights.
+        names: names of the joints, every parent before its children; names that the rig lacks are ignored.
+    """
+    names = [name for name in names if name in rig.joint_names]
+    return select_joints(rig, choose_joints(scene_rig, names, names))
 
 
 def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:

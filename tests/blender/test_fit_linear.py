@@ -247,8 +247,8 @@ def test_the_sidebar_records_with_fitted_weights(tmp_path):
     index = json.loads((tmp_path / "recording" / "recording.json").read_text())
     assert (index["fit"]["kind"], index["fit"]["poses"]) == ("hard", 12)
     rig_data = read_rig(rig)
-    same_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], "hard")
+    same_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], ("hard", "all"))
     assert (same_settings.state, same_settings.sentence) == (FolderState.COMPLETE, "")
     assert same_settings.measured_sentences[0].startswith("Linear skinning with fitted weights (hard), mm: ")
-    other_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], "")
+    other_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], ("", "all"))
     assert other_settings.sentence == "It was recorded with other settings than those above: base skinning."

@@ -77,7 +77,14 @@ def make_fit_poses(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POS
     matrices = random_poses(rng, rig.rest_matrices[:, :3, 3], poses)
     positions = LinearSkinning(rig).positions(matrices)
     positions += rng.normal(0, 1, positions.shape).astype(np.float32) * np.float32(noise)
-    return FitPoses(with_one_joint(rig, np.zeros(rig.vertex_count)), matrices, positions)
+    return FitPoses(
+        with_one_joint(rig, np.zeros(rig.vertex_count)),
+        matrices,
+        positions,
+        np.zeros((poses, 1), np.float32),
+        np.zeros(len(rig.joints), bool),
+        np.zeros(len(rig.joints), bool),
+    )
 
 
 def fit_rig(poses: FitPoses, kind: str) -> Rig:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fits skin weights to poses that `record` has evaluated: `python -m trainer.skin FOLDER hard|smooth`.
+"""Fits skin weights to poses that `record` has evaluated: `python -m trainer.skin FOLDER hard|smooth [--joints auto]`.
 
 `core.recording.fit_folder` writes FOLDER, and this command writes the fitted weights into it. It has the same messages
 and exit statuses as `python -m trainer`.
@@ -9,6 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from fdda_addon.core.joint_option import ALL, parse_joints
 from fdda_addon.core.skin_fit import FIT_KINDS
 from fdda_addon.core.terminal import escape_unencodable_output
 
@@ -23,6 +24,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, help="folder that record made")
     parser.add_argument("kind", choices=FIT_KINDS, help="one joint per vertex, or at most four")
     parser.add_argument("--metres-per-unit", type=float, default=1.0, help="length of a mesh unit in meters")
+    parser.add_argument("--joints", type=parse_joints, default=ALL, help="key joints: auto, all, or their number")
+    parser.add_argument("--random-poses", type=int, default=0, help="number of random poses, which come first")
+    parser.add_argument("--static-joint", type=int, default=-1, help="index of the joint that never moves; -1: none")
     options = parser.parse_args(arguments)
     sink, stop_request = JsonMessageSink(), StopRequest()
     return run_with_messages(lambda: _fit(options, sink, stop_request), sink)
@@ -31,10 +35,11 @@ def main(arguments: list[str] | None = None) -> int:
 def _fit(options: argparse.Namespace, sink: MessageSink, stop_request: StopRequest) -> None:
     try:
         with stop_request.exit_immediately(sink):
-            from .job import fit_folder
+            from .job import KeyJointRequest, fit_folder
     except ModuleNotFoundError as error:
         raise missing_package_error("Fitting skin weights", error) from error
-    fit_folder(options.folder, options.kind, sink, stop_request, options.metres_per_unit)
+    request = KeyJointRequest(options.joints, options.random_poses, options.static_joint)
+    fit_folder(options.folder, options.kind, sink, stop_request, options.metres_per_unit, request)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@ The arrays are untrusted and are checked when they are read.
 
 import math
 import os
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -30,10 +31,15 @@ ARRAY_SHAPES = {
     "skin_joints": ("V", "I"),
     "skin_weights": ("V", "I"),
     "parents": ("J",),
+    "is_dependency": ("J",),
+    "is_sampled": ("J",),
+    "controls": ("n", "C"),
 }
-"""Shapes of the arrays by name: n poses, J joints, V vertices, I skin weights per vertex."""
-INTEGER_ARRAYS = ("skin_joints", "parents")
-STREAMED_ARRAY_NAMES = ("pose_matrices", "positions")
+"""Shapes of the arrays by name: n poses, J joints, V vertices, I skin weights per vertex, C controls; without controls
+a column of zeros."""
+INTEGER_ARRAYS = ("skin_joints", "parents", "is_dependency", "is_sampled")
+STREAMED_ARRAY_NAMES = ("pose_matrices", "positions", "controls")
+RIG_ARRAY_NAMES = ("rest_matrices", "rest_positions", "skin_joints", "skin_weights", "parents")
 
 
 @dataclass(frozen=True)
@@ -45,35 +51,67 @@ class FitPoses:
         pose_matrices: (n, J, 4, 4) float32, mesh-object space, mesh units.
         positions: (n, V, 3) float32 positions that the rig evaluates, mesh-object space, mesh units; may be a
             memory map.
+        controls: (n, C) float32 values of the controls; (n, 1) zeros without controls.
+        is_dependency: (J,) bool, joints that move the mesh otherwise than by skin weights.
+        is_sampled: (J,) bool, joints that random poses move by channels of their own.
     """
 
     rig: Rig
     pose_matrices: np.ndarray
     positions: np.ndarray
+    controls: np.ndarray
+    is_dependency: np.ndarray
+    is_sampled: np.ndarray
 
     def subset(self, poses: slice) -> "FitPoses":
         """Return the poses of a slice."""
-        return FitPoses(self.rig, self.pose_matrices[poses], self.positions[poses])
+        arrays = self.pose_matrices, self.positions, self.controls
+        return replace(self, **dict(zip(STREAMED_ARRAY_NAMES, (array[poses] for array in arrays), strict=True)))
+
+    def with_joints(self, joints: np.ndarray) -> "FitPoses":
+        """Return the poses of the joints with (K,) ascending indices; they have no parents, and their own weights."""
+        indices = np.zeros(len(self.rig.joints), np.int32)
+        indices[joints] = np.arange(len(joints))
+        is_selected = np.isin(self.rig.skin_joints, joints)
+        rig = replace(
+            self.rig,
+            joints=tuple(Joint(self.rig.joints[joint].name, -1) for joint in joints),
+            rest_matrices=self.rig.rest_matrices[joints],
+            skin_joints=np.where(is_selected, indices[self.rig.skin_joints], 0),
+            skin_weights=np.where(is_selected, self.rig.skin_weights, 0),
+        )
+        matrices, roles = self.pose_matrices[:, joints], (self.is_dependency[joints], self.is_sampled[joints])
+        return FitPoses(rig, matrices, self.positions, self.controls, *roles)
 
 
 class FitPosesWriter:
     """Context manager that writes a fixed number of poses into a folder, one by one."""
 
-    def __init__(self, folder: Path, rig: Rig, count: int):
+    def __init__(
+        self, folder: Path, rig: Rig, count: int, dependencies: Collection[str] = (), sampled: Collection[str] = ()
+    ):
         """Args:
             folder: an empty folder.
             rig: the rig with its own skin weights.
             count: number of poses that will be appended.
+            dependencies, sampled: names of joints for `FitPoses.is_dependency` and `FitPoses.is_sampled`.
 
         Raises:
             OutputError: the folder cannot be written.
         """
         self._folder, self._appended_count = folder, 0
-        self._shapes = {"pose_matrices": (len(rig.joints), 4, 4), "positions": (rig.vertex_count, 3)}
+        self._shapes = {
+            "pose_matrices": (len(rig.joints), 4, 4),
+            "positions": (rig.vertex_count, 3),
+            "controls": (max(1, len(rig.controls)),),
+        }
         self._files = {}
         try:
-            for name in ARRAY_SHAPES.keys() - set(STREAMED_ARRAY_NAMES):
-                np.save(folder / f"{name}.npy", getattr(rig, name).astype(_array_dtype(name)), allow_pickle=False)
+            arrays = {name: getattr(rig, name) for name in RIG_ARRAY_NAMES}
+            for array_name, names in (("is_dependency", dependencies), ("is_sampled", sampled)):
+                arrays[array_name] = np.array([name in names for name in rig.joint_names])
+            for name, array in arrays.items():
+                np.save(folder / f"{name}.npy", array.astype(_array_dtype(name)), allow_pickle=False)
             for name, shape in self._shapes.items():
                 self._files[name] = open(folder / f"{name}.npy", "wb")  # noqa: SIM115 - __exit__
                 self._files[name].write(array_header((count, *shape), np.float32))
@@ -81,14 +119,16 @@ class FitPosesWriter:
             self.close()
             raise self._write_error(error) from error
 
-    def append(self, pose_matrices: np.ndarray, positions: np.ndarray) -> None:
-        """Append a pose: (J, 4, 4) pose matrices and (V, 3) positions, as in `FitPoses`.
+    def append(self, pose_matrices: np.ndarray, positions: np.ndarray, controls: np.ndarray | None = None) -> None:
+        """Append a pose: (J, 4, 4) pose matrices, (V, 3) positions and (C,) values of controls, as in `FitPoses`.
 
         Raises:
             OutputError: the disk is full.
             RecordingError: a value is not finite.
         """
-        arrays = {"pose_matrices": pose_matrices[None], "positions": positions[None]}
+        if controls is None or not len(controls):
+            controls = np.zeros(1, np.float32)
+        arrays = {"pose_matrices": pose_matrices[None], "positions": positions[None], "controls": controls[None]}
         check_pose_values(arrays, self._appended_count)
         self._appended_count += 1
         try:
@@ -157,7 +197,8 @@ def read_fit_poses(folder: Path) -> FitPoses:
         *(arrays[name] for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
         Fingerprint("", "", ""),
     )
-    return FitPoses(rig, arrays["pose_matrices"], arrays["positions"])
+    roles = (np.array(arrays[name], bool) for name in ("is_dependency", "is_sampled"))
+    return FitPoses(rig, *(arrays[name] for name in STREAMED_ARRAY_NAMES), *roles)
 
 
 def write_fitted_weights(folder: Path, joints: np.ndarray, weights: np.ndarray) -> None:
@@ -188,6 +229,35 @@ def read_fitted_weights(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]
     if not are_skin_weights(joints, weights, len(rig.joints)):
         raise _damaged_error(folder, "the fitted weights are no weights")
     return joints, weights
+
+
+def write_key_joints(folder: Path, joints: np.ndarray, needed_inputs: np.ndarray) -> None:
+    """Write key joints: their (K,) indices, and the (V, K + C) bool key joints and controls that each vertex needs.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    try:
+        np.save(folder / "key_joints.npy", joints.astype(np.int32), allow_pickle=False)
+        np.save(folder / "needed_inputs.npy", needed_inputs.astype(np.int32), allow_pickle=False)
+    except OSError as error:
+        raise OutputError(f"Cannot write the key joints into '{folder}': {os_error_text(error)}.") from error
+
+
+def read_key_joints(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Read the arrays of `write_key_joints` of a rig with V vertices, J joints and C controls.
+
+    Raises:
+        RecordingError: the arrays are missing, damaged, or of another rig.
+    """
+    joints = np.array(_read_array(folder / "key_joints.npy", 1, np.int32))
+    needed_inputs = np.array(_read_array(folder / "needed_inputs.npy", 2, np.int32), bool)
+    if (np.diff(joints) <= 0).any() or joints[0] < 0 or joints[-1] >= len(rig.joints):
+        raise _damaged_error(folder, "the key joints are no joints")
+    # Without controls, the poses have a column of zeros.
+    if needed_inputs.shape != (rig.vertex_count, len(joints) + max(1, len(rig.controls))):
+        raise _damaged_error(folder, f"the inputs of the vertices have the shape {needed_inputs.shape}")
+    return joints, needed_inputs[:, : len(joints) + len(rig.controls)]
 
 
 def _array_dtype(name: str) -> type:

@@ -8,13 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import OutputError, RecordingError, os_error_text
+from ..key_joints import select_joints
 from ..rig import Fingerprint, Rig, read_joints, rig_differences
+from ..skin_fit import weights_match
 from .folder_check import is_available, is_recording, remove_recording_files
 from .index import INDEX_NAME, REFINED, read_index, read_info
 from .lock import RecordingLock
 from .writer import find_different_keys
 
-SETTING_LABELS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "base skinning"}
+SETTING_LABELS = {
+    "limits": "range of motion",
+    "sources": "number of poses or actions",
+    "fit": "base skinning",
+}
 """Labels of sampling keys in messages."""
 
 
@@ -54,7 +60,7 @@ class FolderContent:
 
 
 def read_folder(
-    path: Path, rig: Rig | None = None, sampling: dict | None = None, fit_linear: str | None = None
+    path: Path, rig: Rig | None = None, sampling: dict | None = None, weights: tuple[str, str] | None = None
 ) -> FolderContent:
     """Read the state of a recording folder.
 
@@ -62,13 +68,13 @@ def read_folder(
         path: the folder, which may be missing.
         rig: the rig to compare with; None skips the comparison.
         sampling: `Sampling.to_json` to compare with; None skips the comparison.
-        fit_linear: kind of fitted skin weights to compare with, empty for the rig's own; None skips the comparison.
+        weights: options `fit_linear` and `joints` to compare with, as for `weights_match`; None skips the comparison.
     """
-    content = _read_content(path, rig, sampling, fit_linear)
+    content = _read_content(path, rig, sampling, weights)
     return replace(content, is_recording=content.state is not FolderState.FREE and is_recording(path))
 
 
-def _read_content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str | None) -> FolderContent:
+def _read_content(path: Path, rig: Rig | None, sampling: dict | None, weights: tuple[str, str] | None) -> FolderContent:
     if not os.path.exists(path / INDEX_NAME):
         if not is_available(path):
             return FolderContent(FolderState.FOREIGN, sentence=f"'{path.name}' is not an empty folder; choose another.")
@@ -88,7 +94,7 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear
     different_keys = find_different_keys(_without_refined(index["sampling"]), sampling) if sampling is not None else []
     info = read_info(index)
     fit = info.fit
-    if fit_linear is not None and fit_linear != (fit.kind if fit else ""):
+    if weights is not None and not weights_match(fit, *weights):
         different_keys.append("fit")
     setting_names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in different_keys}))
     if pose_counts[0] == pose_counts[1]:
@@ -120,6 +126,8 @@ def _without_refined(sampling: dict) -> dict:
 def _rig_differences(index: dict, rig: Rig) -> list[str]:
     joints = read_joints(index["joints"])
     fingerprint = Fingerprint.from_json(index["rig"]["fingerprint"])
+    if fingerprint.has_key_joints and {joint.name for joint in joints} <= set(rig.joint_names):
+        rig = select_joints(rig, joints)
     # The rest matrices are in an array; they are compared when the recording is used.
     return rig_differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
 

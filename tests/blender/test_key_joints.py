@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Recordings with key joints: choice, training, playback, fast rigs, resuming, shards, the sidebar, and errors."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
+from fdda_addon.core.errors import ModelError, RecordingError
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.recording.folder import FolderState, read_folder
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.rig.reading import read_rig
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+
+from .conftest import assert_plays, run, train
+from .scene_state import assert_same_state, drain, scene_state
+
+SETTINGS = RecordingSettings(poses=80, influence_poses=2, joints="auto")
+
+
+@dataclasses.dataclass(frozen=True)
+class LimbFiles:
+    """Paths of the limb with helpers, its recording and model with key joints, and the output of `record`."""
+
+    rig: Path
+    recording: Path
+    model: Path
+    printed: str
+
+    def open(self) -> SceneRig:
+        bpy.ops.wm.open_mainfile(filepath=str(self.rig))
+        return find_rig("limb")
+
+
+@pytest.fixture(scope="module")
+def limb_files(tmp_path_factory, request) -> LimbFiles:
+    folder = tmp_path_factory.mktemp("limb")
+    files = [folder / name for name in ("rig.blend", "recording", "model.onnx")]
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    limb_with_helpers()
+    save_copy(files[0])
+    capture = request.config.pluginmanager.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled():
+        pass
+    capture.read_global_capture()
+    assert run("record", *files[:2], "--poses", 300, "--joints", "auto") == 0
+    printed = capture.read_global_capture().out
+    train(*files[1:], "--epochs", 60)
+    return LimbFiles(*files, printed)
+
+
+def build_limb(build=limb_with_helpers) -> SceneRig:
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return SceneRig(*build())
+
+
+def pose_limb(armature_object: bpy.types.Object) -> None:
+    for number, name in enumerate(MAIN_BONES):
+        armature_object.pose.bones[name].rotation_euler = (0.4, 0.5 - 0.3 * number, -0.2)
+    bpy.context.view_layer.update()
+
+
+def test_bones_that_follow_others_are_not_read(limb_files):
+    recording, info = read_recording(limb_files.recording), read_model_info(limb_files.model)
+    assert recording.rig.joint_names == info.joint_names == MAIN_BONES
+    report = recording.info.fit.key_joints
+    assert (report.joints, report.rig_joints, report.independent, report.still) == (3, 7, 0, 0)
+    assert report.sentence() in limb_files.printed
+    rig = read_rig(limb_files.open())
+    assert set(rig.joint_names) == {*MAIN_BONES, *HELPERS}
+    assert recording.rig.fingerprint.skin_weights != rig.fingerprint.skin_weights
+
+
+def test_the_rest_is_learnt(limb_files):
+    evaluation = drain(evaluate(limb_files.open(), limb_files.model, EvaluationSettings(40)))
+    assert evaluation.linear.mean > 0.001
+    assert evaluation.fdda.mean < 0.15 * evaluation.linear.mean
+
+
+def test_the_model_plays_on_the_rig_and_a_saved_file_keeps_it(limb_files, tmp_path):
+    rig = limb_files.open()
+    bind(rig, limb_files.model)
+    pose_limb(rig.armature_object)
+    shown = assert_plays(rig.mesh_object, limb_files.model)
+    rig.mesh_object.fdda.mode = "LINEAR"
+    assert np.abs(assert_linear(rig.mesh_object) - shown).max() > 1e-4
+    rig.mesh_object.fdda.mode = "FDDA"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "bound.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "bound.blend"))
+    np.testing.assert_array_equal(assert_plays(bpy.data.objects["limb"], limb_files.model), shown)
+
+
+def assert_linear(mesh_object: bpy.types.Object) -> np.ndarray:
+    from .conftest import evaluated_positions
+
+    return evaluated_positions(mesh_object)
+
+
+def test_changed_weights_of_a_bone_that_is_not_read_are_noticed(limb_files):
+    rig = limb_files.open()
+    rig.mesh_object.vertex_groups["half.1"].add([0, 1, 2, 3], 0.5, "REPLACE")
+    with pytest.raises(ModelError, match=r"was trained for another rig: the skin weights differ\. Record"):
+        bind(rig, limb_files.model)
+
+
+def test_new_weights_on_another_bone_are_noticed(limb_files):
+    rig = limb_files.open()
+    rig.mesh_object.vertex_groups["half.1"].name = "other"
+    with pytest.raises(ModelError, match="the skin weights differ"):
+        bind(rig, limb_files.model)
+
+
+def test_a_fast_rig_has_only_the_bones_that_the_model_reads(limb_files, tmp_path):
+    fast = tmp_path / "fast.blend"
+    assert run("fast-rig", limb_files.rig, limb_files.model, fast, "--controls", "keyed") == 0
+    rig = limb_files.open()
+    bind(rig, limb_files.model)
+    pose_limb(rig.armature_object)
+    shown = assert_plays(rig.mesh_object, limb_files.model)
+    bpy.ops.wm.open_mainfile(filepath=str(fast))
+    rig = find_rig("limb")
+    assert {bone.name for bone in rig.armature_object.data.bones} == set(MAIN_BONES)
+    pose_limb(rig.armature_object)
+    np.testing.assert_allclose(assert_plays(rig.mesh_object, limb_files.model), shown, atol=1e-6)
+
+
+def test_poses_are_added_at_the_worst_errors(limb_files, tmp_path):
+    shutil.copytree(limb_files.recording, tmp_path / "recording")
+    options = ("--refine", limb_files.model, "--poses", 6)
+    assert run("record", limb_files.rig, tmp_path / "recording", *options) == 0
+    recording = read_recording(tmp_path / "recording")
+    assert len(recording.pose_matrices) == 306 and recording.rig.joint_names == MAIN_BONES
+
+
+def test_nothing_is_removed_from_a_limb_of_free_bones(tmp_path, capfd):
+    rig = build_limb(limb_of_free_bones)
+    save_copy(tmp_path / "rig.blend")
+    for name, options in (("all", ()), ("auto", ("--joints", "auto")), ("number", ("--joints", 6))):
+        assert run("record", tmp_path / "rig.blend", tmp_path / name, "--poses", 60, *options) == 0
+        printed = capfd.readouterr().out
+        sentence = "Key joints: all 6 joints are read, because each moves by more than "
+        assert (sentence in printed) == (name != "all")
+        for file in (tmp_path / "all").iterdir():
+            assert file.read_bytes() == (tmp_path / name / file.name).read_bytes(), file.name
+    assert rig is not None
+
+
+def test_a_number_says_which_motion_is_lost(tmp_path, capfd):
+    build_limb(limb_of_free_bones)
+    save_copy(tmp_path / "rig.blend")
+    assert run("record", tmp_path / "rig.blend", tmp_path / "recording", "--poses", 60, "--joints", 4) == 0
+    printed = capfd.readouterr().out
+    assert "Key joints: the model reads 4 of 6 joints, but 2 of the others move independently of these, by " in printed
+    assert len(read_recording(tmp_path / "recording").rig.joints) == 4
+
+
+def test_a_resumed_recording_keeps_its_joints(tmp_path, monkeypatch):
+    rig = build_limb()
+    before = scene_state(rig)
+    drain(record(rig, tmp_path / "whole", SETTINGS))
+    assert_same_state(before, scene_state(rig))
+    steps = record(rig, tmp_path / "broken", SETTINGS)
+    for step in steps:
+        if step.stage == "poses" and step.done == 30:
+            break
+    steps.close()
+    assert read_folder(tmp_path / "broken").complete == 30
+    monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
+    resumed = dataclasses.replace(SETTINGS, resume=True)
+    for joints in ("all", "3"):
+        with pytest.raises(RecordingError) as error:
+            drain(record(rig, tmp_path / "broken", dataclasses.replace(resumed, joints=joints)))
+        assert str(error.value) == (
+            f"Cannot resume '{tmp_path / 'broken'}': it was recorded with --joints auto; give that, or record into "
+            "another folder."
+        )
+    drain(record(rig, tmp_path / "broken", resumed))
+    for file in (tmp_path / "whole").iterdir():
+        assert file.read_bytes() == (tmp_path / "broken" / file.name).read_bytes(), file.name
+
+
+def test_shards_have_the_joints_of_their_influences(tmp_path):
+    rig = build_limb()
+    drain(record(rig, tmp_path / "whole", SETTINGS))
+    drain(record(rig, tmp_path / "influences", dataclasses.replace(SETTINGS, detect_influences=True)))
+    for number in (1, 2):
+        shard = dataclasses.replace(SETTINGS, influences=tmp_path / "influences", shard=(number, 2))
+        drain(record(rig, tmp_path / f"shard{number}", shard))
+    assert run("merge-recordings", tmp_path / "shard1", tmp_path / "shard2", tmp_path / "merged") == 0
+    for file in (tmp_path / "whole").iterdir():
+        assert file.read_bytes() == (tmp_path / "merged" / file.name).read_bytes(), file.name
+
+
+def test_the_sidebar_records_with_key_joints(tmp_path):
+    rig = build_limb()
+    settings = rig.mesh_object.fdda.settings
+    settings.poses, settings.joints = 160, "AUTO"
+    assert bpy.ops.fdda.record(object="limb", folder=str(tmp_path / "recording")) == {"FINISHED"}
+    index = json.loads((tmp_path / "recording" / "recording.json").read_text())
+    assert index["fit"]["key_joints"]["requested"] == "auto"
+    same = read_folder(tmp_path / "recording", read_rig(rig), index["sampling"], ("", "auto"))
+    assert (same.state, same.sentence) == (FolderState.COMPLETE, "")
+    assert same.measured_sentences[0].startswith("Key joints: the model reads 3 of 7 joints; ")
+    other = read_folder(tmp_path / "recording", read_rig(rig), index["sampling"], ("", "all"))
+    assert other.sentence == "It was recorded with other settings than those above: base skinning."
+    rig.mesh_object.vertex_groups["half.1"].add([0, 1, 2, 3], 0.5, "REPLACE")
+    changed = read_folder(tmp_path / "recording", read_rig(rig))
+    assert changed.state is FolderState.OTHER and "the skin weights differ" in changed.sentence
+
+
+def test_too_few_random_poses_are_refused(refusal, tmp_path):
+    build_limb()
+    save_copy(tmp_path / "rig.blend")
+    assert refusal("record", tmp_path / "rig.blend", tmp_path / "r", "--poses", 20, "--joints", "auto") == (
+        "Key joints are chosen by at least 40 random poses, and these are 20; record more (--poses), or leave --joints "
+        "out."
+    )
+
+
+def test_an_invalid_number_is_wrong_usage(tmp_path):
+    assert run("record", tmp_path / "rig.blend", tmp_path / "r", "--joints", "0") == 2

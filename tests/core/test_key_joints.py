@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Key joints: the option, the report, rigs with fewer joints, and their fingerprints."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdda_addon.core.joint_option import parse_joints
+from fdda_addon.core.key_joints import KeyJointReport, add_influences, select_joints
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.rig import Fingerprint, Joint, Rig, rig_differences
+from fdda_addon.core.skin_fit import FitReport, SkinFit, weights_match
+
+REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=12)
+ERRORS = FitReport({"rig": 2.0, "fitted": 1.0}, {"rig": 20.0, "fitted": 10.0})
+
+
+def chain_rig(*names: str, weighted: tuple[str, ...] = ("a", "b", "c", "d")) -> Rig:
+    """Return a chain of joints with names; four vertices follow `weighted` joints, each with some of the next."""
+    joints = tuple(Joint(name, index - 1) for index, name in enumerate(names))
+    matrices = np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1))
+    matrices[:, 0, 3] = np.arange(len(names))
+    skin_joints = np.zeros((4, 4), np.int32)
+    skin_joints[:, 0] = [names.index(name) for name in weighted]
+    skin_joints[:, 1] = [names.index(name) for name in (*weighted[1:], weighted[0])]
+    weights = np.tile(np.array([0.75, 0.25, 0, 0], np.float32), (4, 1))
+    positions = np.arange(12, dtype=np.float32).reshape(4, 3)
+    return Rig(joints, positions, matrices, skin_joints, weights, Fingerprint("t", "r", "s"))
+
+
+@pytest.mark.parametrize("text", ["all", "auto", "1", "50", "0050"])
+def test_the_option_is_read(text):
+    assert parse_joints(text) == text.lstrip("0")
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "1.5", "Auto", "1e3", "²", "1000000"])
+def test_other_options_are_refused(text):
+    with pytest.raises(ValueError, match=r"joints are auto, all, or a number from 1, and not "):
+        parse_joints(text)
+
+
+def test_weights_of_other_joints_count_for_the_nearest_ancestor():
+    rig = chain_rig("a", "b", "c", "d")
+    selected = select_joints(rig, (Joint("a", -1), Joint("c", 0)))
+    assert selected.joint_names == ("a", "c")
+    assert selected.skin_joints[:, :2].tolist() == [[0, 0], [0, 1], [1, 1], [1, 0]]
+    np.testing.assert_array_equal(selected.rest_matrices, rig.rest_matrices[[0, 2]])
+    assert selected.fingerprint.has_key_joints and not rig.fingerprint.has_key_joints
+
+
+def test_the_fingerprint_depends_on_all_weights_but_not_on_joints_without_weights():
+    joints = (Joint("a", -1), Joint("c", 0))
+
+    def fingerprint(rig: Rig) -> str:
+        return select_joints(rig, joints).fingerprint.skin_weights
+
+    rig = chain_rig("a", "b", "c", "d")
+    assert fingerprint(chain_rig("root", "a", "b", "x", "c", "d")) == fingerprint(rig)
+    # The other slots of a vertex may have another order.
+    swapped = replace(rig, skin_joints=rig.skin_joints[:, [1, 0, 2, 3]], skin_weights=rig.skin_weights[:, [1, 0, 2, 3]])
+    assert fingerprint(swapped) == fingerprint(rig)
+    changed = rig.skin_weights.copy()
+    changed[3, :2] = 0.5
+    others = [
+        replace(rig, skin_weights=changed),
+        chain_rig("a", "b", "c", "d", weighted=("a", "c", "b", "d")),
+        chain_rig("a", "b", "c", "e", weighted=("a", "b", "c", "e")),
+    ]
+    assert len({fingerprint(rig), *map(fingerprint, others)}) == 4
+    selected = select_joints(others[0], joints)
+    recorded = select_joints(rig, joints)
+    assert rig_differences(recorded.joints, recorded.rest_matrices, 4, recorded.fingerprint, selected) == [
+        "the skin weights differ"
+    ]
+
+
+def test_influences_are_added_by_vertices():
+    rig = chain_rig("a", "b", "c", "d")
+    partitions = make_partitions(rig, {1: (1,)}, {2: (0,)})
+    needed = np.zeros((4, 6), bool)
+    needed[1, 3], needed[2, 5] = True, True
+    added = add_influences(partitions, needed, 4)
+    assert [partition.influencing for partition in added] == [(), (1, 3), (), ()]
+    assert [partition.controls for partition in added] == [(), (), (0, 1), ()]
+
+
+def test_the_report_is_read_back_and_says_what_is_lost():
+    assert KeyJointReport.from_json(REPORT.to_json()) == REPORT
+    assert REPORT.sentence() == (
+        "Key joints: the model reads 60 of 500 joints; in random poses the others follow from these within 0.40 mm "
+        "(rms). No random pose moves 12 of the others relative to their parents."
+    )
+    assert replace(REPORT, independent=7, still=0).sentence() == (
+        "Key joints: the model reads 60 of 500 joints, but 7 of the others move independently of these, by up to 0.40 "
+        "mm (rms), and the model cannot learn that; read more joints, add their controls as inputs, or leave the "
+        "choice to auto."
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("joints", "60"), ("still", -1), ("unexplained_mm", float("nan")), ("requested", "none")]
+)
+def test_damaged_reports_are_refused(key, value):
+    with pytest.raises((TypeError, ValueError)):
+        KeyJointReport.from_json({**REPORT.to_json(), key: value})
+
+
+def test_a_fit_with_key_joints_is_read_back():
+    fit = SkinFit("smooth", 100, ERRORS, ERRORS, REPORT)
+    assert SkinFit.from_json(fit.to_json()) == fit
+    assert fit.sentence().startswith(f"{REPORT.sentence()} Linear skinning with fitted weights (smooth), mm: 1.00 rms")
+
+
+@pytest.mark.parametrize(
+    ("fit", "options", "matches"),
+    [
+        (None, ("", "all"), True),
+        (None, ("", "auto"), True),
+        (None, ("smooth", "all"), False),
+        (SkinFit("hard", 100, ERRORS, ERRORS), ("hard", "auto"), True),
+        (SkinFit("hard", 100, ERRORS, ERRORS), ("", "auto"), False),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("", "auto"), True),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("hard", "auto"), False),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("smooth", "all"), False),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("", "60"), False),
+    ],
+)
+def test_a_recording_has_the_weights_that_options_ask_for(fit, options, matches):
+    assert weights_match(fit, *options) is matches

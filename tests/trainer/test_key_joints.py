@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Choice of key joints among joints that follow others, follow controls, stay still, or move freely."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fitted_weights, read_key_joints
+from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.skinning import LinearSkinning
+from trainer.skin.choice import choose_key_joints
+from trainer.skin.job import KeyJointRequest, fit_folder
+
+BONES, RING = 4, 16
+"""Number of main joints of the chain, and of vertices around each joint."""
+
+
+class Sink:
+    """Collects messages."""
+
+    def __init__(self):
+        self.messages: list[tuple] = []
+
+    def send(self, message_type: object, **values: object) -> None:
+        """Store a message."""
+        self.messages.append((message_type, values))
+
+
+def chain_poses(pose_count: int = 160, followers: tuple[str, ...] = (), seed: int = 0) -> FitPoses:
+    """Create random poses of a chain of main joints, each with one more joint below it for each kind of follower.
+
+    Kinds: "half" rotates half as far as the next main joint, "slide" moves with a control, "free" rotates by itself,
+    "still" does not move relative to its main joint.
+    """
+    rng = np.random.default_rng(seed)
+    vectors = rng.uniform(-0.7, 0.7, (pose_count, BONES, 3))
+    slider = rng.uniform(-1, 1, pose_count)
+    joints, local_matrices = [], []
+    for bone in range(BONES):
+        joints.append(Joint(str(bone), bone - 1))
+        local_matrices.append(_transforms(vectors[:, bone], [0.2, 0, 0] if bone else [0, 0, 0]))
+    for bone in range(BONES):
+        for kind in followers:
+            following = vectors[:, (bone + 1) % BONES]
+            rotations = {"half": following / 2, "free": rng.uniform(-0.5, 0.5, (pose_count, 3))}
+            matrices = _transforms(rotations.get(kind, np.zeros((pose_count, 3))), [0.2, 0, 0])
+            if kind == "slide":
+                matrices[:, 2, 3] += 0.05 * slider
+            joints.append(Joint(str(len(joints)), bone))
+            local_matrices.append(matrices)
+    pose_matrices, rest_matrices = [], []
+    for joint, matrices in zip(joints, local_matrices, strict=True):
+        offset = np.eye(4)
+        offset[0, 3] = 0.2 if joint.parent >= 0 else 0
+        parent = pose_matrices[joint.parent] if joint.parent >= 0 else np.eye(4)
+        pose_matrices.append(parent @ matrices)
+        rest_matrices.append((rest_matrices[joint.parent] if joint.parent >= 0 else np.eye(4)) @ offset)
+    rest = np.stack(rest_matrices).astype(np.float32)
+    rig = _skinned_rig(tuple(joints), rest, rng)
+    poses = np.stack(pose_matrices, axis=1).astype(np.float32)
+    positions = LinearSkinning(rig).positions(poses)
+    controls = slider[:, None].astype(np.float32)
+    return FitPoses(rig, poses, positions, controls, np.zeros(len(joints), bool), np.arange(len(joints)) < BONES)
+
+
+def _transforms(vectors: np.ndarray, offset: list[float]) -> np.ndarray:
+    matrices = np.tile(np.eye(4), (len(vectors), 1, 1))
+    matrices[:, :3, :3] = Rotation.from_rotvec(vectors).as_matrix()
+    matrices[:, :3, 3] = offset
+    return matrices
+
+
+def _skinned_rig(joints: tuple[Joint, ...], rest_matrices: np.ndarray, rng: np.random.Generator) -> Rig:
+    """Return a rig with vertices around each joint, with most weight on it and the others on its parent."""
+    count = len(joints)
+    positions = np.repeat(rest_matrices[:, :3, 3], RING, axis=0) + rng.uniform(-0.06, 0.06, (RING * count, 3))
+    skin_joints, weights = np.zeros((RING * count, 4), np.int32), np.zeros((RING * count, 4), np.float32)
+    main = np.repeat(np.arange(count), RING)
+    skin_joints[:, 0] = main
+    skin_joints[:, 1] = np.maximum([joint.parent for joint in joints], 0)[main]
+    weights[:, 0] = np.where(main == 0, 1, rng.uniform(0.6, 1, len(main)))
+    weights[:, 1] = 1 - weights[:, 0]
+    return Rig(joints, positions.astype(np.float32), rest_matrices, skin_joints, weights, Fingerprint("", "", ""))
+
+
+def choose(poses: FitPoses, requested: str = "auto"):
+    return choose_key_joints(poses, requested, np.zeros(len(poses.rig.joints), bool), 1.0)
+
+
+def test_half_rotating_joints_follow_from_the_main_joints():
+    poses = chain_poses(followers=("half",))
+    choice = choose(poses)
+    # The half of the last main joint and its main joint rotate about other points, so one of them could be enough.
+    assert len(choice.joints) == BONES and choice.report.unexplained_mm < choice.report.tolerance_mm
+    # The vertices around a removed joint need the joint from whose rotation its own follows.
+    for joint in set(range(BONES, 2 * BONES)) - set(choice.joints.tolist()):
+        rotated = (joint - BONES + 1) % BONES
+        if rotated in choice.joints:
+            column = choice.joints.tolist().index(rotated)
+            assert choice.needed_inputs[RING * joint : RING * (joint + 1), column].all()
+
+
+def test_independent_joints_are_all_kept():
+    poses = chain_poses(followers=("free",))
+    choice = choose(poses)
+    assert len(choice.joints) == len(poses.rig.joints) and choice.report.independent == 0
+    assert choice.report.sentence() == (
+        f"Key joints: all {2 * BONES} joints are read, because each moves by more than "
+        f"{choice.report.tolerance_mm:.2f} mm in ways that the others do not explain."
+    )
+
+
+def test_joints_that_follow_a_control_need_it_as_an_input():
+    poses = chain_poses(followers=("slide",))
+    choice = choose(poses)
+    assert choice.joints.tolist() == list(range(BONES))
+    assert choice.needed_inputs[RING * BONES :, -1].all() and not choice.needed_inputs[: RING * BONES, -1].any()
+    # Without the control, one sliding joint shows how far the others slide.
+    assert len(choose(replace(poses, controls=np.zeros((len(poses.controls), 1)))).joints) == BONES + 1
+
+
+def test_still_joints_are_counted():
+    choice = choose(chain_poses(followers=("still",)))
+    assert choice.joints.tolist() == list(range(BONES)) and choice.report.still == BONES
+    assert choice.report.sentence().endswith(f"No random pose moves {BONES} of the others relative to their parents.")
+
+
+def test_a_joint_whose_weights_are_tiny_is_removed_although_it_is_free():
+    poses = chain_poses(followers=("free",))
+    weights = poses.rig.skin_weights.copy()
+    joint = BONES
+    rows = slice(RING * joint, RING * (joint + 1))
+    weights[rows, 0], weights[rows, 1] = 1e-4, 1 - 1e-4
+    rig = replace(poses.rig, skin_weights=weights)
+    poses = replace(poses, rig=rig, positions=LinearSkinning(rig).positions(poses.pose_matrices))
+    assert choose(poses).joints.tolist() == [index for index in range(2 * BONES) if index != joint]
+
+
+def test_a_joint_without_weights_is_kept_if_it_moves_the_mesh_otherwise():
+    poses = chain_poses(followers=("free",))
+    joint = 2 * BONES - 1
+    rig = replace(
+        poses.rig,
+        skin_weights=np.where(poses.rig.skin_joints == joint, 0, poses.rig.skin_weights),
+    )
+    rig = replace(rig, skin_weights=rig.skin_weights / rig.skin_weights.sum(axis=1, keepdims=True))
+    poses = replace(poses, rig=rig, positions=LinearSkinning(rig).positions(poses.pose_matrices))
+    assert joint not in choose(poses).joints
+    is_dependency = np.arange(2 * BONES) == joint
+    assert joint in choose(replace(poses, is_dependency=is_dependency)).joints
+
+
+@pytest.mark.parametrize("count", [2, BONES, 2 * BONES, 100])
+def test_a_number_of_joints_is_met_and_what_is_lost_is_told(count):
+    poses = chain_poses(followers=("free",))
+    choice = choose(poses, str(count))
+    assert len(choice.joints) == min(count, 2 * BONES)
+    removed = 2 * BONES - len(choice.joints)
+    assert choice.report.independent == removed
+    if removed:
+        assert f"but {removed} of the others move independently of these, by up to " in choice.report.sentence()
+        assert choice.report.unexplained_mm > 10
+
+
+def test_weights_are_fitted_to_key_joints(tmp_path):
+    sink = Sink()
+    poses = chain_poses(followers=("half", "still"))
+    names = [joint.name for joint in poses.rig.joints]
+    with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
+        for arrays in zip(poses.pose_matrices, poses.positions, poses.controls, strict=True):
+            writer.append(*arrays)
+    request = KeyJointRequest("auto", 120)
+    fit = fit_folder(tmp_path, "smooth", sink, lambda: False, request=request)
+    joints, weights = read_fitted_weights(tmp_path, poses.rig)
+    key_joints, needed_inputs = read_key_joints(tmp_path, poses.rig)
+    assert fit.key_joints.joints == len(key_joints) < len(names)
+    assert set(np.unique(joints[weights > 0])) <= set(key_joints.tolist())
+    assert needed_inputs.shape == (poses.rig.vertex_count, len(key_joints))
+    assert sink.messages[-1][1]["fit"] == fit.to_json()
+
+
+def test_a_fit_without_removable_joints_writes_nothing(tmp_path):
+    sink = Sink()
+    poses = chain_poses(followers=("free",))
+    with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
+        for arrays in zip(poses.pose_matrices, poses.positions, strict=True):
+            writer.append(*arrays)
+    assert fit_folder(tmp_path, "smooth", sink, lambda: False, request=KeyJointRequest("auto", 160)) is None
+    assert not (tmp_path / "fitted_joints.npy").exists()
+    assert sink.messages[-1][1]["key_joints"]["joints"] == 2 * BONES

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Chooses the key joints of a folder of poses, and finds what the motion of each vertex follows from."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdda_addon.core.joint_option import AUTO
+from fdda_addon.core.key_joints import KeyJointReport
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.patches import divide_into_patches
+from fdda_addon.core.recording.fit_folder import FitPoses
+from fdda_addon.core.rig import Rig
+
+from .input_blocks import LENGTH_RATIO, InputBlocks
+from .key_joints import KeyJoints, KeyJointSearch, joint_moments
+from .solver import SkinSolver
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Key joints of a rig with J joints and C controls.
+
+    Attributes:
+        joints: (K,) indices of the key joints, ascending.
+        needed_inputs: (V, K + C) bool, the key joints and controls from which the motion of a vertex follows that
+            other joints cause.
+        report: numbers of joints and errors.
+    """
+
+    joints: np.ndarray
+    needed_inputs: np.ndarray
+    report: KeyJointReport
+
+
+def choose_key_joints(poses: FitPoses, requested: str, static_joints: np.ndarray, metres_per_unit: float) -> Choice:
+    """Choose key joints by random poses.
+
+    The weights of a rig may be those of a cage, or none. So the vertices that a joint moves are those where either the
+    rig has a weight, or a fit with all joints has one. The fit takes one vertex of each small patch of the mesh.
+
+    Args:
+        poses: n random poses with J joints; every other pose measures errors.
+        requested: "auto", or the number of key joints.
+        static_joints: (J,) bool, joints that are kept in any case.
+        metres_per_unit: as in `Rig`.
+    """
+    rig, joint_count = poses.rig, len(poses.rig.joints)
+    patches = divide_into_patches(rig, make_partitions(rig))
+    representatives = patches.vertices[patches.starts]
+    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives)
+    moments = _larger_moments(
+        joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count),
+        joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count),
+    )
+    without_vertices = poses.is_dependency & (np.trace(moments, axis1=1, axis2=2) == 0)
+    moments[without_vertices] = _moments_at_heads(rig)[without_vertices]
+    blocks = InputBlocks(poses)
+    is_still = blocks.widths[:joint_count] == 0
+    search = KeyJointSearch(poses, moments, blocks, static_joints)
+    result = search.search(None if requested == AUTO else int(requested))
+
+    acts = _acting_joints(rig.skin_joints, rig.skin_weights, joint_count)
+    patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))
+    acts[patches.vertices] |= np.repeat(_acting_joints(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0)
+    columns = np.concatenate([result.joints, np.arange(joint_count, blocks.count)])
+    needed_inputs = (acts.astype(np.float32) @ result.inputs[:, columns].astype(np.float32)) > 0
+    return Choice(result.joints, needed_inputs, _make_report(result, is_still, requested, metres_per_unit))
+
+
+def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit the weights of (n,) vertices to poses; returns (n, 4) joints and (n, 4) weights."""
+    rig = poses.rig
+    selected_rig = replace(
+        rig,
+        rest_positions=rig.rest_positions[vertices],
+        skin_joints=rig.skin_joints[vertices],
+        skin_weights=rig.skin_weights[vertices],
+    )
+    selected = replace(poses, rig=selected_rig, positions=poses.positions[:, vertices])
+    fitted = [arrays for _, *arrays in SkinSolver(selected).fit("smooth")]
+    joints, weights = (np.concatenate(blocks) for blocks in zip(*fitted, strict=True))
+    return joints, weights
+
+
+def _larger_moments(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return for each joint the moment of the larger weights, (J, 4, 4); the last element is the mean square weight."""
+    return np.where((first[:, 3, 3] >= second[:, 3, 3])[:, None, None], first, second)
+
+
+def _moments_at_heads(rig: Rig) -> np.ndarray:
+    """Return (J, 4, 4) moments of points around the heads of joints, for joints that move the mesh without weights."""
+    offsets = LENGTH_RATIO * rig.size * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
+    points = rig.rest_matrices[:, None, :3, 3] + offsets
+    points = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
+    return np.einsum("jpa,jpb->jab", points, points) / len(offsets)
+
+
+def _acting_joints(joints: np.ndarray, weights: np.ndarray, joint_count: int) -> np.ndarray:
+    """Return (V, J) bool, the joints with a weight on each vertex."""
+    acts = np.zeros((len(joints), joint_count), bool)
+    for slot in range(joints.shape[1]):
+        rows = np.flatnonzero(weights[:, slot] > 0)
+        acts[rows, joints[rows, slot]] = True
+    return acts
+
+
+def _make_report(result: KeyJoints, is_still: np.ndarray, requested: str, metres_per_unit: float) -> KeyJointReport:
+    joint_count = len(result.unexplained)
+    is_removed = ~np.isin(np.arange(joint_count), result.joints)
+    return KeyJointReport(
+        requested,
+        len(result.joints),
+        joint_count,
+        1000 * metres_per_unit * float(result.unexplained.max()),
+        1000 * metres_per_unit * result.tolerance,
+        int(result.is_independent.sum()),
+        int((is_removed & is_still).sum()),
+    )

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Chooses key joints: the joints that a model reads, so that the motion of all others follows from them.
+
+The skin matrix S_r of a joint r moves its vertices relative to another joint a, its anchor, by S_a^-1 S_r. A joint can
+be removed if this motion is constant, or if it is a function of the inputs that remain: the transforms of key joints
+relative to their parents, and controls. A joint that random poses move by channels of its own is removed only in the
+first case. The function is a least-squares fit to half of the poses, and its error is measured on the other half, at
+the vertices of the joint. So chance cannot explain a joint that moves independently. Inputs are selected by orthogonal
+matching pursuit (Pati et al., 1993), joints are removed greedily.
+"""
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdda_addon.core.recording.fit_folder import FitPoses
+from fdda_addon.core.skinning import skin_matrices
+
+from .input_blocks import InputBlocks, predict
+
+TOLERANCE_RATIO = 2.5e-4
+"""A joint is removed if the motion that remains unexplained is at most this part of the character's size (rms over
+poses and vertices, times skin weights)."""
+EXPLAINED_RATIO = 0.05
+"""A joint is also removed if this part of its motion remains unexplained: networks fit better than least squares."""
+MAX_INPUTS = 4
+"""Largest number of inputs that explain a joint, besides its anchor."""
+MIN_RELATIVE_GAIN = 0.01
+"""An input is added only if it lowers the squared error of the fit by this part."""
+COST_STEP = 0.1
+"""Costs of removals that differ by less count as equal."""
+ANCHOR_POSES = 24
+"""Number of poses by which the anchor of a joint is chosen."""
+
+
+@dataclass(frozen=True)
+class KeyJoints:
+    """The result of a search among J joints and C controls.
+
+    Attributes:
+        joints: (K,) indices of the key joints, ascending.
+        inputs: (J, J + C) bool, the key joints and controls that explain each removed joint.
+        unexplained: (J,) motion that the inputs do not explain, rms, mesh units; 0 for key joints.
+        is_independent: (J,) bool, removed joints that would not be removed automatically.
+        tolerance: largest unexplained motion of a joint that is removed automatically, mesh units.
+    """
+
+    joints: np.ndarray
+    inputs: np.ndarray
+    unexplained: np.ndarray
+    is_independent: np.ndarray
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class _Explanation:
+    """How a removed joint follows from others.
+
+    Attributes:
+        anchor, inputs: the anchor, and the other inputs that explain the joint.
+        unexplained: motion that remains, mesh units.
+        cost: `unexplained` relative to the largest value with which the joint can be removed.
+    """
+
+    anchor: int
+    inputs: tuple[int, ...]
+    unexplained: float
+    cost: float
+
+
+def joint_moments(rest_positions: np.ndarray, joints: np.ndarray, weights: np.ndarray, joint_count: int) -> np.ndarray:
+    """Compute M_j = sum_v w_vj^3 x_v x_v^T / sum_v w_vj, so that tr(A M_j A^T) is the mean squared motion by A - I.
+
+    A vertex with a small weight moves little and counts little.
+
+    Args:
+        rest_positions: (V, 3), mesh units.
+        joints, weights: (V, I) joints with skin weights, and the weights.
+        joint_count: J.
+
+    Returns:
+        (J, 4, 4) float64, square mesh units; 0 for joints without weights.
+    """
+    points = np.concatenate([rest_positions, np.ones((len(rest_positions), 1))], axis=1).astype(np.float64)
+    products = (points[:, :, None] * points[:, None]).reshape(-1, 16)
+    moments, weight_sums = np.zeros((joint_count, 16)), np.zeros(joint_count)
+    for slot in range(joints.shape[1]):
+        slot_weights = weights[:, slot].astype(np.float64)
+        np.add.at(moments, joints[:, slot], slot_weights[:, None] ** 3 * products)
+        np.add.at(weight_sums, joints[:, slot], slot_weights)
+    return (moments / np.maximum(weight_sums, 1e-9)[:, None]).reshape(-1, 4, 4)
+
+
+class KeyJointSearch:
+    """Removes joints greedily, first those that the others explain best.
+
+    Attributes:
+        tolerance: as in `KeyJoints`.
+    """
+
+    def __init__(self, poses: FitPoses, moments: np.ndarray, blocks: InputBlocks, is_required: np.ndarray):
+        """Prepare the search.
+
+        Args:
+            poses: n poses of J joints; every other pose measures the errors of the fits.
+            moments: (J, 4, 4) moments of the vertices of each joint, square mesh units.
+            blocks: features of the joints and controls in these poses.
+            is_required: (J,) bool, joints that are never removed.
+        """
+        size = max(poses.rig.size, 1e-9)
+        self.tolerance = TOLERANCE_RATIO * size
+        self._blocks, self._is_required, self._is_kept = blocks, is_required, np.ones(len(moments), bool)
+        self._skin = skin_matrices(poses.pose_matrices, poses.rig.rest_matrices).astype(np.float64)
+        self._inverse_skin = np.linalg.inv(self._skin)[:, :, :3]
+        variances, axes = np.linalg.eigh(moments)
+        self._moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
+        self._is_sampled = poses.is_sampled
+        self._parents: list[int] = poses.rig.parents.tolist()
+        self._depths: list[int] = []
+        for parent in self._parents:
+            self._depths.append(self._depths[parent] + 1 if parent >= 0 else 0)
+        self._anchor_motions = self._measure_anchor_motions()
+        self._explanations: dict[int, _Explanation] = {}
+
+    def _measure_anchor_motions(self) -> np.ndarray:
+        """Return (J, J) rms motion of each joint at its vertices relative to each other joint, mesh units."""
+        poses = np.linspace(0, len(self._skin) - 1, min(ANCHOR_POSES, len(self._skin))).astype(int)
+        inverse_skin, joint_count = self._inverse_skin[poses], self._skin.shape[1]
+        motions = np.empty((joint_count, joint_count))
+        for joint in range(joint_count):
+            relative = inverse_skin @ (self._skin[poses, joint] @ self._moment_roots[joint])[:, None]
+            motions[joint] = np.sqrt(relative.var(axis=0).sum(axis=(1, 2)))
+            motions[joint, joint] = np.inf
+        return motions
+
+    def search(self, count: int | None = None) -> KeyJoints:
+        """Remove joints whose unexplained motion is within the tolerance, or until `count` joints are left."""
+        queue = [self._queue_entry(joint, 0.0) for joint in np.flatnonzero(~self._is_required).tolist()]
+        heapq.heapify(queue)
+        while queue and self._is_kept.sum() > (count or 1):
+            *_, joint = heapq.heappop(queue)
+            self._is_kept[joint] = False
+            children = self._blocks.remove(joint)
+            explanations = self._explain_without(joint, children)
+            cost = max(explanation.cost for explanation in explanations.values())
+            is_removable = count is not None or cost <= 1
+            entry = self._queue_entry(joint, cost)
+            # Removals since the last evaluation may have made this one more expensive than others.
+            if is_removable and not (queue and entry > queue[0]):
+                self._explanations |= explanations
+                continue
+            self._is_kept[joint] = True
+            self._blocks.restore(joint, children)
+            if is_removable:
+                heapq.heappush(queue, entry)
+        return self._result()
+
+    def _queue_entry(self, joint: int, cost: float) -> tuple:
+        """Return the place of a joint in the order of removal.
+
+        Animators pose the joints that random poses move, so those come last. Among joints with nearly equal costs,
+        children come first.
+        """
+        step = int(cost / COST_STEP)
+        return cost > 1, bool(self._is_sampled[joint]), step, -self._depths[joint], joint
+
+    def _explain_without(self, joint: int, children: list[int]) -> dict[int, _Explanation]:
+        """Explain a removed joint, and the removed joints that it explained, or its children."""
+        changed = {joint, *children}
+        dependents = [
+            removed
+            for removed, known in self._explanations.items()
+            if known.anchor == joint or not changed.isdisjoint(known.inputs)
+        ]
+        return {removed: self._explain(removed) for removed in (joint, *dependents)}
+
+    def _explain(self, joint: int) -> _Explanation:
+        """Explain the motion of a joint by kept joints and controls.
+
+        The anchor is the joint with the smallest motion relative to it, or the nearest ancestor.
+        """
+        anchor = int(np.where(self._is_kept, self._anchor_motions[joint], np.inf).argmin())
+        best = self._explain_from(joint, anchor)
+        ancestor = self._parents[joint]
+        while ancestor >= 0 and not self._is_kept[ancestor]:
+            ancestor = self._parents[ancestor]
+        if ancestor in (-1, anchor) or best.cost <= COST_STEP:
+            return best
+        return min(best, self._explain_from(joint, ancestor), key=lambda explanation: explanation.cost)
+
+    def _explain_from(self, joint: int, anchor: int) -> _Explanation:
+        """Explain the motion of a joint relative to an anchor."""
+        moved = self._skin[:, joint] @ self._moment_roots[joint]
+        motion = (self._inverse_skin[:, anchor] @ moved).reshape(len(moved), 12)
+        motion = motion - motion[::2].mean(axis=0)
+        inputs, error = self._find_inputs(motion)
+        total = _rms(motion[1::2])
+        if self._is_sampled[joint]:
+            # Animators pose this joint, so what explains it in these poses may not explain it in others.
+            return _Explanation(anchor, inputs, total, total / self.tolerance)
+        return _Explanation(anchor, inputs, error, error / max(self.tolerance, EXPLAINED_RATIO * total))
+
+    def _find_inputs(self, motion: np.ndarray) -> tuple[tuple[int, ...], float]:
+        """Find inputs that explain the (n, 12) motion; return them and the rms of the remaining motion, mesh units."""
+        training, held_out = motion[::2], motion[1::2]
+        inputs: tuple[int, ...] = ()
+        best, remaining = (inputs, _rms(held_out)), training
+        while len(inputs) < MAX_INPUTS and best[1] > self.tolerance / 4:
+            chosen = self._blocks.best_block(remaining, inputs)
+            if chosen is None:
+                break
+            inputs = (*inputs, chosen)
+            fitted, predicted = predict(self._blocks.select(inputs), training)
+            gain = 1 - (training - fitted).var() / max(remaining.var(), 1e-30)
+            remaining = training - fitted
+            if (error := _rms(held_out - predicted)) < best[1]:
+                best = inputs, error
+            if gain < MIN_RELATIVE_GAIN:
+                break
+        return best
+
+    def _result(self) -> KeyJoints:
+        joint_count = len(self._is_kept)
+        inputs, unexplained = np.zeros((joint_count, self._blocks.count), bool), np.zeros(joint_count)
+        is_independent = np.zeros(joint_count, bool)
+        for joint, explanation in self._explanations.items():
+            inputs[joint, [explanation.anchor, *explanation.inputs]] = True
+            unexplained[joint], is_independent[joint] = explanation.unexplained, explanation.cost > 1
+        return KeyJoints(np.flatnonzero(self._is_kept), inputs, unexplained, is_independent, self.tolerance)
+
+
+def _rms(motion: np.ndarray) -> float:
+    """Return the root mean square over poses of (n, 12) motions."""
+    return float(np.sqrt((motion**2).sum(axis=1).mean()))
