@@ -126,11 +126,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         items=(
             ("RIG", "From the Rig", "The weights of the mesh"),
             ("HARD", "Fit (1 bone per vertex)", "Find the bone for each vertex that fits the recorded poses best"),
-            (
-                "SMOOTH",
-                "Fit (4 bones per vertex)",
-                "Find up to four weights per vertex that fit the recorded poses best",
-            ),
+            ("SMOOTH", "Fit (4 bones per vertex)", "Find up to four weights per vertex that fit the poses best"),
         ),
         default="RIG",
     )
@@ -218,16 +214,6 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         soft_max=1000,
     )
     training_seed: IntProperty(name="Seed", description="Random seed of the training", min=0)
-
-
-def fit_kind(settings: FDDA_PG_character) -> str:
-    """Return the kind of fitted skin weights (`core.skin_fit.FIT_KINDS`); empty for the weights of the rig."""
-    return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
-
-
-def joint_option(settings: FDDA_PG_character) -> str:
-    """Return the joints that the model reads, as the option `joints` of a recording (`core.joint_option`)."""
-    return str(settings.joint_count) if settings.joints == "NUMBER" else settings.joints.lower()
 
 
 @not_animatable

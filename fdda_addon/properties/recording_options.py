@@ -8,7 +8,7 @@ import bpy
 from ..core.errors import RigError
 from ..scene.active_rig import cached_active_rig
 from ..scene.scene_rig import SceneRig
-from .character import FDDA_PG_character, fit_kind, joint_option
+from .character import FDDA_PG_character
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.plan import RecordingSettings
@@ -38,12 +38,22 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         resume=resume,
         sample=_sample_options(settings, actions),
         controls=_control_options(settings),
-        fit_linear=fit_kind(settings),
+        fit_linear=_fit_kind(settings),
         min_partition_vertices=settings.min_partition_vertices,
         mirror=settings.mirror and bool(actions),
         target=target_settings(settings),
-        joints=joint_option(settings),
+        joints=_joint_option(settings),
     )
+
+
+def _fit_kind(settings: FDDA_PG_character) -> str:
+    """Return the kind of fitted skin weights (`core.skin_fit.FIT_KINDS`); empty for the weights of the rig."""
+    return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
+
+
+def _joint_option(settings: FDDA_PG_character) -> str:
+    """Return the joints that the model reads, as the option `joints` of a recording (`core.joint_option`)."""
+    return str(settings.joint_count) if settings.joints == "NUMBER" else settings.joints.lower()
 
 
 def complete_settings(scene_rig: SceneRig) -> "RecordingSettings | None":

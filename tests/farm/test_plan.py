@@ -48,6 +48,7 @@ def test_settings_of_a_character_override_the_defaults(write_plan):
         (HERO_CHARACTER + "actions = [3]", "actions is a text, and not 3"),
         (HERO_CHARACTER + "mirror = 1", "mirror is true or false, and not 1"),
         (HERO_CHARACTER + "poses = 0", "there is nothing to record; give poses or actions"),
+        (HERO_CHARACTER + 'joints = "some"', "joints are auto, all, or a number from 1, and not 'some'"),
         (HERO_CHARACTER + 'fit_linear = "soft"', "fit_linear is hard or smooth, and not 'soft'"),
         (HERO_CHARACTER + "train = 3", "train is a section, and not 3"),
         (HERO_CHARACTER + 'train = { "x y" = 3 }', "train cannot have 'x y'"),
