@@ -132,7 +132,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     )
     joints: EnumProperty(
         name="Bones to Read",
-        description="The bones that the model reads; what the others do is learnt, where it follows from these",
+        description="The bones that the model reads; what the others do is learned, where it follows from these",
         items=(
             ("ALL", "All", "All bones that move the mesh"),
             ("AUTO", "Fewest", "The fewest bones from which the others follow in random poses"),
