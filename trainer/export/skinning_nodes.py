@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Graph nodes that compute the positions: each partition, or group of small partitions, takes one matrix product."""
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -24,38 +24,66 @@ The linear part is gathered as one slice, because gathering takes the same time 
 same reason, translations are gathered in slices of three."""
 
 
-@dataclass(frozen=True)
-class _RowLayout:
-    """The rows of a partition's matrix: three per component and half rotation, four per joint, and padding.
+class _PartitionRows:
+    """The rows of a partition: three for each component and half rotation, four for each joint, and padding.
 
     Attributes:
+        index, joint, vertices: index, main joint and (Vp,) vertices of the partition.
+        prepared, skin: its fit and components, and its skin weights.
         component_count: K.
         half_rotation_joints: joints with half-rotation matrices in the partition's fit, as in `JointFit`.
         joints: the joints of the partition's skin weights, followed by the joints of its fit.
-        skin_joint_count: number of joints of the skin weights.
+        padding: number of zero rows at the end, which fill the last slice of three translations.
+        row_count: number of rows.
     """
 
-    component_count: int
-    half_rotation_joints: tuple[int, ...]
-    joints: tuple[int, ...]
-    skin_joint_count: int
+    def __init__(self, trained_model: TrainedModel, index: int):
+        """Lay out the rows of the partition with this index."""
+        self.index, self._rig = index, trained_model.rig
+        self.prepared, self._last_bias = trained_model.prepared[index], trained_model.networks[index].biases[-1]
+        self.joint, self.vertices = trained_model.partitions[index].joint, trained_model.partitions[index].vertices
+        self.skin = SkinBlock(self._rig, trained_model.partitions[index])
+        is_half_rotation = self.prepared.fit.joints >= len(self._rig.joints)
+        self.component_count = len(self.prepared.basis.components)
+        self.half_rotation_joints = self.prepared.fit.joints[is_half_rotation]
+        self.joints = np.append(self.skin.joints, self.prepared.fit.joints[~is_half_rotation])
+        self.padding = -len(self.joints) % 3
+        self._linear_only_count = 3 * (self.component_count + len(self.half_rotation_joints))
+        self.row_count = self._linear_only_count + MATRIX_COLUMNS * len(self.joints) + self.padding
 
-    @property
-    def padding(self) -> int:
-        """Number of zero rows at the end, which fill the last slice of three translations."""
-        return -len(self.joints) % 3
+    def matrix(self) -> np.ndarray:
+        """Compute the (row_count, Vp) float64 constant matrix."""
+        inverse_rest = np.linalg.inv(self._rig.rest_matrices.astype(np.float64))
+        basis, fit, vertex_count = self.prepared.basis, self.prepared.fit, len(self.vertices)
+        weighted_rest = self.skin.weighted_rest.reshape(len(self.skin.joints), 4, -1).astype(np.float64)
+        fit_factors = fit.factors.reshape(-1, 4, vertex_count).astype(np.float64)
+        mean = basis.mean.astype(np.float64)
+        if self.component_count:
+            # The last bias of the network is a constant residual.
+            mean = mean + self._last_bias.astype(np.float64) @ basis.components
+        fit_factors[np.flatnonzero(fit.joints == self.joint), :3] += mean.reshape(vertex_count, 3).T
+        fit_rows = inverse_rest[fit.joints % len(inverse_rest)] @ fit_factors
+        has_translation = fit.joints < len(inverse_rest)
+        component_rows = basis.components.reshape(-1, vertex_count, 3)
+        component_rows = np.einsum("ab,kvb->kav", inverse_rest[self.joint, :3, :3], component_rows)
+        joint_rows = np.concatenate([inverse_rest[self.skin.joints] @ weighted_rest, fit_rows[has_translation]])
+        padding_rows = np.zeros((self.padding, vertex_count))
+        row_blocks = [component_rows, fit_rows[~has_translation, :3], joint_rows[:, :3], joint_rows[:, 3], padding_rows]
+        return np.concatenate([rows.reshape(-1, vertex_count) for rows in row_blocks])
 
-    @property
-    def row_count(self) -> int:
-        linear_only_count = self.component_count + len(self.half_rotation_joints)
-        return 3 * linear_only_count + MATRIX_COLUMNS * len(self.joints) + self.padding
-
-    def skin_mask(self) -> np.ndarray:
-        """Return (row_count,) bool, which rows belong to the joints of the skin weights."""
-        is_skin = np.arange(len(self.joints)) < self.skin_joint_count
-        linear_only_rows = np.zeros(3 * (self.component_count + len(self.half_rotation_joints)), bool)
-        padding_rows = np.zeros(self.padding, bool)
-        return np.concatenate([linear_only_rows, np.repeat(is_skin, 3), is_skin, padding_rows])
+    def factorized_matrix(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return two factors of the constant matrix; the first leaves the rows of the skin joints unchanged."""
+        is_skin_joint = np.arange(len(self.joints)) < len(self.skin.joints)
+        is_skin = np.zeros(self.row_count, bool)
+        is_skin[self._linear_only_count : self.row_count - self.padding] = np.append(
+            np.repeat(is_skin_joint, 3), is_skin_joint
+        )
+        matrix, skin_row_count = self.matrix(), is_skin.sum()
+        vertex_factors = self.prepared.vertex_factors.astype(np.float64)
+        left_factor = np.zeros((self.row_count, skin_row_count + len(vertex_factors)))
+        left_factor[is_skin, :skin_row_count] = np.eye(skin_row_count)
+        left_factor[~is_skin, skin_row_count:] = matrix[~is_skin] @ vertex_factors.T
+        return left_factor, np.concatenate([matrix[is_skin], vertex_factors])
 
 
 def add_skinning(
@@ -88,24 +116,17 @@ def add_skinning(
         outside: name of the (N, 3 B') values that `add_range` returns. One of their elements is a constant 1.
         trained_model: model to export.
     """
-    partitions = trained_model.partitions
-    skins = [SkinBlock(trained_model.rig, partition) for partition in partitions]
-    layouts = [_row_layout(trained_model, index, skin) for index, skin in enumerate(skins)]
-    matrix_shapes = [
-        (layout.row_count, len(partition.vertices)) for layout, partition in zip(layouts, partitions, strict=True)
-    ]
-    products = _group_products(matrix_shapes)
-    ordered_partitions = [index for product in products for index in product]
-    layouts = {index: layouts[index] for index in ordered_partitions}
-    rows = _add_rows(graph, features, coefficients, outside, trained_model, layouts)
-    row_counts = [sum(layouts[index].row_count for index in product) for product in products]
-    row_blocks = graph.split(
-        rows, row_counts, [f"rows_{product_index}" for product_index in range(len(products))], axis=2
-    )
-    order = vertex_order([partitions[index].vertices for index in ordered_partitions])
-    column_order = dict(zip(ordered_partitions, order.columns, strict=True))
+    partitions = [_PartitionRows(trained_model, index) for index in range(len(trained_model.partitions))]
+    shapes = [(partition.row_count, len(partition.vertices)) for partition in partitions]
+    products = [[partitions[index] for index in product] for product in _group_products(shapes)]
+    partitions = [partition for product in products for partition in product]
+    rows = _add_rows(graph, features, coefficients, outside, partitions)
+    row_counts = [sum(partition.row_count for partition in product) for product in products]
+    row_blocks = graph.split(rows, row_counts, [f"rows_{number}" for number in range(len(products))], axis=2)
+    order = vertex_order([partition.vertices for partition in partitions])
+    columns = {partition.index: columns for partition, columns in zip(partitions, order.columns, strict=True)}
     position_blocks = [
-        _add_product(graph, product_rows, f"{number}", product, trained_model, skins, layouts, column_order)
+        _add_product(graph, product_rows, f"{number}", product, columns)
         for number, (product_rows, product) in enumerate(zip(row_blocks, products, strict=True))
     ]
     joined_positions = graph.join(position_blocks, "blocks", axis=2)
@@ -114,40 +135,32 @@ def add_skinning(
 
 
 def _add_product(
-    graph: GraphBuilder,
-    rows: str,
-    suffix: str,
-    product: list[int],
-    trained_model: TrainedModel,
-    skins: list[SkinBlock],
-    layouts: dict[int, _RowLayout],
-    column_order: dict[int, np.ndarray],
+    graph: GraphBuilder, rows: str, suffix: str, product: list[_PartitionRows], columns: dict[int, np.ndarray]
 ) -> str:
-    """Add the product of rows with the matrices of the partitions of a product; returns the name of the positions."""
-    matrices = [_partition_matrix(trained_model, index, skins[index], layouts[index]) for index in product]
-    vertex_factors = trained_model.prepared[product[0]].vertex_factors
-    if len(product) == 1 and vertex_factors is not None:
-        left_factor, matrices[0] = _factorized_matrix(matrices[0], layouts[product[0]], vertex_factors)
-        left_factor = graph.floats(f"left_factor_{suffix}", left_factor)
-        rows = graph.add("MatMul", [rows, left_factor], f"low_rank_{suffix}")
-    vertices = (trained_model.partitions[index].vertices for index in product)
+    """Add the product of rows with the matrices of the partitions of a product.
+
+    Args:
+        graph: graph to which the nodes are added.
+        rows: name of the (N, 3, rows) rows.
+        suffix: end of the names of the nodes.
+        product: the partitions.
+        columns: by partition index, the vertex of each column of its positions; -1 for a column of zeros.
+
+    Returns:
+        Name of the (N, 3, columns) positions.
+    """
+    if len(product) == 1 and product[0].prepared.vertex_factors is not None:
+        left_factor, matrix = product[0].factorized_matrix()
+        rows = graph.add("MatMul", [rows, graph.floats(f"left_factor_{suffix}", left_factor)], f"low_rank_{suffix}")
+        matrices = [matrix]
+    else:
+        matrices = [partition.matrix() for partition in product]
     reordered = [
-        _reorder_columns(matrix, vertices_of_matrix, column_order[index])
-        for matrix, vertices_of_matrix, index in zip(matrices, vertices, product, strict=True)
+        _reorder_columns(matrix, partition.vertices, columns[partition.index])
+        for matrix, partition in zip(matrices, product, strict=True)
     ]
     matrix = graph.floats(f"matrix_{suffix}", _block_diagonal(reordered))
     return graph.add("MatMul", [rows, matrix], f"block_{suffix}")
-
-
-def _row_layout(trained_model: TrainedModel, index: int, skin: SkinBlock) -> _RowLayout:
-    fit_joints, joint_count = trained_model.prepared[index].fit.joints, len(trained_model.rig.joints)
-    joints = np.append(skin.joints, fit_joints[fit_joints < joint_count])
-    return _RowLayout(
-        trained_model.component_counts()[index],
-        tuple(fit_joints[fit_joints >= joint_count].tolist()),
-        tuple(joints.tolist()),
-        len(skin.joints),
-    )
 
 
 def _add_rows(
@@ -155,16 +168,10 @@ def _add_rows(
     features: Features,
     coefficients: Coefficients | None,
     outside: str,
-    trained_model: TrainedModel,
-    layouts: dict[int, _RowLayout],
+    partitions: list[_PartitionRows],
 ) -> str:
-    """Add the (N, 3, rows) rows of all partitions.
-
-    Args:
-        graph, features, coefficients, outside, trained_model: as in `add_skinning`.
-        layouts: layout of each partition, by partition index, in the order of the products.
-    """
-    scaled_matrices, slice_order = _order_slices(features, coefficients, trained_model, layouts)
+    """Add the (N, 3, rows) rows of partitions, in the order of the products; other arguments as in `add_skinning`."""
+    scaled_matrices, slice_order = _order_slices(features, coefficients, partitions)
     joint_of_matrix, factor_of_matrix = zip(*scaled_matrices, strict=True)
     scalar_values = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
     factors = graph.integers("row_factors", np.array(factor_of_matrix)[:, None])
@@ -185,7 +192,7 @@ def _add_rows(
 
 
 def _order_slices(
-    features: Features, coefficients: Coefficients | None, trained_model: TrainedModel, layouts: dict[int, _RowLayout]
+    features: Features, coefficients: Coefficients | None, partitions: list[_PartitionRows]
 ) -> tuple[list[tuple[int, int]], list[int]]:
     """List the scaled matrices of all rows, and the order of their slices; arguments as in `_add_rows`.
 
@@ -196,24 +203,23 @@ def _order_slices(
     # The scalars are `outside`, whose last element is the constant 1, then the confidence, then the coefficients.
     ones_index, confidence_start = VECTOR_SIZE * features.ones_vector, VECTOR_SIZE * (features.ones_vector + 1)
     scaled_matrices: list[tuple[int, int]] = []
-    joint_starts = {}
-    for index, layout in layouts.items():
-        joint_starts[index] = len(scaled_matrices)
-        scaled_matrices += [(joint, ones_index) for joint in layout.joints[: layout.skin_joint_count]]
-        scaled_matrices += [(joint, confidence_start + index) for joint in layout.joints[layout.skin_joint_count :]]
-        scaled_matrices += layout.padding * [(0, ones_index)]
+    joint_starts = []
+    for partition in partitions:
+        joint_starts.append(len(scaled_matrices))
+        skin_joints, fit_joints = np.split(partition.joints, [len(partition.skin.joints)])
+        scaled_matrices += [(joint, ones_index) for joint in skin_joints]
+        scaled_matrices += [(joint, confidence_start + partition.index) for joint in fit_joints]
+        scaled_matrices += partition.padding * [(0, ones_index)]
     # Slices of translations have negative values here, because their offset is known only at the end.
     slice_order = []
-    for index, layout in layouts.items():
-        linear_start = len(scaled_matrices)
-        if layout.component_count:
-            first_coefficient = confidence_start + len(layouts) + coefficients.start_by_partition[index]
-            main_joint = trained_model.partitions[index].joint
-            scaled_matrices += [(main_joint, first_coefficient + k) for k in range(layout.component_count)]
-        scaled_matrices += [(joint, confidence_start + index) for joint in layout.half_rotation_joints]
-        joint_end = joint_starts[index] + len(layout.joints)
-        slice_order += [*range(linear_start, len(scaled_matrices)), *range(joint_starts[index], joint_end)]
-        slice_order += [~(matrix_index // 3) for matrix_index in range(joint_starts[index], joint_end, 3)]
+    for partition, joint_start in zip(partitions, joint_starts, strict=True):
+        linear_start, joint_end = len(scaled_matrices), joint_start + len(partition.joints)
+        if partition.component_count:
+            first_coefficient = confidence_start + len(partitions) + coefficients.start_by_partition[partition.index]
+            scaled_matrices += [(partition.joint, first_coefficient + k) for k in range(partition.component_count)]
+        scaled_matrices += [(joint, confidence_start + partition.index) for joint in partition.half_rotation_joints]
+        slice_order += [*range(linear_start, len(scaled_matrices)), *range(joint_start, joint_end)]
+        slice_order += [~(matrix_index // 3) for matrix_index in range(joint_start, joint_end, 3)]
     scaled_matrices += -len(scaled_matrices) % 3 * [(0, ones_index)]
     return scaled_matrices, [len(scaled_matrices) + ~i if i < 0 else i for i in slice_order]
 
@@ -229,18 +235,12 @@ def _group_products(matrix_shapes: list[tuple[int, int]]) -> list[list[int]]:
     """
     products: list[list[int]] = []
     row_count = column_count = 0
-    for index in sorted(
-        range(len(matrix_shapes)), key=lambda index: (matrix_shapes[index][0] * matrix_shapes[index][1], index)
-    ):
-        if (
-            products
-            and matrix_shapes[index][0] * column_count + matrix_shapes[index][1] * row_count < MAX_PADDING_ELEMENTS
-        ):
-            products[-1].append(index)
-        else:
-            products.append([index])
+    for index, (rows, columns) in sorted(enumerate(matrix_shapes), key=lambda item: (math.prod(item[1]), item[0])):
+        if not products or rows * column_count + columns * row_count >= MAX_PADDING_ELEMENTS:
+            products.append([])
             row_count = column_count = 0
-        row_count, column_count = row_count + matrix_shapes[index][0], column_count + matrix_shapes[index][1]
+        products[-1].append(index)
+        row_count, column_count = row_count + rows, column_count + columns
     return products
 
 
@@ -255,44 +255,3 @@ def _block_diagonal(matrices: list[np.ndarray]) -> np.ndarray:
 def _reorder_columns(matrix: np.ndarray, vertices: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Reorder the columns of a matrix, one for each of `vertices`; `columns` has vertices, or -1 for a zero column."""
     return np.where(columns >= 0, matrix[:, np.searchsorted(vertices, np.maximum(columns, vertices[0]))], 0)
-
-
-def _factorized_matrix(
-    matrix: np.ndarray, layout: _RowLayout, vertex_factors: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Replace a partition's matrix by a product of two; the first leaves the rows of the skin joints unchanged."""
-    is_skin = layout.skin_mask()
-    skin_row_count, vertex_factors = is_skin.sum(), vertex_factors.astype(np.float64)
-    left_factor = np.zeros((len(matrix), skin_row_count + len(vertex_factors)))
-    left_factor[is_skin, :skin_row_count] = np.eye(skin_row_count)
-    left_factor[~is_skin, skin_row_count:] = matrix[~is_skin] @ vertex_factors.T
-    return left_factor, np.concatenate([matrix[is_skin], vertex_factors])
-
-
-def _partition_matrix(trained_model: TrainedModel, index: int, skin: SkinBlock, layout: _RowLayout) -> np.ndarray:
-    """Compute the (rows, Vp) float64 constant matrix of a partition."""
-    inverse_rest = np.linalg.inv(trained_model.rig.rest_matrices.astype(np.float64))
-    partition, prepared = trained_model.partitions[index], trained_model.prepared[index]
-    basis, fit = prepared.basis, prepared.fit
-    vertex_count = len(partition.vertices)
-    weighted_rest = skin.weighted_rest.reshape(len(skin.joints), 4, -1).astype(np.float64)
-    fit_factors = fit.factors.reshape(-1, 4, vertex_count).astype(np.float64)
-    mean = basis.mean.astype(np.float64)
-    if layout.component_count:
-        # The last bias of the network is a constant residual.
-        mean = mean + trained_model.networks[index].biases[-1].astype(np.float64) @ basis.components
-    fit_factors[np.flatnonzero(fit.joints == partition.joint), :3] += mean.reshape(vertex_count, 3).T
-    fit_rows = inverse_rest[fit.joints % len(inverse_rest)] @ fit_factors
-    has_translation = fit.joints < len(inverse_rest)
-    component_rows = basis.components.reshape(-1, vertex_count, 3)
-    component_rows = np.einsum("ab,kvb->kav", inverse_rest[partition.joint, :3, :3], component_rows)
-    joint_rows = np.concatenate([inverse_rest[skin.joints] @ weighted_rest, fit_rows[has_translation]])
-    padding_rows = np.zeros((layout.padding, vertex_count))
-    row_blocks = [
-        component_rows,
-        fit_rows[~has_translation, :3],
-        joint_rows[:, :3],
-        joint_rows[:, 3],
-        padding_rows,
-    ]
-    return np.concatenate([rows.reshape(-1, vertex_count) for rows in row_blocks])
