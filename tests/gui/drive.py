@@ -24,6 +24,7 @@ import endure_story
 import film_story
 import flesh_story
 import leave_story
+import manual_story
 import path_story
 import ranges_story
 import session_story
@@ -44,6 +45,7 @@ STEPS = {
     "update": update_story.STEPS,
     "film": film_story.STEPS,
     "endure": endure_story.STEPS,
+    "manual": manual_story.STEPS,
     "leave": leave_story.STEPS_BEFORE_CLOSING,
     "back": leave_story.STEPS_AFTER_REOPENING,
 }[STORY_NAME]

@@ -28,7 +28,7 @@ MISSING_REQUIREMENT_STATUS = 3
 MAX_BLANK_IMAGE_VALUES = 32
 STORIES = ("path", "film", "work", "shot", "cast", "ranges", "flesh", "session", "leave", "back")
 """Names of the stories, in order. Each runs in a new Blender, and uses the files that the story `path` has saved."""
-LONG_STORIES = ("endure",)
+LONG_STORIES = ("endure", "manual")
 """Stories that run only by name, because they take minutes."""
 
 

@@ -111,12 +111,12 @@ def find_button(identifier: str, across: float = 0.5) -> Iterator[float]:
     # The last position first; all others twice, because Blender may redraw the sidebar during the search.
     last_heights = [_button_heights[identifier]] if identifier in _button_heights else []
     for y in [*last_heights, *search_heights, *search_heights]:
-        if identifier in (yield from _description_at(x, y)):
+        if identifier in (yield from description_at(x, y)):
             _button_heights[identifier] = y
             return x, y
     yield from _scroll("down")
     for y in [sidebar.y + sidebar.height - index * step for index in range(int(sidebar.height / step))]:
-        if identifier in (yield from _description_at(x, y)):
+        if identifier in (yield from description_at(x, y)):
             return x, y
     require(False, f"there is no button {identifier} in the sidebar")
 
@@ -156,12 +156,12 @@ def open_subpanel(above: str, content: str, across: float = 0.5, across_above: f
     step = SEARCH_STEP_PIXELS * scale
     for row in range(1, SUBPANEL_ROWS):
         y = top - row * step
-        if (yield from _description_at(header_x, y)):
+        if (yield from description_at(header_x, y)):
             continue
         yield from click(header_x, y)
         yield from redraw_window()
         for content_row in range(1, CONTENT_ROWS):
-            if content in (yield from _description_at(content_x, y - content_row * step)):
+            if content in (yield from description_at(content_x, y - content_row * step)):
                 return
         # It was another sub-panel, which is closed again, or a label.
         yield from click(header_x, y)
@@ -179,7 +179,7 @@ def _scroll(direction: str) -> Iterator[float]:
     yield from redraw_window()
 
 
-def _description_at(x: float, y: float) -> Iterator[float]:
+def description_at(x: float, y: float) -> Iterator[float]:
     """Return the description of the button at a position of the sidebar; empty without one."""
     move_mouse(x, y)
     yield from wait_for_events()
