@@ -2,7 +2,7 @@
 """Make the pictures of the sidebar from those of `make test-gui`: `python docs/pictures/make_sidebar.py out/gui`.
 
 The pictures of the errors are of a well-trained model: `tests/gui/run.py out/gui --story film`, with the arm that
-`make demo` has bound as out/gui/work/arm.blend, beside its model.
+`make demo` has bound as out/gui/work/arm.blend, beside its model. `make_manual.py` makes those with numbers.
 """
 
 import sys
@@ -20,9 +20,7 @@ TEXT_BRIGHTNESS = 150
 BOTTOM_MARGIN = 16
 COLUMN_GAP = 12
 SECTION_PICTURES = {
-    "manual_prepare": ("03_measure_the_rig", "04_preview_a_random_pose", "07_record"),
     "simulation_sections": ("target", "flesh_recorded"),
-    "manual_play": ("09_train", "12_measure_the_model", "14_evaluate"),
 }
 """Steps of the test whose sections are shown side by side, by the name of the picture."""
 WINDOW_PICTURES = {
@@ -43,7 +41,7 @@ def sections_height(picture: Image.Image) -> int:
 def crop_sections(picture: Image.Image) -> Image.Image:
     """Return the part of the window with the sections of the sidebar."""
     left, top, right = SIDEBAR_BOUNDS
-    return picture.crop((left, top, right, top + sections_height(picture)))
+    return picture.crop((left, top, right, min(top + sections_height(picture), VIEW_BOUNDS[3] - BOTTOM_MARGIN)))
 
 
 def join_pictures(pictures: list[Image.Image]) -> Image.Image:

@@ -6,6 +6,8 @@ It writes screenshots, and `marks.json` with the positions of the numbered butto
 """
 
 import json
+import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,23 +26,27 @@ from arm import (
 from window import (
     main_screen,
     main_window,
+    move_mouse,
     park_mouse,
+    press_mouse_button,
     redraw_window,
-    region_override,
     require,
     save_screenshot,
     view_area,
     view_region,
+    wait_for_events,
     wait_until,
 )
 
-BADGE_INSET_PIXELS = 62
-"""Distance of a number from the right edge of the sidebar."""
+BADGE_INSET_PIXELS, LEFT_BADGE_PIXELS = 62, 16
+"""Distance of a number from the right edge of the sidebar, and from the left edge in rows with texts at the right."""
 PROBE_PIXELS = 3
 """Distance between mouse positions in the search for the edges of a button."""
 FEW_POSES = 25
-ARC_STEPS = 24
-LIMITED_BONES = {"elbow": 0.16, "wrist": 0.1, "index_1": 0.05}
+WIDER_PIXELS = 120
+"""By how much the Properties editor is widened."""
+ARC_STEPS, ELEVATION = 24, math.radians(50)
+LIMITED_BONES = {"shoulder": 0.2, "elbow": 0.2, "wrist": 0.13}
 """Bones whose limits are drawn, with the radius of the arc in meters."""
 
 _marks: dict[str, dict] = {}
@@ -61,8 +67,8 @@ def _box(region: bpy.types.Region | bpy.types.Area) -> list[int]:
     return [region.x, height - region.y - region.height, region.x + region.width, height - region.y]
 
 
-def _number(number: int, identifier: str, across: float = 0.5) -> Iterator[float]:
-    """Return a number and the position in a screenshot where it is drawn, at the right end of a button."""
+def _number(number: int, identifier: str, across: float = 0.5, is_left: bool = False) -> Iterator[float]:
+    """Return a number and the position in a screenshot where it is drawn, at the right or left end of a button."""
     x, y = yield from sidebar.find_button(identifier, across)
     edges = []
     for direction in (1, -1):
@@ -71,7 +77,8 @@ def _number(number: int, identifier: str, across: float = 0.5) -> Iterator[float
             edge += direction * PROBE_PIXELS
         edges.append(edge)
     side = view_region("UI")
-    return [number, side.x + side.width - BADGE_INSET_PIXELS, main_window().height - sum(edges) / 2]
+    badge_x = side.x + (LEFT_BADGE_PIXELS if is_left else side.width - BADGE_INSET_PIXELS)
+    return [number, badge_x, main_window().height - sum(edges) / 2]
 
 
 def show_the_section_without_a_rig(folder: Path) -> Iterator[float]:
@@ -99,7 +106,7 @@ def measure_the_rig(folder: Path) -> Iterator[float]:
 
 def show_the_poses(folder: Path) -> Iterator[float]:
     yield from sidebar.open_section("poses")
-    number = yield from _number(4, "fdda.rest_pose", across=0.85)
+    number = yield from _number(4, "fdda.rest_pose", across=0.85, is_left=True)
     yield from _shoot(folder, "manual_poses", numbers=[number])
 
 
@@ -117,13 +124,15 @@ def train(folder: Path) -> Iterator[float]:
     yield from wait_for_job("train", 240)
     yield from redraw_window()
     numbers = [(yield from _number(6, "fdda.train(")), (yield from _number(7, "fdda.bind("))]
-    yield from _shoot(folder, "manual_training", numbers=numbers)
+    yield from _shoot(folder, "manual_training", numbers=numbers, rows=[y for _, _, y in numbers])
 
 
 def bind(folder: Path) -> Iterator[float]:
     """Press Bind in the section Training; show the modifiers before and after."""
     properties = next(area for area in main_screen().areas if area.type == "PROPERTIES")
     properties.spaces.active.context = "MODIFIER"
+    # Names of modifiers are cut off in the narrow editor.
+    yield from _drag_left_edge(properties, -WIDER_PIXELS)
     for modifier in arm_object().modifiers:
         modifier.show_expanded = False
     yield from _shoot(folder, "manual_modifiers_before", area=_box(properties))
@@ -132,12 +141,28 @@ def bind(folder: Path) -> Iterator[float]:
     for modifier in arm_object().modifiers:
         modifier.show_expanded = False
     yield from _shoot(folder, "manual_modifiers_after", area=_box(properties))
+    yield from _drag_left_edge(properties, WIDER_PIXELS)
     properties.spaces.active.context = "OBJECT"
     yield from sidebar.open_section("playback")
     yield from sidebar.press_button("fdda.measure_model")
     yield from wait_for_job("measure_model", 90)
     yield from redraw_window()
     yield from _shoot(folder, "manual_model", numbers=[])
+
+
+def _drag_left_edge(area: bpy.types.Area, pixels: int) -> Iterator[float]:
+    """Drag the left edge of an area with the mouse."""
+    x, y = area.x - 1, area.y + area.height // 2
+    move_mouse(x, y)
+    yield from wait_for_events()
+    press_mouse_button("mousedown")
+    yield from wait_for_events()
+    for step in (0.5, 1.0):
+        move_mouse(x + step * pixels, y)
+        yield from wait_for_events()
+    press_mouse_button("mouseup")
+    yield 0.5
+    require(abs(area.x - 1 - x - pixels) < 10, f"the edge was moved by {area.x - 1 - x} pixels")
 
 
 def evaluate(folder: Path) -> Iterator[float]:
@@ -153,15 +178,18 @@ def evaluate(folder: Path) -> Iterator[float]:
 
 def show_limits(folder: Path) -> Iterator[float]:
     """Compute arcs of the limits of some bones in the rest pose."""
-    bpy.ops.fdda.unbind(object="arm")
+    from mathutils import Euler
+
     armature_object().animation_data.action = None
     bpy.ops.fdda.rest_pose()
-    with region_override("WINDOW"):
-        bpy.ops.view3d.view_axis(type="FRONT")
-    frame_object(arm_object())
-    yield 1.0
-    arcs = [_arc(name, axis, radius) for name, radius in LIMITED_BONES.items() for axis in range(3)]
+    view_area().spaces[0].show_region_ui = False
+    view_area().spaces[0].region_3d.view_rotation = Euler((ELEVATION, 0, 0)).to_quaternion()
+    yield 0.5
+    frame_object(arm_object(), 1.2)
+    yield 0.5
+    arcs = [_arc(name, 0, radius) for name, radius in LIMITED_BONES.items()]
     yield from _shoot(folder, "manual_limits", arcs=[arc for arc in arcs if arc], area=_box(view_region("WINDOW")))
+    yield from sidebar.open_tab()
 
 
 def _arc(bone_name: str, axis: int, radius: float) -> dict | None:
@@ -187,19 +215,25 @@ def _arc(bone_name: str, axis: int, radius: float) -> dict | None:
 
 
 def train_on_too_few_poses(folder: Path) -> Iterator[float]:
+    bpy.ops.fdda.unbind(object="arm")
     settings = arm_object().fdda.settings
-    settings.poses, settings.recording, settings.model = FEW_POSES, "//few", "//few_model/few.onnx"
+    settings.poses = FEW_POSES
+    settings.recording, settings.model = "//few", "//few_model/few.onnx"
     bpy.ops.fdda.record(object="arm")
     yield from sidebar.open_section("training")
     yield from sidebar.press_button("fdda.train(")
     yield from wait_for_job("train", 240)
     yield from redraw_window()
-    yield from _shoot(folder, "manual_few_poses", numbers=[])
+    numbers = [(yield from _number(6, "fdda.train(")), (yield from _number(7, "fdda.bind("))]
+    yield from _shoot(folder, "manual_few_poses", rows=[y for _, _, y in numbers])
 
 
 def show_the_preferences(folder: Path) -> Iterator[float]:
     import addon_utils
 
+    # As on a machine where nothing is installed yet.
+    os.environ.pop("FDDA_TRAINER_PYTHON", None)
+    bpy.context.preferences.system.use_online_access = True
     area = view_area()
     area.type = "PREFERENCES"
     bpy.context.preferences.active_section = "ADDONS"
@@ -212,6 +246,7 @@ def show_the_preferences(folder: Path) -> Iterator[float]:
     (folder / "marks.json").write_text(json.dumps(_marks, indent=1), encoding="utf-8")
     area.type = "VIEW_3D"
     yield 0.5
+    bpy.context.preferences.system.use_online_access = False
     require(view_area() is not None, "the view is gone")
 
 
@@ -223,7 +258,7 @@ STEPS = (
     train,
     bind,
     evaluate,
-    show_limits,
     train_on_too_few_poses,
+    show_limits,
     show_the_preferences,
 )

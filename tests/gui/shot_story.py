@@ -12,6 +12,7 @@ from arm import (
     arm_object,
     arm_positions,
     armature_object,
+    check_model_plays,
     evaluated_positions,
     extension_module,
     frame_object,
@@ -46,6 +47,18 @@ def open_the_bound_file(folder: Path) -> Iterator[float]:
     """Open a copy of the file with the bound model."""
     yield from open_copy_in(folder / "work" / "shot", folder)
     yield from sidebar.open_tab()
+
+
+def bind_again_after_the_modifier_was_removed(folder: Path) -> Iterator[float]:
+    """Remove the modifier FDDA, as its X in the Properties editor does: Bind Again brings it back."""
+    with region_override("WINDOW"):
+        bpy.ops.object.modifier_remove(modifier="FDDA")
+    yield from wait_until(lambda: arm_object().fdda.status, 5, "nothing says that the modifier is gone")
+    yield from sidebar.open_section("playback")
+    yield from save_screenshot(folder / "modifier_removed.png")
+    yield from sidebar.press_button("fdda.bind(", across=0.75)
+    yield from wait_until(lambda: arm_object().fdda.mode == "FDDA", 10, "Bind Again does not bind")
+    check_model_plays()
 
 
 def choose_a_mask(folder: Path) -> Iterator[float]:
@@ -222,6 +235,7 @@ def click_a_bone_to_show_its_body_part(folder: Path) -> Iterator[float]:
 
 STEPS = (
     open_the_bound_file,
+    bind_again_after_the_modifier_was_removed,
     choose_a_mask,
     paint_the_mask,
     show_the_rig_beside,
