@@ -56,19 +56,16 @@ def add_networks(
         return None
     networks = [trained_model.networks[index] for index in learned_partitions]
     first_layers = [_first_layer(features, trained_model, index) for index in learned_partitions]
-    hidden_weights = [np.stack(layers) for layers in zip(*(network.weights[1:-1] for network in networks), strict=True)]
-    hidden_biases = [
-        np.stack(layers)[:, None] for layers in zip(*(network.biases[1:-1] for network in networks), strict=True)
-    ]
     values = _add_first_layer(graph, clamped, first_layers)
     values = _add_activation(graph, values, trained_model.activation, "hidden_0")
-    for layer, (weights, bias) in enumerate(zip(hidden_weights, hidden_biases, strict=True), 1):
-        values = graph.add("MatMul", [values, graph.floats(f"weights_{layer}", weights)], f"product_{layer}")
-        values = graph.add("Add", [values, graph.floats(f"biases_{layer}", bias)], f"layer_{layer}")
+    for layer in range(1, len(networks[0].weights) - 1):
+        weights = graph.floats(f"weights_{layer}", np.stack([network.weights[layer] for network in networks]))
+        values = graph.add("MatMul", [values, weights], f"product_{layer}")
+        biases = graph.floats(f"biases_{layer}", np.stack([network.biases[layer][None] for network in networks]))
+        values = graph.add("Add", [values, biases], f"layer_{layer}")
         values = _add_activation(graph, values, trained_model.activation, f"hidden_{layer}")
-    return _add_last_layer(
-        graph, values, {index: trained_model.networks[index].weights[-1] for index in learned_partitions}
-    )
+    last_weights = [network.weights[-1] for network in networks]
+    return _add_last_layer(graph, values, dict(zip(learned_partitions, last_weights, strict=True)))
 
 
 def _chunk_size(layer_sizes: Sequence[int], width: int, combine_cost: int) -> int:
@@ -102,10 +99,8 @@ def _add_first_layer(graph: GraphBuilder, clamped: str, layers: list[tuple[np.nd
     vector_counts, units = [len(vectors) for vectors, _ in layers], layers[0][1].shape[2]
     chunk_size = _chunk_size(vector_counts, VECTOR_SIZE * units, len(layers))
     chunks = _chunks(vector_counts, chunk_size)
-    chunk_vectors, weights = (
-        np.zeros((len(chunks), chunk_size), np.int64),
-        np.zeros((len(chunks), chunk_size, VECTOR_SIZE, units)),
-    )
+    chunk_vectors = np.zeros((len(chunks), chunk_size), np.int64)
+    weights = np.zeros((*chunk_vectors.shape, VECTOR_SIZE, units))
     summation_matrix = np.zeros((len(layers), len(chunks)))
     for index, (network, layer_slice) in enumerate(chunks):
         vectors, chunk_weights = (array[layer_slice] for array in layers[network])

@@ -79,23 +79,20 @@ def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
         if columns.stop > columns.start:
             vectors, position = block.add_nodes(graph, is_needed[columns])
             parts[block.is_direct, isinstance(vectors, LocalVectors)].append((columns, vectors, position))
-    direct_locals, derived_locals = (
-        [vectors for _, vectors, _ in parts[is_direct, True]] for is_direct in (True, False)
-    )
-    local_vectors = _join([*direct_locals, ZERO_VECTOR, *derived_locals])
+    local_parts = [*parts[True, True], (slice(0), ZERO_VECTOR, np.zeros(0, np.int64)), *parts[False, True]]
+    local_vectors = _join([vectors for _, vectors, _ in local_parts])
     name, table = _add_local_vectors(graph, trained_model, local_vectors)
     table, pose_rows = _add_half_rotations(graph, trained_model, len(local_vectors.joints), is_needed, name, table)
     values = [vectors.name for _, vectors, _ in parts[True, False]]
     values += [name, *(vectors.name for _, vectors, _ in parts[False, False])]
-    # The zero vector is the last one of the direct vectors.
-    order = [*parts[True, False], *parts[True, True], (slice(0), ZERO_VECTOR, np.zeros(0, np.int64))]
-    direct_count = sum(vectors.count for _, vectors, _ in order)
-    start, all_positions = 0, np.full(len(is_needed), -1, np.int64)
-    for columns, vectors, position in [*order, *parts[False, True], *parts[False, False]]:
-        all_positions[columns] = np.where(position < 0, -1, position + VECTOR_SIZE * start)
-        start += vectors.count
+    count, direct_count, all_positions = 0, 0, np.full(len(is_needed), -1, np.int64)
+    for columns, vectors, position in [*parts[True, False], *local_parts, *parts[False, False]]:
+        all_positions[columns] = np.where(position < 0, -1, position + VECTOR_SIZE * count)
+        count += vectors.count
+        if vectors is ZERO_VECTOR:  # the last one of the direct vectors
+            direct_count = count
     name = graph.join(values, "features", axis=1)
-    return Features(name, direct_count, VECTOR_SIZE * start, all_positions, table, pose_rows)
+    return Features(name, direct_count, VECTOR_SIZE * count, all_positions, table, pose_rows)
 
 
 ZERO_VECTOR = LocalVectors(
@@ -231,10 +228,8 @@ def _add_inverses(graph: GraphBuilder, flat_matrices: str) -> str:
             signs[minor, 4 * i + j] = 1 - 2 * product
     selection[[0, 4, 8], [36, 37, 38]] = 1
     selected = graph.add("MatMul", [flat_matrices, graph.floats("picks", selection)], "picked")
-    first_factors, second_factors, first_column = graph.split(
-        selected, [18, 18, 3], ["left", "right", "column"], axis=2
-    )
-    products = graph.add("Mul", [first_factors, second_factors], "products")
+    *factors, first_column = graph.split(selected, [18, 18, 3], ["left", "right", "column"], axis=2)
+    products = graph.add("Mul", factors, "products")
     adjugate = graph.add("MatMul", [products, graph.floats("minor_signs", signs)], "adjugate")
     expansion = graph.add("Mul", [graph.slice(adjugate, 0, 3, 2, "adjugate_row"), first_column], "expansion")
     determinant = graph.add("ReduceSum", [expansion, graph.integers("last_axis", [2])], "determinant", keepdims=1)
@@ -263,8 +258,6 @@ def add_range(graph: GraphBuilder, features: Features, trained_model: TrainedMod
     scaled_counts = (training_range.counts / training_range.fade_width.astype(np.float64) ** 2).T
     counts[position[position >= 0]] = scaled_counts[position >= 0]
     gemm_inputs = [squared_outside, graph.floats("counts", counts), graph.floats("full_confidence", np.ones(1))]
-    confidence_root = graph.add(
-        "Relu", [graph.add("Gemm", gemm_inputs, "confidence_base", alpha=-1.0)], "confidence_root"
-    )
-    graph.add("Mul", [confidence_root, confidence_root], CONFIDENCE_OUTPUT)
+    root = graph.add("Relu", [graph.add("Gemm", gemm_inputs, "confidence_base", alpha=-1.0)], "confidence_root")
+    graph.add("Mul", [root, root], CONFIDENCE_OUTPUT)
     return clamped, squared_outside

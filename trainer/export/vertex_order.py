@@ -42,44 +42,31 @@ class VertexOrder:
         column_of_vertex = np.zeros(-(-self.vertex_count // block_size) * block_size, np.int64)
         column_of_vertex[all_columns[all_columns >= 0]] = np.flatnonzero(all_columns >= 0)
         if block_size == 1:
-            graph.add(
-                "Gather",
-                [ordered_positions, graph.short_integers("vertex_order", column_of_vertex)],
-                output_name,
-                axis=1,
-            )
+            order = graph.short_integers("vertex_order", column_of_vertex)
+            graph.add("Gather", [ordered_positions, order], output_name, axis=1)
             return
+        is_padded = len(column_of_vertex) > self.vertex_count
         blocks = column_of_vertex.reshape(-1, block_size)
-        is_whole = _whole_blocks(blocks)
-        if self.vertex_count % block_size:
-            is_whole[-1] = False
-        block_order = np.where(
-            is_whole, blocks[:, 0] // block_size, len(all_columns) // block_size + np.cumsum(~is_whole) - 1
-        )
+        is_whole = (blocks[:, 0] % block_size == 0) & (np.diff(blocks, axis=1) == 1).all(axis=1)
+        is_whole[-1] &= not is_padded
+        mixed_order = len(all_columns) // block_size + np.cumsum(~is_whole) - 1
+        block_order = np.where(is_whole, blocks[:, 0] // block_size, mixed_order)
         vertex_blocks = graph.reshape(ordered_positions, [0, -1, 3 * block_size], "vertex_blocks")
         if not is_whole.all():
             mixed_blocks = graph.short_integers("mixed_vertices", blocks[~is_whole].ravel())
             mixed_blocks = graph.add("Gather", [ordered_positions, mixed_blocks], "mixed_positions", axis=1)
             mixed_blocks = graph.reshape(mixed_blocks, [0, -1, 3 * block_size], "mixed_blocks")
             vertex_blocks = graph.add("Concat", [vertex_blocks, mixed_blocks], "all_blocks", axis=1)
-        vertex_blocks = graph.add(
-            "Gather", [vertex_blocks, graph.short_integers("block_order", block_order)], "blocks_in_order", axis=1
-        )
-        is_padded = len(column_of_vertex) > self.vertex_count
+        order = graph.short_integers("block_order", block_order)
+        vertex_blocks = graph.add("Gather", [vertex_blocks, order], "blocks_in_order", axis=1)
         shape = [0, len(column_of_vertex), 3]
         padded_positions = graph.reshape(vertex_blocks, shape, "padded_positions" if is_padded else output_name)
         if is_padded:
             graph.slice(padded_positions, 0, self.vertex_count, 1, output_name)
 
 
-def _whole_blocks(blocks: np.ndarray) -> np.ndarray:
-    """Return (n,) bool, which of (n, size) rows of column indices are one whole block of the columns."""
-    block_size = blocks.shape[1]
-    return (blocks[:, 0] % block_size == 0) & (np.diff(blocks, axis=1) == 1).all(axis=1)
-
-
 def vertex_order(vertices_of_partitions: list[np.ndarray]) -> VertexOrder:
-    """Choose the block size that takes the least time.
+    """Choose the block size that takes the least time. Each partition has its vertices in whole blocks first.
 
     Args:
         vertices_of_partitions: (Vp,) vertex indices of each partition, ascending.
@@ -92,34 +79,21 @@ def vertex_order(vertices_of_partitions: list[np.ndarray]) -> VertexOrder:
     def gather_time_ns(block_size: int) -> float:
         if block_size == 1:
             return GATHER_NS * vertex_count
-        block_count = vertex_count // block_size
-        mixed_block_count = (
-            (np.diff(partition_by_vertex[: block_count * block_size].reshape(block_count, block_size), axis=1) != 0)
-            .any(axis=1)
-            .sum()
-        )
-        mixed_block_count += vertex_count % block_size > 0
-        copy_count = 2 if vertex_count % block_size else 1
-        return (
-            GATHER_NS * (block_count + mixed_block_count * block_size)
-            + COPY_NS * vertex_count * (copy_count + 1)
-            + EXTRA_NODES_NS
-        )
+        whole_count = _is_in_whole_block(partition_by_vertex, block_size).sum() // block_size
+        gathers = vertex_count // block_size + block_size * (-(-vertex_count // block_size) - whole_count)
+        copies = vertex_count * (3 if vertex_count % block_size else 2)
+        return GATHER_NS * gathers + COPY_NS * copies + EXTRA_NODES_NS
 
     block_size = min(BLOCK_SIZES, key=gather_time_ns)
-    columns = tuple(
-        _columns(vertices, partition_by_vertex, index, block_size)
-        for index, vertices in enumerate(vertices_of_partitions)
-    )
-    return VertexOrder(block_size, columns, vertex_count)
+    is_whole, columns = _is_in_whole_block(partition_by_vertex, block_size), []
+    for vertices in vertices_of_partitions:
+        padding = np.full(-len(vertices) % block_size, -1)
+        columns.append(np.concatenate([vertices[is_whole[vertices]], vertices[~is_whole[vertices]], padding]))
+    return VertexOrder(block_size, tuple(columns), vertex_count)
 
 
-def _columns(vertices: np.ndarray, partition_by_vertex: np.ndarray, index: int, block_size: int) -> np.ndarray:
-    """Order a partition's vertices: first the vertices in whole blocks, then the others, padded to whole blocks."""
-    if block_size == 1:
-        return vertices
-    padded_indices = np.append(partition_by_vertex, np.full(-len(partition_by_vertex) % block_size, -1))
-    is_whole = np.repeat((padded_indices.reshape(-1, block_size) == index).all(axis=1), block_size)[
-        : len(partition_by_vertex)
-    ][vertices]
-    return np.concatenate([vertices[is_whole], vertices[~is_whole], np.full(-len(vertices) % block_size, -1)])
+def _is_in_whole_block(partition_by_vertex: np.ndarray, block_size: int) -> np.ndarray:
+    """Return (V,) bool, which vertices lie in a block of adjacent indices that all have the same partition."""
+    padding = np.full(-len(partition_by_vertex) % block_size, -1)
+    blocks = np.append(partition_by_vertex, padding).reshape(-1, block_size)
+    return np.repeat((blocks == blocks[:, :1]).all(axis=1), block_size)[: len(partition_by_vertex)]
