@@ -12,7 +12,7 @@ from ..rig.modifier_stack import check_stack
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import stored_path_for
-from . import model_files, modifier_switch, packed_model, playback, playback_modifier, position_buffer
+from . import model_files, modifier_switch, playback, playback_modifier, position_buffer
 from .opened_model import open_model
 from .session import session
 from .transitions import SHOWS_MODEL, Event
@@ -39,7 +39,7 @@ def bind(
     if mesh_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model_path = model_path.absolute()
-    network = model_files.load_network(model_path) if packed_text is None else packed_model.load(packed_text)
+    network = model_files.load_network(packed_text or model_path)
     with model_disabled(mesh_object):
         opened_model = open_model(scene_rig, network)
         stack = check_stack(mesh_object)
@@ -110,7 +110,7 @@ def on_property_update(mesh_object: bpy.types.Object) -> None:
 def on_mask_update(mesh_object: bpy.types.Object) -> None:
     """Apply the changed mask of a bound object."""
     if mesh_object.fdda.is_bound:
-        playback.on_mask_update(mesh_object)
+        playback.update_mask(session.character_of(mesh_object), mesh_object)
 
 
 @contextmanager

@@ -16,7 +16,8 @@ import bpy
 from bpy.types import Armature, Key, Mesh, Object
 
 SEEN_KEY = "fdda_seen"
-"""Custom property that marks evaluated objects and armatures whose changes were read. It goes with the copy."""
+"""Custom property of evaluated objects and armatures whose changes were read: the mode of their graph, "VIEWPORT" or
+"RENDER". Blender removes it with the evaluated copy."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +46,13 @@ class DepsgraphChanges:
                     # Changed vertex groups may only change relations, which Blender reports as shading.
                     is_edited = SEEN_KEY not in datablock or update.is_updated_shading
                     changes.mesh_objects.append((datablock.original, update.is_updated_geometry, is_edited))
-                    datablock[SEEN_KEY] = True
+                    datablock[SEEN_KEY] = depsgraph.mode
                 elif datablock.type == "ARMATURE" and update.is_updated_geometry and update.is_updated_transform:
                     changes.armatures[datablock.data.original.session_uid] = True
             elif isinstance(datablock, Armature) and SEEN_KEY not in datablock:
                 is_posed = update.is_updated_geometry and update.is_updated_transform
                 changes.armatures.setdefault(datablock.original.session_uid, not is_posed)
-                datablock[SEEN_KEY] = True
+                datablock[SEEN_KEY] = depsgraph.mode
         return changes
 
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Applies the effects of transitions to the data of Blender and to the session."""
 
-from collections.abc import Callable
-
 import bpy
 
 from ..core.errors import FDDAError, ModelError
@@ -32,18 +30,14 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
     elif effect == Effect.SCHEDULE_CHECK:
         session.schedule_check()
     elif mesh_object := character.find_object():
-        if effect == Effect.REPORT:
+        if effect in (Effect.SHOW_MODEL, Effect.SHOW_RIG):
+            modifier_switch.switch_modifiers(mesh_object, effect == Effect.SHOW_MODEL)
+        elif effect == Effect.CREATE_PLAYER:
+            _create_player(character, mesh_object)
+        elif effect == Effect.CHECK_RIG:
+            _check_rig(character, mesh_object)
+        elif effect == Effect.REPORT:
             _report(mesh_object, error)
-        else:
-            _EFFECTS[effect](character, mesh_object)
-
-
-def _show_model(_character: Character, mesh_object: bpy.types.Object) -> None:
-    modifier_switch.switch_modifiers(mesh_object, True)
-
-
-def _show_rig(_character: Character, mesh_object: bpy.types.Object) -> None:
-    modifier_switch.switch_modifiers(mesh_object, False)
 
 
 def _create_player(character: Character, mesh_object: bpy.types.Object) -> None:
@@ -73,14 +67,6 @@ def _report(mesh_object: bpy.types.Object, error: FDDAError | None) -> None:
     mesh_object.fdda.mode = "RIG"
     mesh_object.fdda.status = str(error)
     print(f"FDDA is switched off for '{mesh_object.name}': {error}")
-
-
-_EFFECTS: dict[Effect, Callable[[Character, bpy.types.Object], None]] = {
-    Effect.SHOW_MODEL: _show_model,
-    Effect.SHOW_RIG: _show_rig,
-    Effect.CREATE_PLAYER: _create_player,
-    Effect.CHECK_RIG: _check_rig,
-}
 
 
 def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.types.Object:

@@ -5,10 +5,8 @@ import bpy
 import numpy as np
 
 from ..scene.arrays import MUTE_ELEMENT, write
+from .depsgraph_changes import SEEN_KEY
 from .session import session
-
-VIEWPORT_KEY = "fdda_viewport"
-"""Custom property that marks the evaluated mesh objects of a viewport. Blender removes it with the evaluated copy."""
 
 
 def tag_new_depsgraph(depsgraph: bpy.types.Depsgraph) -> None:
@@ -25,30 +23,17 @@ def tag_new_depsgraph(depsgraph: bpy.types.Depsgraph) -> None:
             buffer.data.update_tag()
 
 
-def mark_viewport_copies(depsgraph: bpy.types.Depsgraph) -> None:
-    """Mark the evaluated objects of a viewport for players with shape keys, because a getter cannot find its graph."""
-    if depsgraph.mode != "VIEWPORT":
-        return
-    for character in [c for c in session.characters.values() if c.player and c.player.needs_viewport_record]:
-        mesh_object = character.find_object()
-        if mesh_object is not None and (evaluated := mesh_object.evaluated_get(depsgraph)).is_evaluated:
-            evaluated[VIEWPORT_KEY], character.player.needs_viewport_record = True, False
-
-
-def mute_shape_keys(mesh_object: bpy.types.Object) -> bool:
+def mute_shape_keys(mesh_object: bpy.types.Object) -> None:
     """Mute the shape keys of an evaluated object, because Blender mixes them even if no modifier reads the result.
 
     This is only done in viewports that show the model; everything that shows the rig needs its shape keys, and a bake
-    may evaluate the position buffer while renders show the rig. The user's settings are restored when Blender copies
-    the shape keys again. Shape keys that another object shares stay unmuted.
-
-    Returns:
-        Whether the object is marked as the copy of a viewport.
+    may evaluate the position buffer while renders show the rig. A getter cannot find its graph, so the mark names it.
+    The user's settings are restored when Blender copies the shape keys again. Shape keys that another object shares
+    stay unmuted.
     """
-    if VIEWPORT_KEY not in mesh_object:
-        return False
+    if mesh_object.get(SEEN_KEY) != "VIEWPORT":
+        return
     shape_keys = mesh_object.data.shape_keys
     # If the first key is muted, all keys were muted since Blender copied them, or the user muted it.
     if not shape_keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
         write(shape_keys.key_blocks, MUTE_ELEMENT, np.ones(len(shape_keys.key_blocks), bool))
-    return True

@@ -46,7 +46,7 @@ def _on_depsgraph_update_post(_scene: bpy.types.Scene, depsgraph: bpy.types.Deps
 @persistent
 def _on_load_post(*_: object) -> None:
     session.reset()
-    if session.networks or session.packed_networks:
+    if session.networks:
         from . import model_files
 
         model_files.release_unused_networks()

@@ -20,34 +20,40 @@ def network_of(mesh_object: bpy.types.Object) -> Network:
     Raises:
         ModelError: the model cannot be loaded.
     """
-    binding = mesh_object.fdda
-    return load_network(model_path(mesh_object)) if binding.packed is None else packed_model.load(binding.packed)
+    packed_text = mesh_object.fdda.packed
+    return load_network(model_path(mesh_object) if packed_text is None else packed_text)
 
 
-def load_network(path: Path) -> Network:
+def load_network(source: Path | bpy.types.Text) -> Network:
     """Load a model once for all objects that use it, and again when its file has changed.
+
+    Args:
+        source: the path of the model, or the text datablock that holds it (`packed_model`).
 
     Raises:
         ModelError: the model cannot be loaded.
     """
-    try:
-        status = os.stat(path)
-    except OSError as error:
-        raise ModelError(f"The model '{path}' cannot be read: {os_error_text(error)}; bind another.") from error
-    file_state = (status.st_mtime_ns, status.st_size)
-    if path not in session.networks or session.networks[path][0] != file_state:
-        session.networks[path] = (file_state, Network(path))
-    return session.networks[path][1]
+    if isinstance(source, Path):
+        try:
+            status = os.stat(source)
+        except OSError as error:
+            raise ModelError(f"The model '{source}' cannot be read: {os_error_text(error)}; bind another.") from error
+        key, state = source, (status.st_mtime_ns, status.st_size)
+    else:
+        key, state = source.session_uid, ()
+    if key not in session.networks or session.networks[key][0] != state:
+        is_file = isinstance(source, Path)
+        network = Network(source) if is_file else Network(Path(source.name), packed_model.read(source))
+        session.networks[key] = (state, network)
+    return session.networks[key][1]
 
 
 def release_unused_networks() -> None:
     """Free the models that no object of the open file is bound to."""
     bound_objects = [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
-    used_paths = {absolute_path(o, o.fdda.model) for o in bound_objects if o.fdda.packed is None}
-    for path in session.networks.keys() - used_paths:
-        del session.networks[path]
-    used_texts = {o.fdda.packed.session_uid for o in bound_objects if o.fdda.packed is not None}
-    packed_model.release_unused_networks(used_texts)
+    used_keys = {o.fdda.packed.session_uid if o.fdda.packed else absolute_path(o, o.fdda.model) for o in bound_objects}
+    for key in session.networks.keys() - used_keys:
+        del session.networks[key]
 
 
 def model_path(mesh_object: bpy.types.Object) -> Path:

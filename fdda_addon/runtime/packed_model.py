@@ -6,13 +6,10 @@ object would be copied with each evaluated copy. The text itself says where its 
 point to the text, so Blender appends and links it with them, and removes it with the last object.
 """
 
-from pathlib import Path
-
 import bpy
 
 from ..core.errors import ModelError
 from ..core.model import MAX_BYTES, check_model
-from .network import Network
 from .session import session
 
 PACKED_MODEL_KEY = "fdda_model"
@@ -59,26 +56,8 @@ def read(text: bpy.types.Text) -> bytes:
     return data
 
 
-def load(text: bpy.types.Text) -> Network:
-    """Load a packed model, or return the loaded one.
-
-    Raises:
-        ModelError: the text holds no model, or an invalid one.
-    """
-    if text.session_uid not in session.packed_networks:
-        network = Network(Path(text.name), read(text))
-        release_unused_networks({other_text.session_uid for other_text in bpy.data.texts})
-        session.packed_networks[text.session_uid] = network
-    return session.packed_networks[text.session_uid]
-
-
-def release_unused_networks(used_text_uids: set[int]) -> None:
-    """Free the loaded models of all texts except the texts with these session ids."""
-    for text_uid in session.packed_networks.keys() - used_text_uids:
-        del session.packed_networks[text_uid]
-
-
 def remove_unused_texts() -> None:
-    """Remove the text datablocks of models that no object uses any more."""
+    """Remove the text datablocks of models that no object uses any more, and free these models."""
     for text in [text for text in bpy.data.texts if PACKED_MODEL_KEY in text and text.users == 0]:
+        session.networks.pop(text.session_uid, None)
         bpy.data.texts.remove(text)

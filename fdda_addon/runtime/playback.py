@@ -36,6 +36,7 @@ def on_frame_change(depsgraph: bpy.types.Depsgraph) -> None:
         updated("SCENE")
         or (updated("ARMATURE") and has_copied_armature(depsgraph))
         or (updated("MESH") and changed_meshes(depsgraph))
+        or any(player.has_new_copy for player in session.players.values())
     ):
         _dispatch_changes(depsgraph)
     session.check_rigs()
@@ -64,9 +65,10 @@ def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
     is_render = depsgraph.mode == "RENDER"
     for character in [c for c in session.characters.values() if c.player is not None]:
         player = character.player
+        player.has_new_copy = False
         if player.mesh_uid in changes.meshes and player.mask is not None and (mesh_object := character.find_object()):
             with session.isolated_errors(character):
-                _update_mask(character, mesh_object, weights_changed=True)
+                update_mask(character, mesh_object, weights_changed=True)
         if is_render:
             continue
         if player.armature_uid in changes.armatures:
@@ -85,7 +87,7 @@ def _dispatch_object_changes(
     character: Character, mesh_object: bpy.types.Object, geometry_changed: bool, is_edited: bool
 ) -> None:
     """Dispatch the changes of a bound object that an evaluation has reported (`DepsgraphChanges.mesh_objects`)."""
-    _update_mask(character, mesh_object)
+    update_mask(character, mesh_object)
     character.animated = modifier_switch.animated_settings(mesh_object)
     if geometry_changed:
         modifier_switch.apply_visibility(mesh_object, character.animated)
@@ -128,7 +130,6 @@ def _update(depsgraph: bpy.types.Depsgraph) -> None:
             session.dispatch(Event.OUTDATE, character)
     scan()
     evaluated_copies.tag_new_depsgraph(depsgraph)
-    evaluated_copies.mark_viewport_copies(depsgraph)
     for character in list(session.characters.values()):
         player = character.player
         if player is None or not (player.error or player.warning != player.reported_warning):
@@ -204,12 +205,8 @@ def _apply_animated_mode(character: Character, mesh_object: bpy.types.Object, de
         scan()
 
 
-def on_mask_update(mesh_object: bpy.types.Object) -> None:
+def update_mask(character: Character, mesh_object: bpy.types.Object, *, weights_changed: bool = False) -> None:
     """Play the pose of a bound object again if its mask has changed."""
-    _update_mask(session.character_of(mesh_object), mesh_object)
-
-
-def _update_mask(character: Character, mesh_object: bpy.types.Object, *, weights_changed: bool = False) -> None:
     player = character.player
     if player is not None and player.update_mask(mesh_object, weights_changed):
         for buffer in [o for o in bpy.data.objects if o.session_uid == character.buffer_uid]:

@@ -20,6 +20,7 @@ from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
 from . import driver, evaluated_copies, rig_signature
+from .depsgraph_changes import SEEN_KEY
 from .model_files import network_of
 from .network import Execution
 from .session import session
@@ -54,8 +55,9 @@ class Player:
         new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
         has_moved: whether there were new inputs since the last update of the batches, which resets it.
         execution: the execution whose arrays hold the positions.
+        pose_input_count: number of `pose_inputs`.
         depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer (`evaluated_copies`).
-        needs_viewport_record: whether an evaluated object has shape keys and is not marked (`evaluated_copies`).
+        has_new_copy: whether Blender has copied the object with its shape keys since changes were read.
         lock: the lock that is held from `read_pose` to `write_positions`.
     """
 
@@ -82,13 +84,14 @@ class Player:
         rig_signature.check(scene_rig, self.network, self.signature)
         self._pose_reader = self._create_pose_reader(scene_rig)
         self._control_reader = ControlReader(scene_rig, info.controls)
+        self.pose_input_count = 3 + len(self._control_reader.sources)
         self._mask_key, self.mask = mask_key(mesh_object), read_mask(mesh_object)
         self._blend: SkinningBlend | None = None
         self.execution = self._single_execution = Execution(self.network, 1)
         self.new_inputs: ModelInputs | None = None
         self.has_moved = False
         self.depsgraph_keys: set[tuple[str, int, str]] = set()
-        self.needs_viewport_record = False
+        self.has_new_copy = False
         # A render may evaluate on another thread while the window does.
         self.lock = threading.Lock()
         self._shown_inputs: tuple | None = None
@@ -102,11 +105,6 @@ class Player:
         """Make Blender evaluate the position buffer whenever an input of the model has changed."""
         pose_inputs, dependencies = self.pose_inputs(mesh_object, buffer), self.dependency_inputs(mesh_object)
         driver.set_driver_inputs(buffer, [driver.playback_input(buffer), *pose_inputs, *dependencies])
-
-    @property
-    def pose_input_count(self) -> int:
-        """The number of `pose_inputs`."""
-        return 3 + len(self._control_reader.sources)
 
     def pose_inputs(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> list[driver.DriverInput]:
         """Return the driver variables whose datablocks `play` reads."""
@@ -178,10 +176,9 @@ class Player:
         """Store any exception of the block in `error`: a getter would lose it, and SystemExit would end Blender."""
         try:
             yield
-        except FDDAError as error:
-            self.error = error
         except BaseException as error:  # SystemExit too.
-            self.error = ModelError(f"The model '{self.network.path}' cannot be played ({error!r}); bind it again.")
+            message = f"The model '{self.network.path}' cannot be played ({error!r}); bind it again."
+            self.error = error if isinstance(error, FDDAError) else ModelError(message)
 
     def read_pose(
         self,
@@ -257,7 +254,8 @@ class Player:
         """Write the positions to an evaluated position buffer, even unchanged: an evaluation may have reset them."""
         set_mesh_positions(buffer.data, self._positions)
         if mesh_object.data.shape_keys is not None:
-            self.needs_viewport_record |= not evaluated_copies.mute_shape_keys(mesh_object)
+            self.has_new_copy |= SEEN_KEY not in mesh_object
+            evaluated_copies.mute_shape_keys(mesh_object)
 
     def _create_blend(self, scene_rig: SceneRig) -> SkinningBlend:
         """Create the blend of the model with linear skinning."""

@@ -67,8 +67,8 @@ class PlaybackSession:
             of the rig that passed (`rig_signature`).
         read_bones: the bones that a check has read, by the session ids of armatures; None while nothing is checked.
         modes: stacks of overriding modes, by the session ids of objects. The last mode of a stack is in effect.
-        networks: by the path of each loaded model: modification time and size of its file, and the model.
-        packed_networks: the loaded packed models, by the session ids of their text datablocks.
+        networks: the loaded models, by their paths or by the session ids of their text datablocks; with each, the time
+            of modification and the size of its file.
         chosen_paths: paths of the models that the user chose since Blender started.
         scanned_count: number of objects in the file at the last scan; -1 to scan after the next evaluation.
         suspension_count: number of saves that have begun and not ended. A handler of another add-on may save a copy
@@ -87,8 +87,7 @@ class PlaybackSession:
         self.moved_buffers: dict[Any, set[int]] = {}
         self.passed_checks: dict[int, tuple] = {}
         self.modes: dict[int, list[str]] = {}
-        self.networks: dict[Path, tuple[tuple, Any]] = {}
-        self.packed_networks: dict[int, Any] = {}
+        self.networks: dict[Path | int, tuple[tuple, Any]] = {}
         self.chosen_paths: set[Path] = set()
         self.scanned_count = -1
         self.suspension_count = 0
