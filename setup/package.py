@@ -12,6 +12,7 @@ and the wheels of onnxruntime for the Python versions. Blender's extension tool 
 import argparse
 import json
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -99,6 +100,15 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
     return wheels
 
 
+def stage_manual(folder: Path) -> None:
+    """Copy the manual into a folder, with the pictures and pages that it refers to."""
+    text = (ROOT / "docs" / "manual.md").read_text(encoding="utf-8")
+    references = re.findall(r"\]\(([\w./-]+)(?:#[^)]*)?\)|<img src=\"([^\"]+)\"", text)
+    for name in {"manual.md", *map("".join, references)}:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / "docs" / name, folder / name)
+
+
 def stage_files(name: str, wheels: list[Path], website: str = "") -> None:
     """Copy the files of the extension for a platform to dist/stage.
 
@@ -111,8 +121,7 @@ def stage_files(name: str, wheels: list[Path], website: str = "") -> None:
     for folder in ("fdda_addon", "trainer", "requirements"):
         shutil.copytree(ROOT / folder, STAGE_FOLDER / folder, ignore=shutil.ignore_patterns("__pycache__"))
     # The help buttons of the sidebar open the manual.
-    (STAGE_FOLDER / "docs").mkdir()
-    shutil.copy(ROOT / "docs" / "manual.md", STAGE_FOLDER / "docs")
+    stage_manual(STAGE_FOLDER / "docs")
     (STAGE_FOLDER / "__init__.py").write_text(INIT_CODE)
     shutil.copy(ROOT / "LICENSE", STAGE_FOLDER)
     (STAGE_FOLDER / "wheels").mkdir()
