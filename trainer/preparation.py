@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from .data.split import Split
 from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
 from .fits.half_rotations import regression_matrices
 from .fits.joint_fit import JointFit, JointRegression, joint_regression
-from .fits.low_rank import factorize, may_factorize
 from .inputs.network_inputs import NetworkInputs
 
 
@@ -55,11 +55,11 @@ class PreparedPartition:
         basis: components of the training residuals that remain after the fit.
         coefficients: (N, K) float32, coefficients of all poses, mesh units.
         residual_rms: rms distance from the mean over training poses and vertices, after the fit, mesh units.
-        validation_truncation: (n,) rms distance over the vertices between the residuals of each validation pose and
-            their approximation by the basis, mesh units.
         validation: (n,) indices of the validation poses.
+        validation_residuals: (n, 3 Vp) float32, their residuals after the fit, mesh units.
         mm_per_unit: millimeters per mesh unit.
         vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
+        dropped_count: number of components that were dropped after the training (`compression`).
     """
 
     name: str
@@ -72,21 +72,22 @@ class PreparedPartition:
     basis: Basis
     coefficients: np.ndarray
     residual_rms: float
-    validation_truncation: np.ndarray
     validation: np.ndarray
+    validation_residuals: np.ndarray
     mm_per_unit: float = 1000.0
     vertex_factors: np.ndarray | None = None
+    dropped_count: int = 0
+
+    @cached_property
+    def validation_truncation(self) -> np.ndarray:
+        """(n,) rms distance over the vertices between validation residuals and their approximation, mesh units."""
+        truncated = self.validation_residuals - self.basis.reconstruct(self.coefficients[self.validation])
+        return np.sqrt((truncated**2).sum(axis=1) / self.vertex_count)
 
     def with_components(self, count: int) -> "PreparedPartition":
         """Return the partition with only the first `count` components."""
-        removed = self.coefficients[self.validation, count:].astype(np.float64)
-        squared = self.validation_truncation**2 + (removed**2).sum(axis=1) / self.vertex_count
-        return replace(
-            self,
-            basis=self.basis.truncate(count),
-            coefficients=np.ascontiguousarray(self.coefficients[:, :count]),
-            validation_truncation=np.sqrt(squared),
-        )
+        coefficients = np.ascontiguousarray(self.coefficients[:, :count])
+        return replace(self, basis=self.basis.truncate(count), coefficients=coefficients)
 
 
 def partition_data(
@@ -150,8 +151,6 @@ def prepare_partition(
     tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
     rng, weights = np.random.default_rng([seed, 2]), split.weights()
     basis = make_basis(residuals[split.training], tolerance, rng, weights)
-    coefficients = basis.project(residuals)
-    truncated = residuals[split.validation] - basis.reconstruct(coefficients[split.validation])
     return PreparedPartition(
         partition.name,
         partition.vertex_count,
@@ -161,10 +160,10 @@ def prepare_partition(
         (features[:, columns] - mean) / scale,
         fit,
         basis,
-        coefficients,
+        basis.project(residuals),
         float(np.sqrt(_mean_square(residuals, basis.mean, split.training) / partition.vertex_count)),
-        np.sqrt((truncated**2).sum(axis=1) / partition.vertex_count),
         split.validation,
+        residuals[split.validation],
         mm_per_unit,
     )
 
@@ -178,7 +177,7 @@ def prepare_partitions(
     last_hidden_units: int = 0,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> list[PreparedPartition]:
-    """Prepare partitions that share one tolerance (`allocate_components`), and factorize large partitions.
+    """Prepare partitions that share one tolerance (`allocate_components`).
 
     Args:
         partitions, split, tolerance_mm, seed, metres_per_unit: as in `prepare_partition`.
@@ -193,31 +192,7 @@ def prepare_partitions(
     errors, vertex_counts = [p.basis.error_by_count for p in prepared], [p.vertex_count for p in prepared]
     tolerance = tolerance_mm / (1000 * metres_per_unit)
     counts = allocate_components(errors, vertex_counts, tolerance, last_hidden_units + 1)
-    return [
-        _factorized(partition_with_all_components.with_components(count), partition.read_regression, split, tolerance)
-        for partition_with_all_components, count, partition in zip(prepared, counts, partitions, strict=True)
-    ]
-
-
-def _factorized(
-    prepared: PreparedPartition, read_regression: Callable[[], JointRegression] | None, split: Split, tolerance: float
-) -> PreparedPartition:
-    """Factorize a partition if that saves parameters; otherwise return it unchanged."""
-    if not may_factorize(prepared.fit, prepared.basis):
-        return prepared
-    fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
-    weights, regression = split.weights(), read_regression()
-    factors = factorize(fit, basis, coefficients, regression, split.training, weights, tolerance)
-    if factors is None:
-        return prepared
-    return replace(
-        prepared,
-        fit=factors.fit,
-        basis=factors.basis,
-        coefficients=factors.coefficients,
-        validation_truncation=np.hypot(prepared.validation_truncation, factors.error_rms),
-        vertex_factors=factors.vertex_factors,
-    )
+    return [partition.with_components(count) for partition, count in zip(prepared, counts, strict=True)]
 
 
 def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:

@@ -19,6 +19,7 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import report_text
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
+from .compression import drop_components, dropped_components_sentence, factorize_partitions
 from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
 from .export.export import ExportedModel, build_model, measure, measure_surface, write_model
@@ -32,9 +33,10 @@ from .networks.checkpoint import Checkpoint, write_checkpoint
 from .networks.confidence import measure_training_range
 from .networks.curves import Progress
 from .networks.loop import TrainingResult, choose_device, train
+from .networks.networks import Network
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import check_training_outputs, training_outputs
-from .preparation import PreparedPartition, partition_data, prepare_partitions
+from .preparation import PartitionData, PreparedPartition, partition_data, prepare_partitions
 from .process import Cancelled
 from .progress import MessageSink
 from .report.contents import make_report
@@ -78,9 +80,11 @@ def train_model(
     warnings = job.start(recording, strict)
     recording = drop_gravity_input(recording, split)
     inputs = job.fit_inputs(recording, split, checkpoint)
-    prepared = job.prepare(recording, inputs, split)
+    partitions = job.collect_partition_data(recording, inputs, split)
+    prepared = job.prepare(partitions, recording, split)
     result = job.train_networks(prepared, inputs, split, checkpoint)
-    trained_model = _make_trained_model(recording, inputs, split, prepared, result, config)
+    prepared, networks = job.compress(prepared, result, partitions, recording, split)
+    trained_model = _make_trained_model(recording, inputs, split, prepared, networks, config)
     exported = job.export(recording, trained_model, split, warm_start)
     report = job.measure(recording, trained_model, split, exported, result, model_path)
     history = _history(recording, exported, checkpoint)
@@ -145,21 +149,25 @@ class _Job:
                 self.log(block.log_text)
         return inputs
 
-    def prepare(self, recording: Recording, inputs: NetworkInputs, split: Split) -> list[PreparedPartition]:
-        """Fit the linear part of each partition, and compute its components."""
+    def collect_partition_data(self, recording: Recording, inputs: NetworkInputs, split: Split) -> list[PartitionData]:
+        """Collect the data of all partitions, and decide whether half-rotation features help."""
         # Surface frames make half-rotation features unnecessary.
         use_half_rotations = not inputs.states.get(SurfaceFrameFeatures.name) and half_rotations_help(
             recording, split.training, self.should_stop
         )
         if use_half_rotations:
             self.log("The rig blends rotations: residuals are fitted to half-rotation features, too.")
+        return partition_data(recording, recording.partitions, inputs, use_half_rotations)
+
+    def prepare(self, partitions: list[PartitionData], recording: Recording, split: Split) -> list[PreparedPartition]:
+        """Fit the linear part of each partition, and compute its components."""
 
         def send_progress(prepared_count: int) -> None:
-            self.sink.send(MessageType.PREPARING, done=prepared_count, total=len(recording.partitions))
+            self.sink.send(MessageType.PREPARING, done=prepared_count, total=len(partitions))
             self.raise_if_stopped()
 
         return prepare_partitions(
-            partition_data(recording, recording.partitions, inputs, use_half_rotations),
+            partitions,
             split,
             self.config.tolerance_mm,
             self.config.seed,
@@ -187,6 +195,21 @@ class _Job:
             should_stop=self.should_stop,
             initial=initial_networks(checkpoint, prepared, columns) if checkpoint else None,
         )
+
+    def compress(
+        self,
+        prepared: list[PreparedPartition],
+        result: TrainingResult,
+        partitions: list[PartitionData],
+        recording: Recording,
+        split: Split,
+    ) -> tuple[list[PreparedPartition], list[Network]]:
+        """Drop components that the networks do not predict, and factorize large partitions."""
+        remaining, networks = drop_components(prepared, result.networks, split, self.config.activation)
+        if text := dropped_components_sentence(prepared, remaining):
+            self.log(text)
+        tolerance = self.config.tolerance_mm / (1000 * recording.rig.metres_per_unit)
+        return factorize_partitions(remaining, networks, partitions, split, tolerance)
 
     def export(
         self, recording: Recording, trained_model: TrainedModel, split: Split, warm_start: bool
@@ -233,7 +256,7 @@ def _make_trained_model(
     inputs: NetworkInputs,
     split: Split,
     prepared: list[PreparedPartition],
-    result: TrainingResult,
+    networks: list[Network],
     config: TrainingConfig,
 ) -> TrainedModel:
     matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
@@ -243,7 +266,7 @@ def _make_trained_model(
         recording.partitions,
         inputs,
         tuple(prepared),
-        result.networks,
+        tuple(networks),
         measure_training_range(features, recording.rig, recording.partitions),
         config.activation,
         is_sheared(recording.pose_matrices),

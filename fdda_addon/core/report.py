@@ -49,6 +49,7 @@ _PARTITION_KEYS = {
     "merged?": [str],
     "features": int,
     "basis": int,
+    "dropped?": int,
     "truncation": float,
     "training": _ERROR_STATISTICS,
     "held_out": _ERROR_STATISTICS,

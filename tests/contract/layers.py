@@ -34,7 +34,7 @@ TRAINER_LAYERS: tuple[tuple[str, ...], ...] = (
     ("train",),
     ("report",),
     ("export",),
-    ("model",),
+    ("compression", "model"),
     ("networks",),
     ("preparation",),
     ("inputs",),

@@ -14,6 +14,7 @@ from trainer.report.error_analysis import (
     REMEDY_BY_CAUSE,
     TOO_FEW_COMPONENTS,
     TOO_FEW_POSES,
+    UNPREDICTED_COMPONENTS,
     _cause,
 )
 from trainer.report.page import render_html
@@ -43,18 +44,19 @@ def test_too_few_poses_are_the_cause(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("truncation", "distance", "generalization", "cause"),
+    ("truncation", "is_dropped", "distance", "generalization", "cause"),
     [
-        (0.9, 3.0, 3.0, TOO_FEW_COMPONENTS),
-        (0.1, 1.0, 3.0, TOO_FEW_POSES),
-        (0.1, 3.0, 3.0, EXTREME_POSES),
-        (0.1, 3.0, 1.0, EXTREME_POSES),
-        (0.1, 1.0, 1.0, HIGH_TRAINING_ERRORS),
-        (0.4, 1.0, 1.0, NO_CLEAR_CAUSE),
+        (0.9, False, 3.0, 3.0, TOO_FEW_COMPONENTS),
+        (0.9, True, 3.0, 3.0, UNPREDICTED_COMPONENTS),
+        (0.1, True, 1.0, 3.0, TOO_FEW_POSES),
+        (0.1, False, 3.0, 3.0, EXTREME_POSES),
+        (0.1, False, 3.0, 1.0, EXTREME_POSES),
+        (0.1, False, 1.0, 1.0, HIGH_TRAINING_ERRORS),
+        (0.4, False, 1.0, 1.0, NO_CLEAR_CAUSE),
     ],
 )
-def test_measured_ratios_determine_the_cause(truncation, distance, generalization, cause):
-    assert _cause(truncation, distance, generalization) == cause and cause in REMEDY_BY_CAUSE
+def test_measured_ratios_determine_the_cause(truncation, is_dropped, distance, generalization, cause):
+    assert _cause(truncation, is_dropped, distance, generalization) == cause and cause in REMEDY_BY_CAUSE
 
 
 def test_the_page_shows_the_analysis(report):

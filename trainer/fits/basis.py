@@ -26,15 +26,18 @@ class Basis:
     Attributes:
         mean: (3 Vp,) float32, mesh units.
         components: (K, 3 Vp) float32, orthonormal rows, no unit. K is 0 when the mean alone is within the tolerance.
-        truncation_rms: rms distance over poses and vertices between the residuals and their approximation by the
-            components, mesh units.
-        error_by_count: (K + 1,) float64, the truncation error of the first 0, 1, ... K components, mesh units.
+        error_by_count: (K + 1,) float64, rms distance over poses and vertices between the residuals and their
+            approximation by the first 0, 1, ... K components, mesh units.
     """
 
     mean: np.ndarray
     components: np.ndarray
-    truncation_rms: float
     error_by_count: np.ndarray
+
+    @property
+    def truncation_rms(self) -> float:
+        """The error of all components, mesh units."""
+        return float(self.error_by_count[-1])
 
     def project(self, residuals: np.ndarray) -> np.ndarray:
         """Compute (N, K) float32 coefficients of (N, 3 Vp) residuals, both in mesh units.
@@ -50,8 +53,7 @@ class Basis:
 
     def truncate(self, count: int) -> "Basis":
         """Return the basis of the first `count` components."""
-        errors = self.error_by_count
-        return Basis(self.mean, self.components[:count], float(errors[count]), errors[: count + 1])
+        return Basis(self.mean, self.components[:count], self.error_by_count[: count + 1])
 
 
 def allocate_components(
@@ -144,7 +146,7 @@ def make_basis(
             components[block] = ((residuals[:, block].astype(np.float64) - mean[block]) * weight_roots).T @ eigenvectors
         eigenvectors = np.linalg.qr(components)[0] if component_count else components
     components = np.ascontiguousarray(eigenvectors.T, np.float32)
-    return Basis(mean, components, float(error_by_count[component_count]), error_by_count[: component_count + 1])
+    return Basis(mean, components, error_by_count[: component_count + 1])
 
 
 def _weighted_mean(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:

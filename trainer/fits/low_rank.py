@@ -27,14 +27,14 @@ class LowRankFactors:
     Attributes:
         vertex_factors: (r, Vp) float32, orthonormal rows, no unit.
         fit, basis: fit and basis, projected to the span of the vertex factors.
-        coefficients: (N, K) float32, coefficients for this basis, mesh units.
+        change_of_basis: (K', K) float64, converts coefficients of the former basis to coefficients of this basis.
         error_rms: rms distance over training poses and vertices from the unfactorized fit and basis, mesh units.
     """
 
     vertex_factors: np.ndarray
     fit: JointFit
     basis: Basis
-    coefficients: np.ndarray
+    change_of_basis: np.ndarray
     error_rms: float
 
 
@@ -80,8 +80,7 @@ def factorize(
     factors = (fit.factors @ vertex_factors.T.astype(np.float64)) @ vertex_factors
     fit = replace(fit, factors=factors.astype(np.float32))
     error = float(errors[rank])
-    basis, coefficients = _projected_basis(vertex_factors, basis, coefficients, error)
-    return LowRankFactors(vertex_factors, fit, basis, coefficients, error)
+    return LowRankFactors(vertex_factors, fit, *_projected_basis(vertex_factors, basis, error), error)
 
 
 def _row_count(fit: JointFit, basis: Basis) -> int:
@@ -105,10 +104,8 @@ def _stacked_factors(fit: JointFit, basis: Basis, center: np.ndarray) -> np.ndar
     return np.concatenate([factors.reshape(-1, vertex_count), components])
 
 
-def _projected_basis(
-    vertex_factors: np.ndarray, basis: Basis, coefficients: np.ndarray, error: float
-) -> tuple[Basis, np.ndarray]:
-    """Project a basis to the span of the vertex factors, orthonormalize it, and return it with its coefficients."""
+def _projected_basis(vertex_factors: np.ndarray, basis: Basis, error: float) -> tuple[Basis, np.ndarray]:
+    """Project a basis to the span of the vertex factors, orthonormalize it, and return it with the change of basis."""
     vertex_count, vertex_factors = vertex_factors.shape[1], vertex_factors.astype(np.float64)
     mean = _by_axis(basis.mean[None], vertex_count)[0] @ vertex_factors.T @ vertex_factors
     components = _by_axis(basis.components, vertex_count) @ vertex_factors.T
@@ -120,10 +117,9 @@ def _projected_basis(
     projected = Basis(
         mean.T.reshape(-1).astype(np.float32),
         np.ascontiguousarray(components, np.float32),
-        float(np.hypot(basis.truncation_rms, error)),
-        np.hypot(basis.error_by_count[: count + 1], error),
+        np.hypot(np.append(basis.error_by_count[:count], basis.truncation_rms), error),
     )
-    return projected, (coefficients @ change_of_basis.T).astype(np.float32)
+    return projected, change_of_basis
 
 
 def _by_axis(components: np.ndarray, vertex_count: int) -> np.ndarray:

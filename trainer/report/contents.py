@@ -98,6 +98,7 @@ def _partition_entry(
         **({"merged": [names[joint] for joint in partition.merged]} if partition.merged else {}),
         "features": len(prepared.columns),
         "basis": len(prepared.basis.components),
+        "dropped": prepared.dropped_count,
         "truncation": prepared.basis.truncation_rms * prepared.mm_per_unit,
         "training": error_statistics(training_errors.fdda[:, vertices]).to_json(),
         "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),

@@ -20,11 +20,14 @@ from ..preparation import PreparedPartition
 if TYPE_CHECKING:  # The page of a report needs no torch.
     from ..model import TrainedModel
 
-TOO_FEW_COMPONENTS, EXTREME_POSES, TOO_FEW_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE = (
-    *("components", "extremes", "poses", "steep", "none"),
+TOO_FEW_COMPONENTS, UNPREDICTED_COMPONENTS, EXTREME_POSES, TOO_FEW_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE = (
+    *("components", "unpredicted", "extremes", "poses", "steep", "none"),
 )
 REMEDY_BY_CAUSE = {
     TOO_FEW_COMPONENTS: "more components: a smaller tolerance",
+    UNPREDICTED_COMPONENTS: (
+        "more poses, or the missing control: the networks do not predict components, which were dropped"
+    ),
     EXTREME_POSES: "more poses at the extremes: refinement, or a larger spread",
     TOO_FEW_POSES: "more poses",
     HIGH_TRAINING_ERRORS: (
@@ -128,7 +131,7 @@ def analyze_errors(
         if is_boundary is not None and is_boundary[partition.vertices].any():
             is_at_boundary = is_boundary[partition.vertices]
             boundary = _ratio(float(is_at_boundary[vertices].mean()), float(is_at_boundary.mean()))
-        cause = _cause(truncation, distance, generalization)
+        cause = _cause(truncation, prepared.dropped_count > 0, distance, generalization)
         counts = len(np.unique(poses)), len(np.unique(vertices))
         analyses.append(ErrorAnalysis(*counts, truncation, boundary, joint, extreme, distance, generalization, cause))
     return analyses
@@ -142,9 +145,9 @@ def _influencing_values(
     return np.concatenate([joints, np.array(recording.controls[poses])[:, list(partition.controls)]], axis=1)
 
 
-def _cause(truncation: float, distance: float, generalization: float) -> str:
+def _cause(truncation: float, is_dropped: bool, distance: float, generalization: float) -> str:
     if truncation >= MIN_TRUNCATION_FRACTION:
-        return TOO_FEW_COMPONENTS
+        return UNPREDICTED_COMPONENTS if is_dropped else TOO_FEW_COMPONENTS
     is_extreme = distance >= MIN_DISTANCE_RATIO
     if generalization >= MIN_GENERALIZATION_RATIO:
         return EXTREME_POSES if is_extreme else TOO_FEW_POSES

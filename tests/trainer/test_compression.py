@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""After the training, components that the networks do not predict are dropped, and large partitions are factorized."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.report import checkpoint_path
+from trainer.__main__ import main
+from trainer.compression import drop_components, dropped_components_sentence, factorize_partitions
+from trainer.config import TrainingConfig
+from trainer.data.split import Split, split_poses, split_recording
+from trainer.inputs.network_inputs import make_inputs
+from trainer.networks.checkpoint import read_checkpoint
+from trainer.networks.loop import train
+from trainer.networks.networks import Network
+from trainer.preparation import PartitionData, PreparedPartition, partition_data, prepare_partition, prepare_partitions
+
+from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
+from .conftest import QUICK_OPTIONS
+from .test_low_rank import INFLUENCING, JOINTS, POSES, VERTICES, sliding_residuals
+
+CONFIG = TrainingConfig(epochs=60, hidden=(16, 16), batch_size=16)
+VERTEX_COUNT = 40
+
+
+def make_data(noise: float, signal: float = 0.01, poses: int = 200) -> PartitionData:
+    """Create residuals of two fixed patterns: one follows the only feature, the other is random in each pose."""
+    rng = np.random.default_rng(0)
+    features = rng.uniform(-1, 1, (poses, 1)).astype(np.float32)
+    patterns = rng.normal(size=(2, VERTEX_COUNT, 3))
+    amplitudes = np.stack([signal * np.sin(2 * features[:, 0]), noise * rng.normal(size=poses)], axis=1)
+    residuals = np.einsum("np,pvc->nvc", amplitudes, patterns).astype(np.float32)
+    return PartitionData("elbow", features, lambda: residuals, VERTEX_COUNT)
+
+
+def train_partitions(*data: PartitionData) -> tuple[list[PreparedPartition], list[Network], Split]:
+    split = split_poses(np.arange(len(data[0].features)), 0.2, 0, 0.2)
+    prepared = [prepare_partition(partition, split, 0.01, 0) for partition in data]
+    return prepared, list(train(prepared, split, CONFIG, torch.device("cpu")).networks), split
+
+
+def mean_error(data: PartitionData, partition: PreparedPartition, network: Network, poses: np.ndarray) -> float:
+    predicted = partition.basis.reconstruct(network.evaluate(partition.inputs[poses], CONFIG.activation))
+    return float(np.linalg.norm(data.read_residuals()[poses] - predicted.reshape(-1, VERTEX_COUNT, 3), axis=2).mean())
+
+
+def test_random_components_are_dropped_and_predictable_ones_stay():
+    data = make_data(noise=0.003)
+    prepared, networks, split = train_partitions(data)
+    (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
+    assert len(prepared[0].basis.components) == 2 and len(partition.basis.components) == 1
+    assert partition.dropped_count == 1 and partition.coefficients.shape == (200, 1)
+    assert network.weights[-1].shape == (16, 1) and network.biases[-1].shape == (1,)
+    errors = [mean_error(data, p, n, split.held_out) for p, n in ((prepared[0], networks[0]), (partition, network))]
+    assert errors[1] < 1.05 * errors[0]
+    residuals = data.read_residuals().reshape(200, -1)
+    truncated = residuals - partition.basis.reconstruct(partition.coefficients)
+    rms = np.sqrt((truncated[split.training] ** 2).sum(axis=1).mean() / VERTEX_COUNT)
+    assert partition.basis.truncation_rms == pytest.approx(rms, rel=0.01)
+    # What remains is the noise.
+    assert partition.validation_truncation.mean() > 3 * prepared[0].validation_truncation.mean()
+
+
+def test_nothing_is_dropped_where_all_is_predictable():
+    prepared, networks, split = train_partitions(make_data(noise=0))
+    (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
+    for poses in (split.training, split.held_out):
+        before, after = (
+            p.basis.reconstruct(n.evaluate(p.inputs[poses], CONFIG.activation))
+            for p, n in ((prepared[0], networks[0]), (partition, network))
+        )
+        np.testing.assert_allclose(after, before, atol=1e-6)
+    assert not partition.dropped_count and dropped_components_sentence(prepared, [partition]) == ""
+
+
+def test_a_partition_of_noise_loses_its_network():
+    prepared, networks, split = train_partitions(make_data(noise=0.01, signal=0), make_data(noise=0))
+    remaining, remaining_networks = drop_components(prepared, networks, split, CONFIG.activation)
+    assert [len(partition.basis.components) for partition in remaining] == [0, 1]
+    assert [weight.shape for weight in remaining_networks[0].weights] == [(1, 0)]
+    assert remaining_networks[0].evaluate(remaining[0].inputs, CONFIG.activation).shape == (200, 0)
+    sentence = dropped_components_sentence(prepared, remaining)
+    assert sentence.startswith("The networks do not predict 1 of 2 components") and "record more poses" in sentence
+
+
+def test_a_dropped_component_that_is_small_needs_no_remedy():
+    prepared, networks, split = train_partitions(make_data(noise=0.001))
+    remaining, _ = drop_components(prepared, networks, split, CONFIG.activation)
+    assert remaining[0].dropped_count == 1
+    sentence = dropped_components_sentence(prepared, remaining)
+    assert "record" not in sentence and sentence.endswith("of what the linear fit leaves.")
+
+
+@pytest.fixture(scope="module")
+def noisy_chain(tmp_path_factory):
+    """Folder with a recording of the chain whose vertices also move at random, and a model trained on it."""
+    folder, rig, poses = tmp_path_factory.mktemp("noisy"), chain_rig(3), 120
+    angles, rng = chain_angles(poses, 3, 0), np.random.default_rng(1)
+    pattern = np.sin(7 * rig.rest_positions.astype(np.float64))
+    residuals = chain_residuals(rig, angles) + 0.01 * rng.normal(size=(poses, 1, 1)) * pattern
+    partitions = make_partitions(rig, {0: (1,), 1: (1, 2), 2: (2,)})
+    with RecordingWriter(folder / "recording", rig, partitions, chain_info(poses)) as writer:
+        writer.append(pose_chain(rig, angles), residuals.astype(np.float32))
+    return folder
+
+
+def test_the_log_and_the_report_name_the_dropped_components(noisy_chain, capsys):
+    model = noisy_chain / "model.onnx"
+    assert main([str(noisy_chain / "recording"), str(model), *QUICK_OPTIONS]) == 0
+    partitions = json.loads((noisy_chain / "report.json").read_text(encoding="utf-8"))["partitions"]
+    dropped, kept = (sum(partition[key] for partition in partitions) for key in ("dropped", "basis"))
+    assert dropped > 0
+    output = capsys.readouterr()
+    assert f"The networks do not predict {dropped} of {dropped + kept} components" in output.out + output.err
+    page = (noisy_chain / "report.html").read_text(encoding="utf-8")
+    assert f"{dropped} more components were left out, because the networks do not predict them." in page
+    # The checkpoint has the remaining components, and a training continues from it.
+    checkpoint = read_checkpoint(checkpoint_path(model))
+    assert [len(partition.basis_components) for partition in checkpoint.partitions] == [p["basis"] for p in partitions]
+    assert main([str(noisy_chain / "recording"), str(model), *QUICK_OPTIONS, "--warm-start"]) == 0
+
+
+def test_factorized_networks_predict_the_projected_residuals(tmp_path):
+    rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
+    with RecordingWriter(tmp_path / "tube", rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
+        writer.append(pose_chain(rig, angles), sliding_residuals(rig, angles))
+    recording = read_recording(tmp_path / "tube")
+    split = split_recording(recording, CONFIG)
+    data = partition_data(recording, recording.partitions, make_inputs(recording.rig, recording.partitions))
+    prepared, rng = prepare_partitions(data, split, 0.04, 0), np.random.default_rng(0)
+    networks = []
+    for partition in prepared:
+        sizes = (len(partition.columns), 8, len(partition.basis.components))
+        weights = [rng.normal(size=shape).astype(np.float32) for shape in pairwise(sizes)]
+        biases = [rng.normal(size=size).astype(np.float32) for size in sizes[1:]]
+        networks.append(Network(tuple(weights), tuple(biases)))
+    factorized, changed_networks = factorize_partitions(prepared, networks, data, split, 4e-5)
+    for before, after, network, changed in zip(prepared, factorized, networks, changed_networks, strict=True):
+        assert after.vertex_factors is not None and before.vertex_factors is None
+        predicted, expected = (
+            (n.evaluate(p.inputs, "silu").astype(np.float64) @ p.basis.components).reshape(POSES, -1, 3)
+            for p, n in ((after, changed), (before, network))
+        )
+        vertex_factors = after.vertex_factors.astype(np.float64)
+        expected = np.einsum("nvc,rv,rw->nwc", expected, vertex_factors, vertex_factors, optimize=True)
+        np.testing.assert_allclose(predicted, expected, atol=1e-4 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            after.coefficients @ after.basis.components @ after.basis.components.T, after.coefficients, atol=1e-5
+        )

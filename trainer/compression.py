@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Makes a trained model smaller: drops components that networks do not predict, and factorizes large partitions."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .data.split import Split
+from .fits.basis import Basis
+from .fits.low_rank import factorize, may_factorize
+from .networks.networks import Network
+from .preparation import PartitionData, PreparedPartition
+
+MIN_GAIN_RATIO = 0.1
+"""A component stays if it lowers the mean error by more than this part of the error, times its part of the parameters
+of all components. So the mean error grows by at most about a tenth, if nearly all components are dropped."""
+MIN_DROPPED_PART = 0.1
+"""If the dropped components have at least this part of the squared residuals, a remedy is suggested."""
+
+
+def drop_components(
+    prepared: Sequence[PreparedPartition], networks: Sequence[Network], split: Split, activation: str
+) -> tuple[list[PreparedPartition], list[Network]]:
+    """Drop the components that lower the mean error of the validation poses too little, or raise it.
+
+    A network cannot predict a component that depends on more than its inputs, or on details that the poses do not show.
+    The components are first replaced by the principal components of the predictions, which are fewer than those of
+    the residuals (reduced-rank regression: Izenman, 1975).
+
+    Args:
+        prepared, networks: partitions with their trained networks.
+        split: split of the poses.
+        activation: as in `TrainingConfig`.
+
+    Returns:
+        The partitions and networks with the remaining components; a partition may lose all.
+    """
+    changes, gains, total_error = [], [], 0.0
+    for partition, network in zip(prepared, networks, strict=True):
+        changes.append(_principal_directions(network.evaluate(partition.inputs[split.training], activation)))
+        error, partition_gains = _component_gains(partition, network, changes[-1], activation)
+        total_error += error
+        gains.append(partition_gains)
+    costs = [3 * p.vertex_count + len(network.weights[-1]) + 1 for p, network in zip(prepared, networks, strict=True)]
+    total_cost = sum(cost * len(partition_gains) for cost, partition_gains in zip(costs, gains, strict=True))
+    min_gain_per_parameter = MIN_GAIN_RATIO * total_error / max(total_cost, 1)
+    remaining = [
+        _change_basis(partition, network, change[:, partition_gains > min_gain_per_parameter * cost], split)
+        for partition, network, change, partition_gains, cost in zip(
+            prepared, networks, changes, gains, costs, strict=True
+        )
+    ]
+    return [partition for partition, _ in remaining], [network for _, network in remaining]
+
+
+def _principal_directions(coefficients: np.ndarray) -> np.ndarray:
+    """Return (K, K) float64, orthonormal columns, the principal directions of (N, K) coefficients, largest first."""
+    coefficients = coefficients.astype(np.float64)
+    return np.linalg.eigh(coefficients.T @ coefficients)[1][:, ::-1]
+
+
+def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining: Sequence[PreparedPartition]) -> str:
+    """Describe which components were dropped, and what may help; empty if none was dropped.
+
+    Args:
+        prepared, remaining: the partitions before and after `drop_components`.
+    """
+    count = sum(len(partition.basis.components) for partition in prepared)
+    dropped_count = sum(partition.dropped_count for partition in remaining)
+    if not dropped_count:
+        return ""
+    dropped_square = sum(
+        after.vertex_count * (after.basis.truncation_rms**2 - before.basis.truncation_rms**2)
+        for before, after in zip(prepared, remaining, strict=True)
+    )
+    part = dropped_square / sum(partition.vertex_count * partition.residual_rms**2 for partition in prepared)
+    text = f"The networks do not predict {dropped_count:,} of {count:,} components, which are left out"
+    if part < MIN_DROPPED_PART:
+        return f"{text}: {100 * part:.1f} % of what the linear fit leaves."
+    return (
+        f"{text}, although they are {100 * part:.0f} % of what the linear fit leaves: record more poses, or make what "
+        "else moves the mesh a control; where the rig jumps, nothing helps."
+    )
+
+
+def _component_gains(
+    partition: PreparedPartition, network: Network, change: np.ndarray, activation: str
+) -> tuple[float, np.ndarray]:
+    """Measure what each component of a changed basis gains on the validation poses.
+
+    Args:
+        partition, network, activation: partition with its trained network.
+        change: (K, K) orthonormal columns, the new components.
+
+    Returns:
+        The mean over the poses of the sum of all vertices' errors, mesh units. Then (K,) by how much it would grow
+        without each of the components.
+    """
+    coefficients = network.evaluate(partition.inputs[partition.validation], activation)
+    errors = partition.validation_residuals - partition.basis.reconstruct(coefficients)
+
+    def summed_error(errors: np.ndarray) -> float:
+        return float(np.linalg.norm(errors.reshape(len(errors), -1, 3), axis=2).sum(axis=1, dtype=np.float64).mean())
+
+    error, change = summed_error(errors), change.astype(np.float32)
+    products = zip((coefficients @ change).T, change.T @ partition.basis.components, strict=True)
+    without = [summed_error(errors + column[:, None] * component) for column, component in products]
+    return error, np.array(without) - error
+
+
+def _change_basis(
+    partition: PreparedPartition, network: Network, change: np.ndarray, split: Split
+) -> tuple[PreparedPartition, Network]:
+    """Replace the K components of a partition by K' orthonormal combinations of them.
+
+    Args:
+        partition, network: partition with its trained network.
+        change: (K, K') float64, orthonormal columns.
+        split: split of the poses.
+    """
+    basis = partition.basis
+    coefficients = partition.coefficients @ change
+    squares, former_squares = (
+        np.average(values[split.training].astype(np.float64) ** 2, axis=0, weights=split.weights())
+        for values in (coefficients, partition.coefficients)
+    )
+    left_square = basis.truncation_rms**2 + (former_squares.sum() - squares.sum()) / partition.vertex_count
+    squares_by_count = np.append(np.cumsum(squares[::-1])[::-1], 0) / partition.vertex_count
+    changed = replace(
+        partition,
+        basis=Basis(
+            basis.mean, (change.T @ basis.components).astype(np.float32), np.sqrt(squares_by_count + left_square)
+        ),
+        coefficients=coefficients.astype(np.float32),
+        dropped_count=len(change) - change.shape[1],
+    )
+    return changed, _change_outputs(network, change)
+
+
+def _change_outputs(network: Network, change: np.ndarray) -> Network:
+    """Return a network with other outputs, (K, K') combinations; without outputs it has one layer."""
+    weights, biases = network.weights, network.biases
+    if not change.shape[1]:
+        return Network((np.zeros((len(weights[0]), 0), np.float32),), (np.zeros(0, np.float32),))
+    change = change.astype(np.float32)
+    return Network((*weights[:-1], weights[-1] @ change), (*biases[:-1], biases[-1] @ change))
+
+
+def factorize_partitions(
+    prepared: Sequence[PreparedPartition],
+    networks: Sequence[Network],
+    partitions: Sequence[PartitionData],
+    split: Split,
+    tolerance: float,
+) -> tuple[list[PreparedPartition], list[Network]]:
+    """Factorize the partitions where that saves parameters (`low_rank`).
+
+    Args:
+        prepared, networks: partitions with their trained networks.
+        partitions: data of the partitions.
+        split: split of the poses.
+        tolerance: rms error that the components may leave, mesh units.
+
+    Returns:
+        The partitions, and the networks with outputs for the changed bases.
+    """
+    factorized = [
+        _factorize_partition(*arguments, split, tolerance)
+        for arguments in zip(prepared, networks, partitions, strict=True)
+    ]
+    return [partition for partition, _ in factorized], [network for _, network in factorized]
+
+
+def _factorize_partition(
+    prepared: PreparedPartition, network: Network, partition: PartitionData, split: Split, tolerance: float
+) -> tuple[PreparedPartition, Network]:
+    if not may_factorize(prepared.fit, prepared.basis):
+        return prepared, network
+    fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
+    weights, regression = split.weights(), partition.read_regression()
+    factors = factorize(fit, basis, coefficients, regression, split.training, weights, tolerance)
+    if factors is None:
+        return prepared, network
+    factorized = replace(
+        prepared,
+        fit=factors.fit,
+        basis=factors.basis,
+        coefficients=(coefficients @ factors.change_of_basis.T).astype(np.float32),
+        vertex_factors=factors.vertex_factors,
+    )
+    return factorized, _change_outputs(network, factors.change_of_basis.T)
