@@ -126,7 +126,7 @@ def test_the_others_play_on_when_one_character_leaves_a_crowd(bound_elbow, elbow
     scene.frame_set(4)
     bpy.data.objects.remove(armature_modifier(crowd[-1]).object)
     scene.frame_set(5)
-    assert "is gone" in crowd.pop().fdda.status
+    assert "has no Armature modifier with an armature any more" in crowd.pop().fdda.status
     scene.frame_set(6)
     crowd.pop().fdda.mode = "RIG"
     scene.frame_set(7)

@@ -29,8 +29,8 @@ def posed_rig(monkeypatch):
     bone.rotation_euler[0], armature_object.location[2], armature_object["wrinkle"] = 1.25, 3.0, 0.5
     # Without a window, Blender never sets the frame again by itself, and nothing is requested.
     unkeyed_changes.keep_unkeyed_changes()
-    assert unkeyed_changes._kept_frame is None
-    monkeypatch.setattr(unkeyed_changes, "_kept_frame", float(FRAME))
+    assert unkeyed_changes._request.frame is None
+    monkeypatch.setattr(unkeyed_changes._request, "frame", float(FRAME))
 
     def values() -> tuple[float, float, float]:
         bpy.context.view_layer.update()
