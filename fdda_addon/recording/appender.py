@@ -51,7 +51,7 @@ class PoseAppender:
         self._batch.append((*self._evaluator.evaluate(), self._pose_setter.is_at_rest))
         self.pose_count += 1
         # A pose that took seconds to settle is written at once.
-        if len(self._batch) == self._batch_size or self._pose_setter.settler:
+        if len(self._batch) == self._batch_size or self._pose_setter.is_settling:
             self._wait_for_append()
             self._pending_append = self._pool.submit(self._append, self._batch)
             self._batch = []

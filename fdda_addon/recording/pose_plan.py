@@ -11,7 +11,8 @@ from ..core.poses import CONTROL, Channel
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits
-from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest, reversible_frames
+from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest
+from ..rig.simulated_poses import reversible_frames
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, make_pose_sampler, make_recording_margin
@@ -104,8 +105,8 @@ class PosePlan:
         """Return the ascending indices of the poses that `show_poses_again` can set, without poses of the margin."""
         if not self.pose_setter.depends_on_history:
             return []
-        if self.pose_setter.settler:
-            # `make_pose_setter` raises an error for clips with a settler.
+        if self.pose_setter.is_settling:
+            # `make_pose_setter` raises an error for clips if poses settle.
             return list(range(self.in_range_count))
         clip_start, indices = self._settings.poses, []
         for clip in self._clips:
@@ -118,12 +119,12 @@ class PosePlan:
 
         A random pose is reached via another random pose, and a frame of a clip by playing the clip backwards.
         """
-        if self.pose_setter.settler:
+        if self.pose_setter.is_settling:
             set_pose = self._make_setter(self._channels)
             with self.pose_setter.prepared():
                 for index in sorted(pose_indices):
                     sample_indices = (index, REPEATABILITY_INDEX_OFFSET + index)
-                    self.pose_setter.settler.settle(
+                    self.pose_setter.set_pose(
                         *(
                             self._make_transition(self._channels, sample_index, set_pose)
                             for sample_index in sample_indices

@@ -14,12 +14,12 @@ from ..core.recording.target import Repeatability
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
-from .phases import InfluencesReady
 from .pose_plan import PosePlan
+from .recorded_mesh import RecordedMesh
 
 
 def measure_repeatability(
-    mesh: InfluencesReady, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, max_poses: int
+    mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, max_poses: int
 ) -> Iterator[Progress]:
     """Reach some poses from another direction, and write the distance from the recorded target to the index.
 
@@ -44,7 +44,7 @@ def measure_repeatability(
             for number in range(max_poses)
         }
     )
-    rig, skinning, settler = writer.rig, LinearSkinning(writer.rig, writer.partitions), plan.pose_setter.settler
+    rig, skinning = writer.rig, LinearSkinning(writer.rig, writer.partitions)
     residuals = open_array(writer.path / "residuals.npy", (writer.complete, rig.vertex_count, 3), np.float32)
     target_distances, linear_distances = [], []
     # Closing the generator stops playback.
@@ -62,7 +62,7 @@ def measure_repeatability(
                 "repeatability",
                 compared_count,
                 len(pose_indices),
-                detail=str(settler.last_rest_state) if settler else "",
+                detail=plan.pose_setter.rest_description,
             )
     statistics = {
         name: round(value, 6) for name, value in error_statistics(np.stack(target_distances)).to_json().items()

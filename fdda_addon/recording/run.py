@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Records rigs: runs the phases of a recording."""
+"""Records meshes of one armature in one session, which has the settings, the poses and the meshes."""
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import bpy
 
 from ..core.errors import RecordingError
 from ..core.key_joints import add_influences
-from ..core.partition import GOLDEN_RATIO, assume_nearby_influences, make_merged_partitions
+from ..core.partition import GOLDEN_RATIO, Partition, assume_nearby_influences, make_merged_partitions
 from ..core.progress import Progress
-from ..core.recording.estimate import check_disk_space, recording_bytes
+from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
 from ..core.recording.folder_check import check_recordable
 from ..core.recording.index import INDEX_NAME, RecordingInfo
 from ..core.recording.shard import Shard, shard_poses
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearSkinning
-from ..poses.clip import Clip, find_clips
+from ..poses.clip import find_clips
 from ..poses.clip_player import ClipPlayer
 from ..rig.modifier_stack import check_evaluable
-from ..rig.pose_setter import make_pose_setter
+from ..rig.target_poses import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_states
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
@@ -31,18 +30,18 @@ from .appender import PoseAppender, append_poses
 from .influence_trials import InfluenceSearch
 from .influences import detect_influences
 from .mesh_group import common_armature, group_into_passes, split_controls
-from .phases import InfluencesReady, MeshPlanned, TimedEvaluator, WeightsFitted, describe_estimate
 from .plan import RecordingSettings, find_actions, make_pose_sampler, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
 from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
+from .recorded_mesh import RecordedMesh, TimedEvaluator
 from .repeatability import measure_repeatability
 from .target_check import check_target_moves
 from .time_check import check_follows_pose
-from .weight_fitting import check_has_weights, fit_weights, make_fit_request
+from .weight_fitting import FittedWeights, check_has_weights, fit_weights, make_fit_request
 
-PreviousState, NextState = TypeVar("PreviousState", MeshPlanned, WeightsFitted), TypeVar("NextState")
 INFLUENCE_SEED_OFFSET = 1 << 32
 """Offset of the indices of random poses for the detection of influences, larger than any pose index of a recording."""
+MeshPhase = Callable[[RecordedMesh, ClipPlayer | None], Iterator[Progress]]
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
@@ -76,211 +75,189 @@ def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSett
     Raises:
         RigError: as `record`, or the meshes follow different armatures.
     """
-    meshes = [scene_rig for scene_rig, _ in rigs]
-    clips = find_clips(common_armature(meshes), settings.actions, settings.strips, settings.mirror)
-    planned, plan = _plan_recordings(rigs, settings, clips)
-    target = plan.pose_setter.target
-    with target.prepared() if target else nullcontext():
-        yield from _record_planned(planned, settings, clips, plan)
+    yield from RecordingSession(rigs, settings).record()
 
 
-def _record_planned(
-    planned: list[MeshPlanned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
-) -> Iterator[Progress]:
-    scene_rigs, posed_rigs = [mesh.scene_rig for mesh in planned], [mesh.posed_rig for mesh in planned]
-    with temporary_rig_states(posed_rigs, clips) if settings.fits_weights else nullcontext() as player:
-        fitted_meshes = yield from _run_phase(planned, lambda mesh: _fit_mesh_weights(mesh, settings, plan, player))
-    for mesh_indices in group_into_passes(scene_rigs):
-        meshes_in_pass = [fitted_meshes[index] for index in mesh_indices]
-        other_rigs = [mesh for index, mesh in enumerate(posed_rigs) if index not in mesh_indices]
-        with temporary_rig_states([posed_rigs[index] for index in mesh_indices], clips, other_rigs) as player:
-            if plan.pose_setter.target:
-                yield from check_target_moves(meshes_in_pass[0], plan, player)
-            check_follows_pose(meshes_in_pass, plan, player)
-            ready_meshes = yield from _run_phase(
-                meshes_in_pass, lambda mesh: _find_influences(mesh, settings, clips, player)
+class RecordingSession:
+    """Records meshes on one armature, each into its own folder, in phases: the methods in their order.
+
+    `record` runs all phases. A phase is a generator that yields its progress, and stores its results in the meshes.
+
+    Attributes:
+        settings: settings of the recording.
+        clips: the clips whose frames follow the random poses.
+        meshes: the meshes.
+        poses: the poses, which the meshes share, and the target whose surface they have.
+        pose_indices: indices of the poses to record.
+    """
+
+    def __init__(self, rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings):
+        """Plan the recordings of meshes and their poses, and raise all errors that can be found in advance."""
+        scene_rigs, self.settings = [scene_rig for scene_rig, _ in rigs], settings
+        self.clips = find_clips(common_armature(scene_rigs), settings.actions, settings.strips, settings.mirror)
+        if settings.mirror and not self.clips:
+            raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
+        controls = [settings.controls] if len(rigs) == 1 else split_controls(scene_rigs, settings)
+        if settings.target.name and len(rigs) > 1:
+            raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
+        sampled_rigs = []
+        for (scene_rig, path), mesh_controls in zip(rigs, controls, strict=True):
+            stack = check_evaluable(scene_rig)
+            sampled_rigs.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
+            if not settings.target.name:
+                check_time_inputs(scene_rig, sampled_rigs[-1][0].controls, stack, find_actions(settings))
+            check_recordable(path, settings.resume, settings.overwrite)
+        target_controls = sampled_rigs[0][0].controls
+        pose_setter = make_pose_setter(scene_rigs[0], settings.target, self.clips, settings.poses, target_controls)
+        channels = [mesh_channels for _, mesh_channels in sampled_rigs]
+        self.poses = PosePlan(list(zip(scene_rigs, channels, strict=True)), settings, self.clips, pose_setter)
+        if self.poses.total < 1:
+            raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
+        self.pose_indices = range(self.poses.total)
+        if settings.detect_influences:
+            self.pose_indices = range(0)
+        elif settings.shard:
+            self.pose_indices = shard_poses(*settings.shard, self.poses.total)
+        self.meshes = [
+            RecordedMesh(
+                *(scene_rig, rig, path, mesh_channels, self.poses.channels_of_mesh(index)),
+                *(self._previous_path(path, len(rigs) > 1), pose_setter.target),
             )
-            yield from _record_poses(ready_meshes, settings, plan, player)
+            for index, ((scene_rig, path), (rig, mesh_channels)) in enumerate(zip(rigs, sampled_rigs, strict=True))
+        ]
+        check_disk_space([(mesh.path, recording_bytes(mesh.rig, len(self.pose_indices))) for mesh in self.meshes])
 
+    def _previous_path(self, path: Path, is_one_of_several: bool) -> Path | None:
+        """Return the recording whose weights and influences the recording at `path` reuses; None if there is none."""
+        if self.settings.resume and (path / INDEX_NAME).exists():
+            return path
+        if self.settings.influences is None:
+            return None
+        return self.settings.influences / path.name if is_one_of_several else self.settings.influences
 
-def _plan_recordings(
-    rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings, clips: tuple[Clip, ...]
-) -> tuple[list[MeshPlanned], PosePlan]:
-    """Plan the recordings of meshes and their shared poses, and raise all errors that can be found in advance."""
-    if settings.mirror and not clips:
-        raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
-    scene_rigs = [scene_rig for scene_rig, _ in rigs]
-    controls = [settings.controls] if len(rigs) == 1 else split_controls(scene_rigs, settings)
-    if settings.target.name and len(rigs) > 1:
-        raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
-    rigs_with_channels = []
-    for (scene_rig, path), mesh_controls in zip(rigs, controls, strict=True):
-        stack = check_evaluable(scene_rig)
-        rigs_with_channels.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
-        if not settings.target.name:
-            check_time_inputs(scene_rig, rigs_with_channels[-1][0].controls, stack, find_actions(settings))
-        check_recordable(path, settings.resume, settings.overwrite)
-    meshes_with_channels = [
-        (scene_rig, channels) for scene_rig, (_, channels) in zip(scene_rigs, rigs_with_channels, strict=True)
-    ]
-    target_controls = rigs_with_channels[0][0].controls
-    pose_setter = make_pose_setter(scene_rigs[0], settings.target, clips, settings.poses, target_controls)
-    plan = PosePlan(meshes_with_channels, settings, clips, pose_setter)
-    if plan.total < 1:
-        raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
-    pose_count = len(_pose_indices(settings, plan.total))
-    check_disk_space(
-        [(path, recording_bytes(rig, pose_count)) for (_, path), (rig, _) in zip(rigs, rigs_with_channels, strict=True)]
-    )
-    previous_paths = [_previous_recording(path, settings, len(rigs) > 1) for _, path in rigs]
-    planned = [
-        MeshPlanned(
-            scene_rig, rig, path, channels, plan.channels_of_mesh(index), previous_paths[index], pose_setter.target
-        )
-        for index, ((scene_rig, path), (rig, channels)) in enumerate(zip(rigs, rigs_with_channels, strict=True))
-    ]
-    return planned, plan
+    def record(self) -> Iterator[Progress]:
+        """Run all phases; the meshes of a pass are evaluated together (`group_into_passes`)."""
+        target = self.poses.pose_setter.target
+        with target.prepared() if target else nullcontext():
+            posed_rigs = [mesh.posed_rig for mesh in self.meshes]
+            with (
+                temporary_rig_states(posed_rigs, self.clips) if self.settings.fits_weights else nullcontext() as player
+            ):
+                yield from self._for_each(self.meshes, self.fit_weights, player)
+            for mesh_indices in group_into_passes([mesh.scene_rig for mesh in self.meshes]):
+                meshes = [self.meshes[index] for index in mesh_indices]
+                other_rigs = [mesh.posed_rig for mesh in self.meshes if mesh not in meshes]
+                with temporary_rig_states([mesh.posed_rig for mesh in meshes], self.clips, other_rigs) as player:
+                    if target:
+                        yield from check_target_moves(meshes[0], self.poses, player)
+                    check_follows_pose(meshes, self.poses, player)
+                    yield from self._for_each(meshes, self.find_influences, player)
+                    yield from self.record_poses(meshes, player)
 
-
-def _previous_recording(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> Path | None:
-    """Return the recording whose weights and influences the recording at `path` reuses; None if there is none."""
-    if settings.resume and (path / INDEX_NAME).exists():
-        return path
-    if settings.influences is None:
-        return None
-    return settings.influences / path.name if is_one_of_several else settings.influences
-
-
-def _pose_indices(settings: RecordingSettings, total: int) -> range:
-    """Return the indices of the poses to record."""
-    if settings.detect_influences:
-        return range(0)
-    return shard_poses(*settings.shard, total) if settings.shard else range(total)
-
-
-def _run_phase(
-    meshes: Sequence[PreviousState], phase: Callable[[PreviousState], Generator[Progress, None, NextState]]
-) -> Generator[Progress, None, list[NextState]]:
-    """Run a phase for each mesh, and return the results. The stages of several meshes include the mesh's name."""
-    results = []
-
-    def collect_result(mesh: PreviousState) -> Iterator[Progress]:
-        results.append((yield from phase(mesh)))
-
-    for mesh in meshes:
-        with closing(collect_result(mesh)) as steps:
-            for step in steps:
-                yield step if len(meshes) == 1 else replace(step, stage=f"{step.stage} of '{mesh.name}'")
-    return results
-
-
-def _fit_mesh_weights(
-    mesh: MeshPlanned, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer | None
-) -> Generator[Progress, None, WeightsFitted]:
-    """Fit the skin weights of a mesh, read previously fitted weights, or keep the weights of the rig."""
-    if mesh.previous_path:
-        weights = read_previous_weights(mesh.previous_path, mesh.scene_rig, mesh.rig, settings)
-        return WeightsFitted(mesh, weights.rig, weights.fit)
-    if not settings.fits_weights:
-        check_has_weights(mesh.scene_rig, mesh.rig)
-        return WeightsFitted(mesh, mesh.rig, None)
-    request = make_fit_request(mesh.scene_rig, mesh.rig, settings, mesh.channels, plan.total)
-    shown_poses = plan.show_poses(player, frozenset(request.poses))
-    weights = yield from fit_weights(mesh.scene_rig, mesh.rig, request, shown_poses, mesh.evaluator(mesh.rig))
-    return WeightsFitted(mesh, weights.rig, weights.fit, weights.needed_inputs)
-
-
-def _find_influences(
-    mesh: WeightsFitted, settings: RecordingSettings, clips: tuple[Clip, ...], player: ClipPlayer
-) -> Generator[Progress, None, InfluencesReady]:
-    """Read previous influences on the partitions of a mesh, or detect them with the channels of this mesh alone."""
-    scene_rig, channels = mesh.planned.scene_rig, mesh.planned.channels
-    sampler = make_pose_sampler(scene_rig, settings)
-    search = InfluenceSearch(
-        channels,
-        lambda index: sampler.draw_pose(channels, INFLUENCE_SEED_OFFSET + index),
-        lambda index: _show_frame(player, clips, index),
-        player.stop,
-        settings.influence_poses,
-        settings.influence_tolerance,
-        mesh.planned.target is not None or mesh.needed_inputs is not None,
-    )
-    evaluator = TimedEvaluator(mesh.planned.evaluator(mesh.rig))
-    previous_path = mesh.planned.previous_path
-    if previous_path and (
-        partitions := read_previous_partitions(previous_path, mesh.rig, settings.min_partition_vertices)
-    ):
-        return InfluencesReady(mesh, partitions, evaluator)
-    if previous_path and previous_path != mesh.planned.path:
-        raise RecordingError(
-            f"The influences in '{previous_path}' are of other partitions than those of '{mesh.name}'; find them with "
-            "the same rig and options (record --detect-influences)."
-        )
-    partitions_without_influences = make_merged_partitions(mesh.rig, settings.min_partition_vertices)
-    target = mesh.planned.target
-    if target and target.follows != POSE:
-        # A target that depends on time does not follow a moved joint immediately, so influences cannot be detected.
-        partitions = assume_nearby_influences(mesh.rig, partitions_without_influences)
-    else:
-        partitions = yield from detect_influences(scene_rig, mesh.rig, partitions_without_influences, evaluator, search)
-    if mesh.needed_inputs is not None:
-        partitions = add_influences(partitions, mesh.needed_inputs, len(mesh.rig.joints))
-    return InfluencesReady(mesh, partitions, evaluator)
-
-
-def _record_poses(
-    meshes: list[InfluencesReady], settings: RecordingSettings, plan: PosePlan, player: ClipPlayer
-) -> Iterator[Progress]:
-    pose_indices = _pose_indices(settings, plan.total)
-    with ExitStack() as stack:
-        appenders = []
+    @staticmethod
+    def _for_each(meshes: list[RecordedMesh], phase: MeshPhase, player: ClipPlayer | None) -> Iterator[Progress]:
+        """Run a phase for each mesh. The stages of several meshes include the mesh's name."""
         for mesh in meshes:
-            info = replace(_make_info(mesh, settings, plan, pose_indices), target=plan.pose_setter.recorded_target)
-            writer = RecordingWriter(
-                mesh.fitted.planned.path,
-                *(mesh.fitted.rig, mesh.partitions, info),
-                *(settings.resume, settings.overwrite),
-            )
-            skinning = LinearSkinning(mesh.fitted.rig, mesh.partitions)
-            appenders.append(PoseAppender(mesh.evaluator, skinning, stack.enter_context(writer), plan.pose_setter))
-        pose_count, settler = min(appender.pose_count for appender in appenders), plan.pose_setter.settler
-        seconds_per_pose = settler.last_rest_state.seconds if settler and settler.last_rest_state else None
-        yield Progress(
-            "poses",
-            pose_count,
-            len(pose_indices),
-            describe_estimate(meshes, len(pose_indices), len(pose_indices) - pose_count, seconds_per_pose),
-        )
-        remaining_poses = plan.show_poses(player, pose_indices[pose_count:])
-        # Close the generators before the writers, so that an interrupted recording keeps the evaluated poses.
-        with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as pose_counts:
-            for recorded_count in pose_counts:
-                yield Progress(
-                    "poses", recorded_count, len(pose_indices), detail=str(settler.last_rest_state) if settler else ""
+            with closing(phase(mesh, player)) as steps:
+                for step in steps:
+                    yield step if len(meshes) == 1 else replace(step, stage=f"{step.stage} of '{mesh.name}'")
+
+    def fit_weights(self, mesh: RecordedMesh, player: ClipPlayer | None) -> Iterator[Progress]:
+        """Fit the skin weights of a mesh, read previously fitted weights, or keep the weights of the rig."""
+        if mesh.previous_path:
+            weights = read_previous_weights(mesh.previous_path, mesh.scene_rig, mesh.rig, self.settings)
+        elif self.settings.fits_weights:
+            request = make_fit_request(mesh.scene_rig, mesh.rig, self.settings, mesh.channels, self.poses.total)
+            shown_poses = self.poses.show_poses(player, frozenset(request.poses))
+            weights = yield from fit_weights(mesh.scene_rig, mesh.rig, request, shown_poses, mesh.make_evaluator())
+        else:
+            check_has_weights(mesh.scene_rig, mesh.rig)
+            weights = FittedWeights(mesh.rig, None)
+        mesh.rig, mesh.fit, mesh.needed_inputs = weights.rig, weights.fit, weights.needed_inputs
+
+    def find_influences(self, mesh: RecordedMesh, player: ClipPlayer) -> Iterator[Progress]:
+        """Read previous influences on the partitions of a mesh, or detect them with the channels of this mesh alone."""
+        mesh.evaluator = TimedEvaluator(mesh.make_evaluator())
+        min_vertices = self.settings.min_partition_vertices
+        if mesh.previous_path:
+            mesh.partitions = read_previous_partitions(mesh.previous_path, mesh.rig, min_vertices) or ()
+            if not mesh.partitions and mesh.previous_path != mesh.path:
+                raise RecordingError(
+                    f"The influences in '{mesh.previous_path}' are of other partitions than those of '{mesh.name}'; "
+                    "find them with the same rig and options (record --detect-influences)."
                 )
-        if plan.repeatable_poses and settings.target.repeatability_poses and len(pose_indices) == plan.total:
-            yield from measure_repeatability(meshes[0], plan, player, writer, settings.target.repeatability_poses)
-            yield Progress("poses", len(pose_indices), len(pose_indices))
+        if mesh.partitions:
+            return
+        partitions = make_merged_partitions(mesh.rig, min_vertices)
+        if mesh.target and mesh.target.follows != POSE:
+            # A target that depends on time does not follow a moved joint immediately: influences cannot be detected.
+            partitions = assume_nearby_influences(mesh.rig, partitions)
+        else:
+            partitions = yield from self._detect_influences(mesh, partitions, player)
+        if mesh.needed_inputs is not None:
+            partitions = add_influences(partitions, mesh.needed_inputs, len(mesh.rig.joints))
+        mesh.partitions = partitions
 
+    def _detect_influences(
+        self, mesh: RecordedMesh, partitions: tuple[Partition, ...], player: ClipPlayer
+    ) -> Iterator[Progress]:
+        sampler = make_pose_sampler(mesh.scene_rig, self.settings)
+        frames = [(clip, frame) for clip in self.clips for frame in clip.frames]
+        search = InfluenceSearch(
+            mesh.channels,
+            lambda index: sampler.draw_pose(mesh.channels, INFLUENCE_SEED_OFFSET + index),
+            # Consecutive indices result in frames that are far apart.
+            lambda index: player.show(*frames[int(index * GOLDEN_RATIO * len(frames)) % len(frames)]),
+            player.stop,
+            self.settings.influence_poses,
+            self.settings.influence_tolerance,
+            mesh.target is not None or mesh.needed_inputs is not None,
+        )
+        return (yield from detect_influences(mesh.scene_rig, mesh.rig, partitions, mesh.evaluator, search))
 
-def _make_info(
-    mesh: InfluencesReady, settings: RecordingSettings, plan: PosePlan, pose_indices: range
-) -> RecordingInfo:
-    """Make the info of the recording of a mesh."""
-    planned = mesh.fitted.planned
-    sampling = make_sampling(planned.scene_rig, settings, planned.limits)
-    file_name, blender_version = Path(bpy.data.filepath).name, bpy.app.version_string
-    is_shard = settings.shard is not None or settings.detect_influences
-    shard = Shard(pose_indices.start, plan.total) if is_shard else None
-    info = RecordingInfo(
-        len(pose_indices), 0, file_name, planned.name, blender_version, sampling, mesh.fitted.fit, shard
-    )
-    if planned.previous_path and planned.previous_path != planned.path:
-        check_influences_match(planned.previous_path, mesh.fitted.rig, info)
-    return info
+    def record_poses(self, meshes: list[RecordedMesh], player: ClipPlayer) -> Iterator[Progress]:
+        """Evaluate the poses that are missing, and write them; then measure the repeatability of a target."""
+        pose_setter, pose_count = self.poses.pose_setter, len(self.pose_indices)
+        with ExitStack() as stack:
+            appenders = []
+            for mesh in meshes:
+                info = self._make_info(mesh)
+                options = self.settings.resume, self.settings.overwrite
+                writer = stack.enter_context(RecordingWriter(mesh.path, mesh.rig, mesh.partitions, info, *options))
+                skinning = LinearSkinning(mesh.rig, mesh.partitions)
+                appenders.append(PoseAppender(mesh.evaluator, skinning, writer, pose_setter))
+            done = min(appender.pose_count for appender in appenders)
+            yield Progress("poses", done, pose_count, self._describe_estimate(meshes, pose_count - done))
+            remaining_poses = self.poses.show_poses(player, self.pose_indices[done:])
+            # Close the generators before the writers, so that an interrupted recording keeps the evaluated poses.
+            with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as pose_counts:
+                for done in pose_counts:
+                    yield Progress("poses", done, pose_count, detail=pose_setter.rest_description)
+            repeated_count = self.settings.target.repeatability_poses
+            if self.poses.repeatable_poses and repeated_count and pose_count == self.poses.total:
+                yield from measure_repeatability(meshes[0], self.poses, player, writer, repeated_count)
+                yield Progress("poses", pose_count, pose_count)
 
+    def _describe_estimate(self, meshes: list[RecordedMesh], remaining_count: int) -> str:
+        """Describe the remaining work of meshes that are evaluated together; empty if no poses remain."""
+        if not remaining_count:
+            return ""
+        settle_seconds = self.poses.pose_setter.seconds_per_pose
+        # The whole scene is evaluated for each pose, so the times of meshes do not add up.
+        seconds = [settle_seconds or mesh.evaluator.seconds_per_pose for mesh in meshes]
+        remaining_seconds = None if None in seconds else max(seconds) * remaining_count
+        vertex_count = sum(mesh.rig.vertex_count for mesh in meshes)
+        total_bytes = sum(recording_bytes(mesh.rig, len(self.pose_indices)) for mesh in meshes)
+        return Estimate(remaining_count, vertex_count, total_bytes, remaining_seconds).sentence()
 
-def _show_frame(player: ClipPlayer, clips: tuple[Clip, ...], index: int) -> None:
-    """Show a frame of the clips; consecutive indices result in frames that are far apart."""
-    frames = [(clip, frame) for clip in clips for frame in clip.frames]
-    player.show(*frames[int(index * GOLDEN_RATIO * len(frames)) % len(frames)])
+    def _make_info(self, mesh: RecordedMesh) -> RecordingInfo:
+        """Make the info of the recording of a mesh."""
+        settings, pose_count = self.settings, len(self.pose_indices)
+        sampling = make_sampling(mesh.scene_rig, settings, mesh.limits)
+        file_name, blender_version = Path(bpy.data.filepath).name, bpy.app.version_string
+        is_shard = settings.shard is not None or settings.detect_influences
+        shard = Shard(self.pose_indices.start, self.poses.total) if is_shard else None
+        info = RecordingInfo(pose_count, 0, file_name, mesh.name, blender_version, sampling, mesh.fit, shard)
+        if mesh.previous_path and mesh.previous_path != mesh.path:
+            check_influences_match(mesh.previous_path, mesh.rig, info)
+        return replace(info, target=self.poses.pose_setter.recorded_target)

@@ -12,8 +12,8 @@ from ..core.progress import Progress
 from ..core.recording.target import SIMULATION
 from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
-from .phases import WeightsFitted
 from .pose_plan import PosePlan
+from .recorded_mesh import RecordedMesh
 
 MAX_CHECKED_POSES = 20
 MIN_RIG_MOTION_RATIO, MAX_STILL_TARGET_RATIO = 0.02, 1e-5
@@ -21,7 +21,7 @@ MIN_RIG_MOTION_RATIO, MAX_STILL_TARGET_RATIO = 0.02, 1e-5
 moves by more than the first ratio."""
 
 
-def check_target_moves(mesh: WeightsFitted, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
+def check_target_moves(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
     """Check that a target moves in poses in which the rig moves.
 
     A simulation is checked in its first frames, other targets in poses that are far apart. Poses that are held settle,
@@ -33,13 +33,13 @@ def check_target_moves(mesh: WeightsFitted, plan: PosePlan, player: ClipPlayer) 
     Raises:
         RigError: the target does not move.
     """
-    evaluator, skinning = mesh.planned.evaluator(mesh.rig), LinearSkinning(mesh.rig)
+    evaluator, skinning = mesh.make_evaluator(), LinearSkinning(mesh.rig)
     is_simulation = plan.pose_setter.target.follows == SIMULATION
     spread_indices = sorted(
         {int(number * GOLDEN_RATIO * plan.total) % plan.total for number in range(MAX_CHECKED_POSES)}
     )
     pose_indices = (
-        range(min(plan.total, 2 if plan.pose_setter.settler else plan.total)) if is_simulation else spread_indices
+        range(min(plan.total, 2 if plan.pose_setter.is_settling else plan.total)) if is_simulation else spread_indices
     )
     first_positions, rig_motion, target_motion = None, 0.0, 0.0
     with closing(plan.show_poses(player, pose_indices)) as poses:
@@ -67,5 +67,5 @@ def check_target_moves(mesh: WeightsFitted, plan: PosePlan, player: ClipPlayer) 
         )
 
 
-def _format_mm(mesh: WeightsFitted, units: float) -> str:
+def _format_mm(mesh: RecordedMesh, units: float) -> str:
     return f"{units * mesh.rig.metres_per_unit * 1000:.0f} mm"

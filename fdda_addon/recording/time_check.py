@@ -13,14 +13,14 @@ from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.recording.target import POSE
 from ..poses.clip_player import ClipPlayer
 from ..scene.armature import clear_pose
-from .phases import WeightsFitted
 from .pose_plan import PosePlan
+from .recorded_mesh import RecordedMesh
 
 POSE_TOLERANCE = 1e-5
 """Largest difference between matrices and controls of poses that count as equal (no unit, or mesh units)."""
 
 
-def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: ClipPlayer) -> None:
+def check_follows_pose(meshes: Sequence[RecordedMesh], plan: PosePlan, player: ClipPlayer) -> None:
     """Check that the surfaces of meshes do not change between frames while pose and controls are the same.
 
     Two poses of the plan are held in the first, middle and last frame of the scene. Targets that depend on time are
@@ -40,7 +40,7 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
     scene = bpy.context.scene
     frame, subframe = scene.frame_current, scene.frame_subframe
     other_frames = {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end} - {frame}
-    evaluators = [mesh.planned.evaluator(mesh.rig) for mesh in meshes]
+    evaluators = [mesh.make_evaluator() for mesh in meshes]
     try:
         for pose_index in {plan.total // 3, plan.total - 1}:
             with closing(plan.show_poses(player, {pose_index})) as poses:
@@ -54,13 +54,13 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
                         _compare_surfaces(mesh, (frame, other_frame), first_evaluation, evaluator.evaluate())
     finally:
         player.stop()
-        clear_pose(meshes[0].planned.scene_rig.armature_object)
+        clear_pose(meshes[0].scene_rig.armature_object)
         player.restore_numbers()
         scene.frame_set(frame, subframe=subframe)
 
 
 def _compare_surfaces(
-    mesh: WeightsFitted,
+    mesh: RecordedMesh,
     frames: tuple[int, int],
     first_evaluation: Sequence[np.ndarray],
     other_evaluation: Sequence[np.ndarray],
@@ -75,7 +75,7 @@ def _compare_surfaces(
     ):
         return
     largest_difference = float(np.linalg.norm(positions - other_positions, axis=1).max())
-    mesh_object = mesh.planned.scene_rig.mesh_object
+    mesh_object = mesh.scene_rig.mesh_object
     extent = max(float(np.abs(mesh.rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
     if largest_difference > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
         raise RigError(
