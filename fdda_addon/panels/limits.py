@@ -88,6 +88,11 @@ def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[s
     return "NONE", name, "  ".join(texts), any(r.moves and r.source != DEFAULT for r in ranges)
 
 
+def lacks_limits(rig: SceneRig) -> bool:
+    """Return whether random poses rotate all bones by the default angle, because no bone has limits."""
+    return rig.mesh_object.fdda.settings.sample == "WEIGHTS" and not has_any_limits(rig)
+
+
 @draw_cached
 def has_any_limits(rig: SceneRig) -> bool:
     """Return whether any bone of the armature had limits or a locked axis at the last check of the rig.

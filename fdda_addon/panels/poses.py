@@ -42,7 +42,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         rig = panel_rig(context)[0]
         if rig is None or not _has_poses(rig):
             return False
-        return limits.has_any_limits(rig) or rig.mesh_object.fdda.settings.sample != "WEIGHTS"
+        return not limits.lacks_limits(rig)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
@@ -85,7 +85,7 @@ def _draw_sentences(layout: bpy.types.UILayout, context: bpy.types.Context, rig:
     """Draw the sentences that come and go, below the buttons, so that these do not move under the mouse."""
     if not _has_poses(rig):
         draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
-    if not limits.has_any_limits(rig) and rig.mesh_object.fdda.settings.sample == "WEIGHTS":
+    if limits.lacks_limits(rig):
         text = "No rotation limits found. Every bone will rotate ±45°; set limits, or press Human Limits."
         draw_wrapped(layout, context, text, "ERROR")
     sampling.draw_channel_counts(layout, context, rig)

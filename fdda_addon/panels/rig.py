@@ -9,7 +9,7 @@ from ..properties.character import file_problem
 from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
 from ..timing import frame_times
-from . import checks, curves
+from . import checks, curves, limits
 from .frame_profile import draw_profile
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
 from .trained_file import find_trained_file
@@ -112,6 +112,8 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
     draw_button(row, context, "fdda.build_model", "Record, Train & Bind", "PLAY")
     if problem:
         draw_wrapped(layout, context, problem, "INFO")
+    elif limits.lacks_limits(rig) and rig.mesh_object.fdda.settings.poses:
+        draw_wrapped(layout, context, "No rotation limits yet: set them in Training Poses first.", "ERROR")
 
 
 def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

@@ -13,6 +13,7 @@ import pytest
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.operators.meshes import MENU_OPERATORS
 from fdda_addon.panels import MODULES, checks, models, playback
+from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
 from fdda_addon.scene.scene_rig import SceneRig
 
 from .conftest import ELBOW_RIG
@@ -44,6 +45,21 @@ def test_a_section_of_a_rig_draws_few_fields(rig: SceneRig, name: str):
     assert drawn
     fields = [text for kind, text, is_open in drawn if kind == "field" and is_open]
     assert len(fields) <= MAX_OPEN_FIELDS, fields
+
+
+def test_missing_limits_are_named_beside_the_button_that_records(rig: SceneRig, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    text, bones = "No rotation limits yet: set them in Training Poses first.", rig.armature_object.pose.bones
+    for bone in bones:
+        bone.lock_rotation = (False, False, False)
+        for axis in range(3):
+            clear_rotation_range(bone, axis)
+    checks.check_now(rig)
+    assert text in texts_of(draw_section("rig"))
+    set_rotation_range(bones[1], 0, 0.0, 2.0)
+    checks.check_now(rig)
+    assert text not in texts_of(draw_section("rig"))
 
 
 @pytest.mark.parametrize(
