@@ -121,9 +121,8 @@ def add_half_rotations(
         Name of a table that also has the half-rotation matrices, at its end. Their last column is zero.
     """
     joint_count = len(rotation_columns)
-    rotations = graph.add(
-        "Gather", [vectors, graph.integers("rotation_columns", rotation_columns)], "rotations", axis=1
-    )
+    rotation_columns = graph.integers("rotation_columns", rotation_columns)
+    rotations = graph.add("Gather", [vectors, rotation_columns], "rotations", axis=1)
     rotation_rows = graph.reshape(rotations, [0, joint_count, AXIS_COUNT * MATRIX_COLUMNS], "rotation_rows")
     # The product with the selection is R - R^T, column by column, with zeros for the last column, and the trace.
     selection = np.zeros((AXIS_COUNT * MATRIX_COLUMNS, AXIS_COUNT * MATRIX_COLUMNS + 1))
@@ -132,17 +131,15 @@ def add_half_rotations(
         selection[AXIS_COUNT * axis + column, AXIS_COUNT * column + axis] -= 1
     selection[[0, 4, 8], -1] = 1
     terms = graph.add("MatMul", [rotation_rows, graph.floats("half_rotation_picks", selection)], "half_rotation_terms")
-    differences, trace = graph.split(
-        terms, [AXIS_COUNT * MATRIX_COLUMNS, 1], ["half_rotation_differences", "half_rotation_traces"], axis=2
-    )
+    names = ["half_rotation_differences", "half_rotation_traces"]
+    differences, trace = graph.split(terms, [AXIS_COUNT * MATRIX_COLUMNS, 1], names, axis=2)
     divisor = graph.add("Add", [trace, graph.floats("three", np.full(1, 3))], "half_rotation_divisors")
     divisor = graph.add("Max", [divisor, graph.floats("min_divisor", np.full(1, MIN_DIVISOR))], "safe_divisors")
     half_rotations = graph.add("Div", [differences, divisor], "half_rotations_in_row")
     matrices = graph.reshape(half_rotations, [0, joint_count, MATRIX_COLUMNS, AXIS_COUNT], "half_rotations")
     table_columns = graph.reshape(table, [0, -1, AXIS_COUNT], "table_columns")
-    carried_axes = graph.add(
-        "Gather", [table_columns, graph.integers("carried_columns", carried_columns)], "carried_axes", axis=1
-    )
+    carried_columns = graph.integers("carried_columns", carried_columns)
+    carried_axes = graph.add("Gather", [table_columns, carried_columns], "carried_axes", axis=1)
     matrices = graph.add("MatMul", [matrices, carried_axes], "half_rotation_matrices")
     matrices = graph.reshape(matrices, [0, joint_count, AXIS_COUNT * MATRIX_COLUMNS], "half_rotation_rows")
     return graph.add("Concat", [table, matrices], "table_with_half_rotations", axis=1)

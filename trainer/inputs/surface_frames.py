@@ -50,17 +50,13 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
         if not state:
             return
         joint_count, (count, corner_count) = len(rig.joints), state["lengths"].shape[1:]
-        shapes = {
-            "vertices": (count,),
-            "main_joints": (count,),
-            "tangents": (2, count, corner_count, 4 * joint_count),
-            "epsilons": (3, count, corner_count),
-            "lengths": (3, count, corner_count),
+        expected = {
+            **dict.fromkeys(("vertices", "main_joints"), (np.dtype(np.int64), (count,))),
+            **dict.fromkeys(("epsilons", "lengths"), (np.dtype(np.float64), (3, count, corner_count))),
+            "tangents": (np.dtype(np.float64), (2, count, corner_count, 4 * joint_count)),
         }
-        dtypes = {name: np.float64 if len(shape) > 1 else np.int64 for name, shape in shapes.items()}
-        if {name: (array.shape, array.dtype.type) for name, array in state.items()} != {
-            name: (shape, dtypes[name]) for name, shape in shapes.items()
-        } or count * joint_count > MAX_JOINT_ENTRIES:
+        types = {name: (array.dtype, array.shape) for name, array in state.items()}
+        if types != expected or count * joint_count > MAX_JOINT_ENTRIES:
             raise ValueError("arrays of surface frames contradict each other")
         for indices, limit in ((state["vertices"], rig.vertex_count), (state["main_joints"], joint_count)):
             if indices.min(initial=0) < 0 or indices.max(initial=0) >= limit:
@@ -106,14 +102,10 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
         )
         poses_by_row = graph.add("Transpose", [POSE_INPUT], "poses_by_row", perm=[0, 2, 1, 3])
         pose_columns = graph.reshape(poses_by_row, [0, MATRIX_ROWS, column_count], "pose_columns")
-        tangents = [
-            graph.add(
-                "MatMul",
-                [pose_columns, graph.floats(f"{tangent_name}_of_poses", weights.reshape(-1, column_count).T)],
-                f"{tangent_name}_tangents",
-            )
-            for tangent_name, weights in zip(("first", "second"), tangent_weights, strict=True)
-        ]
+        tangents = []
+        for kind, weights in zip(("first", "second"), tangent_weights, strict=True):
+            of_poses = graph.floats(f"{kind}_of_poses", weights.reshape(-1, column_count).T)
+            tangents.append(graph.add("MatMul", [pose_columns, of_poses], f"{kind}_tangents"))
         # a x b = (a_y b_z, a_z b_x, a_x b_y) - (a_z b_y, a_x b_z, a_y b_x)
         permuted_tangents = [
             graph.add("Gather", [tangent, graph.integers(f"{tangent}_axes", axes)], f"{tangent}_permuted", axis=1)
@@ -130,31 +122,22 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
         # The last row of a tangent is masked: it is not exactly 0, because skin weights sum to 1 up to rounding.
         row_mask = graph.floats("rows_in_space", [[1, 1, 1, 0]])
         squared_lengths = graph.add("MatMul", [row_mask, squared_lengths], "vector_sums")
-        safe_squared_lengths = graph.add(
-            "Add", [squared_lengths, graph.floats("least_squares", squared_epsilons)], "vectors_safe"
-        )
-        target_lengths = graph.floats("vector_lengths", np.append(lengths.ravel(), np.ones(column_count)))
-        scale_factors = graph.add(
-            "Div", [target_lengths, graph.add("Sqrt", [safe_squared_lengths], "lengths_of_vectors")], "vector_factors"
-        )
-        vectors = graph.add("Mul", [vectors, scale_factors], "scaled_vectors")
+        squared_epsilons = graph.floats("least_squares", squared_epsilons)
+        safe_squared_lengths = graph.add("Add", [squared_lengths, squared_epsilons], "vectors_safe")
+        factors = graph.floats("vector_lengths", np.append(lengths.ravel(), np.ones(column_count)))
+        vector_lengths = graph.add("Sqrt", [safe_squared_lengths], "lengths_of_vectors")
+        factors = graph.add("Div", [factors, vector_lengths], "vector_factors")
+        vectors = graph.add("Mul", [vectors, factors], "scaled_vectors")
         frame_terms, axes = graph.split(vectors, [lengths.size, column_count], ["surface_frame_terms", "axes"], axis=2)
-        frame_terms = graph.reshape(
-            frame_terms, [0, MATRIX_ROWS, len(lengths) * corner_count, frame_count], "terms_by_surface_frame"
-        )
-        frame_sums = graph.add(
-            "ReduceSum", [frame_terms, graph.integers("kinds_and_corners", [2])], "surface_frames", keepdims=0
-        )
+        shape = [0, MATRIX_ROWS, len(lengths) * corner_count, frame_count]
+        frame_terms = graph.reshape(frame_terms, shape, "terms_by_surface_frame")
+        axis = graph.integers("kinds_and_corners", [2])
+        frame_sums = graph.add("ReduceSum", [frame_terms, axis], "surface_frames", keepdims=0)
         # Gathering the main joint's products last is faster than gathering its axes before the product.
         axes = graph.add("Transpose", [axes], "axes_by_row", perm=[0, 2, 1])
-        projected_sums = graph.reshape(
-            graph.add("MatMul", [axes, frame_sums], "along_axes"), [0, column_count * frame_count], "along_axes_in_row"
-        )
+        projected_sums = graph.add("MatMul", [axes, frame_sums], "along_axes")
+        projected_sums = graph.reshape(projected_sums, [0, column_count * frame_count], "along_axes_in_row")
         main_joint_rows = frame_count * (4 * self.main_joints[:, None] + np.arange(3)) + np.arange(frame_count)[:, None]
-        name = graph.add(
-            "Gather",
-            [projected_sums, graph.integers("main_joint_axes", main_joint_rows)],
-            "surface_frame_features",
-            axis=1,
-        )
+        main_joint_rows = graph.integers("main_joint_axes", main_joint_rows)
+        name = graph.add("Gather", [projected_sums, main_joint_rows], "surface_frame_features", axis=1)
         return Vectors(name, frame_count), np.arange(len(is_needed))

@@ -47,11 +47,8 @@ class OneCycleAdamW:
         self._parameters = list(parameters)
         self._learning_rate, self._weight_decay = learning_rate, weight_decay
         self._total_steps, self._warm_up_fraction = total_steps, warm_up_fraction
-        self._means = [torch.zeros_like(parameter) for parameter in self._parameters]
-        self._mean_squares = [torch.zeros_like(parameter) for parameter in self._parameters]
-        self._step_counts = [
-            torch.zeros((), dtype=torch.float32, device=parameter.device) for parameter in self._parameters
-        ]
+        self._means, self._mean_squares = ([torch.zeros_like(p) for p in self._parameters] for _ in range(2))
+        self._step_counts = [torch.zeros((), device=parameter.device) for parameter in self._parameters]
         self._step = 0
 
     def zero_grad(self) -> None:
@@ -84,14 +81,12 @@ class OneCycleAdamW:
     def schedule(self, step: int) -> tuple[float, float]:
         """Return the learning rate and beta 1 of a step; step 0 is the first."""
         peak_step, last_step = self._warm_up_fraction * self._total_steps - 1, self._total_steps - 1
-        initial_rate = self._learning_rate / INITIAL_RATE_DIVISOR
-        final_rate = self._learning_rate / FINAL_RATE_DIVISOR
-        if step <= peak_step:
-            fraction = step / peak_step if peak_step else 1.0
-            rates, betas = (initial_rate, self._learning_rate), (MAX_BETA_1, MIN_BETA_1)
-        else:
+        rates = (self._learning_rate / INITIAL_RATE_DIVISOR, self._learning_rate)
+        betas = (MAX_BETA_1, MIN_BETA_1)
+        fraction = step / peak_step if peak_step else 1.0
+        if step > peak_step:
+            rates, betas = (self._learning_rate, self._learning_rate / FINAL_RATE_DIVISOR), betas[::-1]
             fraction = (step - peak_step) / (last_step - peak_step)
-            rates, betas = (self._learning_rate, final_rate), (MIN_BETA_1, MAX_BETA_1)
         return _interpolate_cosine(*rates, fraction), _interpolate_cosine(*betas, fraction)
 
 
