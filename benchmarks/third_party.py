@@ -20,15 +20,12 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import bpy  # noqa: E402
-import numpy as np  # noqa: E402
 
 import fdda_addon  # noqa: E402
 from fdda_addon.core.errors import FDDAError  # noqa: E402
 from fdda_addon.fast_rig.controls import animating_actions  # noqa: E402
 from fdda_addon.scene.blend_file import save_copy, silenced_stdout  # noqa: E402
-from fdda_addon.scene.mesh import rest_positions  # noqa: E402
 from fdda_addon.scene.scene_rig import SceneRig, find_rigs  # noqa: E402
-from fdda_addon.scene.unit import metres_per_unit  # noqa: E402
 
 FOLDER = ROOT / ".." / "shared" / "data" / "characters" / "third_party"
 MAX_ACTIONS = 8
@@ -52,17 +49,12 @@ class VerbError(Exception):
 
 @dataclass(frozen=True)
 class Character:
-    """A prepared character: its file, its mesh object, what it has, and its actions.
-
-    Attributes:
-        size: diagonal of the bounding box of the mesh at rest, mm.
-    """
+    """A prepared character: its file, its mesh object, what it has, and its actions."""
 
     file: Path
     object_name: str
     vertices: int
     bones: int
-    size: float
     recorded: tuple[str, ...]
     held_out: str
 
@@ -88,7 +80,6 @@ def prepare(source: Path, folder: Path) -> Character:
     if scene_rig.armature_object.animation_data is not None:
         scene_rig.armature_object.animation_data.use_nla = False
         scene_rig.armature_object.animation_data.action = None
-    positions = rest_positions(scene_rig.mesh_object.data)
     path = folder / "rig.blend"
     save_copy(path)
     step = max(1, -(-len(names[:-1]) // MAX_ACTIONS))
@@ -97,7 +88,6 @@ def prepare(source: Path, folder: Path) -> Character:
         scene_rig.mesh_object.name,
         len(scene_rig.mesh_object.data.vertices),
         len(scene_rig.armature_object.data.bones),
-        1000 * metres_per_unit(scene_rig.mesh_object) * float(np.linalg.norm(np.ptp(positions, axis=0))),
         tuple(names[:-1][::step]),
         names[-1] if len(names) > 1 else "",
     )
@@ -166,9 +156,6 @@ def row(source: Path, folder: Path, poses: int, epochs: int) -> str:
     errors = results["evaluate"]
     ratios = [100 * errors["fdda"][key] / max(errors["linear"][key], 1e-9) for key in ("mean", "max")]
     held_out = f"*{character.held_out}*" if character.held_out else "50 random poses, as it has no two actions"
-    if (distance := errors["linear"]["max"] / character.size) > 1:
-        # Nothing can be learned from such a pose.
-        held_out += f"; there the rig itself moves vertices {distance:.0f} times the size of the character away"
     text = f"{ratios[0]:.0f} % ({ratios[1]:.0f} %)"
     return f"{head} {text} | {held_out} | {results['benchmark']['ratio']:.1f} |"
 

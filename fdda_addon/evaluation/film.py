@@ -114,8 +114,9 @@ def film(
                 for picture, size in frames:  # noqa: B007 - used after the loop
                     pictures.append(picture)
                     yield Progress("film", len(pictures), len(errors.positions))
-            yield Progress("encoding", 0, 1)
-            encode(pictures, path, size, settings.fps)
+            with closing(encode(pictures, path, size, settings.fps)) as counts:
+                for count in counts:
+                    yield Progress("encoding", count, len(pictures))
     except OSError as error:
         raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; nothing was changed.") from error
     yield Film(len(pictures), size)

@@ -1,19 +1,33 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Encodes pictures as a video, with the FFmpeg that is part of Blender."""
+"""Encodes pictures as a video, with the FFmpeg that is part of Blender, in another Blender that can be ended."""
 
+import json
+import os
+import queue
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 import bpy
 
 from ..core.errors import OutputError, WrongUsageError
 from ..core.output import atomic_write
-from ..scene.blend_file import blender_path, report_message, silenced_stdout
-from ..scene.compatibility import set_video_format
+from ..scene.blend_file import blender_path
+from ..training.environment.subprocesses import UTF8_OUTPUT, popen_options
 
 ENCODINGS = {".mp4": ("MPEG4", "H264", "H.264"), ".webm": ("WEBM", "WEBM", "VP9")}
 """Blender's names of container and codec, and the name of the codec in messages, by the extension of the file."""
 INDEXES = {".mp4": b"moov", ".webm": b"\x1c\x53\xbb\x6b"}
 """Identifier of the index of frames, by extension. FFmpeg writes the index last, so a file without it is incomplete."""
+WAIT_SECONDS = 0.05
+"""Longest time between two steps while the other Blender encodes."""
+_ENCODED_LINE = re.compile(r"encoded (?P<count>\d+)")
+_ERROR_LINE = re.compile(r"Error: (?P<text>.+)")
 
 
 def check_video_path(path: Path) -> None:
@@ -29,8 +43,8 @@ def check_video_path(path: Path) -> None:
         raise OutputError("This Blender was built without FFmpeg and writes no videos; use Blender from blender.org.")
 
 
-def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) -> None:
-    """Encode pictures as a video.
+def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) -> Iterator[int]:
+    """Encode pictures as a video, as a generator; closing it ends the other Blender and leaves no file.
 
     Args:
         pictures: PNG files in one folder, one for each frame.
@@ -38,43 +52,95 @@ def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) 
         size: width and height, even numbers of pixels.
         fps: frames per second.
 
+    Yields:
+        The number of encoded frames, also while it does not change.
+
     Raises:
         OutputError: the video cannot be written, or this Blender lacks the encoder.
     """
-    scene = bpy.data.scenes.new("FDDA video")
+    suffix = path.suffix.lower()
+    container, codec, codec_name = ENCODINGS[suffix]
+    with atomic_write(path) as temporary_path:
+        job = {
+            "pictures": [blender_path(picture) for picture in pictures],
+            "path": blender_path(temporary_path),
+            "size": size,
+            "fps": fps,
+            "container": container,
+            "codec": codec,
+        }
+        count, problem = 0, ""
+        with _other_blender(json.dumps(job)) as (process, lines):
+            while (line := _next_line(lines)) is not None:
+                if match := _ENCODED_LINE.match(line):
+                    count = int(match["count"])
+                elif match := _ERROR_LINE.match(line):
+                    problem = match["text"].rstrip(".")
+                yield count
+            problem = problem or (f"the other Blender ended with status {process.wait()}" if process.wait() else "")
+        if problem or INDEXES[suffix] not in temporary_path.read_bytes():
+            other = next(other for other in ENCODINGS if other != suffix)
+            raise OSError(
+                f"{problem or 'Blender wrote no video'}; the disk may be full, or this Blender lacks the encoder of "
+                f"{codec_name}: try a name that ends in {other}"
+            )
+
+
+@contextmanager
+def _other_blender(job: str) -> Iterator[tuple[subprocess.Popen, "queue.SimpleQueue[str | None]"]]:
+    """Start a Blender that encodes, and end it afterwards.
+
+    Yields:
+        Its process, and the lines that it prints, None after the last one.
+    """
+    package = Path(__file__).resolve().parents[1]
+    script = (
+        f"import importlib, sys; sys.path.insert(0, {str(package.parent)!r}); "
+        f"importlib.import_module('{package.name}.evaluation.video_encoder').main()"
+    )
+    if bpy.app.binary_path:
+        command = [bpy.app.binary_path, "--background", "--factory-startup", "--python-exit-code", "1"]
+        command += ["--python-expr", script]
+    else:
+        # The bpy module in a Python has no program.
+        command = [sys.executable, "-c", script]
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=os.environ | UTF8_OUTPUT,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+        **popen_options(),
+    )
+    lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
     try:
-        strip = scene.sequence_editor_create().strips.new_image("film", blender_path(pictures[0]), 1, 1)
-        for picture in pictures[1:]:
-            strip.elements.append(picture.name)
-        scene.frame_start, scene.frame_end = 1, len(pictures)
-        render = scene.render
-        render.resolution_x, render.resolution_y = size
-        render.fps = max(1, round(fps))
-        render.fps_base = render.fps / fps
-        scene.view_settings.view_transform = "Standard"
-        container, codec, _ = ENCODINGS[path.suffix.lower()]
-        set_video_format(render.image_settings)
-        render.ffmpeg.format, render.ffmpeg.codec, render.ffmpeg.audio_codec = container, codec, "NONE"
-        render.ffmpeg.constant_rate_factor, render.ffmpeg.gopsize = "HIGH", 12
-        render.use_file_extension = False
-        with atomic_write(path) as temporary_path:
-            _render(scene, temporary_path, path.suffix.lower())
+        # A Blender that has ended already says why in its output.
+        with suppress(BrokenPipeError), process.stdin:
+            process.stdin.write(job)
+        # In a thread, because reading a line blocks and the window must not.
+        reader.start()
+        yield process, lines
     finally:
-        bpy.data.scenes.remove(scene)
+        process.kill()
+        process.wait()
+        if reader.ident is not None:
+            reader.join()
+        process.stdout.close()
 
 
-def _render(scene: bpy.types.Scene, path: Path, suffix: str) -> None:
-    scene.render.filepath = blender_path(path)
-    problem = ""
+def _read(stream: TextIO, lines: "queue.SimpleQueue[str | None]") -> None:
+    for line in stream:
+        lines.put(line)
+    lines.put(None)
+
+
+def _next_line(lines: "queue.SimpleQueue[str | None]") -> str | None:
+    """Return the next line, empty if there is none yet, None at the end."""
     try:
-        with silenced_stdout():
-            bpy.ops.render.render(animation=True, scene=scene.name)
-    except RuntimeError as error:
-        problem = report_message(error)
-    if problem or INDEXES[suffix] not in path.read_bytes():
-        codec = ENCODINGS[suffix][2]
-        other = next(other for other in ENCODINGS if other != suffix)
-        raise OSError(
-            f"{problem or 'Blender wrote no video'}; the disk may be full, or this Blender lacks the encoder of "
-            f"{codec}: try a name that ends in {other}"
-        )
+        return lines.get(timeout=WAIT_SECONDS)
+    except queue.Empty:
+        return ""

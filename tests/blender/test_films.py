@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Films: the verb and the button write videos that Blender can read, or nothing at all."""
 
+import subprocess
 from pathlib import Path
 
 import bpy
@@ -105,7 +106,8 @@ def test_the_verb_writes_a_film_of_the_action(rig: SceneRig, elbow_files, tmp_pa
 def test_a_film_is_written_in_both_formats(errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path, suffix: str):
     before, out = datablocks(), tmp_path / f"film{suffix}"
     *progress, result = film(rig, elbow_files.model, errors, FIRST, out, SMALL)
-    assert [step.stage for step in progress] == ["film"] * 4 + ["encoding"] and isinstance(progress[0], Progress)
+    assert list(dict.fromkeys(step.stage for step in progress)) == ["film", "encoding"]
+    assert progress[3] == Progress("film", 4, 4) and progress[-1] == Progress("encoding", 4, 4)
     assert isinstance(result, Film) and result.frames == 4
     _, frames = read_video(out, tmp_path)
     assert len(frames) == 4 and frames[0].shape[:2] == result.size[::-1]
@@ -118,6 +120,38 @@ def test_a_closed_film_leaves_nothing(errors: PoseErrors, rig: SceneRig, elbow_f
     assert next(steps) == Progress("film", 1, 4) and any(tmp_path.iterdir())
     steps.close()
     assert list(tmp_path.iterdir()) == [] and datablocks() == before
+
+
+def test_a_film_that_is_closed_while_it_is_encoded_leaves_nothing(
+    errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The other Blender ends at once."""
+    out, processes, start = tmp_path / "film.mp4", [], subprocess.Popen
+
+    def start_process(*arguments, **options):
+        processes.append(start(*arguments, **options))
+        return processes[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", start_process)
+    steps = film(rig, elbow_files.model, errors, FIRST, out, SMALL)
+    while next(steps).stage != "encoding":
+        pass
+    assert processes[-1].poll() is None
+    steps.close()
+    assert processes[-1].poll() is not None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_blender_that_does_not_start_is_reported(
+    errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(video.sys, "executable", str(tmp_path / "missing"))
+    with pytest.raises(OutputError, match=r"Cannot write '.+film\.mp4': .*No such file.*; nothing was changed\."):
+        list(film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL))
+    monkeypatch.setattr(video.sys, "executable", "/bin/false")
+    with pytest.raises(OutputError, match="the other Blender ended with status 1; the disk may be full"):
+        list(film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_encoder_is_reported_and_keeps_the_old_film(

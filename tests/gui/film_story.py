@@ -45,15 +45,27 @@ def _press_render_comparison(folder: Path) -> Iterator[float]:
 def cancel_a_film(folder: Path) -> Iterator[float]:
     action = armature_object().animation_data.action
     action.use_frame_range, action.frame_start, action.frame_end = True, BENT_FRAME, BENT_FRAME + FILM_FRAMES - 1
+    yield from _cancel(folder, "film")
+
+
+def cancel_the_encoding(folder: Path) -> Iterator[float]:
+    yield from _cancel(folder, "encoding")
+
+
+def _cancel(folder: Path, stage: str) -> Iterator[float]:
+    """Press ESC in a stage of a film, and check that nothing is left."""
     job = extension_module("jobs.job")
     yield from _press_render_comparison(folder)
 
-    def is_rendering() -> bool:
+    def is_in_stage() -> bool:
         state = job.state_of("render_comparison")
-        return state is not None and state.stage == "film" and state.done > 1
+        return (
+            state is not None and state.is_running and state.stage == stage and (stage == "encoding" or state.done > 1)
+        )
 
-    yield from wait_until(is_rendering, FILM_SECONDS, "the job renders no frames")
-    yield from save_screenshot(folder / "film_progress.png")
+    yield from wait_until(is_in_stage, FILM_SECONDS, f"the job does not reach the stage '{stage}'")
+    yield from save_screenshot(folder / f"{stage}_progress.png")
+    require(job.current() is not None, f"the stage '{stage}' ended before ESC")
     yield from park_mouse()
     yield from press_keys("Escape")
     yield from wait_until(lambda: job.current() is None, FILM_SECONDS, "ESC does not cancel the film")
@@ -80,5 +92,6 @@ STEPS = (
     evaluation_steps.show_the_heat_map,
     evaluation_steps.mark_the_worst_frames,
     cancel_a_film,
+    cancel_the_encoding,
     render_a_film,
 )
