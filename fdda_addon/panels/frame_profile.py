@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws the profile of a frame in the section "Rig": a bar for each part, and the slowest bones."""
+"""Draws the profile of a frame in the section "Rig": a bar with the shares of its parts, and the slowest bones."""
 
+from string import ascii_uppercase
 from typing import TYPE_CHECKING
 
 import bpy
@@ -15,6 +16,8 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
 MIN_SHOWN_SHARE = 0.01
 """A part with a smaller share of the frame is not drawn."""
+MIN_LETTER_SHARE = 0.05
+"""A segment of the bar with a smaller share has no room for its letter."""
 
 
 def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
@@ -36,13 +39,27 @@ def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 def _draw_parts(layout: bpy.types.UILayout, profile: "FrameProfile") -> None:
+    shares = [part.duration.median / max(profile.total, 1e-9) for part in profile.parts]
+    shown = [(part, share) for part, share in zip(profile.parts, shares, strict=True) if share >= MIN_SHOWN_SHARE]
+    letters = ascii_uppercase[: len(shown)]
     column = layout.column(align=True)
-    for part in profile.parts:
-        share = part.duration.median / max(profile.total, 1e-9)
-        if share >= MIN_SHOWN_SHARE:
-            row = column.split(factor=0.5)
-            row.label(text=part.title)
-            row.progress(factor=share, text=f"{part.duration} ms")
+    _draw_bar(column, [(letter, share) for letter, (_, share) in zip(letters, shown, strict=False)])
+    for index, (part, share) in enumerate(shown):
+        row = column.split(factor=0.6)
+        row.label(text=f"{letters[index : index + 1]}  {part.title}")
+        row.label(text=f"{part.duration} ms, {share:.0%}")
+
+
+def _draw_bar(layout: bpy.types.UILayout, segments: list[tuple[str, float]]) -> None:
+    """Draw a bar of segments, each with its letter, as wide as its share; every second segment is filled."""
+    remaining, rest = sum(share for _, share in segments), layout.row(align=True)
+    for index, (letter, share) in enumerate(segments):
+        is_last = index + 1 == len(segments)
+        cell = rest if is_last else rest.split(factor=share / remaining, align=True)
+        cell.progress(factor=float(index % 2 == 0), text=letter if share >= MIN_LETTER_SHARE else "")
+        if not is_last:
+            rest = cell.row(align=True)
+        remaining -= share
 
 
 def _draw_groups(layout: bpy.types.UILayout, profile: "FrameProfile") -> None:

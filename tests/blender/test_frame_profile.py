@@ -250,14 +250,19 @@ def test_a_bound_model_does_not_play_while_its_rig_is_profiled(bound_elbow):
     assert parts == {"Armature", "CorrectiveSmooth"}
 
 
-def test_the_sidebar_draws_a_bar_for_each_part(slow_rig):
+def test_the_sidebar_draws_a_bar_with_the_shares(slow_rig):
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
     profile, drawn = last_profile(slow_rig.mesh_object), []
     context = SimpleNamespace(region=SimpleNamespace(width=300), preferences=bpy.context.preferences)
     draw_profile(Layout(drawn), context, slow_rig)
     texts = [element.text for element in drawn]
     assert f"Frame Profile ({profile.frame.median:.1f} ms)" in texts
-    assert f"{profile.parts[0].title}" in texts and f"{profile.parts[0].duration} ms" in texts
+    assert f"A  {profile.parts[0].title}" in texts
+    share = profile.parts[0].duration.median / profile.total
+    assert f"{profile.parts[0].duration} ms, {share:.0%}" in texts
+    segments = [text for text in texts if text in {"A", "B", "C", "D"}]
+    wide_parts = sum(part.duration.median >= 0.05 * profile.total for part in profile.parts)
+    assert "".join(segments) == "ABCD"[:wide_parts]
     sentences = profile.savings_sentences()
     assert len(sentences) == 2
     assert all(sentence.split(" ms")[0] in " ".join(texts) for sentence in sentences)

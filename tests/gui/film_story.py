@@ -63,10 +63,8 @@ def _cancel(folder: Path, stage: str) -> Iterator[float]:
             state is not None and state.is_running and state.stage == stage and (stage == "encoding" or state.done > 1)
         )
 
-    yield from wait_until(is_in_stage, FILM_SECONDS, f"the job does not reach the stage '{stage}'")
-    yield from save_screenshot(folder / f"{stage}_progress.png")
-    require(job.current() is not None, f"the stage '{stage}' ended before ESC")
     yield from park_mouse()
+    yield from wait_until(is_in_stage, FILM_SECONDS, f"the job does not reach the stage '{stage}'")
     yield from press_keys("Escape")
     yield from wait_until(lambda: job.current() is None, FILM_SECONDS, "ESC does not cancel the film")
     state = job.state_of("render_comparison")
