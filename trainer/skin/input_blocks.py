@@ -5,6 +5,8 @@ import numpy as np
 
 from fdda_addon.core.recording.fit_folder import FitPoses
 
+from ..fits.least_squares import solve_ridge
+
 BLOCK_COLUMNS = 6
 """Largest number of principal components of the features of an input."""
 MIN_SPREAD = 1e-4
@@ -111,8 +113,7 @@ class InputBlocks:
 def predict(columns: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit the (n / 2, m) motion in training poses by (n, c) columns; return the fit there and in the other poses."""
     training, held_out = columns[::2], columns[1::2]
-    gram = training.T @ training + RIDGE * len(training) * np.eye(columns.shape[1])
-    coefficients = np.linalg.solve(gram, training.T @ motion)
+    coefficients = solve_ridge(training.T @ training, training.T @ motion, RIDGE * len(training))
     return training @ coefficients, held_out @ coefficients
 
 
