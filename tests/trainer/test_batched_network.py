@@ -104,6 +104,19 @@ def test_a_partition_without_inputs_keeps_its_mean():
     assert trained.networks[2].biases[-1].shape == (0,)
 
 
+def test_the_progress_shows_what_a_constant_partition_misses_in_unseen_poses_alone():
+    learned, split = make_partition_data(2, 6, 5), split_poses(np.arange(150), CONFIG.validation_fraction, CONFIG.seed)
+    residuals = np.zeros((150, 6, 3), np.float32)
+    residuals[split.validation] = 0.01
+    constant = PartitionData("constant", np.ones((150, 0), np.float32), lambda: residuals, 6)
+    progress = []
+    _, trained = train_partitions([learned, constant], on_epoch=progress.append)
+    last, curve = progress[-1], trained.curves[0]
+    assert last.training_mm == pytest.approx(curve.training_mm[-1] / 2)
+    # Each coordinate of half of the vertices is off by 10 mm.
+    assert last.validation_mm == pytest.approx(curve.validation_mm[-1] / 2 + 10 * 3**0.5 / 2)
+
+
 def test_irrelevant_inputs_are_suppressed(monkeypatch):
     relevant = make_partition_data(4, 12, 8, poses=200)
     noise_features = np.random.default_rng(9).normal(size=(200, 80)).astype(np.float32)

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 import torch
@@ -203,7 +204,8 @@ class _Loop:
                 curve.validation_mm.append(validation_error)
                 curve.worst_mm.append(worst_error)
             if on_epoch:
-                means = (self._mean_over_vertices(errors, all_partitions) for errors in errors_mm[:2])
+                truncations = [(p.basis.truncation_rms, p.validation_truncation.mean()) for p in all_partitions]
+                means = map(_mean_over_vertices, errors_mm[:2], zip(*truncations, strict=True), repeat(all_partitions))
                 on_epoch(Progress(epoch, config.epochs, *means))
 
     def _train_epoch(
@@ -218,14 +220,6 @@ class _Loop:
             squared_errors = self._step(optimizer, batch_poses)
             total_mm += (squared_errors * self.to_mm.square() + self.truncation_mm.square()).sqrt().sum(dim=1)
         return total_mm / pose_count
-
-    def _mean_over_vertices(self, errors_mm: list[float], all_partitions: Sequence[PreparedPartition]) -> float:
-        """Return the mean error over all vertices, mm; constant partitions have the error of their basis."""
-        errors, learned_errors = [], iter(errors_mm)
-        for partition in all_partitions:
-            constant_mm = float(partition.validation_truncation.mean()) * partition.mm_per_unit
-            errors.append(next(learned_errors) if len(partition.basis.components) else constant_mm)
-        return float(np.average(errors, weights=[partition.vertex_count for partition in all_partitions]))
 
     def _step(self, optimizer: OneCycleAdamW, poses: torch.Tensor) -> torch.Tensor:
         """Take one optimization step; returns (P, n) squared errors in units of each partition's residual."""
@@ -280,3 +274,21 @@ def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: torch.device) -
     for index, array in enumerate(arrays):
         padded[index, :, : array.shape[1]] = array[poses]
     return torch.from_numpy(padded).to(device)
+
+
+def _mean_over_vertices(
+    errors_mm: list[float], truncations: Sequence[float], all_partitions: Sequence[PreparedPartition]
+) -> float:
+    """Return the mean error over all vertices, mm.
+
+    Args:
+        errors_mm: errors of the partitions with networks, mm.
+        truncations: errors of the bases of all partitions, in units of their residuals. Constant partitions have no
+            other error.
+        all_partitions: all partitions.
+    """
+    errors, learned_errors = [], iter(errors_mm)
+    for partition, truncation in zip(all_partitions, truncations, strict=True):
+        has_network = len(partition.basis.components) > 0
+        errors.append(next(learned_errors) if has_network else float(truncation) * partition.mm_per_unit)
+    return float(np.average(errors, weights=[partition.vertex_count for partition in all_partitions]))
