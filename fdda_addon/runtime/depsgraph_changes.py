@@ -25,13 +25,12 @@ class DepsgraphChanges:
     """Parts of rigs that an evaluation has changed.
 
     Attributes:
-        mesh_objects: the changed bound objects, whether their geometry changed, and whether more than their pose may
-            have changed.
+        mesh_objects: the changed bound objects, and whether more than their pose may have changed.
         armatures: by the session id of each armature that was posed or edited: whether it may have been edited.
         meshes: by the session id of each changed mesh: whether more than its rest positions may have changed.
     """
 
-    mesh_objects: list[tuple[bpy.types.Object, bool, bool]]
+    mesh_objects: list[tuple[bpy.types.Object, bool]]
     armatures: dict[int, bool]
     meshes: dict[int, bool]
 
@@ -45,7 +44,7 @@ class DepsgraphChanges:
                 if datablock.type == "MESH" and datablock.fdda.is_bound:
                     # Changed vertex groups may only change relations, which Blender reports as shading.
                     is_edited = SEEN_KEY not in datablock or update.is_updated_shading
-                    changes.mesh_objects.append((datablock.original, update.is_updated_geometry, is_edited))
+                    changes.mesh_objects.append((datablock.original, is_edited))
                     datablock[SEEN_KEY] = depsgraph.mode
                 elif datablock.type == "ARMATURE" and update.is_updated_geometry and update.is_updated_transform:
                     changes.armatures[datablock.data.original.session_uid] = True

@@ -57,10 +57,10 @@ def on_depsgraph_update(depsgraph: bpy.types.Depsgraph) -> None:
 def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
     """Dispatch the changes of bound objects, their meshes and their armatures."""
     changes = DepsgraphChanges.read(depsgraph)
-    for mesh_object, geometry_changed, is_edited in changes.mesh_objects:
+    for mesh_object, is_edited in changes.mesh_objects:
         character = session.character_of(mesh_object)
         with session.isolated_errors(character):
-            _dispatch_object_changes(character, mesh_object, geometry_changed, is_edited)
+            _dispatch_object_changes(character, mesh_object, is_edited)
     # The graph of a render reports all datablocks as changed.
     is_render = depsgraph.mode == "RENDER"
     for character in [c for c in session.characters.values() if c.player is not None]:
@@ -83,20 +83,18 @@ def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
     _dispatch_edit_modes(changes)
 
 
-def _dispatch_object_changes(
-    character: Character, mesh_object: bpy.types.Object, geometry_changed: bool, is_edited: bool
-) -> None:
+def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object, is_edited: bool) -> None:
     """Dispatch the changes of a bound object that an evaluation has reported (`DepsgraphChanges.mesh_objects`)."""
     update_mask(character, mesh_object)
     character.animated = modifier_switch.animated_settings(mesh_object)
-    if geometry_changed:
+    if is_edited:
         modifier_switch.apply_visibility(mesh_object, character.animated)
         modifier_switch.disconnect_visible(mesh_object, character.animated)
     player = character.player
     if player is None:
         if character.state in SHOWS_MODEL or mesh_object.fdda.is_playing:
             session.scanned_count = -1
-    elif geometry_changed and not (player.fits_object(mesh_object) and _reads_buffer(mesh_object, character)):
+    elif is_edited and not (player.fits_object(mesh_object) and _reads_buffer(mesh_object, character)):
         session.dispatch(Event.OUTDATE, character)
     elif is_edited:
         session.report_change(character, OBJECT)
@@ -104,7 +102,7 @@ def _dispatch_object_changes(
 
 def _dispatch_edit_modes(changes: DepsgraphChanges) -> None:
     """Dispatch the edit modes that the meshes of playing characters have entered or left."""
-    reported_uids = {mesh_object.session_uid for mesh_object, *_ in changes.mesh_objects}
+    reported_uids = {mesh_object.session_uid for mesh_object, _ in changes.mesh_objects}
     for character in [c for c in session.characters.values() if c.player is not None]:
         is_reported = character.object_uid in reported_uids or character.reported
         if not is_reported and character.state != State.EDITED:
