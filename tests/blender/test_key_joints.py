@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
+from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
 from fdda_addon.core.errors import ModelError, RecordingError
 from fdda_addon.core.model import read_model_info
@@ -155,6 +156,24 @@ def test_nothing_is_removed_from_a_limb_of_free_bones(tmp_path, capfd):
         for file in (tmp_path / "all").iterdir():
             assert file.read_bytes() == (tmp_path / name / file.name).read_bytes(), file.name
     assert rig is not None
+
+
+def test_a_bone_that_a_control_moves_follows_from_the_control(tmp_path):
+    rig = build_limb()
+    armature_object = rig.armature_object
+    add_property(armature_object, "puff")
+    drivers = {curve.data_path: curve.driver for curve in armature_object.animation_data.drivers}
+    drivers['pose.bones["push.1"].location'].variables[0].targets[0].data_path = '["puff"]'
+    settings = dataclasses.replace(SETTINGS, poses=160)
+    drain(record(rig, tmp_path / "without", settings))
+    still = read_recording(tmp_path / "without").info.fit.key_joints
+    assert (still.joints, still.still) == (3, 1)
+    assert "No random pose moves 1 of the others relative to their parents." in still.sentence()
+    settings = dataclasses.replace(settings, controls=('armature_object/["puff"]',))
+    drain(record(rig, tmp_path / "with", settings))
+    recording = read_recording(tmp_path / "with")
+    assert recording.rig.joint_names == MAIN_BONES
+    assert any(partition.controls for partition in recording.partitions)
 
 
 def test_a_number_says_which_motion_is_lost(tmp_path, capfd):
