@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fitted_weights, read_key_joints
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning
@@ -162,6 +163,14 @@ def test_a_number_of_joints_is_met_and_what_is_lost_is_told(count):
     if removed:
         assert f"but {removed} of the others move independently of these, by up to " in choice.report.sentence()
         assert choice.report.unexplained_mm > 10
+
+
+def test_a_scale_of_zero_is_refused():
+    poses = chain_poses()
+    matrices = poses.pose_matrices.copy()
+    matrices[3, 2, :3, :3] = 0
+    with pytest.raises(RecordingError, match="A bone has a scale of zero in some pose, so key joints cannot be chosen"):
+        choose(replace(poses, pose_matrices=matrices))
 
 
 def test_weights_are_fitted_to_key_joints(tmp_path):

@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
 from fdda_addon.core.key_joints import KeyJointReport
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.patches import divide_into_patches
 from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import Rig
+from fdda_addon.core.skinning import are_invertible
 
 from .input_blocks import LENGTH_RATIO, InputBlocks
 from .key_joints import KeyJoints, KeyJointSearch, joint_moments
@@ -44,7 +46,15 @@ def choose_key_joints(poses: FitPoses, requested: str, static_joints: np.ndarray
         requested: "auto", or the number of key joints.
         static_joints: (J,) bool, joints that are kept in any case.
         metres_per_unit: as in `Rig`.
+
+    Raises:
+        RecordingError: a joint has a scale of zero in some pose.
     """
+    if not are_invertible(poses.pose_matrices).all():
+        raise RecordingError(
+            "A bone has a scale of zero in some pose, so key joints cannot be chosen; look for the key, constraint or "
+            "driver that sets it."
+        )
     rig, joint_count = poses.rig, len(poses.rig.joints)
     patches = divide_into_patches(rig, make_partitions(rig))
     representatives = patches.vertices[patches.starts]
