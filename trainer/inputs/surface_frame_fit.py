@@ -19,7 +19,7 @@ from ..data.split import Split
 from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
 from ..fits.least_squares import solve_ridge
 from ..process import Cancelled
-from .smoothed_surface import SmoothedSurface, find_face_corners
+from .smoothed_surface import FaceCorners, SmoothedSurface, find_face_corners
 from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
 MAX_POSES = 400
@@ -96,9 +96,7 @@ def select_surface_frames(
     training = split.training[np.unique(np.linspace(0, len(split.training) - 1, MAX_POSES).astype(np.int64))]
     matrices, face_corners = np.array(recording.pose_matrices[training]), find_face_corners(rig)
     skin = skin_matrices(matrices, rig.rest_matrices)
-    corner_counts = np.diff(face_corners.starts)
-    max_corners = min(np.quantile(corner_counts[corner_counts > 0], CORNER_COUNT_QUANTILE), MAX_CORNERS)
-    is_usable = (corner_counts > 0) & (corner_counts <= max_corners)
+    is_usable = _may_be_candidate(face_corners)
     min_mean_square = (tolerance_mm / (1000 * rig.metres_per_unit)) ** 2
     candidates, column_spaces = [], {}
     for index, partition in enumerate(recording.partitions):
@@ -113,9 +111,8 @@ def select_surface_frames(
             column_spaces[index] = column_space
     poses = _EvaluatedPoses(matrices, np.linalg.inv(skin[:, :, :3, :3].astype(np.float64)), column_spaces)
     candidates.sort(key=lambda candidate: -candidate.mean_square)
-    candidates = candidates[
-        : min(MEAN_CANDIDATES_PER_PARTITION * len(recording.partitions), MAX_JOINT_ENTRIES // len(rig.joints))
-    ]
+    max_count = min(MEAN_CANDIDATES_PER_PARTITION * len(recording.partitions), MAX_JOINT_ENTRIES // len(rig.joints))
+    candidates = candidates[:max_count]
     if not candidates:
         return NO_SURFACE_FRAMES
     smoothed_surface = SmoothedSurface(rig, face_corners)
@@ -134,6 +131,13 @@ def select_surface_frames(
     ):
         return NO_SURFACE_FRAMES
     return replace(surface_frames, lengths=lengths).subset(explained_fractions >= MIN_EXPLAINED_VARIANCE)
+
+
+def _may_be_candidate(face_corners: FaceCorners) -> np.ndarray:
+    """Return (V,) bool, the vertices in faces that do not have too many corners."""
+    counts = np.diff(face_corners.starts)
+    max_count = min(np.quantile(counts[counts > 0], CORNER_COUNT_QUANTILE), MAX_CORNERS)
+    return (counts > 0) & (counts <= max_count)
 
 
 def _remove_projection(column_space: np.ndarray, values: np.ndarray) -> np.ndarray:
