@@ -24,8 +24,7 @@ from trainer.inputs.controls import ControlFeatures
 from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs, fit_inputs
 from trainer.inputs.surface_frames import SurfaceFrameFeatures
-from trainer.model import TrainedModel, is_sheared
-from trainer.networks.confidence import measure_training_range
+from trainer.model import TrainedModel, make_trained_model
 from trainer.networks.curves import Curves
 from trainer.networks.loop import train
 from trainer.preparation import partition_data, prepare_partition
@@ -122,19 +121,7 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
     prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor_start, "wall": time.perf_counter() - wall_start}
-    poses, controls = (np.array(a[split.training]) for a in (recording.pose_matrices, recording.controls))
-    training_features = inputs.compute_features(poses, controls)
-    training_range = measure_training_range(training_features, recording.rig, recording.partitions)
-    trained_model = TrainedModel(
-        recording.rig,
-        recording.partitions,
-        inputs,
-        tuple(prepared),
-        trained.networks,
-        training_range,
-        config.activation,
-        is_sheared(recording.pose_matrices),
-    )
+    trained_model = make_trained_model(recording, inputs, split, prepared, trained.networks, config.activation)
     exported = build_model(recording, trained_model, split.validation, config.to_json())
     held_out = measure(exported.session, study_data.held_out, np.arange(len(study_data.held_out.pose_matrices)))
     with atomic_write(model_path) as temporary:

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The result of a training, which is exported and evaluated."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 
+from .data.split import Split
 from .inputs.network_inputs import NetworkInputs
 from .networks.checkpoint import Checkpoint, PartitionCheckpoint
-from .networks.confidence import TrainingRange
+from .networks.confidence import TrainingRange, measure_training_range
 from .networks.networks import Network
 from .preparation import PreparedPartition
 
@@ -89,6 +92,29 @@ class TrainedModel:
     def component_counts(self) -> list[int]:
         """Return K, the number of components, of each partition."""
         return [len(prepared.basis.components) for prepared in self.prepared]
+
+
+def make_trained_model(
+    recording: Recording,
+    inputs: NetworkInputs,
+    split: Split,
+    prepared: Sequence[PreparedPartition],
+    networks: Sequence[Network],
+    activation: str,
+) -> TrainedModel:
+    """Put together the result of a training, and measure the range of its training poses."""
+    matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
+    features = inputs.compute_features(matrices, controls)
+    return TrainedModel(
+        recording.rig,
+        recording.partitions,
+        inputs,
+        tuple(prepared),
+        tuple(networks),
+        measure_training_range(features, recording.rig, recording.partitions),
+        activation,
+        is_sheared(recording.pose_matrices),
+    )
 
 
 def is_sheared(pose_matrices: np.ndarray) -> bool:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import onnxruntime
 import torch
 
@@ -28,9 +27,8 @@ from .fits.half_rotations import half_rotations_help
 from .goal import GoalResult, evaluate_goal
 from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
 from .inputs.surface_frames import SurfaceFrameFeatures
-from .model import TrainedModel, is_sheared
+from .model import TrainedModel, make_trained_model
 from .networks.checkpoint import Checkpoint, write_checkpoint
-from .networks.confidence import measure_training_range
 from .networks.curves import Progress
 from .networks.loop import TrainingResult, choose_device, train
 from .networks.networks import Network
@@ -84,7 +82,7 @@ def train_model(
     prepared = job.prepare(partitions, recording, split)
     result = job.train_networks(prepared, inputs, split, checkpoint)
     prepared, networks = job.compress(prepared, result, partitions, recording, split)
-    trained_model = _make_trained_model(recording, inputs, split, prepared, networks, config)
+    trained_model = make_trained_model(recording, inputs, split, prepared, networks, config.activation)
     exported = job.export(recording, trained_model, split, warm_start)
     report = job.measure(recording, trained_model, split, exported, result, model_path)
     history = _history(recording, exported, checkpoint)
@@ -249,28 +247,6 @@ class _Job:
         return make_report(
             recording, trained_model, exported, training_errors, surface, result.curves, model_path.name, analyses
         )
-
-
-def _make_trained_model(
-    recording: Recording,
-    inputs: NetworkInputs,
-    split: Split,
-    prepared: list[PreparedPartition],
-    networks: list[Network],
-    config: TrainingConfig,
-) -> TrainedModel:
-    matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
-    features = inputs.compute_features(matrices, controls)
-    return TrainedModel(
-        recording.rig,
-        recording.partitions,
-        inputs,
-        tuple(prepared),
-        tuple(networks),
-        measure_training_range(features, recording.rig, recording.partitions),
-        config.activation,
-        is_sheared(recording.pose_matrices),
-    )
 
 
 def _history(recording: Recording, exported: ExportedModel, checkpoint: Checkpoint | None) -> list[dict]:

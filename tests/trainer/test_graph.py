@@ -28,10 +28,10 @@ SHEAR[0, 1] = 0.3
 
 def collect_trained_models(monkeypatch) -> list[TrainedModel]:
     """Return a list to which every later training adds its model."""
-    trained_models, make_trained_model = [], trainer.train._make_trained_model
+    trained_models, make_trained_model = [], trainer.train.make_trained_model
     monkeypatch.setattr(
         trainer.train,
-        "_make_trained_model",
+        "make_trained_model",
         lambda *args: trained_models.append(make_trained_model(*args)) or trained_models[-1],
     )
     return trained_models
