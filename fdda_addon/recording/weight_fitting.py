@@ -181,10 +181,14 @@ def fit_weights(
         if not result.key_joints:
             return FittedWeights(replace(rig, skin_joints=joints, skin_weights=weights), result)
         key_joints, needed_inputs = read_key_joints(folder, rig)
+    key_names = [rig.joint_names[joint] for joint in key_joints]
+    key_rig = read_key_joints_rig(scene_rig, rig, key_names)
+    # Without the removed joints, others may be nearer to the root and come earlier.
+    new_indices = [key_rig.joint_names.index(name) for name in key_names]
     indices = np.zeros(len(rig.joints), np.int32)
-    indices[key_joints] = np.arange(len(key_joints))
-    key_rig = read_key_joints_rig(scene_rig, rig, [rig.joint_names[joint] for joint in key_joints])
+    indices[key_joints] = new_indices
     fitted_rig = replace(key_rig, skin_joints=indices[joints], skin_weights=weights)
+    needed_inputs[:, new_indices] = needed_inputs[:, : len(key_names)].copy()
     return FittedWeights(fitted_rig, result, needed_inputs)
 
 

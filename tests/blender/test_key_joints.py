@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
+from blend_fixtures.characters.bones import NewBone, add_bones, limit
 from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
 from fdda_addon.core.errors import ModelError, RecordingError
@@ -22,6 +23,7 @@ from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.mesh import rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
@@ -183,6 +185,30 @@ def test_a_number_says_which_motion_is_lost(tmp_path, capfd):
     printed = capfd.readouterr().out
     assert "Key joints: the model reads 4 of 6 joints, but 2 of the others move independently of these, by " in printed
     assert len(read_recording(tmp_path / "recording").rig.joints) == 4
+
+
+def test_weights_stay_with_their_joints_if_the_order_changes(tmp_path):
+    """As in Rigify, the bone "tail" has a parent that copies a joint: without that parent, it comes after the joint."""
+    rig = build_limb(limb_of_free_bones)
+    copied = rig.armature_object.data.bones["bone.4"]
+    ends = tuple(copied.head_local), tuple(copied.tail_local)
+    add_bones(rig.armature_object, NewBone("copy", *ends, "bone.0"), NewBone("tail", *ends, "copy"))
+    bones = rig.armature_object.pose.bones
+    constraint = bones["copy"].constraints.new("COPY_TRANSFORMS")
+    constraint.target, constraint.subtarget = rig.armature_object, "bone.4"
+    bones["tail"].rotation_mode = "XYZ"
+    limit(bones["tail"], "LIMIT_ROTATION", {0: (-40.0, 40.0)})
+    positions = rest_positions(rig.mesh_object.data)
+    far = np.flatnonzero(positions[:, 0] > np.quantile(positions[:, 0], 0.9)).tolist()
+    rig.mesh_object.vertex_groups.new(name="tail").add(far, 0.5, "REPLACE")
+    all_names = read_rig(rig).joint_names
+    drain(record(rig, tmp_path / "recording", SETTINGS))
+    recording = read_recording(tmp_path / "recording")
+    names, fit = recording.rig.joint_names, recording.info.fit
+    assert "copy" in all_names and "copy" not in names
+    assert names != tuple(name for name in all_names if name in names)
+    residuals_mm = 1000 * np.linalg.norm(np.load(tmp_path / "recording" / "residuals.npy"), axis=2)
+    assert np.sqrt((residuals_mm**2).mean()) < 1.5 * fit.training.rms_mm["fitted"]
 
 
 def test_a_resumed_recording_keeps_its_joints(tmp_path, monkeypatch):
