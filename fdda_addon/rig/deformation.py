@@ -26,6 +26,7 @@ _B_BONE_SETTINGS = tuple(
     if name.startswith("bbone_") and name not in _DISPLAY_PROPERTIES
 )
 _read_b_bone = attrgetter(*_B_BONE_SETTINGS)
+_PLAIN_TYPES = frozenset({bool, int, float, str})
 _SIGNIFICANT_DIGITS = 6
 
 
@@ -67,22 +68,23 @@ def read_b_bones(armature: bpy.types.Armature) -> dict:
 def b_bone_values(armature: bpy.types.Armature) -> dict[str, tuple]:
     """Read what `read_b_bones` reads, quickly and without rounding: a value for each of `_B_BONE_SETTINGS`."""
     # Rigify drives the easing: Blender writes the value of the current pose into the bone.
-    animated = animated_paths(armature)
+    animated: dict[str, set[str]] = {}
+    for path in animated_paths(armature):
+        bone_path, _, name = path.rpartition(".")
+        animated.setdefault(bone_path, set()).add(name)
     values_by_bone = {}
     for bone in armature.bones:
         if bone.use_deform and bone.bbone_segments > 1:
             values = tuple(map(_copy, _read_b_bone(bone)))
-            if animated:
-                path = bone.path_from_id()
-                paths = [f"{path}.{name}" for name in _B_BONE_SETTINGS]
-                values = tuple(None if p in animated else v for p, v in zip(paths, values, strict=True))
+            if names := animated.get(bone.path_from_id()) if animated else None:
+                values = tuple(None if n in names else v for n, v in zip(_B_BONE_SETTINGS, values, strict=True))
             values_by_bone[bone.name] = values
     return values_by_bone
 
 
 def _copy(value: object) -> object:
     """Copy the value of a property if it refers to Blender's data: the elements of an array, or the name of a bone."""
-    if isinstance(value, float | int | str):
+    if type(value) in _PLAIN_TYPES:
         return value
     return tuple(value) if hasattr(value, "__len__") else getattr(value, "name", "")
 
