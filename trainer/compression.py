@@ -125,7 +125,9 @@ def _change_basis(
         np.average(values[split.training].astype(np.float64) ** 2, axis=0, weights=split.weights())
         for values in (coefficients, partition.coefficients)
     )
-    left_square = basis.truncation_rms**2 + (former_squares.sum() - squares.sum()) / partition.vertex_count
+    # Rounding may make the squares of all components slightly larger than before.
+    dropped_square = max(0.0, float(former_squares.sum() - squares.sum())) / partition.vertex_count
+    left_square = basis.truncation_rms**2 + dropped_square
     squares_by_count = np.append(np.cumsum(squares[::-1])[::-1], 0) / partition.vertex_count
     changed = replace(
         partition,

@@ -2,6 +2,7 @@
 """After the training, components that the networks do not predict are dropped, and large partitions are factorized."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +14,7 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import checkpoint_path
 from trainer.__main__ import main
-from trainer.compression import drop_components, dropped_components_sentence, factorize_partitions
+from trainer.compression import _change_basis, drop_components, dropped_components_sentence, factorize_partitions
 from trainer.config import TrainingConfig
 from trainer.data.split import Split, split_poses, split_recording
 from trainer.inputs.network_inputs import make_inputs
@@ -88,6 +89,17 @@ def test_a_partition_of_noise_loses_its_network():
     assert remaining_networks[0].evaluate(remaining[0].inputs, CONFIG.activation).shape == (200, 0)
     sentence = dropped_components_sentence(prepared, remaining)
     assert sentence.startswith("The networks do not predict 1 of 2 components") and "record more poses" in sentence
+
+
+def test_components_without_truncation_error_have_a_finite_error():
+    """Rounding makes the squared error that remains without dropped components negative."""
+    prepared, networks, split = train_partitions(make_data(noise=0.003))
+    basis = replace(prepared[0].basis, error_by_count=prepared[0].basis.error_by_count * [1, 1, 0])
+    exact = replace(prepared[0], basis=basis)
+    for angle in np.linspace(0, 3, 50):
+        change = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        changed, _ = _change_basis(exact, networks[0], change, split)
+        assert np.isfinite(changed.basis.error_by_count).all()
 
 
 def test_a_dropped_component_that_is_small_needs_no_remedy():
