@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from .joint_option import parse_joints
+from .joint_option import AUTO, parse_joints
 from .partition import Partition
 from .rig import KEY_JOINTS_PREFIX, Fingerprint, Joint, Rig
 
@@ -56,6 +56,8 @@ class KeyJointReport:
     def sentence(self) -> str:
         """Describe the choice, and what is lost."""
         removed = self.rig_joints - self.joints
+        if not removed and self.requested != AUTO:
+            return f"Key joints: all {self.rig_joints} joints are read, because {self.requested} were asked for."
         if not removed:
             return (
                 f"Key joints: all {self.rig_joints} joints are read, because each moves by more than "
@@ -71,7 +73,10 @@ class KeyJointReport:
         else:
             text += f"; in random poses the others follow from these within {self.unexplained_mm:.2f} mm (rms)."
         if self.still:
-            text += f" No random pose moves {self.still} of the others relative to their parents."
+            text += (
+                f" No random pose moves {self.still} of the others relative to their parents, so the model does not "
+                "show their own motion."
+            )
         return text
 
 

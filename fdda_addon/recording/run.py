@@ -169,7 +169,9 @@ class RecordingSession:
         elif self.settings.fits_weights:
             request = make_fit_request(mesh.scene_rig, mesh.rig, self.settings, mesh.channels, self.poses.total)
             shown_poses = self.poses.show_poses(player, frozenset(request.poses))
-            weights = yield from fit_weights(mesh.scene_rig, mesh.rig, request, shown_poses, mesh.make_evaluator())
+            # After an error, its traceback keeps the generator, which would restore limits only later.
+            with closing(shown_poses):
+                weights = yield from fit_weights(mesh.scene_rig, mesh.rig, request, shown_poses, mesh.make_evaluator())
         else:
             check_has_weights(mesh.scene_rig, mesh.rig)
             weights = FittedWeights(mesh.rig, None)

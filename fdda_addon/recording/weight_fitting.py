@@ -27,7 +27,8 @@ from .plan import RecordingSettings
 
 MAX_FIT_POSES = 300
 MAX_FIT_BYTES = 256 << 20
-"""Largest number of poses to which weights are fitted, and largest size of their positions."""
+"""Largest number of poses to which weights are fitted, and largest size of their positions, unless that is less than
+the smallest number of poses."""
 MIN_RANDOM_POSES = 40
 """Smallest number of random poses by which key joints are chosen."""
 WAIT_SECONDS = 0.02
@@ -59,7 +60,8 @@ def choose_fit_poses(pose_count: int, vertex_count: int, random_count: int = 0) 
             f"Skin weights are fitted to at least {MIN_POSES} poses, and these are {pose_count}; record more, or leave "
             "--fit-linear out."
         )
-    fit_pose_count = min(pose_count, MAX_FIT_POSES, max(MIN_POSES, MAX_FIT_BYTES // (12 * vertex_count)))
+    min_pose_count = 3 * MIN_RANDOM_POSES // 2 if random_count else MIN_POSES
+    fit_pose_count = min(pose_count, MAX_FIT_POSES, max(min_pose_count, MAX_FIT_BYTES // (12 * vertex_count)))
     chosen_random_count = min(random_count, max(2 * fit_pose_count // 3, fit_pose_count - (pose_count - random_count)))
     parts = ((0, random_count, chosen_random_count), (random_count, pose_count, fit_pose_count - chosen_random_count))
     return [

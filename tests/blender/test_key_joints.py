@@ -13,14 +13,15 @@ import pytest
 from blend_fixtures.characters.bones import NewBone, add_bones, limit
 from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
-from fdda_addon.core.errors import ModelError, RecordingError
+from fdda_addon.core.errors import ModelError, RecordingError, RigError
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.rig.reading import read_rig
+from fdda_addon.recording.weight_fitting import MIN_RANDOM_POSES, choose_fit_poses
+from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import rest_positions
@@ -153,8 +154,9 @@ def test_nothing_is_removed_from_a_limb_of_free_bones(tmp_path, capfd):
     for name, options in (("all", ()), ("auto", ("--joints", "auto")), ("number", ("--joints", 6))):
         assert run("record", tmp_path / "rig.blend", tmp_path / name, "--poses", 60, *options) == 0
         printed = capfd.readouterr().out
-        sentence = "Key joints: all 6 joints are read, because each moves by more than "
-        assert (sentence in printed) == (name != "all")
+        sentence = "Key joints: all 6 joints are read, because "
+        reason = {"auto": "each moves by more than ", "number": "6 were asked for."}.get(name, "")
+        assert (sentence + reason in printed) == (name != "all")
         for file in (tmp_path / "all").iterdir():
             assert file.read_bytes() == (tmp_path / name / file.name).read_bytes(), file.name
     assert rig is not None
@@ -170,7 +172,7 @@ def test_a_bone_that_a_control_moves_follows_from_the_control(tmp_path):
     drain(record(rig, tmp_path / "without", settings))
     still = read_recording(tmp_path / "without").info.fit.key_joints
     assert (still.joints, still.still) == (3, 1)
-    assert "No random pose moves 1 of the others relative to their parents." in still.sentence()
+    assert "No random pose moves 1 of the others relative to their parents, so the model does" in still.sentence()
     settings = dataclasses.replace(settings, controls=('armature_object/["puff"]',))
     drain(record(rig, tmp_path / "with", settings))
     recording = read_recording(tmp_path / "with")
@@ -263,6 +265,34 @@ def test_the_sidebar_records_with_key_joints(tmp_path):
     rig.mesh_object.vertex_groups["half.1"].add([0, 1, 2, 3], 0.5, "REPLACE")
     changed = read_folder(tmp_path / "recording", read_rig(rig))
     assert changed.state is FolderState.OTHER and "the skin weights differ" in changed.sentence
+
+
+def test_large_meshes_have_enough_random_poses():
+    poses = choose_fit_poses(1000, 2_000_000, 600)
+    assert sum(index < 600 for index in poses) == MIN_RANDOM_POSES and len(poses) == 60
+    assert len(choose_fit_poses(1000, 2_000_000)) < MIN_RANDOM_POSES
+
+
+def test_an_error_in_a_pose_of_the_fit_restores_limits_at_once(tmp_path, monkeypatch):
+    rig = build_limb(limb_of_free_bones)
+    for bone in rig.armature_object.pose.bones:
+        limit(bone, "LIMIT_ROTATION", {0: (-40.0, 40.0), 1: (-40.0, 40.0), 2: (-40.0, 40.0)})
+    before = scene_state(rig)
+    settings = dataclasses.replace(SETTINGS, margin=1.5)
+    limits = [constraint for bone in rig.armature_object.pose.bones for constraint in bone.constraints]
+
+    def evaluate_pose(_):
+        if any(constraint.mute for constraint in limits):
+            raise RigError("no pose")
+        return evaluate_before(_)
+
+    evaluate_before = PoseEvaluator.evaluate
+    monkeypatch.setattr(PoseEvaluator, "evaluate", evaluate_pose)
+    # The error keeps its traceback, and that the frames of the generators.
+    with pytest.raises(RigError, match="no pose") as error:
+        drain(record(rig, tmp_path / "recording", settings))
+    assert_same_state(before, scene_state(rig))
+    assert error.traceback and not any(constraint.mute for constraint in limits)
 
 
 def test_too_few_random_poses_are_refused(refusal, tmp_path):

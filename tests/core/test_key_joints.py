@@ -89,7 +89,11 @@ def test_the_report_is_read_back_and_says_what_is_lost():
     assert KeyJointReport.from_json(REPORT.to_json()) == REPORT
     assert REPORT.sentence() == (
         "Key joints: the model reads 60 of 500 joints; in random poses the others follow from these within 0.40 mm "
-        "(rms). No random pose moves 12 of the others relative to their parents."
+        "(rms). No random pose moves 12 of the others relative to their parents, so the model does not show their own "
+        "motion."
+    )
+    assert replace(REPORT, requested="600", joints=500).sentence() == (
+        "Key joints: all 500 joints are read, because 600 were asked for."
     )
     assert replace(REPORT, independent=7, still=0).sentence() == (
         "Key joints: the model reads 60 of 500 joints, but 7 of the others move independently of these, by up to 0.40 "

@@ -11,8 +11,10 @@ from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fitted_weights, read_key_joints
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning
+from trainer.process import Cancelled
 from trainer.skin.choice import choose_key_joints
 from trainer.skin.job import KeyJointRequest, fit_folder
+from trainer.skin.key_joints import KeyJointSearch
 
 BONES, RING = 4, 16
 """Number of main joints of the chain, and of vertices around each joint."""
@@ -87,7 +89,8 @@ def _skinned_rig(joints: tuple[Joint, ...], rest_matrices: np.ndarray, rng: np.r
 
 
 def choose(poses: FitPoses, requested: str = "auto"):
-    return choose_key_joints(poses, requested, np.zeros(len(poses.rig.joints), bool), 1.0)
+    is_static = np.zeros(len(poses.rig.joints), bool)
+    return choose_key_joints(poses, len(poses.positions), requested, is_static, 1.0)
 
 
 def test_half_rotating_joints_follow_from_the_main_joints():
@@ -125,7 +128,49 @@ def test_joints_that_follow_a_control_need_it_as_an_input():
 def test_still_joints_are_counted():
     choice = choose(chain_poses(followers=("still",)))
     assert choice.joints.tolist() == list(range(BONES)) and choice.report.still == BONES
-    assert choice.report.sentence().endswith(f"No random pose moves {BONES} of the others relative to their parents.")
+    assert choice.report.sentence().endswith(
+        f"No random pose moves {BONES} of the others relative to their parents, so the model does not show their own "
+        "motion."
+    )
+
+
+def with_still_root(poses: FitPoses) -> FitPoses:
+    """Return poses of a rig with one more joint: a root without weights that does not move."""
+    rig, pose_count = poses.rig, len(poses.pose_matrices)
+    joints = (Joint("root", -1), *(Joint(joint.name, joint.parent + 1) for joint in rig.joints))
+    rest_matrices = np.concatenate([np.eye(4, dtype=np.float32)[None], rig.rest_matrices])
+    matrices = np.tile(np.eye(4, dtype=np.float32), (pose_count, 1, 1, 1))
+    return replace(
+        poses,
+        rig=replace(rig, joints=joints, rest_matrices=rest_matrices, skin_joints=rig.skin_joints + 1),
+        pose_matrices=np.concatenate([matrices, poses.pose_matrices], axis=1),
+        is_dependency=np.append(False, poses.is_dependency),
+        is_sampled=np.append(False, poses.is_sampled),
+    )
+
+
+@pytest.mark.parametrize("requested", ["auto", "3"])
+def test_a_root_that_does_not_move_stays_so_that_a_character_can_walk_with_it(requested):
+    choice = choose(with_still_root(chain_poses(followers=("half", "still"))), requested)
+    assert choice.joints[0] == 0
+    assert len(choice.joints) == (BONES + 1 if requested == "auto" else 3)
+
+
+def test_a_joint_that_only_actions_move_is_kept():
+    poses, random_count, moved = chain_poses(followers=("still",)), 120, BONES + 1
+    matrices = poses.pose_matrices.copy()
+    matrices[random_count:, moved] @= _transforms(np.array([[0.0, 0.3, 0.0]]), [0, 0, 0])[0].astype(np.float32)
+    poses = replace(poses, pose_matrices=matrices)
+    choice = choose_key_joints(poses, random_count, "auto", np.zeros(2 * BONES, bool), 1.0)
+    assert choice.joints.tolist() == [*range(BONES), moved]
+    assert choose(poses.subset(slice(0, random_count))).joints.tolist() == list(range(BONES))
+
+
+def test_a_bone_is_left_besides_the_static_joint():
+    poses = chain_poses()
+    is_static = np.arange(BONES) == BONES - 1
+    choice = choose_key_joints(poses, len(poses.positions), "1", is_static, 1.0)
+    assert len(choice.joints) == 2 and BONES - 1 in choice.joints
 
 
 def test_a_joint_whose_weights_are_tiny_is_removed_although_it_is_free():
@@ -188,6 +233,23 @@ def test_weights_are_fitted_to_key_joints(tmp_path):
     assert set(np.unique(joints[weights > 0])) <= set(key_joints.tolist())
     assert needed_inputs.shape == (poses.rig.vertex_count, len(key_joints))
     assert sink.messages[-1][1]["fit"] == fit.to_json()
+
+
+@pytest.mark.parametrize("stopped_call", [1, 4])
+def test_a_stop_ends_the_choice_at_once(tmp_path, monkeypatch, stopped_call):
+    poses = chain_poses(followers=("half", "still"))
+    with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
+        for arrays in zip(poses.pose_matrices, poses.positions, strict=True):
+            writer.append(*arrays)
+    calls = []
+
+    def should_stop() -> bool:
+        calls.append(None)
+        return len(calls) == stopped_call
+
+    monkeypatch.setattr(KeyJointSearch, "_result", lambda _: pytest.fail("the search went on"))
+    with pytest.raises(Cancelled):
+        fit_folder(tmp_path, "smooth", Sink(), should_stop, request=KeyJointRequest("auto", 160))
 
 
 def test_a_fit_without_removable_joints_writes_nothing(tmp_path):

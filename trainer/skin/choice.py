@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Chooses the key joints of a folder of poses, and finds what the motion of each vertex follows from."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +15,9 @@ from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import are_invertible
 
+from ..process import Cancelled
 from .input_blocks import LENGTH_RATIO, InputBlocks
-from .key_joints import KeyJoints, KeyJointSearch, joint_moments
+from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments, measure_unseen_motions
 from .solver import SkinSolver
 
 
@@ -35,21 +37,34 @@ class Choice:
     report: KeyJointReport
 
 
-def choose_key_joints(poses: FitPoses, requested: str, static_joints: np.ndarray, metres_per_unit: float) -> Choice:
+def choose_key_joints(
+    all_poses: FitPoses,
+    random_count: int,
+    requested: str,
+    static_joints: np.ndarray,
+    metres_per_unit: float,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Choice:
     """Choose key joints by random poses.
+
+    Joints that only frames of actions move are kept, because random poses do not show what they would follow from.
 
     The weights of a rig may be those of a cage, or none. So the vertices that a joint moves are those where either the
     rig has a weight, or a fit with all joints has one. The fit takes one vertex of each small patch of the mesh.
 
     Args:
-        poses: n random poses with J joints; every other pose measures errors.
+        all_poses: poses with J joints; random ones, and then frames of actions.
+        random_count: number of random poses; every other of these measures errors.
         requested: "auto", or the number of key joints.
         static_joints: (J,) bool, joints that are kept in any case.
         metres_per_unit: as in `Rig`.
+        should_stop: called often.
 
     Raises:
-        RecordingError: a joint has a scale of zero in some pose.
+        Cancelled: `should_stop` returned True.
+        RecordingError: a joint has a scale of zero in some random pose.
     """
+    poses = all_poses.subset(slice(0, random_count))
     if not are_invertible(poses.pose_matrices).all():
         raise RecordingError(
             "A bone has a scale of zero in some pose, so key joints cannot be chosen; look for the key, constraint or "
@@ -58,7 +73,7 @@ def choose_key_joints(poses: FitPoses, requested: str, static_joints: np.ndarray
     rig, joint_count = poses.rig, len(poses.rig.joints)
     patches = divide_into_patches(rig, make_partitions(rig))
     representatives = patches.vertices[patches.starts]
-    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives)
+    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives, should_stop)
     moments = _larger_moments(
         joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count),
         joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count),
@@ -67,8 +82,10 @@ def choose_key_joints(poses: FitPoses, requested: str, static_joints: np.ndarray
     moments[without_vertices] = _moments_at_heads(rig)[without_vertices]
     blocks = InputBlocks(poses)
     is_still = blocks.widths[:joint_count] == 0
-    search = KeyJointSearch(poses, moments, blocks, static_joints)
-    result = search.search(None if requested == AUTO else int(requested))
+    tolerance = TOLERANCE_RATIO * poses.rig.size
+    is_unseen = is_still & (measure_unseen_motions(all_poses, random_count, moments) > tolerance)
+    search = KeyJointSearch(poses, moments, blocks, static_joints | is_unseen)
+    result = search.search(None if requested == AUTO else int(requested), should_stop)
 
     acts = _acting_joints(rig.skin_joints, rig.skin_weights, joint_count)
     patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))
@@ -78,7 +95,9 @@ def choose_key_joints(poses: FitPoses, requested: str, static_joints: np.ndarray
     return Choice(result.joints, needed_inputs, _make_report(result, is_still, requested, metres_per_unit))
 
 
-def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fit_vertices(
+    poses: FitPoses, vertices: np.ndarray, should_stop: Callable[[], bool]
+) -> tuple[np.ndarray, np.ndarray]:
     """Fit the weights of (n,) vertices to poses; returns (n, 4) joints and (n, 4) weights."""
     rig = poses.rig
     selected_rig = replace(
@@ -88,7 +107,11 @@ def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np
         skin_weights=rig.skin_weights[vertices],
     )
     selected = replace(poses, rig=selected_rig, positions=poses.positions[:, vertices])
-    fitted = [arrays for _, *arrays in SkinSolver(selected).fit("smooth")]
+    fitted = []
+    for _, *arrays in SkinSolver(selected).fit("smooth"):
+        if should_stop():
+            raise Cancelled
+        fitted.append(arrays)
     joints, weights = (np.concatenate(blocks) for blocks in zip(*fitted, strict=True))
     return joints, weights
 

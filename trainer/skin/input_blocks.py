@@ -69,10 +69,18 @@ class InputBlocks:
         halves /= np.maximum(3 + np.trace(rotations, axis1=1, axis2=2), 0.1)[:, None]
         return np.concatenate([relative.reshape(-1, 12), 2 * halves], axis=1)
 
+    def parent(self, joint: int) -> int:
+        """Return the nearest ancestor of a joint that was not removed; -1 if there is none."""
+        return int(self._parents[joint])
+
+    def children(self, joint: int) -> list[int]:
+        """Return the joints, removed ones among them, whose features are relative to a joint."""
+        return np.flatnonzero(self._parents == joint).tolist()
+
     def remove(self, joint: int) -> list[int]:
         """Remove a joint, and return its children, whose features are relative to its parent now."""
         self._is_usable[joint] = False
-        children = np.flatnonzero(self._parents == joint).tolist()
+        children = self.children(joint)
         for child in children:
             self._parents[child] = self._parents[joint]
             self._set(child, self._joint_features(child))

@@ -68,7 +68,7 @@ def fit_folder(
     """
     started = time.perf_counter()
     poses = read_fit_poses(folder)
-    choice = _choose(poses, request, metres_per_unit) if request.joints != ALL else None
+    choice = _choose(poses, request, metres_per_unit, should_stop) if request.joints != ALL else None
     if choice and len(choice.joints) == len(poses.rig.joints):
         values = {"fit": None, "key_joints": choice.report.to_json()}
         sink.send(MessageType.FINISHED, seconds=time.perf_counter() - started, **values)
@@ -94,9 +94,11 @@ def fit_folder(
     return result
 
 
-def _choose(poses: FitPoses, request: KeyJointRequest, metres_per_unit: float) -> Choice:
+def _choose(
+    poses: FitPoses, request: KeyJointRequest, metres_per_unit: float, should_stop: Callable[[], bool]
+) -> Choice:
     is_static = np.arange(len(poses.rig.joints)) == request.static_joint
-    return choose_key_joints(poses.subset(slice(0, request.random_poses)), request.joints, is_static, metres_per_unit)
+    return choose_key_joints(poses, request.random_poses, request.joints, is_static, metres_per_unit, should_stop)
 
 
 def measure(poses: FitPoses, fitted: Rig) -> FitReport:

@@ -7,16 +7,21 @@ relative to their parents, and controls. A joint that random poses move by chann
 first case. The function is a least-squares fit to half of the poses, and its error is measured on the other half, at
 the vertices of the joint. So chance cannot explain a joint that moves independently. Inputs are selected by orthogonal
 matching pursuit (Pati et al., 1993), joints are removed greedily.
+
+A root, or a joint that random poses do not move, stays while one of its children does: the features of children are
+relative to it, so that they do not change when an animation moves it, as a character walks with its root.
 """
 
 import heapq
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from fdda_addon.core.recording.fit_folder import FitPoses
-from fdda_addon.core.skinning import skin_matrices
+from fdda_addon.core.skinning import are_invertible, skin_matrices
 
+from ..process import Cancelled
 from .input_blocks import InputBlocks, predict
 
 TOLERANCE_RATIO = 2.5e-4
@@ -92,6 +97,31 @@ def joint_moments(rest_positions: np.ndarray, joints: np.ndarray, weights: np.nd
     return (moments / np.maximum(weight_sums, 1e-9)[:, None]).reshape(-1, 4, 4)
 
 
+def measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndarray) -> np.ndarray:
+    """Measure how far frames of actions move joints relative to their parents from where random poses have them.
+
+    Args:
+        poses: poses of J joints, the random ones first.
+        random_count: number of random poses.
+        moments: as for `KeyJointSearch`.
+
+    Returns:
+        (J,) largest distance of any pose from the mean of the random poses, rms over the vertices, mesh units.
+    """
+    is_usable = are_invertible(poses.pose_matrices).all(axis=1)
+    is_usable[:random_count] = True
+    skin = skin_matrices(poses.pose_matrices[is_usable], poses.rig.rest_matrices).astype(np.float64)
+    variances, axes = np.linalg.eigh(moments)
+    moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
+    distances = np.zeros(len(moments))
+    for joint, parent in enumerate(poses.rig.parents.tolist()):
+        relative = np.linalg.solve(skin[:, parent], skin[:, joint]) if parent >= 0 else skin[:, joint]
+        motion = (relative @ moment_roots[joint])[:, :3]
+        motion -= motion[:random_count].mean(axis=0)
+        distances[joint] = np.sqrt((motion**2).sum(axis=(1, 2))).max()
+    return distances
+
+
 class KeyJointSearch:
     """Removes joints greedily, first those that the others explain best.
 
@@ -115,7 +145,7 @@ class KeyJointSearch:
         self._inverse_skin = np.linalg.inv(self._skin)[:, :, :3]
         variances, axes = np.linalg.eigh(moments)
         self._moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
-        self._is_sampled = poses.is_sampled
+        self._is_sampled, self._is_still = poses.is_sampled, blocks.widths[: len(moments)] == 0
         self._parents: list[int] = poses.rig.parents.tolist()
         self._depths: list[int] = []
         for parent in self._parents:
@@ -124,22 +154,43 @@ class KeyJointSearch:
         self._explanations: dict[int, _Explanation] = {}
 
     def _measure_anchor_motions(self) -> np.ndarray:
-        """Return (J, J) rms motion of each joint at its vertices relative to each other joint, mesh units."""
+        """Return (J, J) rms motion of each joint at its vertices relative to each other joint, mesh units.
+
+        A joint that does not move here, but may in an animation, is an anchor of its descendants. For other joints the
+        motion relative to it is infinite.
+        """
         poses = np.linspace(0, len(self._skin) - 1, min(ANCHOR_POSES, len(self._skin))).astype(int)
         inverse_skin, joint_count = self._inverse_skin[poses], self._skin.shape[1]
         motions = np.empty((joint_count, joint_count))
         for joint in range(joint_count):
             relative = inverse_skin @ (self._skin[poses, joint] @ self._moment_roots[joint])[:, None]
             motions[joint] = np.sqrt(relative.var(axis=0).sum(axis=(1, 2)))
+            is_ancestor = np.zeros(joint_count, bool)
+            ancestor = self._parents[joint]
+            while ancestor >= 0:
+                is_ancestor[ancestor], ancestor = True, self._parents[ancestor]
+            motions[joint, self._is_still & ~is_ancestor] = np.inf
             motions[joint, joint] = np.inf
         return motions
 
-    def search(self, count: int | None = None) -> KeyJoints:
-        """Remove joints whose unexplained motion is within the tolerance, or until `count` joints are left."""
+    def search(self, count: int | None = None, should_stop: Callable[[], bool] = lambda: False) -> KeyJoints:
+        """Remove joints whose unexplained motion is within the tolerance, or until `count` joints are left.
+
+        At least one joint is left besides those that are never removed.
+
+        Raises:
+            Cancelled: `should_stop` returned True.
+        """
         queue = [self._queue_entry(joint, 0.0) for joint in np.flatnonzero(~self._is_required).tolist()]
         heapq.heapify(queue)
-        while queue and self._is_kept.sum() > (count or 1):
+        min_count, waiting = max(count or 1, int(self._is_required.sum()) + 1), set()
+        while queue and self._is_kept.sum() > min_count:
+            if should_stop():
+                raise Cancelled
             *_, joint = heapq.heappop(queue)
+            if self._carries_children(joint):
+                waiting.add(joint)
+                continue
             self._is_kept[joint] = False
             children = self._blocks.remove(joint)
             explanations = self._explain_without(joint, children)
@@ -149,12 +200,22 @@ class KeyJointSearch:
             # Removals since the last evaluation may have made this one more expensive than others.
             if is_removable and not (queue and entry > queue[0]):
                 self._explanations |= explanations
+                parent = self._blocks.parent(joint)
+                if parent in waiting and not self._carries_children(parent):
+                    waiting.remove(parent)
+                    heapq.heappush(queue, self._queue_entry(parent, 0.0))
                 continue
             self._is_kept[joint] = True
             self._blocks.restore(joint, children)
             if is_removable:
                 heapq.heappush(queue, entry)
         return self._result()
+
+    def _carries_children(self, joint: int) -> bool:
+        """Return whether a joint has children that are kept, and is a root or does not move."""
+        if not self._is_still[joint] and self._blocks.parent(joint) >= 0:
+            return False
+        return bool(self._is_kept[self._blocks.children(joint)].any())
 
     def _queue_entry(self, joint: int, cost: float) -> tuple:
         """Return the place of a joint in the order of removal.
@@ -180,7 +241,8 @@ class KeyJointSearch:
 
         The anchor is the joint with the smallest motion relative to it, or the nearest ancestor.
         """
-        anchor = int(np.where(self._is_kept, self._anchor_motions[joint], np.inf).argmin())
+        kept = np.flatnonzero(self._is_kept)
+        anchor = int(kept[self._anchor_motions[joint, kept].argmin()])
         best = self._explain_from(joint, anchor)
         ancestor = self._parents[joint]
         while ancestor >= 0 and not self._is_kept[ancestor]:
