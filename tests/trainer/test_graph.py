@@ -9,13 +9,15 @@ import onnx
 import pytest
 
 import trainer.train
+from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.export import network_nodes, skinning_nodes
-from trainer.export.export import open_session, reference_positions
+from trainer.export.export import check_parity, open_session, reference_positions
 from trainer.export.graph import build_graph
 from trainer.model import TrainedModel, is_sheared
 
@@ -209,3 +211,23 @@ def test_constants_are_the_matrices_and_little_else(trained, trained_model, repo
     assert separate_bytes < 1.5 * 4 * (network_parameters + matrix_elements) + 16_000
     # The block-diagonal matrix has more zeros.
     assert separate_bytes < shared_bytes < separate_bytes + 2 * 4 * 6_000
+
+
+class ShiftedSession:
+    """A session whose positions are off by 0.1 mm."""
+
+    def __init__(self, session):
+        self._session = session
+
+    def run(self, outputs, inputs):
+        positions, *others = self._session.run(outputs, inputs)
+        return positions + np.float32(1e-4), *others
+
+
+def test_a_difference_from_pytorch_is_refused_unless_the_error_is_far_larger(trained_model, recording):
+    """A rig that bursts has errors of meters, and float32 rounds its residuals by millimeters."""
+    session = ShiftedSession(open_session(build_graph(trained_model).SerializeToString()))
+    check = (session, read_recording(recording), trained_model, np.arange(5))
+    with pytest.raises(TrainingError, match=r"differs from PyTorch by 0\.17\d mm, more than the allowed .* bursts"):
+        check_parity(*check, 0.001)
+    assert check_parity(*check, 0.1) == pytest.approx(3**0.5 * 1e-4, rel=0.01)
