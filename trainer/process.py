@@ -163,6 +163,6 @@ def missing_package_error(activity: str, error: ModuleNotFoundError) -> Training
     package = str(error.name).partition(".")[0]
     return TrainingError(
         f"{activity} needs the Python package '{package}', which {sys.executable} does not have; install torch, onnx, "
-        "onnxruntime, numpy and scipy there, install the training environment in the preferences of the "
+        "onnxruntime, numpy, scipy and jinja2 there, install the training environment in the preferences of the "
         "add-on, or set FDDA_TRAINER_PYTHON to a Python that has them."
     )

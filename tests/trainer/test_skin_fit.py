@@ -238,7 +238,7 @@ def test_a_missing_scipy_is_named(tmp_path):
     message = Message.decode(process.stdout)
     assert message.type is MessageType.FAILED
     assert message.values["text"].startswith("Fitting skin weights needs the Python package 'scipy', which ")
-    assert "numpy and scipy there, install the training environment" in message.values["text"]
+    assert "numpy, scipy and jinja2 there, install the training environment" in message.values["text"]
 
 
 def damage_cases() -> Iterator:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-# torch requires jinja2, so each training environment has it.
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from fdda_addon.core.input_file import read_input

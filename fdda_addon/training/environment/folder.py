@@ -18,7 +18,7 @@ from ...core.path_limits import MAX_WINDOWS_PATH_LENGTH
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """Module name of the installed extension, "bl_ext.REPOSITORY.fdda"; empty if the add-on is not installed."""
-PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy")
+PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "jinja2")
 """Packages that the trainer imports."""
 COMPLETION_MARKER = "fdda-complete"
 MAX_WHEEL_PATH_LENGTH = 126
