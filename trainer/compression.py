@@ -70,10 +70,7 @@ def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining
     dropped_count = sum(partition.dropped_count for partition in remaining)
     if not dropped_count:
         return ""
-    dropped_square = sum(
-        after.vertex_count * (after.basis.truncation_rms**2 - before.basis.truncation_rms**2)
-        for before, after in zip(prepared, remaining, strict=True)
-    )
+    dropped_square = sum(partition.vertex_count * partition.dropped_rms**2 for partition in remaining)
     part = dropped_square / sum(partition.vertex_count * partition.residual_rms**2 for partition in prepared)
     text = f"The networks do not predict {dropped_count:,} of {count:,} components, which are left out"
     if part < MIN_DROPPED_PART:
@@ -136,6 +133,7 @@ def _change_basis(
         ),
         coefficients=coefficients.astype(np.float32),
         dropped_count=len(change) - change.shape[1],
+        dropped_rms=float(np.sqrt(dropped_square)),
     )
     return changed, _change_outputs(network, change)
 

@@ -60,6 +60,7 @@ class PreparedPartition:
         mm_per_unit: millimeters per mesh unit.
         vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
         dropped_count: number of components that were dropped after the training (`compression`).
+        dropped_rms: rms distance over training poses and vertices that they represent, mesh units.
     """
 
     name: str
@@ -77,6 +78,7 @@ class PreparedPartition:
     mm_per_unit: float = 1000.0
     vertex_factors: np.ndarray | None = None
     dropped_count: int = 0
+    dropped_rms: float = 0.0
 
     @cached_property
     def validation_truncation(self) -> np.ndarray:

@@ -4,8 +4,11 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording.writer import RecordingWriter
 from trainer.__main__ import main
 from trainer.report.error_analysis import (
     EXTREME_POSES,
@@ -19,7 +22,7 @@ from trainer.report.error_analysis import (
 )
 from trainer.report.page import render_html
 
-from .chain import write_chain
+from .chain import chain_angles, chain_info, chain_rig, pose_chain, write_chain
 
 
 def train_chain(folder: Path, poses: int, *options: str) -> list[dict]:
@@ -41,6 +44,26 @@ def test_too_few_poses_are_the_cause(tmp_path):
     partitions = train_chain(tmp_path, 30, "--epochs", "300", "--tolerance-mm", "0.001", "--held-out-fraction", "0.4")
     analysis = max(partitions, key=lambda p: p["held_out"]["max"])["largest_errors"]
     assert analysis["generalization"] > 1.5 and analysis["cause"] in (TOO_FEW_POSES, EXTREME_POSES)
+
+
+@pytest.mark.parametrize(
+    ("detail_mm", "tolerance_mm", "cause"), [(0.0, 0.1, UNPREDICTED_COMPONENTS), (3.0, 3.2, TOO_FEW_COMPONENTS)]
+)
+def test_dropped_components_are_the_cause_only_if_most_of_the_error_is_in_them(
+    tmp_path, detail_mm, tolerance_mm, cause
+):
+    """One large pattern is random in each pose; so are many small ones, which are within the tolerance."""
+    rig, poses, rng = chain_rig(2), 200, np.random.default_rng(0)
+    angles, patterns = chain_angles(poses, 2, 0), rng.normal(size=(41, rig.vertex_count * 3)) / np.sqrt(3)
+    sizes = np.append(2.0, np.full(40, detail_mm / np.sqrt(40))) / 1000
+    residuals = ((rng.normal(size=(poses, 41)) * sizes) @ patterns).reshape(poses, rig.vertex_count, 3)
+    partitions = make_partitions(rig, {0: (1,), 1: (1,)})
+    with RecordingWriter(tmp_path / "recording", rig, partitions, chain_info(poses)) as writer:
+        writer.append(pose_chain(rig, angles), residuals.astype(np.float32))
+    options = ("--epochs", "60", "--tolerance-mm", str(tolerance_mm))
+    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *options]) == 0
+    dropped = [p for p in json.loads((tmp_path / "report.json").read_text())["partitions"] if p["dropped"]]
+    assert dropped and {p["largest_errors"]["cause"] for p in dropped} == {cause}
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,9 @@ def analyze_errors(
         if is_boundary is not None and is_boundary[partition.vertices].any():
             is_at_boundary = is_boundary[partition.vertices]
             boundary = _ratio(float(is_at_boundary[vertices].mean()), float(is_at_boundary.mean()))
-        cause = _cause(truncation, prepared.dropped_count > 0, distance, generalization)
+        # Dropped components are the cause only if they are most of what the remaining ones leave.
+        is_dropped = 2 * prepared.dropped_rms**2 > prepared.basis.truncation_rms**2
+        cause = _cause(truncation, is_dropped, distance, generalization)
         counts = len(np.unique(poses)), len(np.unique(vertices))
         analyses.append(ErrorAnalysis(*counts, truncation, boundary, joint, extreme, distance, generalization, cause))
     return analyses
