@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from fdda_addon.core.metrics import distances
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import checkpoint_path
+from fdda_addon.core.skinning import LinearSkinning
+from fdda_addon.runtime.network import Network as ModelNetwork
+from trainer import compression
 from trainer.__main__ import main
 from trainer.compression import _change_basis, drop_components, dropped_components_sentence, factorize_partitions
 from trainer.config import TrainingConfig
@@ -131,12 +135,31 @@ def test_the_log_and_the_report_name_the_dropped_components(noisy_chain, capsys)
     assert dropped > 0
     output = capsys.readouterr()
     assert f"The networks do not predict {dropped} of {dropped + kept} components" in output.out + output.err
-    page = (noisy_chain / "report.html").read_text(encoding="utf-8")
+    page = " ".join((noisy_chain / "report.html").read_text(encoding="utf-8").split())
     assert f"{dropped} more components were left out, because the networks do not predict them." in page
     # The checkpoint has the remaining components, and a training continues from it.
     checkpoint = read_checkpoint(checkpoint_path(model))
     assert [len(partition.basis_components) for partition in checkpoint.partitions] == [p["basis"] for p in partitions]
     assert main([str(noisy_chain / "recording"), str(model), *QUICK_OPTIONS, "--warm-start"]) == 0
+
+
+def test_a_model_without_components_plays_and_its_training_continues(recording, trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(compression, "MIN_GAIN_RATIO", np.inf)
+    model = tmp_path / "model.onnx"
+    assert main([str(recording), str(model), *QUICK_OPTIONS]) == 0
+    report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert all(partition["basis"] == 0 for partition in report["partitions"])
+    assert any(partition["dropped"] > 0 for partition in report["partitions"])
+    # The linear fit remains.
+    assert report["fdda"]["held_out"]["mean"] < 0.9 * report["linear"]["held_out"]["mean"]
+    rig = read_recording(recording).rig
+    poses = pose_chain(rig, chain_angles(20, len(rig.joints), 5))
+    complete, linear = ModelNetwork(trained / "model.onnx").positions(poses), LinearSkinning(rig).positions(poses)
+    assert distances(ModelNetwork(model).positions(poses), complete).mean() < distances(linear, complete).mean()
+    monkeypatch.undo()
+    assert main([str(recording), str(model), *QUICK_OPTIONS, "--warm-start"]) == 0
+    continued = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert continued["fdda"]["held_out"]["mean"] < 0.5 * report["fdda"]["held_out"]["mean"]
 
 
 def test_factorized_networks_predict_the_projected_residuals(tmp_path):
