@@ -21,6 +21,11 @@ def _is_positive(value: float) -> bool:
     return 0 < value < math.inf
 
 
+def _is_seed(value: int) -> bool:
+    # torch takes no larger seeds.
+    return 0 <= value < 1 << 63
+
+
 def _is_part(value: float) -> bool:
     return 0 < value <= 0.4
 
@@ -41,7 +46,7 @@ class TrainingConfig:
         TrainingError: a value is impossible.
     """
 
-    seed: int = _setting(0, "of the split, the initial weights and the order of the poses", _is_at_least(0))
+    seed: int = _setting(0, "of the split, the initial weights and the order of the poses", _is_seed)
     tolerance_mm: float = _setting(
         TOLERANCE_MM, "rms error that the components may leave over the whole mesh, in mm", _is_positive
     )

@@ -23,6 +23,7 @@ from trainer.config import TrainingConfig, add_options, config_from_arguments
         ("held_out_fraction", 0.0),
         ("goal_mm", -1.0),
         ("seed", -1),
+        ("seed", 1 << 63),
         ("batch_size", float("nan")),
         ("include_unsettled", None),
     ],
