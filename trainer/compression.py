@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Makes a trained model smaller: drops components that networks do not predict, and factorizes large partitions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from .fits.basis import Basis
 from .fits.low_rank import factorize, may_factorize
 from .networks.networks import Network
 from .preparation import PartitionData, PreparedPartition
+from .process import Cancelled
 
 MIN_GAIN_RATIO = 0.1
 """A component stays if it lowers the mean error by more than this part of the error, times its part of the parameters
@@ -20,7 +21,11 @@ MIN_DROPPED_PART = 0.1
 
 
 def drop_components(
-    prepared: Sequence[PreparedPartition], networks: Sequence[Network], split: Split, activation: str
+    prepared: Sequence[PreparedPartition],
+    networks: Sequence[Network],
+    split: Split,
+    activation: str,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[PreparedPartition], list[Network]]:
     """Drop the components that lower the mean error of the validation poses too little, or raise it.
 
@@ -32,12 +37,18 @@ def drop_components(
         prepared, networks: partitions with their trained networks.
         split: split of the poses.
         activation: as in `TrainingConfig`.
+        should_stop: called before each partition.
 
     Returns:
         The partitions and networks with the remaining components; a partition may lose all.
+
+    Raises:
+        Cancelled: `should_stop` returned True.
     """
     changes, gains, total_error = [], [], 0.0
     for partition, network in zip(prepared, networks, strict=True):
+        if should_stop():
+            raise Cancelled
         changes.append(_principal_directions(network.evaluate(partition.inputs[split.training], activation)))
         error, partition_gains = _component_gains(partition, network, changes[-1], activation)
         total_error += error
@@ -153,6 +164,7 @@ def factorize_partitions(
     partitions: Sequence[PartitionData],
     split: Split,
     tolerance: float,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[PreparedPartition], list[Network]]:
     """Factorize the partitions where that saves parameters (`low_rank`).
 
@@ -161,14 +173,19 @@ def factorize_partitions(
         partitions: data of the partitions.
         split: split of the poses.
         tolerance: rms error that the components may leave, mesh units.
+        should_stop: called before each partition.
 
     Returns:
         The partitions, and the networks with outputs for the changed bases.
+
+    Raises:
+        Cancelled: `should_stop` returned True.
     """
-    factorized = [
-        _factorize_partition(*arguments, split, tolerance)
-        for arguments in zip(prepared, networks, partitions, strict=True)
-    ]
+    factorized = []
+    for arguments in zip(prepared, networks, partitions, strict=True):
+        if should_stop():
+            raise Cancelled
+        factorized.append(_factorize_partition(*arguments, split, tolerance))
     return [partition for partition, _ in factorized], [network for _, network in factorized]
 
 

@@ -203,11 +203,13 @@ class _Job:
         split: Split,
     ) -> tuple[list[PreparedPartition], list[Network]]:
         """Drop components that the networks do not predict, and factorize large partitions."""
-        remaining, networks = drop_components(prepared, result.networks, split, self.config.activation)
+        remaining, networks = drop_components(
+            prepared, result.networks, split, self.config.activation, self.should_stop
+        )
         if text := dropped_components_sentence(prepared, remaining):
             self.log(text)
         tolerance = self.config.tolerance_mm / (1000 * recording.rig.metres_per_unit)
-        return factorize_partitions(remaining, networks, partitions, split, tolerance)
+        return factorize_partitions(remaining, networks, partitions, split, tolerance, self.should_stop)
 
     def export(
         self, recording: Recording, trained_model: TrainedModel, split: Split, warm_start: bool

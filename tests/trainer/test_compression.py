@@ -26,6 +26,7 @@ from trainer.networks.checkpoint import read_checkpoint
 from trainer.networks.loop import train
 from trainer.networks.networks import Network
 from trainer.preparation import PartitionData, PreparedPartition, partition_data, prepare_partition, prepare_partitions
+from trainer.process import Cancelled
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
@@ -104,6 +105,18 @@ def test_components_without_truncation_error_have_a_finite_error():
         change = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         changed, _ = _change_basis(exact, networks[0], change, split)
         assert np.isfinite(changed.basis.error_by_count).all()
+
+
+def test_compression_can_be_cancelled_between_partitions():
+    data = make_data(noise=0), make_data(noise=0)
+    prepared, networks, split = train_partitions(*data)
+    for compress in (
+        lambda should_stop: drop_components(prepared, networks, split, CONFIG.activation, should_stop),
+        lambda should_stop: factorize_partitions(prepared, networks, data, split, 1e-5, should_stop),
+    ):
+        answers = iter([False, True])
+        with pytest.raises(Cancelled):
+            compress(lambda answers=answers: next(answers))
 
 
 def test_a_dropped_component_that_is_small_needs_no_remedy():
