@@ -165,6 +165,20 @@ def test_a_file_that_is_not_a_report_is_refused(tmp_path, capsys):
     assert not (tmp_path / "report.html").exists()
 
 
-def test_the_page_needs_no_torch(trained):
-    code = "import sys; sys.modules['torch'] = None; import trainer.report.__main__"
-    subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, check=True)
+def write_page_without(package: str, path: os.PathLike) -> subprocess.CompletedProcess:
+    code = f"import sys; sys.modules['{package}'] = None; from trainer.report.__main__ import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, str(path)]
+    return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+
+
+def test_the_page_needs_no_torch(report, tmp_path):
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert write_page_without("torch", tmp_path / "report.json").returncode == 0
+    assert (tmp_path / "report.html").exists()
+
+
+def test_a_python_without_jinja2_is_named(report, tmp_path):
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    result = write_page_without("jinja2", tmp_path / "report.json")
+    assert result.returncode == 1 and result.stderr.count("\n") == 1
+    assert result.stderr.startswith(f"The page of a report needs the Python package 'jinja2', which {sys.executable}")

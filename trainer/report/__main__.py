@@ -5,15 +5,13 @@ import argparse
 import sys
 from pathlib import Path
 
-from jinja2 import TemplateError
-
 from fdda_addon.core.errors import FDDAError, TrainingError
 from fdda_addon.core.file_kind import PAGE
 from fdda_addon.core.output import check_outputs, write_text
 from fdda_addon.core.report import page_path, read_evaluation, read_report
 from fdda_addon.core.terminal import escape_unencodable_output
 
-from .page import render_html
+from ..process import missing_package_error
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -36,6 +34,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _write_page(options: argparse.Namespace) -> None:
+    try:
+        from jinja2 import TemplateError
+
+        from .page import render_html
+    except ModuleNotFoundError as error:
+        raise missing_package_error("The page of a report", error) from error
     page = page_path(options.report)
     check_outputs({page: PAGE}, [options.report], options.overwrite)
     report = read_report(options.report)
