@@ -156,6 +156,26 @@ def test_a_root_that_does_not_move_stays_so_that_a_character_can_walk_with_it(re
     assert len(choice.joints) == (BONES + 1 if requested == "auto" else 3)
 
 
+@pytest.mark.parametrize("has_weights", [True, False])
+def test_a_joint_that_stays_for_its_children_has_weights_only_if_it_has_some_in_the_rig(has_weights):
+    """The joint 1 is between the first main joint and the second, and moves with the first."""
+    poses, order = chain_poses(), [0, 0, *range(1, BONES)]
+    joints = (Joint("0", -1), Joint("still", 0), *(Joint(str(index), index) for index in range(1, BONES)))
+    skin_joints = poses.rig.skin_joints + (poses.rig.skin_joints > 0)
+    skin_joints[:RING] = 1 if has_weights else 0
+    poses = replace(
+        poses,
+        rig=replace(poses.rig, joints=joints, rest_matrices=poses.rig.rest_matrices[order], skin_joints=skin_joints),
+        pose_matrices=poses.pose_matrices[:, order],
+        is_dependency=poses.is_dependency[order],
+        is_sampled=np.arange(BONES + 1) != 1,
+    )
+    choice = choose(poses)
+    assert choice.joints.tolist() == list(range(BONES + 1))
+    assert (1 in choice.weighted_joints) == has_weights
+    assert set(choice.weighted_joints.tolist()) >= {0, *range(2, BONES + 1)}
+
+
 def test_a_joint_that_only_actions_move_is_kept():
     poses, random_count, moved = chain_poses(followers=("still",)), 120, BONES + 1
     matrices = poses.pose_matrices.copy()

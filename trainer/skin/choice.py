@@ -13,11 +13,11 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.patches import divide_into_patches
 from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import are_invertible
+from fdda_addon.core.skinning import are_invertible, skin_matrices
 
 from ..process import Cancelled
 from .input_blocks import LENGTH_RATIO, InputBlocks
-from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments, measure_unseen_motions
+from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments
 from .solver import SkinSolver
 
 
@@ -27,12 +27,14 @@ class Choice:
 
     Attributes:
         joints: (K,) indices of the key joints, ascending.
+        weighted_joints: indices of the key joints to which weights are fitted, ascending.
         needed_inputs: (V, K + C) bool, the key joints and controls from which the motion of a vertex follows that
             other joints cause.
         report: numbers of joints and errors.
     """
 
     joints: np.ndarray
+    weighted_joints: np.ndarray
     needed_inputs: np.ndarray
     report: KeyJointReport
 
@@ -83,8 +85,8 @@ def choose_key_joints(
     blocks = InputBlocks(poses)
     is_still = blocks.widths[:joint_count] == 0
     tolerance = TOLERANCE_RATIO * poses.rig.size
-    is_unseen = is_still & (measure_unseen_motions(all_poses, random_count, moments) > tolerance)
-    search = KeyJointSearch(poses, moments, blocks, static_joints | is_unseen)
+    is_unseen = is_still & (_measure_unseen_motions(all_poses, random_count, moments) > tolerance)
+    search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
     result = search.search(None if requested == AUTO else int(requested), should_stop)
 
     acts = _acting_joints(rig.skin_joints, rig.skin_weights, joint_count)
@@ -92,7 +94,8 @@ def choose_key_joints(
     acts[patches.vertices] |= np.repeat(_acting_joints(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0)
     columns = np.concatenate([result.joints, np.arange(joint_count, blocks.count)])
     needed_inputs = (acts.astype(np.float32) @ result.inputs[:, columns].astype(np.float32)) > 0
-    return Choice(result.joints, needed_inputs, _make_report(result, is_still, requested, metres_per_unit))
+    report = _make_report(result, is_still, requested, metres_per_unit)
+    return Choice(result.joints, result.joints[result.is_weighted], needed_inputs, report)
 
 
 def _fit_vertices(
@@ -114,6 +117,31 @@ def _fit_vertices(
         fitted.append(arrays)
     joints, weights = (np.concatenate(blocks) for blocks in zip(*fitted, strict=True))
     return joints, weights
+
+
+def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndarray) -> np.ndarray:
+    """Measure how far frames of actions move joints relative to their parents from where random poses have them.
+
+    Args:
+        poses: poses of J joints, the random ones first.
+        random_count: number of random poses.
+        moments: as for `KeyJointSearch`.
+
+    Returns:
+        (J,) largest distance of any pose from the mean of the random poses, rms over the vertices, mesh units.
+    """
+    is_usable = are_invertible(poses.pose_matrices).all(axis=1)
+    is_usable[:random_count] = True
+    skin = skin_matrices(poses.pose_matrices[is_usable], poses.rig.rest_matrices).astype(np.float64)
+    variances, axes = np.linalg.eigh(moments)
+    moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
+    distances = np.zeros(len(moments))
+    for joint, parent in enumerate(poses.rig.parents.tolist()):
+        relative = np.linalg.solve(skin[:, parent], skin[:, joint]) if parent >= 0 else skin[:, joint]
+        motion = (relative @ moment_roots[joint])[:, :3]
+        motion -= motion[:random_count].mean(axis=0)
+        distances[joint] = np.sqrt((motion**2).sum(axis=(1, 2))).max()
+    return distances
 
 
 def _larger_moments(first: np.ndarray, second: np.ndarray) -> np.ndarray:

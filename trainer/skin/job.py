@@ -75,7 +75,7 @@ def fit_folder(
         return None
     vertex_count = poses.rig.vertex_count
     training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
-    fitted_poses = training.with_joints(choice.joints) if choice else training
+    fitted_poses = training.with_joints(choice.weighted_joints) if choice else training
     joints, weights = (np.zeros((vertex_count, INFLUENCES), dtype) for dtype in (np.int32, np.float32))
     for block, *fitted in SkinSolver(fitted_poses).fit(kind):
         if should_stop():
@@ -83,7 +83,7 @@ def fit_folder(
         joints[block], weights[block] = fitted
         sink.send(MessageType.PROGRESS, done=block.stop, total=vertex_count)
     if choice:
-        joints = choice.joints[joints].astype(np.int32)
+        joints = choice.weighted_joints[joints].astype(np.int32)
     skinned = replace(poses.rig, skin_joints=joints, skin_weights=weights, metres_per_unit=metres_per_unit)
     reports = measure(held_out, skinned), measure(training, skinned)
     result = SkinFit(kind, len(poses.positions), *reports, choice.report if choice else None)

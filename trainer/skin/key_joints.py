@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdda_addon.core.recording.fit_folder import FitPoses
-from fdda_addon.core.skinning import are_invertible, skin_matrices
+from fdda_addon.core.skinning import skin_matrices
 
 from ..process import Cancelled
 from .input_blocks import InputBlocks, predict
@@ -45,6 +45,7 @@ class KeyJoints:
 
     Attributes:
         joints: (K,) indices of the key joints, ascending.
+        is_weighted: (K,) bool, key joints that may have skin weights; the others are kept for their children alone.
         inputs: (J, J + C) bool, the key joints and controls that explain each removed joint.
         unexplained: (J,) motion that the inputs do not explain, rms, mesh units; 0 for key joints.
         is_independent: (J,) bool, removed joints that would not be removed automatically.
@@ -52,6 +53,7 @@ class KeyJoints:
     """
 
     joints: np.ndarray
+    is_weighted: np.ndarray
     inputs: np.ndarray
     unexplained: np.ndarray
     is_independent: np.ndarray
@@ -97,31 +99,6 @@ def joint_moments(rest_positions: np.ndarray, joints: np.ndarray, weights: np.nd
     return (moments / np.maximum(weight_sums, 1e-9)[:, None]).reshape(-1, 4, 4)
 
 
-def measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndarray) -> np.ndarray:
-    """Measure how far frames of actions move joints relative to their parents from where random poses have them.
-
-    Args:
-        poses: poses of J joints, the random ones first.
-        random_count: number of random poses.
-        moments: as for `KeyJointSearch`.
-
-    Returns:
-        (J,) largest distance of any pose from the mean of the random poses, rms over the vertices, mesh units.
-    """
-    is_usable = are_invertible(poses.pose_matrices).all(axis=1)
-    is_usable[:random_count] = True
-    skin = skin_matrices(poses.pose_matrices[is_usable], poses.rig.rest_matrices).astype(np.float64)
-    variances, axes = np.linalg.eigh(moments)
-    moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
-    distances = np.zeros(len(moments))
-    for joint, parent in enumerate(poses.rig.parents.tolist()):
-        relative = np.linalg.solve(skin[:, parent], skin[:, joint]) if parent >= 0 else skin[:, joint]
-        motion = (relative @ moment_roots[joint])[:, :3]
-        motion -= motion[:random_count].mean(axis=0)
-        distances[joint] = np.sqrt((motion**2).sum(axis=(1, 2))).max()
-    return distances
-
-
 class KeyJointSearch:
     """Removes joints greedily, first those that the others explain best.
 
@@ -129,18 +106,22 @@ class KeyJointSearch:
         tolerance: as in `KeyJoints`.
     """
 
-    def __init__(self, poses: FitPoses, moments: np.ndarray, blocks: InputBlocks, is_required: np.ndarray):
+    def __init__(
+        self, poses: FitPoses, moments: np.ndarray, blocks: InputBlocks, is_static: np.ndarray, is_unseen: np.ndarray
+    ):
         """Prepare the search.
 
         Args:
             poses: n poses of J joints; every other pose measures the errors of the fits.
             moments: (J, 4, 4) moments of the vertices of each joint, square mesh units.
             blocks: features of the joints and controls in these poses.
-            is_required: (J,) bool, joints that are never removed.
+            is_static: (J,) bool, joints that never move.
+            is_unseen: (J,) bool, joints that only actions move. Neither are removed.
         """
         size = max(poses.rig.size, 1e-9)
         self.tolerance = TOLERANCE_RATIO * size
-        self._blocks, self._is_required, self._is_kept = blocks, is_required, np.ones(len(moments), bool)
+        self._blocks, self._is_kept = blocks, np.ones(len(moments), bool)
+        self._is_required = is_static | is_unseen
         self._skin = skin_matrices(poses.pose_matrices, poses.rig.rest_matrices).astype(np.float64)
         self._inverse_skin = np.linalg.inv(self._skin)[:, :, :3]
         variances, axes = np.linalg.eigh(moments)
@@ -150,14 +131,20 @@ class KeyJointSearch:
         self._depths: list[int] = []
         for parent in self._parents:
             self._depths.append(self._depths[parent] + 1 if parent >= 0 else 0)
+        has_weights = np.zeros(len(moments), bool)
+        has_weights[poses.rig.skin_joints[poses.rig.skin_weights > 0]] = True
+        is_root = np.array(self._parents) < 0
+        self._has_own_weights = has_weights | is_root | self._is_required
+        self._is_weightless_root = is_root & ~has_weights & ~is_static
+        self._is_anchor_of_descendants = self._is_still & ~is_static
         self._anchor_motions = self._measure_anchor_motions()
         self._explanations: dict[int, _Explanation] = {}
 
     def _measure_anchor_motions(self) -> np.ndarray:
         """Return (J, J) rms motion of each joint at its vertices relative to each other joint, mesh units.
 
-        A joint that does not move here, but may in an animation, is an anchor of its descendants. For other joints the
-        motion relative to it is infinite.
+        The motion is infinite relative to joints that are no anchors. A joint that random poses do not move, but an
+        animation may, is an anchor of its descendants alone.
         """
         poses = np.linspace(0, len(self._skin) - 1, min(ANCHOR_POSES, len(self._skin))).astype(int)
         inverse_skin, joint_count = self._inverse_skin[poses], self._skin.shape[1]
@@ -169,7 +156,7 @@ class KeyJointSearch:
             ancestor = self._parents[joint]
             while ancestor >= 0:
                 is_ancestor[ancestor], ancestor = True, self._parents[ancestor]
-            motions[joint, self._is_still & ~is_ancestor] = np.inf
+            motions[joint, self._is_weightless_root | (self._is_anchor_of_descendants & ~is_ancestor)] = np.inf
             motions[joint, joint] = np.inf
         return motions
 
@@ -211,6 +198,11 @@ class KeyJointSearch:
                 heapq.heappush(queue, entry)
         return self._result()
 
+    @property
+    def _may_have_weights(self) -> np.ndarray:
+        """Return (J,) bool; the others are kept for their children alone, because they move as their parents do."""
+        return self._has_own_weights | (self._blocks.widths[: len(self._parents)] > 0)
+
     def _carries_children(self, joint: int) -> bool:
         """Return whether a joint has children that are kept, and is a root or does not move."""
         if not self._is_still[joint] and self._blocks.parent(joint) >= 0:
@@ -241,11 +233,12 @@ class KeyJointSearch:
 
         The anchor is the joint with the smallest motion relative to it, or the nearest ancestor.
         """
-        kept = np.flatnonzero(self._is_kept)
+        is_candidate = self._is_kept & self._may_have_weights
+        kept = np.flatnonzero(is_candidate if is_candidate.any() else self._is_kept)
         anchor = int(kept[self._anchor_motions[joint, kept].argmin()])
         best = self._explain_from(joint, anchor)
         ancestor = self._parents[joint]
-        while ancestor >= 0 and not self._is_kept[ancestor]:
+        while ancestor >= 0 and not is_candidate[ancestor]:
             ancestor = self._parents[ancestor]
         if ancestor in (-1, anchor) or best.cost <= COST_STEP:
             return best
@@ -289,7 +282,11 @@ class KeyJointSearch:
         for joint, explanation in self._explanations.items():
             inputs[joint, [explanation.anchor, *explanation.inputs]] = True
             unexplained[joint], is_independent[joint] = explanation.unexplained, explanation.cost > 1
-        return KeyJoints(np.flatnonzero(self._is_kept), inputs, unexplained, is_independent, self.tolerance)
+        joints = np.flatnonzero(self._is_kept)
+        is_weighted = self._may_have_weights[joints]
+        if not is_weighted.any():
+            is_weighted[:] = True
+        return KeyJoints(joints, is_weighted, inputs, unexplained, is_independent, self.tolerance)
 
 
 def _rms(motion: np.ndarray) -> float:
