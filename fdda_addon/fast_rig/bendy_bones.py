@@ -5,13 +5,13 @@ from collections.abc import Iterable, Iterator
 
 import bpy
 
-from .bone_reader import bone_node, datablock_node, deforming_bones, is_armature
+from .bone_reader import bone_node, bones_of_modifier, datablock_node, deforming_bones, is_armature
 from .dependency_graph import Node
 
 
 def unread_curves(
     armature_object: bpy.types.Object,
-    mesh_objects: Iterable[bpy.types.Object],
+    replaced_modifiers: dict[str, set[str]],
     controls: Iterable[str],
     kept: set[Node],
 ) -> frozenset[str]:
@@ -21,23 +21,36 @@ def unread_curves(
 
     Args:
         armature_object: the armature object.
-        mesh_objects: the objects that models deform.
+        replaced_modifiers: names of the modifiers that a model replaces, by name of the mesh object.
         controls: names of the bones that animators see.
         kept: what is kept if all segments stay; the objects and bones that are not kept read no curve.
     """
-    models = set(mesh_objects)
-    readers = [o for o in bpy.data.objects if o not in models and datablock_node(o) in kept]
-    read = {node for scene_object in readers for node in _bones_with_read_curves(scene_object, kept)}
+    readers = [o for o in bpy.data.objects if datablock_node(o) in kept]
+    read = {
+        node
+        for scene_object in readers
+        for node in _bones_with_read_curves(
+            scene_object, None if scene_object.library else replaced_modifiers.get(scene_object.name), kept
+        )
+    }
     bones = (bone for bone in armature_object.data.bones if bone.bbone_segments > 1)
     return frozenset({b.name for b in bones if bone_node(armature_object, b.name) not in read} - set(controls))
 
 
-def _bones_with_read_curves(scene_object: bpy.types.Object, kept: set[Node]) -> Iterator[Node]:
-    """Yield the bones whose curve deforms an object, or is followed by constraints of it or of its kept bones."""
+def _bones_with_read_curves(
+    scene_object: bpy.types.Object, replaced: set[str] | None, kept: set[Node]
+) -> Iterator[Node]:
+    """Yield the bones whose curve deforms an object, or is followed by constraints of it or of its kept bones.
+
+    Args:
+        scene_object: the object.
+        replaced: names of the modifiers that a model of the object replaces; None if it has no model.
+        kept: the kept nodes.
+    """
     for modifier in scene_object.modifiers:
-        if modifier.type == "ARMATURE" and modifier.object is not None:
-            yield from deforming_bones(scene_object, modifier.object, modifier.use_bone_envelopes)
-    if is_armature(scene_object.parent) and scene_object.parent_type == "ARMATURE":
+        if modifier.name not in (replaced or ()):
+            yield from bones_of_modifier(scene_object, modifier)
+    if replaced is None and is_armature(scene_object.parent) and scene_object.parent_type == "ARMATURE":
         yield from deforming_bones(scene_object, scene_object.parent)
     bones = scene_object.pose.bones if scene_object.pose else ()
     owners = [scene_object, *(bone for bone in bones if bone_node(scene_object, bone.name) in kept)]

@@ -10,6 +10,7 @@ from .dependency_graph import DependencyGraph, Node, chain_members, datablock_ke
 _SUBTARGETS = {"target": "subtarget", "pole_target": "pole_subtarget", "space_object": "space_subtarget"}
 """Property of a constraint or of a modifier that names a bone, by the property that points to its object."""
 _CHAIN_CONSTRAINTS = {"IK", "SPLINE_IK"}
+_ARMATURE_MODIFIERS = {"ARMATURE", "GREASE_PENCIL_ARMATURE"}
 
 
 def datablock_node(datablock: bpy.types.ID) -> Node:
@@ -88,6 +89,12 @@ def deforming_bones(
     for bone in armature_object.data.bones:
         if bone.use_deform and (use_envelopes or not group_names or bone.name in group_names):
             yield bone_node(armature_object, bone.name)
+
+
+def bones_of_modifier(scene_object: bpy.types.Object, modifier: bpy.types.Modifier) -> Iterator[Node]:
+    """Yield the bones with which an Armature modifier deforms a mesh, a curve, a lattice or a Grease Pencil object."""
+    if modifier.type in _ARMATURE_MODIFIERS and is_armature(modifier.object):
+        yield from deforming_bones(scene_object, modifier.object, modifier.use_bone_envelopes)
 
 
 def _shape_needs(armature_object: bpy.types.Object, pose_bone: bpy.types.PoseBone) -> Iterator[Node]:

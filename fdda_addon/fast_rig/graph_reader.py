@@ -9,7 +9,15 @@ from ..rig.sources import Sources
 from ..scene.compatibility import node_input
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
-from .bone_reader import add_bones, constraint_needs, datablock_node, deforming_bones, is_armature, pointer_needs
+from .bone_reader import (
+    add_bones,
+    bones_of_modifier,
+    constraint_needs,
+    datablock_node,
+    deforming_bones,
+    is_armature,
+    pointer_needs,
+)
 from .dependency_graph import DependencyGraph, Node
 from .driver_reader import add_drivers
 
@@ -115,9 +123,8 @@ def _object_needs(scene_object: bpy.types.Object, modifiers: Iterable[bpy.types.
 def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier) -> Iterator[Node]:
     """Yield the datablocks and bones that a modifier reads, except through drivers."""
     yield from pointer_needs(modifier)
-    if modifier.type == "ARMATURE" and modifier.object is not None:
-        yield from deforming_bones(scene_object, modifier.object, modifier.use_bone_envelopes)
-    elif modifier.type == "NODES" and modifier.node_group is not None:
+    yield from bones_of_modifier(scene_object, modifier)
+    if modifier.type == "NODES" and modifier.node_group is not None:
         for item in modifier.node_group.interface.items_tree:
             value = node_input(modifier, item.identifier) if item.item_type == "SOCKET" else None
             if isinstance(value, bpy.types.ID):

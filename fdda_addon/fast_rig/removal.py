@@ -48,7 +48,7 @@ def remove_unneeded(
     roots += [bone_node(armature_object, name) for name in (*joint_names, *controls)]
     replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
     kept_with_curves = read_graph(scene_rigs, replaced).kept(roots)
-    straight = unread_curves(armature_object, [rig.mesh_object for rig in scene_rigs], controls, kept_with_curves)
+    straight = unread_curves(armature_object, replaced, controls, kept_with_curves)
     graph = read_graph(scene_rigs, replaced, straight)
     kept = graph.kept(roots)
     drivers = remove_drivers(scene_rigs, graph.nodes, kept, straight)

@@ -171,7 +171,9 @@ def test_a_curve_that_nothing_reads_goes_with_its_handle_and_its_driver(bendy_ar
     assert not armature_object.animation_data.drivers
 
 
-@pytest.mark.parametrize("reader", ["control", "modifier", "parent", "constraint", "armature constraint"])
+@pytest.mark.parametrize(
+    "reader", ["control", "modifier", "parent", "constraint", "armature constraint", "constraint of the mesh"]
+)
 def test_a_curve_stays_if_something_reads_it(bendy_arm, reader):
     """Animators see controls; other objects and constraints follow the curve."""
     armature_object = bendy_arm.armature_object
@@ -182,8 +184,9 @@ def test_a_curve_stays_if_something_reads_it(bendy_arm, reader):
         other.modifiers.new("Armature", "ARMATURE").object = armature_object
     elif reader == "parent":
         other.parent, other.parent_type = armature_object, "ARMATURE"
-    elif reader == "constraint":
-        constraint = other.constraints.new("COPY_LOCATION")
+    elif reader.startswith("constraint"):
+        owner = other if reader == "constraint" else bendy_arm.mesh_object
+        constraint = owner.constraints.new("COPY_LOCATION")
         constraint.target, constraint.subtarget, constraint.use_bbone_shape = armature_object, BENDY, True
     elif reader == "armature constraint":
         target = other.constraints.new("ARMATURE").targets.new()
@@ -192,3 +195,19 @@ def test_a_curve_stays_if_something_reads_it(bendy_arm, reader):
     removed = remove_unneeded([bendy_arm], [BENDY], controls)
     assert removed.bones == {f"{UNUSED}_child"}
     assert armature_object.data.bones[BENDY].bbone_segments == 8 and len(armature_object.animation_data.drivers) == 1
+
+
+def grease_pencil_object() -> bpy.types.Object:
+    """Create an object with strokes; Blender 4.5 creates it only with an operator."""
+    bpy.ops.object.grease_pencil_add(type="EMPTY")
+    return bpy.context.object
+
+
+def test_the_curve_of_a_bone_that_deforms_strokes_stays(bendy_arm):
+    armature_object = bendy_arm.armature_object
+    strokes = grease_pencil_object()
+    strokes.vertex_groups.new(name=BENDY)
+    strokes.modifiers.new("Armature", "GREASE_PENCIL_ARMATURE").object = armature_object
+    removed = remove_unneeded([bendy_arm], ["lower"], ["control"])
+    assert removed.bones == {f"{UNUSED}_child"}
+    assert armature_object.data.bones[BENDY].bbone_segments == 8
