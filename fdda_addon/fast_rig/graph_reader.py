@@ -7,10 +7,12 @@ import bpy
 
 from ..rig.sources import Sources
 from ..scene.compatibility import node_input
+from ..scene.node_groups import read_bone_names
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
 from .bone_reader import (
     add_bones,
+    bone_node,
     bones_of_modifier,
     constraint_needs,
     datablock_node,
@@ -129,6 +131,9 @@ def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier
             value = node_input(modifier, item.identifier) if item.item_type == "SOCKET" else None
             if isinstance(value, bpy.types.ID):
                 yield datablock_node(value)
+        if bone_names := set(read_bone_names(modifier.node_group)):
+            bones = ((o, bone.name) for o in bpy.data.objects if is_armature(o) for bone in o.data.bones)
+            yield from (bone_node(o, name) for o, name in bones if "" in bone_names or name in bone_names)
 
 
 def _rendered_objects(layer_collection: bpy.types.LayerCollection) -> Iterator[bpy.types.Object]:

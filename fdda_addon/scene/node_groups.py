@@ -16,6 +16,8 @@ ATTRIBUTE_NODES = {
 POSITION_NODE = "GeometryNodeSetPosition"
 SIMULATION_NODES = {"GeometryNodeSimulationInput", "GeometryNodeSimulationOutput"}
 TIME_NODES = {"GeometryNodeInputSceneTime", *SIMULATION_NODES}
+BONE_NODE = "GeometryNodeBoneInfo"
+"""The node *Bone Info* of Blender 5.2."""
 UNLINKED_GEOMETRY = "unlinked"
 """Stands for a geometry input without a link, in place of a node type."""
 
@@ -51,6 +53,19 @@ def find_time_node(tree: bpy.types.NodeTree | None) -> bpy.types.Node | None:
         if node.type == "GROUP" and (nested_node := find_time_node(node.node_tree)):
             return nested_node
     return None
+
+
+def read_bone_names(tree: bpy.types.NodeTree | None) -> Iterator[str]:
+    """Yield the names of the bones that the nodes *Bone Info* of a group and of nested groups read.
+
+    An empty name stands for a bone that a linked socket names, which may be any bone.
+    """
+    for node in tree.nodes if tree is not None else ():
+        if node.bl_idname == BONE_NODE:
+            socket = node.inputs["Bone Name"]
+            yield "" if socket.is_linked else socket.default_value
+        elif node.type == "GROUP":
+            yield from read_bone_names(node.node_tree)
 
 
 def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:

@@ -15,6 +15,7 @@ from fdda_addon.fast_rig.graph_reader import read_graph
 from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, evaluate_joints
 from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
 from fdda_addon.fast_rig.removal import remove_unneeded
+from fdda_addon.scene.node_groups import BONE_NODE
 from fdda_addon.scene.scene_rig import SceneRig
 
 from .conftest import ELBOW
@@ -211,3 +212,20 @@ def test_the_curve_of_a_bone_that_deforms_strokes_stays(bendy_arm):
     removed = remove_unneeded([bendy_arm], ["lower"], ["control"])
     assert removed.bones == {f"{UNUSED}_child"}
     assert armature_object.data.bones[BENDY].bbone_segments == 8
+
+
+@pytest.mark.skipif(not hasattr(bpy.types, BONE_NODE), reason="this Blender has no node Bone Info")
+@pytest.mark.parametrize("is_linked", [False, True])
+def test_a_node_keeps_the_bones_that_it_may_read(is_linked):
+    scene_rig = SceneRig(*studio_arm())
+    armature_object = scene_rig.armature_object
+    tree = bpy.data.node_groups.new("bones", "GeometryNodeTree")
+    node = tree.nodes.new(BONE_NODE)
+    node.inputs["Armature"].default_value, node.inputs["Bone Name"].default_value = armature_object, UNUSED
+    if is_linked:
+        tree.links.new(tree.nodes.new("FunctionNodeInputString").outputs[0], node.inputs["Bone Name"])
+    other = bpy.data.objects.new("prop", bpy.data.meshes.new("prop"))
+    bpy.context.scene.collection.objects.link(other)
+    other.modifiers.new("Nodes", "NODES").node_group = tree
+    removed = remove_unneeded([scene_rig], ["lower"], ["control"])
+    assert removed.bones == (set() if is_linked else {f"{UNUSED}_child"})
