@@ -11,7 +11,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
 
 import bpy
 
@@ -116,24 +115,23 @@ def _other_blender(job: str) -> Iterator[tuple[subprocess.Popen, "queue.SimpleQu
         **popen_options(),
     )
     lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
+    # In a thread, because writing a long job and reading a line block, and the window must not.
+    thread = threading.Thread(target=_communicate, args=(process, job, lines), daemon=True)
+    thread.start()
     try:
-        # A Blender that has ended already says why in its output.
-        with suppress(BrokenPipeError), process.stdin:
-            process.stdin.write(job)
-        # In a thread, because reading a line blocks and the window must not.
-        reader.start()
         yield process, lines
     finally:
         process.kill()
         process.wait()
-        if reader.ident is not None:
-            reader.join()
+        thread.join()
         process.stdout.close()
 
 
-def _read(stream: TextIO, lines: "queue.SimpleQueue[str | None]") -> None:
-    for line in stream:
+def _communicate(process: subprocess.Popen, job: str, lines: "queue.SimpleQueue[str | None]") -> None:
+    # A Blender that has ended already says why in its output.
+    with suppress(OSError), process.stdin:
+        process.stdin.write(job)
+    for line in process.stdout:
         lines.put(line)
     lines.put(None)
 

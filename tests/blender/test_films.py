@@ -2,6 +2,8 @@
 """Films: the verb and the button write videos that Blender can read, or nothing at all."""
 
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import bpy
@@ -120,6 +122,17 @@ def test_a_closed_film_leaves_nothing(errors: PoseErrors, rig: SceneRig, elbow_f
     assert next(steps) == Progress("film", 1, 4) and any(tmp_path.iterdir())
     steps.close()
     assert list(tmp_path.iterdir()) == [] and datablocks() == before
+
+
+def test_a_long_list_of_pictures_does_not_wait_for_the_other_blender(monkeypatch: pytest.MonkeyPatch):
+    """The pipe to a Blender that is still starting holds 64 kB, on Windows less."""
+    start, seconds = subprocess.Popen, 20
+    command = [sys.executable, "-c", f"import time; time.sleep({seconds})"]
+    monkeypatch.setattr(subprocess, "Popen", lambda _, **options: start(command, **options))
+    started = time.monotonic()
+    with video._other_blender("x" * 2**20) as (process, _):
+        assert process.poll() is None
+    assert time.monotonic() - started < seconds / 2
 
 
 def test_a_film_that_is_closed_while_it_is_encoded_leaves_nothing(
