@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import bpy
 from bpy.types import Armature, Key, Mesh, Object
 
-SEEN_KEY = "fdda_seen"
-"""Custom property of evaluated objects and armatures whose changes were read: the mode of their graph, "VIEWPORT" or
-"RENDER". Blender removes it with the evaluated copy."""
+_SEEN_KEY = "fdda_seen"
+"""Custom property of evaluated objects and armatures whose changes were read: the mode of their graph, and the
+session id of the original. Blender removes it with the evaluated copy."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,30 @@ class DepsgraphChanges:
             if isinstance(datablock, Object):
                 if datablock.type == "MESH" and datablock.fdda.is_bound:
                     # Changed vertex groups may only change relations, which Blender reports as shading.
-                    is_edited = SEEN_KEY not in datablock or update.is_updated_shading
+                    is_edited = not seen_mode(datablock) or update.is_updated_shading
                     changes.mesh_objects.append((datablock.original, is_edited))
-                    datablock[SEEN_KEY] = depsgraph.mode
+                    _mark_seen(datablock, depsgraph.mode)
                 elif datablock.type == "ARMATURE" and update.is_updated_geometry and update.is_updated_transform:
                     changes.armatures[datablock.data.original.session_uid] = True
-            elif isinstance(datablock, Armature) and SEEN_KEY not in datablock:
+            elif isinstance(datablock, Armature) and not seen_mode(datablock):
                 is_posed = update.is_updated_geometry and update.is_updated_transform
                 changes.armatures.setdefault(datablock.original.session_uid, not is_posed)
-                datablock[SEEN_KEY] = depsgraph.mode
+                _mark_seen(datablock, depsgraph.mode)
         return changes
+
+
+def seen_mode(datablock: bpy.types.ID) -> str:
+    """Return the mode of the graph whose changes of an evaluated datablock were read, "VIEWPORT" or "RENDER".
+
+    It is empty if Blender has copied the datablock since.
+    """
+    mode, _, uid = datablock.get(_SEEN_KEY, "").partition(" ")
+    # Scripts that copy an evaluated datablock into the file copy the mark of another datablock.
+    return mode if uid == str(datablock.original.session_uid) else ""
+
+
+def _mark_seen(datablock: bpy.types.ID, mode: str) -> None:
+    datablock[_SEEN_KEY] = f"{mode} {datablock.original.session_uid}"
 
 
 def has_copied_armature(depsgraph: bpy.types.Depsgraph) -> bool:
@@ -60,7 +74,7 @@ def has_copied_armature(depsgraph: bpy.types.Depsgraph) -> bool:
 
     Rigs of Rigify drive the B-Bones, so that Blender reports their armature data in every frame.
     """
-    return any(isinstance(update.id, Armature) and SEEN_KEY not in update.id for update in depsgraph.updates)
+    return any(isinstance(update.id, Armature) and not seen_mode(update.id) for update in depsgraph.updates)
 
 
 def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:

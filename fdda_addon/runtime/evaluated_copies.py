@@ -5,7 +5,7 @@ import bpy
 import numpy as np
 
 from ..scene.arrays import MUTE_ELEMENT, write
-from .depsgraph_changes import SEEN_KEY
+from .depsgraph_changes import seen_mode
 from .session import session
 
 
@@ -31,7 +31,7 @@ def mute_shape_keys(mesh_object: bpy.types.Object) -> None:
     The user's settings are restored when Blender copies the shape keys again. Shape keys that another object shares
     stay unmuted.
     """
-    if mesh_object.get(SEEN_KEY) != "VIEWPORT":
+    if seen_mode(mesh_object) != "VIEWPORT":
         return
     shape_keys = mesh_object.data.shape_keys
     # If the first key is muted, all keys were muted since Blender copied them, or the user muted it.

@@ -20,7 +20,7 @@ from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
 from . import driver, evaluated_copies, rig_signature
-from .depsgraph_changes import SEEN_KEY
+from .depsgraph_changes import seen_mode
 from .model_files import network_of
 from .network import Execution
 from .session import session
@@ -51,7 +51,7 @@ class Player:
         error: the exception that stopped playback during an evaluation; None if there was none.
         warning, reported_warning: the current warning and the one in the status of the object; empty for none.
         mask: limits the model to a part of the mesh; None for none.
-        needs_recreation: whether the armature has other bones than those that the player reads.
+        needs_recreation: whether the armature object has other data, or other bones than those that the player reads.
         new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
         has_moved: whether there were new inputs since the last update of the batches, which resets it.
         execution: the execution whose arrays hold the positions.
@@ -77,8 +77,8 @@ class Player:
         self.needs_recreation = False
         info = self.network.info
         scene_rig = self.scene_rig(mesh_object)
-        self._armature_object_uid = scene_rig.armature_object.session_uid
-        self.armature_uid, self.mesh_uid = scene_rig.armature_object.data.session_uid, mesh_object.data.session_uid
+        armature_object, self.mesh_uid = scene_rig.armature_object, mesh_object.data.session_uid
+        self._armature_object_uid, self.armature_uid = armature_object.session_uid, armature_object.data.session_uid
         self._check_vertex_count(mesh_object)
         self.signature = rig_signature.read_signature(scene_rig)
         rig_signature.check(scene_rig, self.network, self.signature)
@@ -89,9 +89,8 @@ class Player:
         self._blend: SkinningBlend | None = None
         self.execution = self._single_execution = Execution(self.network, 1)
         self.new_inputs: ModelInputs | None = None
-        self.has_moved = False
         self.depsgraph_keys: set[tuple[str, int, str]] = set()
-        self.has_new_copy = False
+        self.has_moved = self.has_new_copy = False
         # A render may evaluate on another thread while the window does.
         self.lock = threading.Lock()
         self._shown_inputs: tuple | None = None
@@ -199,7 +198,8 @@ class Player:
         self.new_inputs = None
         if armature_object is None or mesh_object is None:
             return False
-        if not self._pose_reader.fits(armature_object):
+        data = armature_object.data.original
+        if data.session_uid != self.armature_uid or not self._pose_reader.fits(armature_object):
             self.needs_recreation = True
             return False
         self._check_vertex_count(mesh_object.original)
@@ -254,7 +254,7 @@ class Player:
         """Write the positions to an evaluated position buffer, even unchanged: an evaluation may have reset them."""
         set_mesh_positions(buffer.data, self._positions)
         if mesh_object.data.shape_keys is not None:
-            self.has_new_copy |= SEEN_KEY not in mesh_object
+            self.has_new_copy |= not seen_mode(mesh_object)
             evaluated_copies.mute_shape_keys(mesh_object)
 
     def _create_blend(self, scene_rig: SceneRig) -> SkinningBlend:

@@ -90,6 +90,32 @@ def test_a_change_by_a_script_shows_the_rig(bound_elbow, change_name, update, is
     assert_rig_shown(bound_elbow, clause, capsys)
 
 
+@pytest.mark.parametrize("update", ["view layer", "frame"])
+def test_other_armature_data_show_the_rig_if_they_differ(bound_elbow, elbow_files, update, capsys):
+    rig = bpy.data.objects[ELBOW_RIG]
+    for is_deforming in (True, False):
+        pose(angle=1.0)
+        data = rig.data.copy()
+        data.bones["lower"].use_deform = is_deforming
+        rig.data = data
+        trigger_check(update)
+        if is_deforming:
+            assert_plays(bound_elbow, elbow_files.model)
+    assert_rig_shown(bound_elbow, "some vertices follow no bone", capsys)
+
+
+def test_a_change_of_a_copy_of_evaluated_armature_data_shows_the_rig(bound_elbow, elbow_files, capsys):
+    """Blender copies custom properties of evaluated data, too."""
+    rig = bpy.data.objects[ELBOW_RIG]
+    pose(angle=0.5)
+    rig.data = rig.data.evaluated_get(bpy.context.evaluated_depsgraph_get()).copy()
+    pose(angle=1.0)
+    assert_plays(bound_elbow, elbow_files.model)
+    rig.data.bones["lower"].use_deform = False
+    trigger_check("view layer")
+    assert_rig_shown(bound_elbow, "some vertices follow no bone", capsys)
+
+
 def test_a_change_of_the_reference_key_shows_the_rig(bound_elbow, capsys):
     add_shape_key(bound_elbow)
     pose(angle=1.0)

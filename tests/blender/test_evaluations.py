@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.runtime.binding import bind
-from fdda_addon.runtime.depsgraph_changes import SEEN_KEY
+from fdda_addon.runtime.depsgraph_changes import seen_mode
 from fdda_addon.runtime.model_files import model_path
 from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
@@ -276,7 +276,7 @@ def test_depsgraphs_are_identified_by_mode_scene_and_view_layer(bound_elbow, tmp
     seen_graphs = []
 
     def record_graph(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-        seen_graphs.append((depsgraph.mode, bound_elbow.evaluated_get(depsgraph).get(SEEN_KEY) == "VIEWPORT"))
+        seen_graphs.append((depsgraph.mode, seen_mode(bound_elbow.evaluated_get(depsgraph)) == "VIEWPORT"))
 
     with handler("frame_change_post", record_graph):
         for frame in range(3):
