@@ -27,7 +27,10 @@ def drop_components(
     activation: str,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[PreparedPartition], list[Network]]:
-    """Drop the components that lower the mean error of the validation poses too little, or raise it.
+    """Drop the components that lower the mean error too little, or raise it.
+
+    The error is measured on the validation poses. Margin poses also count, with their weight, because components may
+    represent what only happens beyond the range of motion. All of them were trained on, so no others can be measured.
 
     A network cannot predict a component that depends on more than its inputs, or on details that the poses do not show.
     The components are first replaced by the principal components of the predictions, which are fewer than those of
@@ -50,7 +53,7 @@ def drop_components(
         if should_stop():
             raise Cancelled
         changes.append(_principal_directions(network.evaluate(partition.inputs[split.training], activation)))
-        error, partition_gains = _component_gains(partition, network, changes[-1], activation)
+        error, partition_gains = _component_gains(partition, network, changes[-1], split, activation)
         total_error += error
         gains.append(partition_gains)
     costs = [3 * p.vertex_count + len(network.weights[-1]) + 1 for p, network in zip(prepared, networks, strict=True)]
@@ -93,13 +96,14 @@ def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining
 
 
 def _component_gains(
-    partition: PreparedPartition, network: Network, change: np.ndarray, activation: str
+    partition: PreparedPartition, network: Network, change: np.ndarray, split: Split, activation: str
 ) -> tuple[float, np.ndarray]:
-    """Measure what each component of a changed basis gains on the validation poses.
+    """Measure what each component of a changed basis gains on the validation poses, and on poses of the margin.
 
     Args:
         partition, network, activation: partition with its trained network.
         change: (K, K) orthonormal columns, the new components.
+        split: split of the poses.
 
     Returns:
         The mean over the poses of the sum of all vertices' errors, mesh units. Then (K,) by how much it would grow
@@ -107,6 +111,28 @@ def _component_gains(
     """
     coefficients = network.evaluate(partition.inputs[partition.validation], activation)
     errors = partition.validation_residuals - partition.basis.reconstruct(coefficients)
+    error, gains = _gains_in_poses(partition, coefficients, errors, change)
+    if len(split.margin):
+        poses = split.margin[:: -(-len(split.margin) // len(partition.validation))]
+        coefficients = network.evaluate(partition.inputs[poses], activation)
+        # What the components do not represent is small in these poses, and left out.
+        errors = (partition.coefficients[poses] - coefficients) @ partition.basis.components
+        margin_error, margin_gains = _gains_in_poses(partition, coefficients, errors, change)
+        is_margin, weights = np.isin(split.training, split.margin), split.weights()
+        ratio = weights[is_margin].sum() / weights[~is_margin].sum()
+        error, gains = error + ratio * margin_error, gains + ratio * margin_gains
+    return error, gains
+
+
+def _gains_in_poses(
+    partition: PreparedPartition, coefficients: np.ndarray, errors: np.ndarray, change: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Measure what components gain in n poses; other arguments and result as in `_component_gains`.
+
+    Args:
+        coefficients: (n, K) predicted coefficients.
+        errors: (n, 3 Vp) residuals minus predicted residuals, mesh units.
+    """
 
     def summed_error(errors: np.ndarray) -> float:
         return float(np.linalg.norm(errors.reshape(len(errors), -1, 3), axis=2).sum(axis=1, dtype=np.float64).mean())

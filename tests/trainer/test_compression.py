@@ -107,6 +107,24 @@ def test_components_without_truncation_error_have_a_finite_error():
         assert np.isfinite(changed.basis.error_by_count).all()
 
 
+def test_a_component_for_poses_beyond_the_range_of_motion_stays():
+    rng = np.random.default_rng(0)
+    inside, beyond = rng.uniform(-1, 1, 200), rng.uniform(1, 2, 100) * rng.choice([-1, 1], 100)
+    features = np.append(inside, beyond)[:, None].astype(np.float32)
+    bursts = np.sign(features) * np.maximum(np.abs(features) - 1, 0)
+    amplitudes = np.concatenate([0.01 * np.cos(2 * features), 0.1 * bursts], axis=1)
+    patterns = rng.normal(size=(2, VERTEX_COUNT, 3))
+    residuals = np.einsum("np,pvc->nvc", amplitudes, patterns).astype(np.float32)
+    data = PartitionData("elbow", features, lambda: residuals, VERTEX_COUNT)
+    inner, margin = split_poses(np.arange(200), 0.2, 0, 0.2), np.arange(200, 300)
+    split = Split(np.append(inner.training, margin), inner.validation, inner.held_out, margin)
+    prepared = [prepare_partition(data, split, 0.01, 0)]
+    networks = train(prepared, split, CONFIG, torch.device("cpu")).networks
+    (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
+    error = mean_error(data, partition, network, margin)
+    assert error < 1.1 * mean_error(data, prepared[0], networks[0], margin) < 0.2 * np.abs(residuals[margin]).mean()
+
+
 def test_compression_can_be_cancelled_between_partitions():
     data = make_data(noise=0), make_data(noise=0)
     prepared, networks, split = train_partitions(*data)
