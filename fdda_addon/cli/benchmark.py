@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import RigError, WrongUsageError
+from ..core.errors import FDDAError, WrongUsageError
 from ..core.file_kind import BENCHMARK
 from ..core.output import check_outputs, write_json
 from ..core.progress import Progress
@@ -80,7 +80,7 @@ def _profile(options: argparse.Namespace) -> None:
         profile = _last_step(profile_frame(scene_rig), progress)
         try:
             profile = replace(profile, fast_rig=_last_step(measure_saving(scene_rig, options.rig), progress))
-        except RigError as error:
+        except FDDAError as error:
             profile = replace(profile, fast_rig_problem=str(error))
     write_json(options.json, profile.to_json())
     print(profile.table())

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import FDDAError
+from ..core.temporary import temporary_folder_error
 from .job import JobOperator
 from .rig_operator import RigOperator
 
@@ -67,7 +68,7 @@ def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object
     from ..timing.fast_rig_saving import FastRigSaving
 
     try:
-        with tempfile.TemporaryDirectory(prefix="fdda-") as folder:
+        with tempfile.TemporaryDirectory(prefix="fdda-", ignore_cleanup_errors=True) as folder:
             file, result_file = Path(folder) / "rig.blend", Path(folder) / "saving.json"
             save_copy(file)
             arguments = [str(file), "--fast-rig", f"--object={object_name}", "--json", str(result_file)]
@@ -77,6 +78,8 @@ def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object
         yield replace(profile, fast_rig=saving)
     except FDDAError as error:
         yield replace(profile, fast_rig_problem=str(error))
+    except OSError as error:
+        yield replace(profile, fast_rig_problem=str(temporary_folder_error(error)))
 
 
 CLASSES = (FDDA_OT_profile_frame,)

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The frame profile: the parts of a frame, the bones with the slowest constraints, and the restored scene."""
 
+import errno
 import json
+import os
+import tempfile
 from types import SimpleNamespace
 
 import bpy
@@ -10,6 +13,7 @@ import pytest
 from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.operators.frame_profile import last_profile
 from fdda_addon.panels.frame_profile import draw_profile
+from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing.armature_copy import armature_copy
 from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, parts_by_bone
@@ -217,6 +221,28 @@ def test_the_profile_says_why_no_fast_rig_can_be_made(slow_rig, tmp_path, capfd)
     profile = json.loads(path.read_text())["profile"]
     assert profile["fast_rig"] is None and profile["fast_rig_problem"].startswith("'other' uses the armature of")
     assert "A fast rig cannot be made: 'other' uses the armature of" in capfd.readouterr().out
+
+
+def fail_to_write(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_the_profile_stays_if_the_fast_rig_cannot_be_written(slow_rig, tmp_path, monkeypatch):
+    """The measurement of the frame has taken minutes on large rigs."""
+    hide_extra_bones(slow_rig)
+    file, path = tmp_path / "rig.blend", tmp_path / "profile.json"
+    bpy.ops.wm.save_as_mainfile(filepath=str(file))
+    monkeypatch.setattr(blend_file, "remove_file", fail_to_write)
+    assert run("benchmark", file, "--profile", "--json", path) == 0
+    profile = json.loads(path.read_text())["profile"]
+    assert profile["parts"] and "No space left" in profile["fast_rig_problem"]
+
+
+def test_the_button_keeps_the_profile_without_a_temporary_folder(slow_rig, monkeypatch):
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", fail_to_write)
+    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
+    profile = last_profile(slow_rig.mesh_object)
+    assert profile.parts and "No temporary file can be written" in profile.fast_rig_problem
 
 
 @pytest.mark.parametrize("arguments", [["m.onnx", "--profile"], ["m.onnx", "--fast-rig"], []])
