@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .data.split import Split
+from .data.split import MARGIN_POSE_WEIGHT, Split
 from .fits.basis import Basis
 from .fits.low_rank import factorize, may_factorize
 from .networks.networks import Network
@@ -29,8 +29,8 @@ def drop_components(
 ) -> tuple[list[PreparedPartition], list[Network]]:
     """Drop the components that lower the mean error too little, or raise it.
 
-    The error is measured on the validation poses. Margin poses also count, with their weight, because components may
-    represent what only happens beyond the range of motion. All of them were trained on, so no others can be measured.
+    The error is measured on the validation poses. Margin poses and refined poses also count, with a lower weight,
+    because components may represent what only happens in extreme poses. These are all training poses.
 
     A network cannot predict a component that depends on more than its inputs, or on details that the poses do not show.
     The components are first replaced by the principal components of the predictions, which are fewer than those of
@@ -98,7 +98,7 @@ def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining
 def _component_gains(
     partition: PreparedPartition, network: Network, change: np.ndarray, split: Split, activation: str
 ) -> tuple[float, np.ndarray]:
-    """Measure what each component of a changed basis gains on the validation poses, and on poses of the margin.
+    """Measure what each component of a changed basis gains on the validation poses, and on extreme poses.
 
     Args:
         partition, network, activation: partition with its trained network.
@@ -112,15 +112,15 @@ def _component_gains(
     coefficients = network.evaluate(partition.inputs[partition.validation], activation)
     errors = partition.validation_residuals - partition.basis.reconstruct(coefficients)
     error, gains = _gains_in_poses(partition, coefficients, errors, change)
-    if len(split.margin):
-        poses = split.margin[:: -(-len(split.margin) // len(partition.validation))]
+    extremes = np.union1d(split.margin, split.refined)
+    if len(extremes):
+        poses = extremes[:: -(-len(extremes) // len(partition.validation))]
         coefficients = network.evaluate(partition.inputs[poses], activation)
         # What the components do not represent is small in these poses, and left out.
         errors = (partition.coefficients[poses] - coefficients) @ partition.basis.components
-        margin_error, margin_gains = _gains_in_poses(partition, coefficients, errors, change)
-        is_margin, weights = np.isin(split.training, split.margin), split.weights()
-        ratio = weights[is_margin].sum() / weights[~is_margin].sum()
-        error, gains = error + ratio * margin_error, gains + ratio * margin_gains
+        extreme_error, extreme_gains = _gains_in_poses(partition, coefficients, errors, change)
+        ratio = MARGIN_POSE_WEIGHT * len(extremes) / (len(split.training) - len(extremes))
+        error, gains = error + ratio * extreme_error, gains + ratio * extreme_gains
     return error, gains
 
 

@@ -107,7 +107,8 @@ def test_components_without_truncation_error_have_a_finite_error():
         assert np.isfinite(changed.basis.error_by_count).all()
 
 
-def test_a_component_for_poses_beyond_the_range_of_motion_stays():
+@pytest.mark.parametrize("kind", ["margin", "refined"])
+def test_a_component_for_extreme_poses_stays(kind):
     rng = np.random.default_rng(0)
     inside, beyond = rng.uniform(-1, 1, 200), rng.uniform(1, 2, 100) * rng.choice([-1, 1], 100)
     features = np.append(inside, beyond)[:, None].astype(np.float32)
@@ -116,13 +117,13 @@ def test_a_component_for_poses_beyond_the_range_of_motion_stays():
     patterns = rng.normal(size=(2, VERTEX_COUNT, 3))
     residuals = np.einsum("np,pvc->nvc", amplitudes, patterns).astype(np.float32)
     data = PartitionData("elbow", features, lambda: residuals, VERTEX_COUNT)
-    inner, margin = split_poses(np.arange(200), 0.2, 0, 0.2), np.arange(200, 300)
-    split = Split(np.append(inner.training, margin), inner.validation, inner.held_out, margin)
+    inner, extremes = split_poses(np.arange(200), 0.2, 0, 0.2), np.arange(200, 300)
+    split = Split(np.append(inner.training, extremes), inner.validation, inner.held_out, **{kind: extremes})
     prepared = [prepare_partition(data, split, 0.01, 0)]
     networks = train(prepared, split, CONFIG, torch.device("cpu")).networks
     (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
-    error = mean_error(data, partition, network, margin)
-    assert error < 1.1 * mean_error(data, prepared[0], networks[0], margin) < 0.2 * np.abs(residuals[margin]).mean()
+    error = mean_error(data, partition, network, extremes)
+    assert error < 1.1 * mean_error(data, prepared[0], networks[0], extremes) < 0.2 * np.abs(residuals[extremes]).mean()
 
 
 def test_compression_can_be_cancelled_between_partitions():

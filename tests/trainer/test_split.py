@@ -87,6 +87,7 @@ def test_all_refined_poses_are_training_poses(recording):
     after = split(recording, Source(ACTION, 100, "walk", (1, 1)), Source(REFINED, 7, "model.onnx"))
     assert np.array_equal(after.held_out, before.held_out) and np.array_equal(after.validation, before.validation)
     assert np.array_equal(after.training[-7:], np.arange(100, 107))
+    assert np.array_equal(after.refined, np.arange(100, 107)) and not len(before.refined)
 
 
 def test_all_margin_poses_are_training_poses(recording):

@@ -29,12 +29,14 @@ class Split:
         validation: poses that select the best weights.
         held_out: poses that measure the error; nothing is computed from them or selected by them.
         margin: the poses of `training` that lie outside the range of motion.
+        refined: the poses of `training` that were added where errors were largest.
     """
 
     training: np.ndarray
     validation: np.ndarray
     held_out: np.ndarray
     margin: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    refined: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def weights(self) -> np.ndarray:
         """Return (n,) float64 weights of the training poses: 1, and `MARGIN_POSE_WEIGHT` for poses of the margin."""
@@ -81,6 +83,7 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     """
     sources = recording.info.sampling.sources
     always_trains = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in sources])
+    is_refined = always_trains.copy()
     is_random = np.concatenate([np.full(s.poses, s.kind == RANDOM) for s in sources])
     margin_poses = np.zeros(0, np.int64)
     if margin := recording.info.sampling.margin:
@@ -109,7 +112,7 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
         for name in ("training", "validation", "held_out")
     )
     training = np.append(training, np.flatnonzero(always_trains & is_usable))
-    return Split(training, validation, held_out, margin_poses)
+    return Split(training, validation, held_out, margin_poses, np.flatnonzero(is_refined & is_usable))
 
 
 def _frame_blocks(sources: tuple[Source, ...]) -> list[list[int]]:
