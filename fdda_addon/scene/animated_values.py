@@ -61,14 +61,22 @@ def read_scene_values(scene: bpy.types.Scene) -> AnimatedValues:
 
 
 def restore_values(scene_values: AnimatedValues) -> None:
-    """Write values that have changed back to their datablocks, if these still exist."""
+    """Write values that have changed back to their datablocks, if these and their properties still exist."""
     for datablock, values in scene_values:
         try:
-            changed = {path: value for path, value in values.items() if read_value(datablock, path) != value}
-            for path, value in changed.items():
-                set_value(datablock, path, value)
-            if changed:
+            if any([_restore_value(datablock, path, value) for path, value in values.items()]):
                 datablock.update_tag()
-        except (ReferenceError, ValueError):
-            # The datablock or the property was removed in the meantime.
+        except ReferenceError:
+            # The datablock was removed in the meantime.
             continue
+
+
+def _restore_value(owner: bpy.types.ID, path: str, value: object) -> bool:
+    """Write a value back, and return whether it had changed; a property that was removed is left out."""
+    try:
+        if read_value(owner, path) == value:
+            return False
+    except ValueError:
+        return False
+    set_value(owner, path, value)
+    return True

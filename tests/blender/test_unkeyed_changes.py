@@ -69,12 +69,16 @@ def test_a_job_keeps_unkeyed_changes_of_other_objects():
         for frame in (1, 30):
             added.keyframe_insert("location", frame=frame)
     other.data.keyframe_insert("lens", frame=1)
+    for name in ("first", "last"):
+        other[name] = 1.0
+        other.keyframe_insert(f'["{name}"]', frame=1)
     scene.frame_set(FRAME)
     other.location[1], other.data.lens = 2.5, 80.0
     with temporary_pose(armature_object):
         scene.frame_set(FRAME + 5)
         assert other.location[1] == 0
         bpy.data.objects.remove(removed)
+        del other["first"], other["last"]
     bpy.context.view_layer.update()
     evaluated = other.evaluated_get(bpy.context.evaluated_depsgraph_get())
     assert (evaluated.location[1], evaluated.data.lens, scene.frame_current) == (2.5, 80.0, FRAME)
