@@ -83,7 +83,8 @@ def prepared_trials(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch) -> I
         states = _sample_states(scene_rig, rig, search, 2 * search.poses)
         clear_pose(scene_rig.armature_object)
         with override_joints(scene_rig, rig.joints, search.has_other_bones) as override:
-            yield _OverrideTrials(scene_rig, rig, states, override)
+            leaders = _find_leading_roots(rig, states, override.rest) if search.has_other_bones else {}
+            yield _OverrideTrials(scene_rig, rig, states, override, leaders)
     clear_pose(scene_rig.armature_object)
 
 
@@ -143,7 +144,17 @@ class _ChannelTrials:
 class _OverrideTrials:
     """Trials that set joints and controls to their values in other poses, and keep all others."""
 
-    def __init__(self, scene_rig: SceneRig, rig: Rig, states: "list[_PoseState]", override: JointOverride):
+    def __init__(
+        self,
+        scene_rig: SceneRig,
+        rig: Rig,
+        states: "list[_PoseState]",
+        override: JointOverride,
+        leading_roots: dict[int, int],
+    ):
+        self._followers: dict[int, list[int]] = {}
+        for follower, leader in leading_roots.items():
+            self._followers.setdefault(leader, []).append(follower)
         self._scene_rig, self._rig, self._override = scene_rig, rig, override
         joint_transforms = np.stack([state.joints for state in states])
         changes = np.abs(joint_transforms - joint_transforms[0])
@@ -163,7 +174,7 @@ class _OverrideTrials:
         self._bone_of_control = {indices[0]: name for name, indices in self._movable_bones.items()}
         self.undetectable_controls = frozenset(range(len(rig.controls))) - movable_bone_controls
         self.undetectable_controls -= frozenset(self._movable_controls)
-        self.inputs = [(JOINT, index) for index in moving_joints]
+        self.inputs = [(JOINT, index) for index in moving_joints if index not in leading_roots]
         self.inputs += [(CONTROL, index) for index in sorted([*self._movable_controls, *self._bone_of_control])]
         trial_count = len(states) // 2
         rest_state = _PoseState(override.rest, states[0].controls, dict.fromkeys(bones, Matrix()))
@@ -172,6 +183,8 @@ class _OverrideTrials:
 
     def show(self, trial: int, moved: Sequence[int]) -> None:
         inputs = [self.inputs[number] for number in moved]
+        joints = [index for kind, index in inputs if kind == JOINT]
+        inputs += [(JOINT, follower) for index in joints for follower in self._followers.get(index, ())]
         state = self._base_states[trial].with_inputs_of(self._moved_states[trial], inputs, self._bone_of_control)
         self._override.set(state.joints)
         for index in self._movable_controls:
@@ -207,6 +220,28 @@ class _PoseState:
             else:
                 controls[index] = other.controls[index]
         return _PoseState(joints, controls, bones)
+
+
+def _find_leading_roots(rig: Rig, states: list[_PoseState], rest: np.ndarray) -> dict[int, int]:
+    """Find the roots that move exactly as an earlier root in all states, and return that root's index by theirs.
+
+    In Rigify, constraints attach several roots to the bone "root". Bones between them would be torn if one moved alone.
+
+    Args:
+        rig: the rig.
+        states: poses of its joints.
+        rest: (J, 4, 4) rest matrices relative to parent joints.
+    """
+    roots = [index for index, parent in enumerate(rig.parents.tolist()) if parent < 0]
+    motions = np.stack([state.joints[roots] for state in states]) @ np.linalg.inv(rest[roots])
+    motions[..., :3, 3] *= rig.metres_per_unit
+    leaders: dict[int, int] = {}
+    for number, root in enumerate(roots):
+        differences = np.abs(motions[:, :number] - motions[:, number, None]).max(axis=(0, 2, 3))
+        same = np.flatnonzero(differences < MIN_TRANSFORM_CHANGE)
+        if len(same):
+            leaders[root] = roots[same[0]]
+    return leaders
 
 
 def _sample_states(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, count: int) -> list[_PoseState]:

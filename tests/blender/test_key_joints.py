@@ -213,6 +213,29 @@ def test_weights_stay_with_their_joints_if_the_order_changes(tmp_path):
     assert np.sqrt((residuals_mm**2).mean()) < 1.5 * fit.training.rms_mm["fitted"]
 
 
+def test_a_root_that_follows_another_is_moved_with_it(tmp_path):
+    """As in Rigify, constraints attach "bone.0" and the removed bone "pin" to the bone "world", which moves all."""
+    rig = build_limb()
+    armature_object = rig.armature_object
+    ends = (0.0, 0.0, 0.0), (0.1, 0.0, 0.0)
+    add_bones(armature_object, NewBone("world", *ends), NewBone("pin", *ends), NewBone("fin", *ends, "world"))
+    bones = armature_object.pose.bones
+    for name in ("bone.0", "pin"):
+        constraint = bones[name].constraints.new("ARMATURE")
+        target = constraint.targets.new()
+        target.target, target.subtarget = armature_object, "world"
+    for name in ("world", "fin"):
+        limit(bones[name], "LIMIT_ROTATION", {0: (-40.0, 40.0), 1: (-40.0, 40.0), 2: (-40.0, 40.0)})
+    for number, name in enumerate(("pin", "fin")):
+        rig.mesh_object.vertex_groups.new(name=name).add(range(number, 200, 2), 0.5, "REPLACE")
+    drain(record(rig, tmp_path / "recording", SETTINGS))
+    recording = read_recording(tmp_path / "recording")
+    names = recording.rig.joint_names
+    assert {"world", "bone.0"} <= set(names) and "pin" not in names
+    influences = {names[joint] for partition in recording.partitions for joint in partition.influencing}
+    assert influences and influences.isdisjoint({"world", "bone.0"})
+
+
 def test_a_resumed_recording_keeps_its_joints(tmp_path, monkeypatch):
     rig = build_limb()
     before = scene_state(rig)

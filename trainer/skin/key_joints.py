@@ -22,7 +22,7 @@ from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.skinning import skin_matrices
 
 from ..process import Cancelled
-from .input_blocks import InputBlocks, predict
+from .input_blocks import MIN_SPREAD, InputBlocks, predict
 
 TOLERANCE_RATIO = 2.5e-4
 """A joint is removed if the motion that remains unexplained is at most this part of the character's size (rms over
@@ -118,8 +118,8 @@ class KeyJointSearch:
             is_static: (J,) bool, joints that never move.
             is_unseen: (J,) bool, joints that only actions move. Neither are removed.
         """
-        size = max(poses.rig.size, 1e-9)
-        self.tolerance = TOLERANCE_RATIO * size
+        self._size = max(poses.rig.size, 1e-9)
+        self.tolerance = TOLERANCE_RATIO * self._size
         self._blocks, self._is_kept = blocks, np.ones(len(moments), bool)
         self._is_required = is_static | is_unseen
         self._skin = skin_matrices(poses.pose_matrices, poses.rig.rest_matrices).astype(np.float64)
@@ -279,8 +279,12 @@ class KeyJointSearch:
         joint_count = len(self._is_kept)
         inputs, unexplained = np.zeros((joint_count, self._blocks.count), bool), np.zeros(joint_count)
         is_independent = np.zeros(joint_count, bool)
+        roots = [joint for joint in np.flatnonzero(self._is_kept).tolist() if self._blocks.parent(joint) < 0]
+        differences = np.abs(self._skin[:, roots] - self._skin[:, roots[:1]])
+        # What moves all roots moves the whole character, and no residual follows from it.
+        free_roots = set(roots) if differences.max() < MIN_SPREAD * max(1.0, self._size) else set()
         for joint, explanation in self._explanations.items():
-            inputs[joint, [explanation.anchor, *explanation.inputs]] = True
+            inputs[joint, [*({explanation.anchor} - free_roots), *explanation.inputs]] = True
             unexplained[joint], is_independent[joint] = explanation.unexplained, explanation.cost > 1
         joints = np.flatnonzero(self._is_kept)
         is_weighted = self._may_have_weights[joints]
