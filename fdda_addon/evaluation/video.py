@@ -26,7 +26,7 @@ INDEXES = {".mp4": b"moov", ".webm": b"\x1c\x53\xbb\x6b"}
 WAIT_SECONDS = 0.05
 """Longest time between two steps while the other Blender encodes."""
 _ENCODED_LINE = re.compile(r"encoded (?P<count>\d+)")
-_ERROR_LINE = re.compile(r"Error: (?P<text>.+)")
+_FAILURE_LINE = re.compile(r"encoding failed: (?P<text>.+)")
 
 
 def check_video_path(path: Path) -> None:
@@ -73,7 +73,7 @@ def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) 
             while (line := _next_line(lines)) is not None:
                 if match := _ENCODED_LINE.match(line):
                     count = int(match["count"])
-                elif match := _ERROR_LINE.match(line):
+                elif match := _FAILURE_LINE.match(line):
                     problem = match["text"].rstrip(".")
                 yield count
             problem = problem or (f"the other Blender ended with status {process.wait()}" if process.wait() else "")

@@ -12,7 +12,7 @@ from ..scene.compatibility import set_video_format
 
 
 def main() -> None:
-    """Encode, printing `encoded N` after each frame, or `Error: ` and the reason."""
+    """Encode, printing `encoded N` after each frame, or `encoding failed: ` and the reason."""
     job = json.load(sys.stdin)
     scene = _scene(job["pictures"], job["size"], job["fps"])
     set_video_format(scene.render.image_settings)
@@ -24,7 +24,8 @@ def main() -> None:
     try:
         bpy.ops.render.render(animation=True, scene=scene.name)
     except RuntimeError as error:
-        print(f"Error: {report_message(error)}", flush=True)
+        # Blender itself prints lines that begin with "Error: " when it ends, also after a success.
+        print(f"\nencoding failed: {report_message(error)}", flush=True)
     sys.stdout.flush()
     # Nothing is left to do, and Blender 4.5 as a module may hang at its end.
     os._exit(0)

@@ -158,10 +158,12 @@ def test_a_film_that_is_closed_while_it_is_encoded_leaves_nothing(
 def test_a_blender_that_does_not_start_is_reported(
     errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(video.sys, "executable", str(tmp_path / "missing"))
-    with pytest.raises(OutputError, match=r"Cannot write '.+film\.mp4': .*No such file.*; nothing was changed\."):
-        list(film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL))
-    monkeypatch.setattr(video.sys, "executable", "/bin/false")
+    with monkeypatch.context() as context:
+        context.setattr(video.sys, "executable", str(tmp_path / "missing"))
+        with pytest.raises(OutputError, match=r"Cannot write '.+film\.mp4': .*No such file.*; nothing was changed\."):
+            list(film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL))
+    # An add-on that cannot be imported
+    monkeypatch.setattr(video, "__file__", str(tmp_path / "missing" / "evaluation" / "video.py"))
     with pytest.raises(OutputError, match="the other Blender ended with status 1; the disk may be full"):
         list(film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL))
     assert list(tmp_path.iterdir()) == []
