@@ -25,6 +25,8 @@ from .environment.folder import user_folder
 from .environment.subprocesses import popen_options
 from .process import Training
 
+SIGNAL_CHECKS = 4 if sys.platform == "win32" else 1
+"""Checks before a process is ended: on Windows, a Blender that reads the messages has them open for a moment, too."""
 POLL_SECONDS = 0.1
 _child_processes: dict[int, subprocess.Popen] = {}
 """Trainer processes that this Blender has started, by process id. Only their exit status can be read."""
@@ -236,6 +238,9 @@ class _ForeignProcess:
 
     def _send_signal(self, signal_number: int) -> None:
         # The process id may be reused by another process.
-        if self._files.is_running():
-            with contextlib.suppress(OSError):
-                os.kill(self.pid, signal_number)
+        for _ in range(SIGNAL_CHECKS):
+            if not self._files.is_running():
+                return
+            time.sleep(POLL_SECONDS / 3)
+        with contextlib.suppress(OSError):
+            os.kill(self.pid, signal_number)
