@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..timing.frame_profile import FrameProfile
 
 MIN_SHOWN_SHARE = 0.01
-"""A part with a smaller share of the frame is not drawn."""
+"""A part with a smaller share of the evaluation is not drawn. Drawing may take many times as long as the evaluation."""
 MIN_LETTER_SHARE = 0.05
 """A segment of the bar with a smaller share has no room for its letter."""
 
@@ -39,15 +39,19 @@ def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 def _draw_parts(layout: bpy.types.UILayout, profile: "FrameProfile") -> None:
-    shares = [part.duration.median / max(profile.total, 1e-9) for part in profile.parts]
-    shown = [(part, share) for part, share in zip(profile.parts, shares, strict=True) if share >= MIN_SHOWN_SHARE]
+    smallest_ms = MIN_SHOWN_SHARE * profile.frame.median
+    shown = [
+        (part, part.duration.median / max(profile.total, 1e-9))
+        for part in profile.parts
+        if part.duration.median >= smallest_ms
+    ]
     letters = ascii_uppercase[: len(shown)]
     column = layout.column(align=True)
     _draw_bar(column, [(letter, share) for letter, (_, share) in zip(letters, shown, strict=False)])
     for index, (part, share) in enumerate(shown):
-        row = column.split(factor=0.6)
+        row = column.split(factor=0.5)
         row.label(text=f"{letters[index : index + 1]}  {part.title}")
-        row.label(text=f"{part.duration} ms, {share:.0%}")
+        row.label(text=f"{part.duration} ms, {f'{share:.0%}' if share >= 0.01 else 'below 1%'}")
 
 
 def _draw_bar(layout: bpy.types.UILayout, segments: list[tuple[str, float]]) -> None:

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import tempfile
+from dataclasses import replace
 from types import SimpleNamespace
 
 import bpy
@@ -12,6 +13,7 @@ import pytest
 
 from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.operators.frame_profile import last_profile
+from fdda_addon.panels import frame_profile as frame_profile_panel
 from fdda_addon.panels.frame_profile import draw_profile
 from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
@@ -19,7 +21,7 @@ from fdda_addon.timing.armature_copy import armature_copy
 from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, parts_by_bone
 from fdda_addon.timing.durations import ARMATURE_SCENE_NAME, Duration
 from fdda_addon.timing.fast_rig_saving import FastRigSaving
-from fdda_addon.timing.frame_profile import BONES, MODIFIER, REST, FrameProfile
+from fdda_addon.timing.frame_profile import BONES, DRAWING, MODIFIER, REST, FramePart, FrameProfile
 from fdda_addon.timing.profiling import profile_frame
 
 from .conftest import run
@@ -292,3 +294,17 @@ def test_the_sidebar_draws_a_bar_with_the_shares(slow_rig):
     sentences = profile.savings_sentences()
     assert len(sentences) == 2
     assert all(sentence.split(" ms")[0] in " ".join(texts) for sentence in sentences)
+
+
+def test_slow_drawing_hides_no_part(slow_rig, monkeypatch):
+    """Without a graphics card, drawing takes a hundred times as long as the rig."""
+    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
+    profile, drawn = last_profile(slow_rig.mesh_object), []
+    drawing = FramePart(DRAWING, "", "", Duration(1000 * profile.frame.median, 0.0))
+    slow = replace(profile, parts=(*profile.parts, drawing))
+    monkeypatch.setattr(frame_profile_panel, "last_profile", lambda _: slow)
+    context = SimpleNamespace(region=SimpleNamespace(width=300), preferences=bpy.context.preferences)
+    draw_profile(Layout(drawn), context, slow_rig)
+    texts = [element.text for element in drawn]
+    assert f"A  {profile.parts[0].title}" in texts and f"{profile.parts[0].duration} ms, below 1%" in texts
+    assert any(text.endswith("  Drawing") for text in texts)
