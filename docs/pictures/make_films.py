@@ -20,7 +20,8 @@ from fdda_addon.cli.progress import ProgressPrinter
 from fdda_addon.core.defaults import FILM_TIMED_FRAMES
 from fdda_addon.core.progress import Progress
 from fdda_addon.evaluation.film import FDDA, FDDA_ERROR, LINEAR, LINEAR_ERROR, RIG, FilmSettings, film
-from fdda_addon.evaluation.run import PoseErrors, evaluate_action
+from fdda_addon.evaluation.results import PoseErrors
+from fdda_addon.evaluation.run import evaluate_action
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from fdda_addon.timing.benchmark import benchmark
 

@@ -9,7 +9,8 @@ from ..core.errors import WrongUsageError
 from ..core.file_kind import EVALUATION, PICTURE, VIDEO
 from ..core.output import atomic_write_all, check_outputs, to_json_text
 from ..core.progress import Progress
-from ..evaluation.run import Evaluation, EvaluationSettings, evaluate
+from ..evaluation.results import Evaluation
+from ..evaluation.run import EvaluationSettings, evaluate
 from ..poses.clip import find_clips
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig

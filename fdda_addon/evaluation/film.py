@@ -23,7 +23,7 @@ from ..scene.scene_rig import SceneRig
 from .colored_mesh import MeshFactory, set_colors
 from .picture import CELL_MARGIN_RATIO, Picture, View, check_can_render
 from .pictures import SURFACE_COLOR
-from .run import PoseErrors
+from .results import PoseErrors
 from .video import encode
 
 RIG, LINEAR, FDDA, LINEAR_ERROR, FDDA_ERROR = "rig", "linear", "fdda", "linear error", "fdda error"

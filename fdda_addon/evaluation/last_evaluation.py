@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
     from ..core.metrics import ErrorStatistics
     from ..core.poses import Channel
-    from .run import Evaluation
+    from .results import Evaluation
 
 MAX_STORED_EVALUATIONS = 4
 """Largest number of stored evaluations, because the errors of a dense mesh take much memory."""

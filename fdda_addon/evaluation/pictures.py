@@ -14,7 +14,7 @@ from ..runtime.opened_model import open_model
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 from .picture import Cell, View, draw
-from .run import PoseErrors
+from .results import PoseErrors
 
 SURFACE_COLOR = (0.78, 0.64, 0.55)
 

@@ -3,7 +3,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,11 @@ import numpy as np
 from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
 from ..core.errors import FDDAError, RigError
 from ..core.mask import Mask
-from ..core.metrics import ErrorStatistics, distances, error_statistics
-from ..core.partition import Partition
+from ..core.metrics import distances
 from ..core.poses import Channel, sample_pose, widen_ranges
 from ..core.progress import Progress
 from ..core.skinning import LinearSkinning
-from ..core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
+from ..core.surface import Surface, SurfaceComparison, surface_errors
 from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable
@@ -36,6 +35,7 @@ from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
+from .results import Evaluation, PoseErrors
 
 FIRST_HELD_OUT_INDEX = 1 << 33
 """Index of the first held-out random pose. It is larger than the number of poses of any recording, so the held-out
@@ -78,96 +78,6 @@ class EvaluationSettings:
     surface: bool = True
     strips: tuple[str, ...] = ()
     target: TargetSettings = NO_TARGET
-
-
-@dataclass
-class PoseErrors:
-    """The errors on one set of poses.
-
-    Attributes:
-        name: name of the set.
-        pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
-        positions: (N, V, 3) float32, positions of the rig, mesh-object space, mesh units.
-        controls: (N, C) float32, values of the controls.
-        fdda, linear: (N, V) float32, distances of the model and of linear skinning from the rig, meters.
-        fdda_surface, linear_surface: errors of normals and edges; None for a mesh without faces, or if the surface was
-            not compared.
-    """
-
-    name: str
-    pose_matrices: np.ndarray
-    positions: np.ndarray
-    controls: np.ndarray
-    fdda: np.ndarray
-    linear: np.ndarray
-    fdda_surface: SurfaceErrors | None = None
-    linear_surface: SurfaceErrors | None = None
-
-    def to_json(self) -> dict:
-        """Return the statistics of the errors as JSON, described in docs/formats.md."""
-        return {
-            "name": self.name,
-            "poses": len(self.fdda),
-            "fdda": error_statistics(self.fdda).to_json(),
-            "linear": error_statistics(self.linear).to_json(),
-            **surface_json(self.fdda_surface, self.linear_surface),
-        }
-
-
-@dataclass
-class Evaluation:
-    """The errors of a model on all sets of poses.
-
-    Attributes:
-        partitions: partitions of the model.
-        joints: names of the joints.
-        held_out: errors on the random poses; without random poses, on the first action or strip.
-        actions: errors on each action and strip.
-        scaled_ranges: errors on the random poses of each scaled range of motion.
-        named: errors on each named pose.
-        channels: channels of the random poses.
-    """
-
-    partitions: tuple[Partition, ...]
-    joints: tuple[str, ...]
-    held_out: PoseErrors
-    actions: list[PoseErrors] = field(default_factory=list)
-    scaled_ranges: list[PoseErrors] = field(default_factory=list)
-    named: list[PoseErrors] = field(default_factory=list)
-    channels: tuple[Channel, ...] = ()
-
-    @property
-    def fdda(self) -> ErrorStatistics:
-        """Return the statistics of the model's errors on the held-out poses."""
-        return error_statistics(self.held_out.fdda)
-
-    @property
-    def linear(self) -> ErrorStatistics:
-        """Return the statistics of the errors of linear skinning on the held-out poses."""
-        return error_statistics(self.held_out.linear)
-
-    def to_json(self) -> dict:
-        """Return the evaluation as JSON, described in docs/formats.md; lengths in mm, angles in degrees."""
-        return {
-            "unit": "mm",
-            "poses": len(self.held_out.fdda),
-            "vertices": self.held_out.fdda.shape[1],
-            "fdda": self.fdda.to_json(),
-            "linear": self.linear.to_json(),
-            "partitions": [
-                {
-                    "joint": self.joints[partition.joint],
-                    "vertices": len(partition.vertices),
-                    "fdda": error_statistics(self.held_out.fdda[:, partition.vertices]).to_json(),
-                    "linear": error_statistics(self.held_out.linear[:, partition.vertices]).to_json(),
-                }
-                for partition in self.partitions
-            ],
-            "actions": [errors.to_json() for errors in self.actions],
-            "scaled_ranges": [errors.to_json() for errors in self.scaled_ranges],
-            "named": [errors.to_json() for errors in self.named],
-            **surface_json(self.held_out.fdda_surface, self.held_out.linear_surface),
-        }
 
 
 def evaluate(

@@ -76,7 +76,8 @@ def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) 
                 elif match := _FAILURE_LINE.match(line):
                     problem = match["text"].rstrip(".")
                 yield count
-            problem = problem or (f"the other Blender ended with status {process.wait()}" if process.wait() else "")
+            if (status := process.wait()) and not problem:
+                problem = f"the other Blender ended with status {status}"
         if problem or INDEXES[suffix] not in temporary_path.read_bytes():
             other = next(other for other in ENCODINGS if other != suffix)
             raise OSError(

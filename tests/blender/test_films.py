@@ -27,7 +27,8 @@ from fdda_addon.evaluation.film import (
     round_up,
 )
 from fdda_addon.evaluation.picture import Cell, View, draw
-from fdda_addon.evaluation.run import PoseErrors, evaluate_action
+from fdda_addon.evaluation.results import PoseErrors
+from fdda_addon.evaluation.run import evaluate_action
 from fdda_addon.scene.scene_rig import SceneRig
 
 from .conftest import ELBOW, run
