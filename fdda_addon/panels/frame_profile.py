@@ -49,9 +49,9 @@ def _draw_parts(layout: bpy.types.UILayout, profile: "FrameProfile") -> None:
     column = layout.column(align=True)
     _draw_bar(column, [(letter, share) for letter, (_, share) in zip(letters, shown, strict=False)])
     for index, (part, share) in enumerate(shown):
-        row = column.split(factor=0.5)
-        row.label(text=f"{letters[index : index + 1]}  {part.title}")
-        row.label(text=f"{part.duration} ms, {f'{share:.0%}' if share >= 0.01 else 'below 1%'}")
+        row = column.split(factor=0.55)
+        row.label(text=f"{letters[index : index + 1]}  {f'{share:.0%}' if share >= 0.01 else '<1%'}  {part.title}")
+        row.label(text=f"{part.duration} ms")
 
 
 def _draw_bar(layout: bpy.types.UILayout, segments: list[tuple[str, float]]) -> None:
