@@ -1,20 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Changes of a rig while its model plays: the model keeps playing if it still fits; otherwise the rig shows."""
 
-from collections import Counter
-from collections.abc import Callable
-from types import SimpleNamespace
-
 import bpy
 import numpy as np
 import pytest
 
 from fdda_addon.rig.reading import read_model_rig
-from fdda_addon.runtime import playback, rig_signature
-from fdda_addon.runtime import session as session_module
 from fdda_addon.runtime.model_files import network_of
 from fdda_addon.runtime.session import session
-from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
@@ -308,112 +301,8 @@ def test_weight_paint_mode_delays_the_check(bound_elbow, capsys):
     assert_rig_shown(bound_elbow, WEIGHTS_DIFFER, capsys)
 
 
-def test_playback_and_posing_do_not_check_the_rig(bound_elbow, elbow_files, monkeypatch):
-    """Frame changes, posing and driven shape keys do not read the rig again."""
-    add_shape_key(bound_elbow)
-    key = bound_elbow.data.shape_keys.key_blocks["bulge"]
-    driver = key.driver_add("value").driver
-    variable = driver.variables.new()
-    variable.type, variable.targets[0].id = "TRANSFORMS", bpy.data.objects[ELBOW_RIG]
-    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
-    driver.type = "SUM"
-    pose(angle=0.2)
-    pose(angle=0.3)
-    monkeypatch.setattr(rig_signature, "read_model_rig", None)
-    monkeypatch.setattr(rig_signature, "rest_digest", None)
-    for frame in range(5):
-        bpy.context.scene.frame_set(frame)
-        pose(angle=0.1 * frame)
-    assert_plays(bound_elbow, elbow_files.model)
-
-
-def test_posing_reads_the_bones_of_a_shared_armature_once_and_no_modifiers(bound_elbow, elbow_files, monkeypatch):
-    crowd = crowd_of(bound_elbow, 3)
-    bpy.context.view_layer.update()
-    counts = Counter()
-    for name in ("bone_signature", "read_modifiers_and_drivers"):
-        function = getattr(rig_signature, name)
-        monkeypatch.setattr(
-            rig_signature,
-            name,
-            lambda *arguments, name=name, function=function: counts.update([name]) or function(*arguments),
-        )
-    for angle in (0.2, 0.4):
-        pose(angle=angle)
-        for mesh_object in crowd:
-            assert_plays(mesh_object, elbow_files.model)
-    assert counts == {"bone_signature": 2}
-
-
-def test_a_frame_reads_no_bones_of_driven_armature_data(bound_elbow, elbow_files, monkeypatch):
-    drive_b_bone()
-    monkeypatch.setattr(rig_signature, "bone_signature", None)
-    shown = []
-    for frame in (5, 12, 25):
-        bpy.context.scene.frame_set(frame)
-        shown.append(assert_plays(bound_elbow, elbow_files.model))
-    assert np.abs(shown[0] - shown[-1]).max() > 1e-3
-
-
 def test_added_bones_do_not_change_the_order_of_joints(bound_elbow):
     rig = bpy.data.objects[ELBOW_RIG]
     change_in_edit_mode(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
     info = network_of(bound_elbow).info
     assert read_model_rig(find_rig(), info).joints == info.joints
-
-
-@pytest.fixture
-def window(monkeypatch) -> SimpleNamespace:
-    """A stand-in for what the session asks of Blender: a window, in which timers run."""
-    timers: list[Callable[[], float | None]] = []
-    registered = SimpleNamespace(is_registered=timers.__contains__, register=lambda timer, **_: timers.append(timer))
-    app = SimpleNamespace(background=False, timers=registered)
-    for module in (session_module, playback):
-        monkeypatch.setattr(module, "bpy", Proxy(bpy, app=app))
-    return SimpleNamespace(timers=timers)
-
-
-class Proxy:
-    """A module with some attributes replaced."""
-
-    def __init__(self, module: object, **replaced: object):
-        self._module = module
-        vars(self).update(replaced)
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._module, name)
-
-
-def test_in_a_window_posing_reads_no_bones_until_it_pauses(bound_elbow, elbow_files, window, monkeypatch, capsys):
-    drive_b_bone()
-    read_parts, read_signature = [], rig_signature.read_signature
-    monkeypatch.setattr(
-        rig_signature,
-        "read_signature",
-        lambda rig, *parts: read_parts.append(set(*parts)) or read_signature(rig, *parts),
-    )
-    for angle in (0.2, 0.4, 0.6):
-        pose(angle=angle)
-        assert_plays(bound_elbow, elbow_files.model)
-    assert not read_parts and window.timers == [session.check_timer]
-    assert session.check_timer() > 0, "posing has not paused long enough"
-    assert not read_parts
-    monkeypatch.setattr(session_module, "CHECK_DELAY_S", 0)
-    assert session.check_timer() is None
-    assert read_parts == [{"bones", "object"}] and not bound_elbow.fdda.status
-    assert session.characters[bound_elbow.session_uid].state == State.PLAYING
-    bpy.data.objects[ELBOW_RIG].data.bones["lower"].use_deform = False
-    pose(angle=0.8)
-    assert bound_elbow.fdda.mode == "FDDA"
-    assert session.check_timer() is None
-    bpy.context.view_layer.update()
-    assert_rig_shown(bound_elbow, "some vertices follow no bone", capsys)
-
-
-def test_in_a_window_a_frame_checks_what_has_changed_before(bound_elbow, window, capsys):
-    pose(angle=1.0)
-    bpy.data.objects[ELBOW_RIG].data.bones["lower"].use_deform = False
-    bpy.context.view_layer.update()
-    assert bound_elbow.fdda.mode == "FDDA"
-    bpy.context.scene.frame_set(7)
-    assert_rig_shown(bound_elbow, "some vertices follow no bone", capsys)

@@ -26,10 +26,10 @@ from fdda_addon.rig.reading import PoseReader, read_rig
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
-from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
 from .conftest import ELBOW, assert_plays, evaluated_positions, pose, run, train
 from .refusals import save_elbow
+from .resuming import check_resuming
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 SMOOTH_SETTINGS = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
@@ -196,29 +196,8 @@ def test_refining_poses_cannot_fit_weights_again(tmp_path, refusal):
 
 
 def test_a_resumed_recording_keeps_its_weights(tmp_path, monkeypatch):
-    rig = fresh_elbow()
-    before = scene_state(rig)
-    drain(record(rig, tmp_path / "whole", SMOOTH_SETTINGS))
-    assert_same_state(before, scene_state(rig))
-    steps = record(rig, tmp_path / "broken", SMOOTH_SETTINGS)
-    for step in steps:
-        if step.stage == "poses" and step.done == 30:
-            break
-    steps.close()
-    assert read_folder(tmp_path / "broken").complete == 30
-    # Resuming starts no trainer, because the recording contains the weights.
-    monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
-    resumed = dataclasses.replace(SMOOTH_SETTINGS, resume=True)
-    for other_kind in ("", "hard"):
-        with pytest.raises(RecordingError) as error:
-            drain(record(rig, tmp_path / "broken", dataclasses.replace(resumed, fit_linear=other_kind)))
-        assert str(error.value) == (
-            f"Cannot resume '{tmp_path / 'broken'}': it was recorded with --fit-linear smooth; give that, or record "
-            "into another folder."
-        )
-    drain(record(rig, tmp_path / "broken", resumed))
-    for file in (tmp_path / "whole").iterdir():
-        assert file.read_bytes() == (tmp_path / "broken" / file.name).read_bytes(), file.name
+    others = [dataclasses.replace(SMOOTH_SETTINGS, fit_linear=kind) for kind in ("", "hard")]
+    check_resuming(fresh_elbow(), tmp_path, SMOOTH_SETTINGS, others, "--fit-linear smooth", monkeypatch)
 
 
 def test_a_recording_of_the_rigs_own_weights_is_not_resumed_with_others(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from blend_fixtures.characters.bones import NewBone, add_bones, limit
 from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
-from fdda_addon.core.errors import ModelError, RecordingError, RigError
+from fdda_addon.core.errors import ModelError, RigError
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.reader import read_recording
@@ -26,9 +26,9 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
-from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
 from .conftest import assert_plays, run, train
+from .resuming import check_resuming
 from .scene_state import assert_same_state, drain, scene_state
 
 SETTINGS = RecordingSettings(poses=80, influence_poses=2, joints="auto")
@@ -237,28 +237,8 @@ def test_a_root_that_follows_another_is_moved_with_it(tmp_path):
 
 
 def test_a_resumed_recording_keeps_its_joints(tmp_path, monkeypatch):
-    rig = build_limb()
-    before = scene_state(rig)
-    drain(record(rig, tmp_path / "whole", SETTINGS))
-    assert_same_state(before, scene_state(rig))
-    steps = record(rig, tmp_path / "broken", SETTINGS)
-    for step in steps:
-        if step.stage == "poses" and step.done == 30:
-            break
-    steps.close()
-    assert read_folder(tmp_path / "broken").complete == 30
-    monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
-    resumed = dataclasses.replace(SETTINGS, resume=True)
-    for joints in ("all", "3"):
-        with pytest.raises(RecordingError) as error:
-            drain(record(rig, tmp_path / "broken", dataclasses.replace(resumed, joints=joints)))
-        assert str(error.value) == (
-            f"Cannot resume '{tmp_path / 'broken'}': it was recorded with --joints auto; give that, or record into "
-            "another folder."
-        )
-    drain(record(rig, tmp_path / "broken", resumed))
-    for file in (tmp_path / "whole").iterdir():
-        assert file.read_bytes() == (tmp_path / "broken" / file.name).read_bytes(), file.name
+    others = [dataclasses.replace(SETTINGS, joints=joints) for joints in ("all", "3")]
+    check_resuming(build_limb(), tmp_path, SETTINGS, others, "--joints auto", monkeypatch)
 
 
 def test_shards_have_the_joints_of_their_influences(tmp_path):

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import bpy
 import numpy as np
-from window import region_override, require, view_area, wait_until
+from window import redraw_window, region_override, require, view_area, wait_until
 
 EXTENSION = "bl_ext.user_default.fdda"
 BENT_FRAME = 110
@@ -108,6 +108,18 @@ def require_unkeyed_pose(deed: str) -> None:
 def mean_distance_mm(first_positions: np.ndarray, second_positions: np.ndarray) -> float:
     """Return the mean distance between corresponding vertices, mm."""
     return float(np.linalg.norm(first_positions - second_positions, axis=1).mean()) * 1000
+
+
+def show_preferences(area: bpy.types.Area) -> Iterator[float]:
+    """Turn an area into the preferences, with the add-on's own unfolded."""
+    import addon_utils
+
+    area.type = "PREFERENCES"
+    bpy.context.preferences.active_section = "ADDONS"
+    bpy.context.window_manager.addon_search = "FDDA"
+    module = next(m for m in addon_utils.modules() if m.__name__ == EXTENSION)
+    addon_utils.module_bl_info(module)["show_expanded"] = True
+    yield from redraw_window()
 
 
 def wait_for_job(verb: str, seconds: float) -> Iterator[float]:

@@ -24,6 +24,7 @@ from arm import (
     make_empty_folder,
     mean_distance_mm,
     open_copy_in,
+    show_preferences,
     wait_for_job,
 )
 from window import (
@@ -154,14 +155,7 @@ def trust_a_folder(folder: Path) -> Iterator[float]:
     preferences = bpy.context.preferences.addons[EXTENSION].preferences
     trusted_folder = make_empty_folder(folder / "work" / "trusted")
     area = next(a for a in main_screen().areas if a.type == "VIEW_3D")
-    area.type = "PREFERENCES"
-    bpy.context.preferences.active_section = "ADDONS"
-    bpy.context.window_manager.addon_search = "FDDA"
-    import addon_utils
-
-    module = next(m for m in addon_utils.modules() if m.__name__ == EXTENSION)
-    addon_utils.module_bl_info(module)["show_expanded"] = True
-    yield from redraw_window()
+    yield from show_preferences(area)
     yield 0.5
     yield from save_screenshot(folder / "preferences.png")
     preferences_region = next(r for r in area.regions if r.type == "WINDOW")

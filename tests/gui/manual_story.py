@@ -15,12 +15,12 @@ import bpy
 import sidebar
 from arm import (
     BLEND_FILE_NAME,
-    EXTENSION,
     arm_object,
     armature_object,
     extension_module,
     frame_object,
     make_empty_folder,
+    show_preferences,
     wait_for_job,
 )
 from window import (
@@ -229,18 +229,11 @@ def train_on_too_few_poses(folder: Path) -> Iterator[float]:
 
 
 def show_the_preferences(folder: Path) -> Iterator[float]:
-    import addon_utils
-
     # As on a machine where nothing is installed yet.
     os.environ.pop("FDDA_TRAINER_PYTHON", None)
     bpy.context.preferences.system.use_online_access = True
     area = view_area()
-    area.type = "PREFERENCES"
-    bpy.context.preferences.active_section = "ADDONS"
-    bpy.context.window_manager.addon_search = "FDDA"
-    module = next(m for m in addon_utils.modules() if m.__name__ == EXTENSION)
-    addon_utils.module_bl_info(module)["show_expanded"] = True
-    yield from redraw_window()
+    yield from show_preferences(area)
     yield from save_screenshot(folder / "manual_preferences.png")
     _marks["manual_preferences"] = {"area": _box(area)}
     (folder / "marks.json").write_text(json.dumps(_marks, indent=1), encoding="utf-8")
