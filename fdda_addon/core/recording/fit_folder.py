@@ -252,7 +252,7 @@ def read_key_joints(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     """
     joints = np.array(_read_array(folder / "key_joints.npy", 1, np.int32))
     needed_inputs = np.array(_read_array(folder / "needed_inputs.npy", 2, np.int32), bool)
-    if (np.diff(joints) <= 0).any() or joints[0] < 0 or joints[-1] >= len(rig.joints):
+    if not len(joints) or (np.diff(joints) <= 0).any() or joints[0] < 0 or joints[-1] >= len(rig.joints):
         raise _damaged_error(folder, "the key joints are no joints")
     # Without controls, the poses have a column of zeros.
     if needed_inputs.shape != (rig.vertex_count, len(joints) + max(1, len(rig.controls))):

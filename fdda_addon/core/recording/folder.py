@@ -16,11 +16,7 @@ from .index import INDEX_NAME, REFINED, read_index, read_info
 from .lock import RecordingLock
 from .writer import find_different_keys
 
-SETTING_LABELS = {
-    "limits": "range of motion",
-    "sources": "number of poses or actions",
-    "fit": "base skinning",
-}
+SETTING_LABELS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "base skinning"}
 """Labels of sampling keys in messages."""
 
 
