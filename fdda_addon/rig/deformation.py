@@ -13,7 +13,8 @@ from ..scene.compatibility import node_input
 from ..scene.controls import owner_name
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
-from .modifier_stack import BIND_PROPERTIES, is_fdda_modifier, recorded_modifiers
+from .modifier_effects import BIND_PROPERTIES
+from .modifier_stack import is_fdda_modifier, recorded_modifiers
 
 _COMMON_PROPERTIES = frozenset(bpy.types.Modifier.bl_rna.properties.keys())
 """Properties that all modifiers have; none of them changes the effect on the mesh."""

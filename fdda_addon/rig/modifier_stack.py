@@ -9,54 +9,18 @@ module does not import numpy, because Blender starts without it.
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import Enum, auto
 
 import bpy
 
 from ..core.errors import RigError
-from ..scene.node_groups import GeometryEffect, find_time_node, geometry_effect
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
+from .modifier_effects import INDIRECT_TYPES, ModifierEffect, effect_of, is_unbound, time_dependence
 
 PLAYBACK_GROUP_KEY = "fdda_playback_group"
 """Custom property of the node group of FDDA modifiers."""
 
-DEFORMING_TYPES = {
-    "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
-    "LAPLACIANSMOOTH", "LATTICE", "MESH_CACHE", "MESH_DEFORM", "MESH_SEQUENCE_CACHE", "SHRINKWRAP", "SIMPLE_DEFORM",
-    "SMOOTH", "SOFT_BODY", "SURFACE_DEFORM", "WARP", "WAVE",
-}  # fmt: skip
-TOPOLOGY_CHANGING_TYPES = {
-    "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "MASK", "MIRROR", "MULTIRES",
-    "PARTICLE_INSTANCE", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
-}  # fmt: skip
-TIME_DEPENDENT_TYPES = {
-    "BUILD": "changes with time", "CLOTH": "is a simulation", "DYNAMIC_PAINT": "is a simulation",
-    "EXPLODE": "is a simulation", "FLUID": "is a simulation", "MESH_CACHE": "plays a cache",
-    "MESH_SEQUENCE_CACHE": "plays a cache", "OCEAN": "changes with time", "PARTICLE_INSTANCE": "is a simulation",
-    "SOFT_BODY": "is a simulation", "WAVE": "changes with time",
-}  # fmt: skip
-BIND_PROPERTIES = {
-    "CORRECTIVE_SMOOTH": "is_bind", "LAPLACIANDEFORM": "is_bind", "MESH_DEFORM": "is_bound",
-    "SURFACE_DEFORM": "is_bound",
-}  # fmt: skip
-"""Types of modifiers that must be bound to a rest pose, and their property that is true if they are bound."""
-INDIRECT_TYPES = {
-    "DATA_TRANSFER", "TRIANGULATE", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY",
-}  # fmt: skip
-"""Modifiers that move no vertices, but change the effect of later modifiers: they edit weights or edges."""
 ORIGINAL_MESH_TYPES = {"MULTIRES", "SOFT_BODY"}
 """Modifiers that need the original mesh: Blender allows no Geometry Nodes modifier, such as FDDA's, before them."""
-
-
-class _ModifierEffect(Enum):
-    NEUTRAL = auto()
-    """Keeps the vertices and their positions: it changes UV maps, weights or normals, or emits particles."""
-    DEFORMS = auto()
-    """Moves vertices."""
-    GENERATES = auto()
-    """Changes the topology."""
-    UNKNOWN = auto()
-    """Only an evaluation shows whether it deforms or generates."""
 
 
 @dataclass(frozen=True)
@@ -93,18 +57,18 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
         RigError: Geometry Nodes have to be evaluated, and the object is hidden.
     """
     modifiers = [m for m in mesh_object.modifiers if not is_fdda_modifier(m)]
-    effects = [_effect_of(m) for m in modifiers]
-    unknown_indices = [i for i, m in enumerate(modifiers) if effects[i] is _ModifierEffect.UNKNOWN and m.show_viewport]
+    effects = [effect_of(m) for m in modifiers]
+    unknown_indices = [i for i, m in enumerate(modifiers) if effects[i] is ModifierEffect.UNKNOWN and m.show_viewport]
     generating_modifiers = [
         m
         for m, effect in zip(modifiers, effects, strict=True)
-        if effect in {_ModifierEffect.GENERATES, _ModifierEffect.UNKNOWN}
+        if effect in {ModifierEffect.GENERATES, ModifierEffect.UNKNOWN}
     ]
     for i in unknown_indices:
         with _modifiers_disabled(mesh_object, [m for m in generating_modifiers if m != modifiers[i]]):
-            effects[i] = _ModifierEffect.DEFORMS if _keeps_topology(mesh_object) else _ModifierEffect.GENERATES
+            effects[i] = ModifierEffect.DEFORMS if _keeps_topology(mesh_object) else ModifierEffect.GENERATES
     deforming_indices = [
-        i for i, effect in enumerate(effects) if effect in {_ModifierEffect.DEFORMS, _ModifierEffect.UNKNOWN}
+        i for i, effect in enumerate(effects) if effect in {ModifierEffect.DEFORMS, ModifierEffect.UNKNOWN}
     ]
     original_mesh_modifier_indices = [i for i, m in enumerate(modifiers) if m.type in ORIGINAL_MESH_TYPES]
     # If all deforming modifiers are off, all of them count, because the user may switch them on later.
@@ -114,7 +78,7 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     if fdda_index is not None and any(i < fdda_index for i in deforming_indices):
         last_replaced_index = fdda_index - 1
     generating_indices = [
-        i for i, effect in enumerate(effects) if effect is _ModifierEffect.GENERATES and modifiers[i].show_viewport
+        i for i, effect in enumerate(effects) if effect is ModifierEffect.GENERATES and modifiers[i].show_viewport
     ]
     downstream_candidates = sorted({*generating_indices, *effective_indices})
     return ModifierStack(
@@ -141,7 +105,7 @@ def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifie
     """
     fdda_index = _fdda_modifier_index(mesh_object)
     if fdda_index is not None:
-        return [m for m in mesh_object.modifiers[:fdda_index] if _effect_of(m) is not _ModifierEffect.NEUTRAL]
+        return [m for m in mesh_object.modifiers[:fdda_index] if effect_of(m) is not ModifierEffect.NEUTRAL]
     return [mesh_object.modifiers[name] for name in read_stack(mesh_object).replaced]
 
 
@@ -157,7 +121,7 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
     candidates = [
         m
         for m in mesh_object.modifiers[:index]
-        if _effect_of(m) is not _ModifierEffect.NEUTRAL or m.type in INDIRECT_TYPES
+        if effect_of(m) is not ModifierEffect.NEUTRAL or m.type in INDIRECT_TYPES
     ]
     binding = getattr(mesh_object, "fdda", None)
     if binding is None or not binding.is_playing:
@@ -167,9 +131,7 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
     for modifier in candidates:
         visibility = stored_visibilities.get(modifier.persistent_uid, modifier)
         # A modifier that is on in renders alone changes the topology there, before the FDDA modifier.
-        generates = (
-            _effect_of(modifier) is _ModifierEffect.GENERATES and binding.use_in_render and visibility.show_render
-        )
+        generates = effect_of(modifier) is ModifierEffect.GENERATES and binding.use_in_render and visibility.show_render
         if visibility.show_viewport or generates:
             modifiers.append(modifier)
     return modifiers
@@ -195,7 +157,7 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
                 f"{subject} {verb}, so its result does not follow from the pose; switch it off in the viewport, or "
                 "remove it."
             )
-        if _is_unbound(modifier):
+        if is_unbound(modifier):
             raise RigError(
                 f"{subject} is not bound, so it does nothing; bind it first, or switch it off in the viewport."
             )
@@ -284,48 +246,6 @@ def _modifiers_disabled(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.t
                 modifier.show_viewport = True
         if uids:
             bpy.context.view_layer.update()
-
-
-def _effect_of(modifier: bpy.types.Modifier) -> _ModifierEffect:
-    if modifier.type == "NODES":
-        kinds = {
-            GeometryEffect.ATTRIBUTES: _ModifierEffect.NEUTRAL,
-            GeometryEffect.POSITIONS: _ModifierEffect.DEFORMS,
-            GeometryEffect.ANY: _ModifierEffect.UNKNOWN,
-        }
-        return kinds[geometry_effect(modifier.node_group)]
-    if modifier.type == "OCEAN":
-        return _ModifierEffect.DEFORMS if modifier.geometry_mode == "DISPLACE" else _ModifierEffect.GENERATES
-    if modifier.type == "FLUID":
-        return _ModifierEffect.GENERATES if modifier.fluid_type == "DOMAIN" else _ModifierEffect.NEUTRAL
-    if modifier.type == "DYNAMIC_PAINT":
-        surfaces = modifier.canvas_settings.canvas_surfaces if modifier.canvas_settings else ()
-        return (
-            _ModifierEffect.DEFORMS
-            if any(s.surface_type in {"DISPLACE", "WAVE"} for s in surfaces)
-            else _ModifierEffect.NEUTRAL
-        )
-    if modifier.type in DEFORMING_TYPES:
-        return _ModifierEffect.DEFORMS
-    return _ModifierEffect.GENERATES if modifier.type in TOPOLOGY_CHANGING_TYPES else _ModifierEffect.NEUTRAL
-
-
-def time_dependence(modifier: bpy.types.Modifier) -> str:
-    """Describe how a modifier depends on time, as a verb phrase; empty if it does not."""
-    if modifier.type == "NODES":
-        node = find_time_node(modifier.node_group)
-        return f"changes with time (node '{node.name}' of '{node.id_data.name}')" if node else ""
-    if _effect_of(modifier) is _ModifierEffect.NEUTRAL:
-        return ""
-    return TIME_DEPENDENT_TYPES.get(modifier.type, "")
-
-
-def _is_unbound(modifier: bpy.types.Modifier) -> bool:
-    if modifier.type not in BIND_PROPERTIES or (
-        modifier.type == "CORRECTIVE_SMOOTH" and modifier.rest_source != "BIND"
-    ):
-        return False
-    return not getattr(modifier, BIND_PROPERTIES[modifier.type])
 
 
 def _evaluated_object(mesh_object: bpy.types.Object) -> bpy.types.Object:

@@ -14,7 +14,7 @@ from ..core.mesh_cache import read_frame_count
 from ..scene.node_groups import SIMULATION_NODES, find_time_node
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import resolve_path
-from .modifier_stack import TIME_DEPENDENT_TYPES
+from .modifier_effects import TIME_DEPENDENT_TYPES
 from .sources import Sources
 from .time_inputs import control_keys, time_inputs
 

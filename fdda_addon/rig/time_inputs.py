@@ -12,7 +12,8 @@ from ..core.errors import RigError
 from ..scene.animation import changes_value, curves_with_actions, value_range
 from ..scene.controls import fcurve_target, owner_of
 from ..scene.scene_rig import SceneRig
-from .modifier_stack import ModifierStack, is_fdda_modifier, time_dependence
+from .modifier_effects import time_dependence
+from .modifier_stack import ModifierStack, is_fdda_modifier
 from .other_armatures import check_other_armatures
 from .sources import OwnedCurve, Sources
 
