@@ -59,7 +59,6 @@ _PARTITION_KEYS = {
         "poses": int,
         "vertices": int,
         "truncation": float,
-        "boundary": _Nullable(float),
         "joint": str,
         "extreme": float,
         "distance": float,

@@ -40,7 +40,7 @@ REPORT = {
             "linear": ERRORS,
             "histogram": [3],
             "largest_errors": {
-                **{"poses": 1, "vertices": 1, "truncation": 0.5, "boundary": None, "joint": "", "extreme": 1.0},
+                **{"poses": 1, "vertices": 1, "truncation": 0.5, "joint": "", "extreme": 1.0},
                 **{"distance": 1.0, "generalization": 1.0, "cause": "none"},
             },
             "curve": {"training": [1.0, 0.5], "validation": [1.0, 0.6], "worst": [2.0, 1.0], "best_epoch": 2},

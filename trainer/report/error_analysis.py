@@ -58,8 +58,6 @@ class ErrorAnalysis:
     Attributes:
         poses, vertices: numbers of different poses and vertices with these errors.
         truncation: part of the squared errors that the components do not represent.
-        boundary: ratio between the frequency of boundary vertices among these errors and among all vertices. A boundary
-            vertex has an edge to another partition. None if there is no boundary vertex.
         joint: name of the influencing joint or control that is furthest from its mean in these poses; empty if nothing
             influences the partition.
         extreme: ratio between the distance of this joint from its mean in these poses and in all held-out poses.
@@ -72,7 +70,6 @@ class ErrorAnalysis:
     poses: int
     vertices: int
     truncation: float
-    boundary: float | None
     joint: str
     extreme: float
     distance: float
@@ -106,7 +103,6 @@ def analyze_errors(
         joint_features(np.array(recording.pose_matrices[poses]), rig.rest_matrices, rig.parents)
         for poses in (split.held_out, training)
     )
-    is_boundary = _boundary_mask(recording, trained_model)
     analyses = []
     for partition, prepared in zip(trained_model.partitions, trained_model.prepared, strict=True):
         errors = held_out_errors[:, partition.vertices].astype(np.float64)
@@ -127,15 +123,11 @@ def analyze_errors(
         truncation = _truncation_fraction(recording, partition, prepared, split.held_out, poses, vertices, errors)
         percentiles = (float(np.percentile(e, 99.9)) for e in (errors, training_errors[:, partition.vertices]))
         generalization = _ratio(*percentiles)
-        boundary = None
-        if is_boundary is not None and is_boundary[partition.vertices].any():
-            is_at_boundary = is_boundary[partition.vertices]
-            boundary = _ratio(float(is_at_boundary[vertices].mean()), float(is_at_boundary.mean()))
         # Dropped components are the cause only if they are most of what the remaining ones leave.
         is_dropped = 2 * prepared.dropped_rms**2 > prepared.basis.truncation_rms**2
         cause = _cause(truncation, is_dropped, distance, generalization)
         counts = len(np.unique(poses)), len(np.unique(vertices))
-        analyses.append(ErrorAnalysis(*counts, truncation, boundary, joint, extreme, distance, generalization, cause))
+        analyses.append(ErrorAnalysis(*counts, truncation, joint, extreme, distance, generalization, cause))
     return analyses
 
 
@@ -160,23 +152,6 @@ def _cause(truncation: float, is_dropped: bool, distance: float, generalization:
 
 def _ratio(value: float, reference: float) -> float:
     return value / reference if reference > 0 else 1.0
-
-
-def _boundary_mask(recording: Recording, trained_model: TrainedModel) -> np.ndarray | None:
-    """Return (V,) bool, the vertices with an edge to another partition; None without faces."""
-    starts, corners = recording.rig.face_starts, recording.rig.face_vertices
-    if not len(starts):
-        return None
-    partition_index_of_vertex = np.zeros(recording.rig.vertex_count, np.int64)
-    for index, partition in enumerate(trained_model.partitions):
-        partition_index_of_vertex[partition.vertices] = index
-    ends = np.append(starts[1:], len(corners))
-    next_corner = np.arange(len(corners)) + 1
-    next_corner[ends - 1] = starts
-    crosses_boundary = partition_index_of_vertex[corners] != partition_index_of_vertex[corners[next_corner]]
-    is_boundary = np.zeros(len(partition_index_of_vertex), bool)
-    is_boundary[corners[crosses_boundary]] = is_boundary[corners[next_corner][crosses_boundary]] = True
-    return is_boundary
 
 
 def _most_extreme_joint(
