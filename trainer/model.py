@@ -10,6 +10,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 
+from .blocks import block_slices
 from .data.split import Split
 from .inputs.network_inputs import NetworkInputs
 from .networks.checkpoint import Checkpoint, PartitionCheckpoint
@@ -20,7 +21,6 @@ from .preparation import PreparedPartition
 MAX_COLUMN_COSINE = 1e-5
 """A pose matrix is sheared if two of its columns have a larger cosine. Rounding to float32 causes a tenth of it.
 A cosine of 3e-5 already lowers the confidence of nearly locked joints if their bones are treated as orthogonal."""
-BLOCK_POSES = 256
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ def is_sheared(pose_matrices: np.ndarray) -> bool:
     Args:
         pose_matrices: (N, J, 4, 4).
     """
-    for start in range(0, len(pose_matrices), BLOCK_POSES):
-        axes = np.asarray(pose_matrices[start : start + BLOCK_POSES], np.float64)[:, :, :3, :3]
+    for block in block_slices(len(pose_matrices), pose_matrices[0].size):
+        axes = np.asarray(pose_matrices[block], np.float64)[:, :, :3, :3]
         lengths = np.linalg.norm(axes, axis=2)
         products = np.abs(axes.transpose(0, 1, 3, 2) @ axes)[:, :, [0, 0, 1], [1, 2, 2]]
         if (products > MAX_COLUMN_COSINE * lengths[:, :, [0, 0, 1]] * lengths[:, :, [1, 2, 2]]).any():

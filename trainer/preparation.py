@@ -11,7 +11,7 @@ from fdda_addon.core.features import MIN_FEATURE_SPREAD, float32_rounding
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 
-from .blocks import BLOCK_ELEMENTS
+from .blocks import block_slices
 from .data.split import Split
 from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
 from .fits.half_rotations import regression_matrices
@@ -199,8 +199,8 @@ def prepare_partitions(
 
 def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:
     """Return the mean over poses of the squared distance between (N, W) residuals and their mean (W,)."""
-    total, step = 0.0, max(1, BLOCK_ELEMENTS // residuals.shape[1])
-    for start in range(0, len(poses), step):
-        errors = residuals[poses[start : start + step]].astype(np.float64) - mean
+    total = 0.0
+    for block in block_slices(len(poses), residuals.shape[1]):
+        errors = residuals[poses[block]].astype(np.float64) - mean
         total += float(np.einsum("nw,nw->", errors, errors))
     return total / len(poses)

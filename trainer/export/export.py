@@ -30,6 +30,7 @@ from fdda_addon.core.skin_fit import skin_to_text
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
 
+from ..blocks import block_slices
 from ..fits.half_rotations import regression_matrices
 from ..model import TrainedModel
 from .graph import build_graph
@@ -43,8 +44,6 @@ errors of meters, and residuals that float32 rounds by millimeters."""
 MAX_CONFIDENCE_DIFFERENCE = 1e-3
 MAX_SURFACE_POSES = 50
 """Maximum number of poses in which normals are compared. At 50,000 vertices a pose takes a tenth of a second."""
-BLOCK_ELEMENTS = 1 << 24
-"""Poses are evaluated in blocks of at most this many coordinates."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def measure(session: onnxruntime.InferenceSession, recording: Recording, poses: 
     rig = recording.rig
     fdda, linear = (np.empty((len(poses), rig.vertex_count), np.float32) for _ in range(2))
     skinning = LinearSkinning(rig, recording.partitions)
-    for block in _blocks(len(poses), rig.vertex_count):
+    for block in block_slices(len(poses), 3 * rig.vertex_count):
         positions, skinned, truth = _evaluate(session, recording, skinning, poses[block])
         fdda[block] = distances(positions, truth, rig.metres_per_unit)
         linear[block] = distances(skinned, truth, rig.metres_per_unit)
@@ -171,7 +170,7 @@ def check_parity(
         TrainingError: the difference is too large, or the outputs are not finite.
     """
     max_difference, rig = 0.0, recording.rig
-    for block in _blocks(len(poses), rig.vertex_count):
+    for block in block_slices(len(poses), 3 * rig.vertex_count):
         inputs = _inputs(recording, poses[block])
         positions, confidence = session.run(None, inputs)
         controls = np.array(recording.controls[poses[block]])
@@ -291,8 +290,3 @@ def write_model(path: Path, content: bytes) -> None:
     """
     path.write_bytes(content)
     read_model_info(path)
-
-
-def _blocks(pose_count: int, vertex_count: int) -> list[slice]:
-    block_size = max(1, BLOCK_ELEMENTS // (3 * vertex_count))
-    return [slice(start, start + block_size) for start in range(0, pose_count, block_size)]

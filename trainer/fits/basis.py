@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..blocks import block_slices
+
 MAX_POSES = 1000
 """Maximum number of poses from which components are computed. Coefficients are then computed for all poses."""
 MAX_COMPONENTS = 128
@@ -15,8 +17,6 @@ MAX_ERROR_RATIO = 2.0
 """Maximum ratio of a partition's error to its allowed error when partitions share the tolerance."""
 FINE_TOLERANCE_FACTOR = 4.0
 """Factor by which the tolerance is divided to compute the bases from which components are allocated."""
-BLOCK_LENGTH = 1 << 14
-"""Number of columns, or of rows, that are converted to float64 at a time, so that the sums need little memory."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def make_basis(
     use_gram = pose_count <= coordinate_count
     weight_roots = np.sqrt(weights)[:, None]
     gram_matrix = np.zeros((min(pose_count, coordinate_count),) * 2)
-    for block in _block_slices(coordinate_count if use_gram else pose_count):
+    for block in block_slices(*residuals.shape[::-1] if use_gram else residuals.shape):
         block_values = residuals[:, block] if use_gram else residuals[block]
         centered = (block_values.astype(np.float64) - (mean[block] if use_gram else mean)) * weight_roots[
             slice(None) if use_gram else block
@@ -141,7 +141,7 @@ def make_basis(
     eigenvectors = eigenvectors[:, :component_count]
     if use_gram:
         components = np.empty((coordinate_count, component_count))
-        for block in _block_slices(coordinate_count):
+        for block in block_slices(coordinate_count, pose_count):
             # Block by block, because a product with float64 makes a float64 copy of all residuals.
             components[block] = ((residuals[:, block].astype(np.float64) - mean[block]) * weight_roots).T @ eigenvectors
         eigenvectors = np.linalg.qr(components)[0] if component_count else components
@@ -153,10 +153,6 @@ def _weighted_mean(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     if (weights == 1).all():
         return residuals.mean(axis=0, dtype=np.float64).astype(np.float32)
     total = np.zeros(residuals.shape[1])
-    for block in _block_slices(residuals.shape[1]):
+    for block in block_slices(*residuals.shape[::-1]):
         total[block] = weights @ residuals[:, block].astype(np.float64)
     return (total / weights.sum()).astype(np.float32)
-
-
-def _block_slices(length: int) -> list[slice]:
-    return [slice(start, start + BLOCK_LENGTH) for start in range(0, length, BLOCK_LENGTH)]

@@ -14,7 +14,7 @@ import numpy as np
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
-from ..blocks import BLOCK_ELEMENTS
+from ..blocks import block_slices
 from .least_squares import add_ridge, solve_ridge
 
 RIDGE = 1e-6
@@ -107,9 +107,8 @@ class JointRegression:
         width = self.design.shape[2]
         gram, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
         total = 0.0
-        step = max(1, BLOCK_ELEMENTS // residuals[0].size)
-        for start in range(0, len(training), step):
-            poses = training[start : start + step]
+        for block in block_slices(len(training), residuals[0].size):
+            poses = training[block]
             rows = self.design[poses].reshape(-1, width)
             gram += rows.T @ rows
             values = residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1).astype(np.float64)
@@ -122,8 +121,7 @@ class JointRegression:
         columns = (4 * selected[:, None] + np.arange(4)).ravel()
         solution = solve_ridge(gram[np.ix_(columns, columns)], moments[columns], ridge[columns])
         remaining = np.empty_like(residuals)
-        for start in range(0, len(residuals), step):
-            poses = slice(start, start + step)
+        for poses in block_slices(len(residuals), residuals[0].size):
             remaining[poses] = residuals[poses] - (self.design[poses][:, :, columns] @ solution).transpose(0, 2, 1)
         return JointFit(self.joints[selected], self._factors(solution.reshape(len(selected), 4, -1))), remaining
 

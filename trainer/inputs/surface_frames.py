@@ -20,7 +20,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 
-from ..blocks import BLOCK_ELEMENTS
+from ..blocks import block_slices
 from ..config import TrainingConfig
 from ..data.split import Split
 from ..graph_builder import GraphBuilder
@@ -83,15 +83,13 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
 
     def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray:
         """Compute the features along the axes of the main joints; a uniform scale of the character cancels out."""
-        frame_count = len(self)
-        features = np.empty((len(pose_matrices), VECTOR_SIZE * frame_count), np.float32)
-        step = max(1, BLOCK_ELEMENTS // max(1, 3 * self.lengths.size))
-        for start in range(0, len(features) if frame_count else 0, step):
-            poses = pose_matrices[start : start + step].astype(np.float64)
+        features = np.empty((len(pose_matrices), VECTOR_SIZE * len(self)), np.float32)
+        for block in block_slices(len(features) if len(self) else 0, 3 * self.lengths.size):
+            poses = pose_matrices[block].astype(np.float64)
             frame_sums = np.einsum("nfdkc,fdk->ndc", self.compute_corner_vectors(poses), self.lengths)
             axes = poses[:, self.main_joints, :3, :3]
             axes /= np.sqrt((axes**2).sum(axis=2, keepdims=True) + MIN_SQUARED_LENGTH)
-            features[start : start + step] = np.einsum("ndab,nda->ndb", axes, frame_sums).reshape(len(poses), -1)
+            features[block] = np.einsum("ndab,nda->ndb", axes, frame_sums).reshape(len(poses), -1)
         return features
 
     def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[Vectors, np.ndarray]:

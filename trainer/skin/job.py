@@ -16,7 +16,7 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skin_fit import INFLUENCES, FitReport, SkinFit
 from fdda_addon.core.skinning import LinearSkinning
 
-from ..blocks import BLOCK_ELEMENTS
+from ..blocks import block_slices
 from ..process import Cancelled
 from ..progress import MessageSink
 from .choice import Choice, choose_key_joints
@@ -103,14 +103,12 @@ def _choose(
 
 def measure(poses: FitPoses, fitted: Rig) -> FitReport:
     """Measure the errors of linear skinning with the rig's own and with the fitted weights."""
-    step, metres_per_unit = max(1, BLOCK_ELEMENTS // (3 * fitted.vertex_count)), fitted.metres_per_unit
     rms, maxima = {}, {}
     for name, rig in (("rig", poses.rig), ("fitted", fitted)):
         skinning, squares, maximum = LinearSkinning(rig), 0.0, 0.0
-        for start in range(0, len(poses.positions), step):
-            block = slice(start, start + step)
+        for block in block_slices(len(poses.positions), 3 * fitted.vertex_count):
             positions = skinning.positions(poses.pose_matrices[block])
-            errors = distances(positions, poses.positions[block], metres_per_unit).astype(np.float64)
+            errors = distances(positions, poses.positions[block], fitted.metres_per_unit).astype(np.float64)
             squares, maximum = squares + float((errors**2).sum()), max(maximum, float(errors.max()))
         rms[name] = 1000 * (squares / (len(poses.positions) * fitted.vertex_count)) ** 0.5
         maxima[name] = 1000 * maximum

@@ -19,7 +19,7 @@ from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.skin_fit import INFLUENCES
 from fdda_addon.core.skinning import skin_matrices
 
-from ..blocks import BLOCK_ELEMENTS
+from ..blocks import block_slices
 
 RIG_CANDIDATES = 4
 """Number of candidate joints of a vertex that come from its weights in the rig, the heaviest first."""
@@ -70,10 +70,8 @@ class SkinSolver:
             sums to 1; unused slots are 0.
         """
         max_candidates = RIG_CANDIDATES + SINGLE_CANDIDATES + ADDED_CANDIDATES
-        block_size = max(1, BLOCK_ELEMENTS // max(16 * max_candidates**2, 4 * self._joint_count, 3 * self._pose_count))
-        vertex_count = self._poses.rig.vertex_count
-        for start in range(0, vertex_count, block_size):
-            block = slice(start, min(start + block_size, vertex_count))
+        vertex_elements = max(16 * max_candidates**2, 4 * self._joint_count, 3 * self._pose_count)
+        for block in block_slices(self._poses.rig.vertex_count, vertex_elements):
             yield block, *_Block(self, block).fit(kind)
 
 
