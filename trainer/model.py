@@ -10,17 +10,12 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 
-from .blocks import block_slices
 from .data.split import Split
 from .inputs.network_inputs import NetworkInputs
 from .networks.checkpoint import Checkpoint, PartitionCheckpoint
 from .networks.confidence import TrainingRange, measure_training_range
 from .networks.networks import Network
 from .preparation import PreparedPartition
-
-MAX_COLUMN_COSINE = 1e-5
-"""A pose matrix is sheared if two of its columns have a larger cosine. Rounding to float32 causes a tenth of it.
-A cosine of 3e-5 already lowers the confidence of nearly locked joints if their bones are treated as orthogonal."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +30,6 @@ class TrainedModel:
         networks: network of each partition.
         training_range: range of the training poses.
         activation: activation of the networks.
-        sheared: whether the columns of some recorded pose matrix are not orthogonal.
     """
 
     rig: Rig
@@ -45,7 +39,6 @@ class TrainedModel:
     networks: tuple[Network, ...]
     training_range: TrainingRange
     activation: str
-    sheared: bool
 
     def feature_statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (F,) float64 mean and scale of each feature; 0 and 1 where no network takes it."""
@@ -113,20 +106,4 @@ def make_trained_model(
         tuple(networks),
         measure_training_range(features, recording.rig, recording.partitions),
         activation,
-        is_sheared(recording.pose_matrices),
     )
-
-
-def is_sheared(pose_matrices: np.ndarray) -> bool:
-    """Return whether some matrix has columns that are not orthogonal; scale alone is no shear.
-
-    Args:
-        pose_matrices: (N, J, 4, 4).
-    """
-    for block in block_slices(len(pose_matrices), pose_matrices[0].size):
-        axes = np.asarray(pose_matrices[block], np.float64)[:, :, :3, :3]
-        lengths = np.linalg.norm(axes, axis=2)
-        products = np.abs(axes.transpose(0, 1, 3, 2) @ axes)[:, :, [0, 0, 1], [1, 2, 2]]
-        if (products > MAX_COLUMN_COSINE * lengths[:, :, [0, 0, 1]] * lengths[:, :, [1, 2, 2]]).any():
-            return True
-    return False

@@ -225,7 +225,6 @@ class _Job:
             "validation_poses": len(split.validation),
             "held_out_poses": len(split.held_out),
             "warm_start": warm_start,
-            "sheared": trained_model.sheared,
         }
         self.log(f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
         exported = build_model(recording, trained_model, split.held_out, training_info)

@@ -6,9 +6,7 @@ a space. A vector is either a column of a joint's matrix, in the space of the ca
 a main joint. The carried joint is the joint as its parent carries it along. All vectors together take one gather of
 spaces, two gathers of points, and one product.
 
-If no recorded bone is sheared, the columns of R are orthogonal. R^-1 is then the transpose of R with each row divided
-by its squared length, which takes a third of the nodes of an inverse. The features of surface frames
-come after the vectors. Half-rotation matrices are computed from the same vectors.
+The features of surface frames come after the vectors. Half-rotation matrices are computed from the same vectors.
 """
 
 from dataclasses import dataclass
@@ -24,14 +22,12 @@ from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, LocalVector
 from ..inputs.joints import needed_joints
 from ..model import TrainedModel
 
-MATRIX_ROW, TRANSPOSE_ROW = 5, 6
-"""Rows of the table for a space, after the rows of its columns.
+MATRIX_ROW, ROWS_PER_SPACE = 5, 6
+"""Row of the table with the matrix of a space, column by column, and the number of rows of a space.
 
-Each of the first four rows has one column of the matrix, three times in succession. Row `ZERO_COLUMN` is zero.
-`MATRIX_ROW` has the matrix, column by column. `TRANSPOSE_ROW` has its transpose; it does not exist if a bone is
-sheared."""
-MIN_SQUARED_LENGTH = 1e-18
-"""Added to squared lengths before a division, so that a joint that is scaled to zero gives finite values."""
+Each of the first four rows has one column of the matrix, three times in succession. Row `ZERO_COLUMN` is zero."""
+MIN_DETERMINANT = 1e-18
+"""Added to determinants before a division, so that a joint that is scaled to zero gives finite values."""
 
 
 @dataclass(frozen=True)
@@ -121,30 +117,18 @@ def _join(parts: list[LocalVectors]) -> LocalVectors:
 
 def _add_local_vectors(graph: GraphBuilder, trained_model: TrainedModel, vectors: LocalVectors) -> tuple[str, str]:
     """Add the nodes of joined vectors; returns the names of the (N, ., 3) vectors and of the (N, ., 12) table."""
-    rows_per_space = _rows_per_space(trained_model)
     space_count = len(vectors.joints) + len(trained_model.rig.joints)
     flat_matrices = graph.reshape(_add_spaces(graph, vectors), [0, space_count, 16], "flat_spaces")
-    selection = graph.floats("table_picks", _table_selection(rows_per_space))
+    selection = graph.floats("table_picks", _table_selection())
     table = graph.reshape(graph.add("MatMul", [flat_matrices, selection], "table_rows"), [0, -1, 12], "table")
-    inverse_source = _add_inverses(graph, flat_matrices) if trained_model.sheared else table
-    inverse_rows = vectors.spaces if trained_model.sheared else rows_per_space * vectors.spaces + TRANSPOSE_ROW
-    end_rows, origin_rows = (indices @ [rows_per_space, 1] for indices in (vectors.ends, vectors.origins))
-    inverses = graph.add(
-        "Gather", [inverse_source, graph.integers("vector_spaces", inverse_rows)], "vector_inverses", axis=1
-    )
+    end_rows, origin_rows = (indices @ [ROWS_PER_SPACE, 1] for indices in (vectors.ends, vectors.origins))
+    inverses = [_add_inverses(graph, flat_matrices), graph.integers("vector_spaces", vectors.spaces)]
+    inverses = graph.add("Gather", inverses, "vector_inverses", axis=1)
     end_points = [graph.add("Gather", [table, graph.integers("vector_ends", end_rows)], "ends", axis=1)]
     end_points.append(graph.add("Gather", [table, graph.integers("vector_origins", origin_rows)], "origins", axis=1))
     offsets = graph.add("Sub", end_points, "offsets")
     row_sums = graph.floats("row_sums", np.kron(np.eye(3), np.ones((4, 1))))
-    name = graph.add("MatMul", [graph.add("Mul", [inverses, offsets], "terms"), row_sums], "vectors")
-    if not trained_model.sheared:
-        squared_inverses = graph.add("Mul", [inverses, inverses], "inverses_squared")
-        name = graph.add("Div", [name, graph.add("MatMul", [squared_inverses, row_sums], "lengths")], "local_vectors")
-    return name, table
-
-
-def _rows_per_space(trained_model: TrainedModel) -> int:
-    return TRANSPOSE_ROW + (not trained_model.sheared)
+    return graph.add("MatMul", [graph.add("Mul", [inverses, offsets], "terms"), row_sums], "vectors"), table
 
 
 def _needed_features(trained_model: TrainedModel) -> np.ndarray:
@@ -172,18 +156,12 @@ def _add_spaces(graph: GraphBuilder, vectors: LocalVectors) -> str:
     return graph.add("Concat", [space_matrices, POSE_INPUT], "spaces", axis=1)
 
 
-def _table_selection(rows: int) -> np.ndarray:
+def _table_selection() -> np.ndarray:
     """Return the (16, 12 rows) matrix whose product with a flattened 4x4 matrix is its rows of the table."""
-    selection = np.zeros((16, rows, VECTOR_SIZE, 4))
-    for row, inner in np.ndindex(VECTOR_SIZE, 3):
-        for column in range(MATRIX_COLUMNS):
-            selection[4 * inner + column, column, row, inner] = 1
-        if rows > TRANSPOSE_ROW:
-            selection[4 * inner + row, TRANSPOSE_ROW, row, inner] = 1
-            # The fourth element comes from the 1 in the corner of the matrix, so that no length is zero.
-            selection[-1, TRANSPOSE_ROW, row, 3] = np.sqrt(MIN_SQUARED_LENGTH)
+    selection = np.zeros((16, ROWS_PER_SPACE, 12))
     for column, row in np.ndindex(MATRIX_COLUMNS, 3):
-        selection.reshape(16, rows, -1)[4 * row + column, MATRIX_ROW, 3 * column + row] = 1
+        selection[4 * row + column, column, [row, row + 4, row + 8]] = 1
+        selection[4 * row + column, MATRIX_ROW, 3 * column + row] = 1
     return selection.reshape(16, -1)
 
 
@@ -200,17 +178,16 @@ def _add_half_rotations(
     The first of the added spaces are those of `JointFeatures`, and so are the first vectors.
     """
     joint_count, half_rotation_joints = len(trained_model.rig.joints), trained_model.half_rotation_joints()
-    rows_per_space = _rows_per_space(trained_model)
-    matrix_rows = rows_per_space * (added_space_count + np.arange(joint_count)) + MATRIX_ROW
+    matrix_rows = ROWS_PER_SPACE * (added_space_count + np.arange(joint_count)) + MATRIX_ROW
     pose_rows = np.append(matrix_rows, np.full(joint_count, -1))
     if len(half_rotation_joints):
-        appended_rows = rows_per_space * (added_space_count + joint_count) + np.arange(len(half_rotation_joints))
+        appended_rows = ROWS_PER_SPACE * (added_space_count + joint_count) + np.arange(len(half_rotation_joints))
         pose_rows[joint_count + half_rotation_joints] = appended_rows
         joints = needed_joints(is_needed[: FEATURES_PER_JOINT * joint_count])
         carried_spaces = np.searchsorted(joints, half_rotation_joints)[:, None]
         zero_vector = np.full_like(carried_spaces, MATRIX_COLUMNS * len(joints))
         rotation_columns = np.append(MATRIX_COLUMNS * carried_spaces + np.arange(3), zero_vector, axis=1)
-        carried_columns = MATRIX_COLUMNS * (rows_per_space * carried_spaces + MATRIX_ROW) + np.arange(3)
+        carried_columns = MATRIX_COLUMNS * (ROWS_PER_SPACE * carried_spaces + MATRIX_ROW) + np.arange(3)
         table = add_half_rotations(graph, vectors, rotation_columns, table, carried_columns)
     return table, pose_rows
 
@@ -218,7 +195,7 @@ def _add_half_rotations(
 def _add_inverses(graph: GraphBuilder, flat_matrices: str) -> str:
     """Invert the upper left 3x3 of (N, G, 16) matrices; returns (N, G, 12), three rows that each end with a zero."""
     # Each element of the adjugate is a difference of two products. The selection by ones and zeros is exact.
-    selection, signs = np.zeros((16, 39)), np.zeros((18, 12))
+    selection, signs = np.zeros((16, 48)), np.zeros((18, 12))
     for i, j in np.ndindex(3, 3):
         rows, columns = ((j + 1) % 3, (j + 2) % 3), ((i + 1) % 3, (i + 2) % 3)
         for product, product_columns in enumerate((columns, columns[::-1])):
@@ -226,14 +203,15 @@ def _add_inverses(graph: GraphBuilder, flat_matrices: str) -> str:
             selection[4 * rows[0] + product_columns[0], minor] = 1
             selection[4 * rows[1] + product_columns[1], 18 + minor] = 1
             signs[minor, 4 * i + j] = 1 - 2 * product
-    selection[[0, 4, 8], [36, 37, 38]] = 1
+        selection[4 * j + i, 36 + 4 * i + j] = 1
     selected = graph.add("MatMul", [flat_matrices, graph.floats("picks", selection)], "picked")
-    *factors, first_column = graph.split(selected, [18, 18, 3], ["left", "right", "column"], axis=2)
+    *factors, transposed = graph.split(selected, [18, 18, 12], ["left", "right", "transposed"], axis=2)
     products = graph.add("Mul", factors, "products")
     adjugate = graph.add("MatMul", [products, graph.floats("minor_signs", signs)], "adjugate")
-    expansion = graph.add("Mul", [graph.slice(adjugate, 0, 3, 2, "adjugate_row"), first_column], "expansion")
-    determinant = graph.add("ReduceSum", [expansion, graph.integers("last_axis", [2])], "determinant", keepdims=1)
-    safe_determinant = graph.add("Add", [determinant, graph.floats("smallest", MIN_SQUARED_LENGTH)], "safe_determinant")
+    expansions = graph.add("Mul", [adjugate, transposed], "expansions")
+    # The expansions along the three rows are equal.
+    determinant = graph.add("MatMul", [expansions, graph.floats("thirds", np.full((12, 1), 1 / 3))], "determinant")
+    safe_determinant = graph.add("Add", [determinant, graph.floats("smallest", MIN_DETERMINANT)], "safe_determinant")
     return graph.add("Div", [adjugate, safe_determinant], "inverses")
 
 
