@@ -81,7 +81,6 @@ MECHANISMS = {
     "component allocation": Mechanism({"trainer.preparation.allocate_components": _allocate_equally}),
     "low-rank factors": Mechanism({"trainer.compression.may_factorize": lambda *_: False}),
     "dropped components": Mechanism({"trainer.compression.MIN_GAIN_RATIO": -np.inf}),
-    "shared products": Mechanism({"trainer.export.skinning_nodes.MAX_PADDING_ELEMENTS": 0}, is_export=True),
     "pieces of layers": Mechanism(
         {"trainer.export.network_nodes._chunk_size": lambda layer_sizes, *_: max(layer_sizes)}, is_export=True
     ),

@@ -21,7 +21,6 @@ from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
-from trainer.export import skinning_nodes
 from trainer.export.graph import build_graph
 from trainer.fits.half_rotations import half_rotation_matrices, half_rotations_help, regression_matrices
 from trainer.fits.joint_fit import JointFit, joint_regression
@@ -223,9 +222,8 @@ def test_a_warm_start_keeps_half_rotations(recording, model_and_path, tmp_path, 
     assert report["fdda"]["held_out"]["mean"] < 0.1 * report["linear"]["held_out"]["mean"]
 
 
-def test_half_rotations_cost_thirteen_nodes_and_three_parameters_per_vertex(model_and_path, monkeypatch):
+def test_half_rotations_cost_thirteen_nodes_and_three_parameters_per_vertex(model_and_path):
     trained_model = model_and_path[0]
-    monkeypatch.setattr(skinning_nodes, "MAX_PADDING_ELEMENTS", 0)
     graph, plain = (
         build_graph(tested_model) for tested_model in (trained_model, without_half_rotations(trained_model))
     )

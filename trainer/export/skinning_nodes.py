@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Graph nodes that compute the positions: each partition, or group of small partitions, takes one matrix product."""
-
-import math
+"""Graph nodes that compute the positions: each partition takes one matrix product."""
 
 import numpy as np
 
@@ -15,8 +13,6 @@ from .network_nodes import Coefficients
 from .pose_nodes import Features
 from .vertex_order import vertex_order
 
-MAX_PADDING_ELEMENTS = 6_000
-"""Maximum number of zeros in a matrix of several partitions. Reading more takes longer than one more product."""
 LINEAR_PART_SIZE = 3 * VECTOR_SIZE
 """Number of elements of a matrix's linear part, its first three columns. Matrices are stored column by column.
 
@@ -117,49 +113,40 @@ def add_skinning(
         trained_model: model to export.
     """
     partitions = [_PartitionRows(trained_model, index) for index in range(len(trained_model.partitions))]
-    shapes = [(partition.row_count, len(partition.vertices)) for partition in partitions]
-    products = [[partitions[index] for index in product] for product in _group_products(shapes)]
-    partitions = [partition for product in products for partition in product]
     rows = _add_rows(graph, features, coefficients, outside, partitions)
-    row_counts = [sum(partition.row_count for partition in product) for product in products]
-    row_blocks = graph.split(rows, row_counts, [f"rows_{number}" for number in range(len(products))], axis=2)
+    row_counts, names = [p.row_count for p in partitions], [f"rows_{p.index}" for p in partitions]
+    row_blocks = graph.split(rows, row_counts, names, axis=2)
     order = vertex_order([partition.vertices for partition in partitions])
-    columns = {partition.index: columns for partition, columns in zip(partitions, order.columns, strict=True)}
     position_blocks = [
-        _add_product(graph, product_rows, f"{number}", product, columns)
-        for number, (product_rows, product) in enumerate(zip(row_blocks, products, strict=True))
+        _add_product(graph, *arguments) for arguments in zip(row_blocks, partitions, order.columns, strict=True)
     ]
     joined_positions = graph.join(position_blocks, "blocks", axis=2)
     joined_positions = graph.add("Transpose", [joined_positions], "positions_by_partition", perm=[0, 2, 1])
     order.add(graph, joined_positions, POSITIONS_OUTPUT)
 
 
-def _add_product(
-    graph: GraphBuilder, rows: str, suffix: str, product: list[_PartitionRows], columns: dict[int, np.ndarray]
-) -> str:
-    """Add the product of rows with the matrices of the partitions of a product.
+def _add_product(graph: GraphBuilder, rows: str, partition: _PartitionRows, columns: np.ndarray) -> str:
+    """Add the product of the (N, 3, rows) rows of a partition with its matrix.
 
     Args:
         graph: graph to which the nodes are added.
-        rows: name of the (N, 3, rows) rows.
-        suffix: end of the names of the nodes.
-        product: the partitions.
-        columns: by partition index, the vertex of each column of its positions; -1 for a column of zeros.
+        rows: name of the rows.
+        partition: the partition.
+        columns: the vertex of each column of its positions; -1 for a column of zeros.
 
     Returns:
         Name of the (N, 3, columns) positions.
     """
-    if len(product) == 1 and product[0].prepared.vertex_factors is not None:
-        left_factor, matrix = product[0].factorized_matrix()
-        rows = graph.add("MatMul", [rows, graph.floats(f"left_factor_{suffix}", left_factor)], f"low_rank_{suffix}")
-        matrices = [matrix]
+    suffix = partition.index
+    if partition.prepared.vertex_factors is None:
+        matrix = partition.matrix()
     else:
-        matrices = [partition.matrix() for partition in product]
-    reordered = [
-        _reorder_columns(matrix, partition.vertices, columns[partition.index])
-        for matrix, partition in zip(matrices, product, strict=True)
-    ]
-    matrix = graph.floats(f"matrix_{suffix}", _block_diagonal(reordered))
+        left_factor, matrix = partition.factorized_matrix()
+        rows = graph.add("MatMul", [rows, graph.floats(f"left_factor_{suffix}", left_factor)], f"low_rank_{suffix}")
+    # Each of the partition's vertices has a column of the matrix.
+    vertices = partition.vertices
+    indices = np.searchsorted(vertices, np.maximum(columns, vertices[0]))
+    matrix = graph.floats(f"matrix_{suffix}", np.where(columns >= 0, matrix[:, indices], 0))
     return graph.add("MatMul", [rows, matrix], f"block_{suffix}")
 
 
@@ -170,7 +157,7 @@ def _add_rows(
     outside: str,
     partitions: list[_PartitionRows],
 ) -> str:
-    """Add the (N, 3, rows) rows of partitions, in the order of the products; other arguments as in `add_skinning`."""
+    """Add the (N, 3, rows) rows of all partitions; other arguments as in `add_skinning`."""
     scaled_matrices, slice_order = _order_slices(features, coefficients, partitions)
     joint_of_matrix, factor_of_matrix = zip(*scaled_matrices, strict=True)
     scalar_values = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
@@ -222,36 +209,3 @@ def _order_slices(
         slice_order += [~(matrix_index // 3) for matrix_index in range(joint_start, joint_end, 3)]
     scaled_matrices += -len(scaled_matrices) % 3 * [(0, ones_index)]
     return scaled_matrices, [len(scaled_matrices) + ~i if i < 0 else i for i in slice_order]
-
-
-def _group_products(matrix_shapes: list[tuple[int, int]]) -> list[list[int]]:
-    """Group matrices into products: small matrices share a block-diagonal matrix as long as it has few zeros.
-
-    Args:
-        matrix_shapes: numbers of rows and columns of each matrix.
-
-    Returns:
-        Indices of the matrices of each product.
-    """
-    products: list[list[int]] = []
-    row_count = column_count = 0
-    for index, (rows, columns) in sorted(enumerate(matrix_shapes), key=lambda item: (math.prod(item[1]), item[0])):
-        if not products or rows * column_count + columns * row_count >= MAX_PADDING_ELEMENTS:
-            products.append([])
-            row_count = column_count = 0
-        products[-1].append(index)
-        row_count, column_count = row_count + rows, column_count + columns
-    return products
-
-
-def _block_diagonal(matrices: list[np.ndarray]) -> np.ndarray:
-    row_starts, column_starts = np.cumsum([(0, 0), *(matrix.shape for matrix in matrices)], axis=0).T
-    joined = np.zeros((row_starts[-1], column_starts[-1]))
-    for index, matrix in enumerate(matrices):
-        joined[row_starts[index] : row_starts[index + 1], column_starts[index] : column_starts[index + 1]] = matrix
-    return joined
-
-
-def _reorder_columns(matrix: np.ndarray, vertices: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Reorder the columns of a matrix, one for each of `vertices`; `columns` has vertices, or -1 for a zero column."""
-    return np.where(columns >= 0, matrix[:, np.searchsorted(vertices, np.maximum(columns, vertices[0]))], 0)
