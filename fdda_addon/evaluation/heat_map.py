@@ -47,12 +47,6 @@ class Paint:
     partition_count: int = 0
 
 
-_paints: dict[int, Paint] = {}
-"""The colors of meshes, by the session ids of mesh objects."""
-_hidden_uids: set[int] = set()
-"""Session ids of the objects whose colors could not be drawn."""
-
-
 def paint_errors(mesh_object: bpy.types.Object) -> None:
     """Show the errors of the last evaluation of a mesh as colors."""
     _paint(mesh_object, Paint(ERRORS))
@@ -81,32 +75,37 @@ def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PART
 
 def clear(mesh_object: bpy.types.Object) -> None:
     """Remove the colors of a mesh."""
-    _paints.pop(mesh_object.session_uid, None)
-    if not _paints:
-        overlay.stop()
+    _colors.paints.pop(mesh_object.session_uid, None)
+    if not _colors.paints:
+        _colors.stop()
     redraw_views()
 
 
 def clear_all() -> None:
     """Remove the colors of all meshes."""
-    _paints.clear()
-    overlay.stop()
+    _colors.paints.clear()
+    _colors.stop()
 
 
 def paint_kind(mesh_object: bpy.types.Object) -> str:
     """Return the kind of the colors of a mesh, `ERRORS` or `PARTITIONS`; empty if the mesh has no colors."""
-    paint = _paints.get(mesh_object.session_uid)
+    paint = _colors.paints.get(mesh_object.session_uid)
     return paint.kind if paint else ""
 
 
 def is_hidden(mesh_object: bpy.types.Object) -> bool:
-    """Return whether the colors of a mesh could not be drawn, because of edit mode or a changed topology."""
-    return mesh_object.session_uid in _hidden_uids
+    """Return whether the colors of a mesh cannot be drawn, because of edit mode or a changed topology."""
+    paint, evaluation = _colors.paints.get(mesh_object.session_uid), last_evaluation.get(mesh_object)
+    if paint is None or (paint.kind == ERRORS and evaluation is None):
+        return False
+    count = evaluation.vertices if paint.kind == ERRORS else len(paint.partition_colors)
+    evaluated = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    return evaluated.mode == "EDIT" or len(evaluated.data.vertices) != count
 
 
 def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
     """Return the colors of a mesh at the current frame, (V, 3) float32, sRGB; None if there are none."""
-    paint = _paints.get(mesh_object.session_uid)
+    paint = _colors.paints.get(mesh_object.session_uid)
     if paint is None:
         return None
     if paint.kind == PARTITIONS:
@@ -131,76 +130,78 @@ def suggested_range_mm(mesh_object: bpy.types.Object) -> float:
 
 
 def _paint(mesh_object: bpy.types.Object, paint: Paint) -> None:
-    _paints[mesh_object.session_uid] = paint
+    _colors.paints[mesh_object.session_uid] = paint
     if not bpy.app.background:
-        overlay.start(_overlay_meshes, _legend, _overlay_bones)
+        _colors.start()
     redraw_views()
 
 
-def _overlay_meshes(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
-    """Return the meshes to draw, and discard the colors of objects that no longer exist."""
-    painted_objects = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _paints}
-    for removed_uid in _paints.keys() - painted_objects.keys():
-        del _paints[removed_uid]
-    meshes, hidden_uids = [], set()
-    for uid, mesh_object in painted_objects.items():
-        colors = colors_of(mesh_object)
-        if colors is None or not mesh_object.visible_get(view_layer=context.view_layer):
-            continue
-        mesh = overlay.overlay_mesh(context, mesh_object, colors)
-        if mesh is None:
-            hidden_uids.add(uid)
-        else:
-            meshes.append(mesh)
-    if hidden_uids != _hidden_uids:
-        _hidden_uids.clear()
-        _hidden_uids.update(hidden_uids)
-        # A draw handler must not request a redraw itself, so a timer requests it.
-        bpy.app.timers.register(redraw_views, first_interval=0)
-    return meshes
+class _MeshColors(overlay.Overlay):
+    """The colors of the open file's meshes, drawn while there are any.
 
+    Attributes:
+        paints: the colors, by the session ids of mesh objects.
+    """
 
-def _overlay_bones(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
-    """Return the bones of armatures in pose mode, which are drawn again because the colors cover them."""
-    bones = []
-    for mesh_object in context.view_layer.objects:
-        armature_object = armature_of(mesh_object) if mesh_object.session_uid in _paints else None
-        if armature_object is None or armature_object.mode != "POSE":
-            continue
-        matrix, active_bone = armature_object.matrix_world, armature_object.data.bones.active
-        for bone in armature_object.pose.bones:
-            if is_bone_hidden(bone):
+    def __init__(self) -> None:
+        super().__init__()
+        self.paints: dict[int, Paint] = {}
+
+    def meshes(self, context: bpy.types.Context) -> list[overlay.OverlayMesh]:
+        """Return the meshes to draw, and discard the colors of objects that no longer exist."""
+        painted_objects = {o.session_uid: o for o in bpy.data.objects if o.session_uid in self.paints}
+        for removed_uid in self.paints.keys() - painted_objects.keys():
+            del self.paints[removed_uid]
+        meshes = []
+        for mesh_object in painted_objects.values():
+            colors = colors_of(mesh_object)
+            if colors is not None and mesh_object.visible_get(view_layer=context.view_layer):
+                meshes.append(self.overlay_mesh(context, mesh_object, colors))
+        return [mesh for mesh in meshes if mesh is not None]
+
+    def bones(self, context: bpy.types.Context) -> list[overlay.OverlayBone]:
+        """Return the bones of armatures in pose mode, which are drawn again because the colors cover them."""
+        bones = []
+        for mesh_object in context.view_layer.objects:
+            armature_object = armature_of(mesh_object) if mesh_object.session_uid in self.paints else None
+            if armature_object is None or armature_object.mode != "POSE":
                 continue
-            color = (
-                ACTIVE_BONE_COLOR
-                if bone.bone == active_bone
-                else (SELECTED_BONE_COLOR if is_selected(bone) else BONE_COLOR)
-            )
-            bones.append(overlay.OverlayBone(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
-    return bones
+            matrix, active_bone = armature_object.matrix_world, armature_object.data.bones.active
+            for bone in armature_object.pose.bones:
+                if is_bone_hidden(bone):
+                    continue
+                color = (
+                    ACTIVE_BONE_COLOR
+                    if bone.bone == active_bone
+                    else (SELECTED_BONE_COLOR if is_selected(bone) else BONE_COLOR)
+                )
+                bones.append(overlay.OverlayBone(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
+        return bones
+
+    def legend(self, context: bpy.types.Context) -> tuple[list[str], float | None]:
+        """Return the lines of the legend, and the range of the heat map in mm; None if no errors are shown."""
+        painted_objects = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in self.paints}
+        active_object = context.view_layer.objects.active
+        active_painted_object = painted_objects.get(active_object.session_uid) if active_object else None
+        mesh_object = active_painted_object or next(iter(painted_objects.values()), None)
+        if mesh_object is None:
+            return [], None
+        paint = self.paints[mesh_object.session_uid]
+        if paint.kind == PARTITIONS:
+            return [f"{mesh_object.name}: {paint.partition_count} body parts"], None
+        evaluation, view = last_evaluation.get(mesh_object), context.window_manager.fdda_view
+        if evaluation is None:
+            return [], None
+        errors = errors_of(mesh_object)
+        method = "skinning" if view.deformation == "linear" else "model"
+        description = _describe_errors(evaluation, view.statistic, context.scene.frame_current, view.pose)
+        if errors is None:
+            return [f"{mesh_object.name}, {method}: {description}"], None
+        statistics = f"mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.2f} mm"
+        return [f"{mesh_object.name}, {method}: {description}", statistics], view.range_mm
 
 
-def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
-    """Return the lines of the legend, and the range of the heat map in mm; the range is None if no errors are shown."""
-    painted_objects = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in _paints}
-    active_object = context.view_layer.objects.active
-    active_painted_object = painted_objects.get(active_object.session_uid) if active_object else None
-    mesh_object = active_painted_object or next(iter(painted_objects.values()), None)
-    if mesh_object is None:
-        return [], None
-    paint = _paints[mesh_object.session_uid]
-    if paint.kind == PARTITIONS:
-        return [f"{mesh_object.name}: {paint.partition_count} body parts"], None
-    evaluation, view = last_evaluation.get(mesh_object), context.window_manager.fdda_view
-    if evaluation is None:
-        return [], None
-    errors = errors_of(mesh_object)
-    method = "skinning" if view.deformation == "linear" else "model"
-    description = _describe_errors(evaluation, view.statistic, context.scene.frame_current, view.pose)
-    if errors is None:
-        return [f"{mesh_object.name}, {method}: {description}"], None
-    statistics = f"mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.2f} mm"
-    return [f"{mesh_object.name}, {method}: {description}", statistics], view.range_mm
+_colors = _MeshColors()
 
 
 def _describe_errors(evaluation: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Stores the last evaluation of each mesh object until Blender ends, for the sidebar, the viewport and the timeline."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
@@ -41,9 +42,11 @@ class PartitionErrors:
     linear: "ErrorStatistics"
 
 
-@dataclass(frozen=True)
+@dataclass
 class LastEvaluation:
     """Errors of a model on the frames of an action, or on random poses.
+
+    Only the attributes of a closed file change.
 
     Attributes:
         name: name of the action; empty for random poses.
@@ -54,6 +57,8 @@ class LastEvaluation:
         total: statistics of the errors of all vertices, mm, for each of `METHODS`.
         partitions: errors of the partitions, in descending order of the largest error of the model.
         channels: channels of the random poses.
+        closed_character: identifies the character after its file was closed (`reopening`); empty before.
+        was_painted: whether the heat map showed the errors when the file was closed.
     """
 
     name: str
@@ -64,7 +69,9 @@ class LastEvaluation:
     total: "dict[str, ErrorStatistics]"
     partitions: tuple[PartitionErrors, ...]
     channels: "tuple[Channel, ...]"
-    _cached_errors: "dict[tuple[str, str], np.ndarray]" = field(default_factory=dict, repr=False, compare=False)
+    closed_character: tuple = ()
+    was_painted: bool = False
+    _cached: dict[tuple, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def poses(self) -> int:
@@ -95,19 +102,35 @@ class LastEvaluation:
         errors = self.errors[method]
         if statistic == "pose":
             return None if pose is None or not 0 <= pose < len(errors) else errors[pose]
-        # Cache the result, because viewports need it at every redraw and there are millions of errors.
-        cache_key = (method, statistic)
-        if cache_key not in self._cached_errors:
-            self._cached_errors[cache_key] = errors.mean(axis=0) if statistic == "mean" else errors.max(axis=0)
-        return self._cached_errors[cache_key]
+        return self._computed_once(
+            (method, statistic), lambda: errors.mean(axis=0) if statistic == "mean" else errors.max(axis=0)
+        )
+
+    def errors_by_frame(self) -> list[tuple[int, float]]:
+        """Return pairs of frame and largest error of the model in mm; empty for random poses."""
+        if not self.name:
+            return []
+        return self._computed_once(
+            ("errors_by_frame",),
+            lambda: list(enumerate((self.errors["fdda"].max(axis=1) * 1000).tolist(), self.first_frame)),
+        )
 
     def worst_poses(self, count: int) -> list[tuple[int, float]]:
         """Return the poses with the largest errors of the model, worst first, as pairs of index and error in mm."""
+        return self._computed_once(("worst_poses", count), lambda: self._find_worst_poses(count))
+
+    def _find_worst_poses(self, count: int) -> list[tuple[int, float]]:
         from ..core.metrics import worst_poses
 
         errors = self.errors["fdda"]
         indices = worst_poses(errors, count, MIN_FRAMES_APART if self.name else 1)
         return [(index, float(errors[index].max()) * 1000) for index in indices]
+
+    def _computed_once(self, key: tuple, compute: Callable[[], Any]) -> Any:
+        """Return the stored result of a computation: each redraw needs it, and there are millions of errors."""
+        if key not in self._cached:
+            self._cached[key] = compute()
+        return self._cached[key]
 
 
 def store(
@@ -156,6 +179,8 @@ def store(
 
 def restore(mesh_object: bpy.types.Object, evaluation: LastEvaluation) -> None:
     """Store an evaluation as the last of an object."""
+    for uid in [uid for uid, stored in _evaluations.items() if stored is evaluation]:
+        del _evaluations[uid]
     _evaluations.pop(mesh_object.session_uid, None)
     while len(_evaluations) >= MAX_STORED_EVALUATIONS:
         del _evaluations[next(iter(_evaluations))]
@@ -165,6 +190,11 @@ def restore(mesh_object: bpy.types.Object, evaluation: LastEvaluation) -> None:
 def get(mesh_object: bpy.types.Object) -> LastEvaluation | None:
     """Return the last evaluation of an object; None if it was not evaluated in this session."""
     return _evaluations.get(mesh_object.session_uid)
+
+
+def closed(character: tuple) -> LastEvaluation | None:
+    """Return the evaluation of a character of a closed file; None if none is stored."""
+    return next((e for e in _evaluations.values() if e.closed_character == character), None)
 
 
 def remove(mesh_object: bpy.types.Object) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Draws meshes with vertex colors, bones, and a legend over the 3D viewports."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import blf
@@ -35,11 +35,6 @@ void main()
 }
 """
 
-_draw_handles: list[object] = []
-_shader: gpu.types.GPUShader | None = None
-_cached_triangles: dict[int, tuple[tuple[int, int, int], gpu.types.GPUIndexBuf]] = {}
-"""Key of the mesh (`_triangles_of`) and its cached triangles, by the session id of the mesh object."""
-
 
 @dataclass(frozen=True)
 class OverlayMesh:
@@ -68,97 +63,117 @@ class OverlayBone:
     color: tuple[float, float, float, float]
 
 
-def start(
-    get_meshes: Callable[[bpy.types.Context], list[OverlayMesh]],
-    get_legend: Callable[[bpy.types.Context], tuple[list[str], float | None]],
-    get_bones: Callable[[bpy.types.Context], list[OverlayBone]],
-) -> None:
-    """Start drawing in all viewports.
+class Overlay:
+    """Draws over all viewports from `start` to `stop`, and owns the draw handlers and the GPU resources.
 
-    Args:
-        get_meshes: called at each redraw; returns the meshes to draw.
-        get_legend: called at each redraw; returns the lines of the legend, and the range of a heat map in mm or None.
-        get_bones: called at each redraw; returns the bones to draw over the meshes.
+    A subclass returns what is drawn; its methods are called at each redraw.
     """
-    if not _draw_handles:
-        add_handler = bpy.types.SpaceView3D.draw_handler_add
-        _draw_handles.append(add_handler(_draw_view, (get_meshes, get_bones), "WINDOW", "POST_VIEW"))
-        _draw_handles.append(add_handler(_draw_legend, (get_legend,), "WINDOW", "POST_PIXEL"))
+
+    def __init__(self) -> None:
+        self._draw_handles: list[object] = []
+        self._shader: gpu.types.GPUShader | None = None
+        # Key of the mesh (`_triangles_of`) and its triangles, by the session id of the mesh object.
+        self._triangles: dict[int, tuple[tuple[int, int, int], gpu.types.GPUIndexBuf]] = {}
+
+    def meshes(self, context: bpy.types.Context) -> list[OverlayMesh]:
+        """Return the meshes to draw."""
+        raise NotImplementedError
+
+    def bones(self, context: bpy.types.Context) -> list[OverlayBone]:
+        """Return the bones to draw over the meshes."""
+        raise NotImplementedError
+
+    def legend(self, context: bpy.types.Context) -> tuple[list[str], float | None]:
+        """Return the lines of the legend, and the range of a heat map in mm or None."""
+        raise NotImplementedError
+
+    def start(self) -> None:
+        """Start drawing."""
+        if not self._draw_handles:
+            add_handler = bpy.types.SpaceView3D.draw_handler_add
+            self._draw_handles.append(add_handler(self._draw_view, (), "WINDOW", "POST_VIEW"))
+            self._draw_handles.append(add_handler(self._draw_legend, (), "WINDOW", "POST_PIXEL"))
+
+    def stop(self) -> None:
+        """Stop drawing, and free the GPU resources, which must be freed before Blender's GPU context."""
+        self._shader = None
+        while self._draw_handles:
+            bpy.types.SpaceView3D.draw_handler_remove(self._draw_handles.pop(), "WINDOW")
+        self._triangles.clear()
+
+    def overlay_mesh(
+        self, context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray
+    ) -> OverlayMesh | None:
+        """Create the overlay of an evaluated mesh; return None in edit mode, or if modifiers change the topology.
+
+        Args:
+            context: the context with the dependency graph.
+            mesh_object: the object.
+            colors: (V, 3) float32, sRGB.
+        """
+        evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())
+        mesh = evaluated.data
+        if evaluated.mode == "EDIT":
+            # Edits such as Rotate Edge change the triangles, but not the counts that identify the mesh.
+            self._triangles.pop(mesh_object.session_uid, None)
+            return None
+        if len(mesh.vertices) != len(colors):
+            return None
+        positions, normals = mesh_positions(mesh), read(mesh.vertex_normals, VECTOR_ELEMENT)
+        triangles = self._triangles_of(mesh_object, mesh)
+        return OverlayMesh(positions, normals, colors, triangles, evaluated.matrix_world.copy())
+
+    def _triangles_of(self, mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.types.GPUIndexBuf:
+        """Return the triangles of an evaluated mesh, stored because computing them takes longer than drawing them.
+
+        Args:
+            mesh_object: the original object. Triangles are computed if its mesh or the number of elements has changed.
+            mesh: the evaluated mesh.
+        """
+        mesh_key = (mesh_object.data.session_uid, len(mesh.vertices), len(mesh.loops))
+        stored = self._triangles.get(mesh_object.session_uid)
+        if stored is None or stored[0] != mesh_key:
+            mesh.calc_loop_triangles()
+            triangles = gpu.types.GPUIndexBuf(type="TRIS", seq=read(mesh.loop_triangles, TRIANGLE_ELEMENT))
+            stored = self._triangles[mesh_object.session_uid] = mesh_key, triangles
+        return stored[1]
+
+    def _draw_view(self) -> None:
+        context = bpy.context
+        shader, region_view = self._mesh_shader(), context.region_data
+        gpu.state.depth_test_set("LESS_EQUAL")
+        gpu.state.depth_mask_set(True)
+        try:
+            for mesh in self.meshes(context):
+                _draw_mesh(mesh, shader, region_view)
+        finally:
+            gpu.state.depth_mask_set(False)
+            gpu.state.depth_test_set("NONE")
+        _draw_bones(context, self.bones(context))
+
+    def _draw_legend(self) -> None:
+        lines, range_mm = self.legend(bpy.context)
+        if lines:
+            _draw_lines(bpy.context, lines, range_mm)
+
+    def _mesh_shader(self) -> gpu.types.GPUShader:
+        if self._shader is None:
+            self._shader = _create_mesh_shader()
+        return self._shader
 
 
-def stop() -> None:
-    """Stop drawing, and free the GPU resources, which must be freed before Blender's GPU context."""
-    global _shader
-    _shader = None
-    while _draw_handles:
-        bpy.types.SpaceView3D.draw_handler_remove(_draw_handles.pop(), "WINDOW")
-    _cached_triangles.clear()
-
-
-def overlay_mesh(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray) -> OverlayMesh | None:
-    """Create the overlay of an evaluated mesh; return None in edit mode, or if modifiers change the topology.
-
-    Args:
-        context: the context with the dependency graph.
-        mesh_object: the object.
-        colors: (V, 3) float32, sRGB.
-    """
-    evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())
-    mesh = evaluated.data
-    if evaluated.mode == "EDIT":
-        # Edits such as Rotate Edge change the triangles, but not the counts that identify the mesh.
-        _cached_triangles.pop(mesh_object.session_uid, None)
-        return None
-    if len(mesh.vertices) != len(colors):
-        return None
-    positions, normals = mesh_positions(mesh), read(mesh.vertex_normals, VECTOR_ELEMENT)
-    return OverlayMesh(positions, normals, colors, _triangles_of(mesh_object, mesh), evaluated.matrix_world.copy())
-
-
-def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.types.GPUIndexBuf:
-    """Return the triangles of an evaluated mesh, cached because computing them takes longer than drawing them.
-
-    Args:
-        mesh_object: the original object. The cache is replaced if its mesh or the number of elements has changed.
-        mesh: the evaluated mesh.
-    """
-    mesh_key = (mesh_object.data.session_uid, len(mesh.vertices), len(mesh.loops))
-    cached = _cached_triangles.get(mesh_object.session_uid)
-    if cached is None or cached[0] != mesh_key:
-        mesh.calc_loop_triangles()
-        triangles = read(mesh.loop_triangles, TRIANGLE_ELEMENT)
-        cached = _cached_triangles[mesh_object.session_uid] = (
-            mesh_key,
-            gpu.types.GPUIndexBuf(type="TRIS", seq=triangles),
-        )
-    return cached[1]
-
-
-def _draw_view(
-    get_meshes: Callable[[bpy.types.Context], list[OverlayMesh]],
-    get_bones: Callable[[bpy.types.Context], list[OverlayBone]],
-) -> None:
-    context = bpy.context
-    shader, region_view = _mesh_shader(), context.region_data
-    gpu.state.depth_test_set("LESS_EQUAL")
-    gpu.state.depth_mask_set(True)
-    try:
-        for mesh in get_meshes(context):
-            attributes = {"position": mesh.positions, "normal": mesh.normals, "color": mesh.colors}
-            vertices = gpu.types.GPUVertBuf(_vertex_format(attributes), len(mesh.positions))
-            for name, values in attributes.items():
-                vertices.attr_fill(name, values)
-            batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=mesh.triangles)
-            shader.bind()
-            shader.uniform_float("transform", region_view.perspective_matrix @ mesh.matrix)
-            towards_viewer = (region_view.view_matrix @ mesh.matrix).to_3x3().inverted_safe().col[2].normalized()
-            shader.uniform_float("towards", towards_viewer)
-            shader.uniform_float("offset", DEPTH_OFFSET)
-            batch.draw(shader)
-    finally:
-        gpu.state.depth_mask_set(False)
-        gpu.state.depth_test_set("NONE")
-    _draw_bones(context, get_bones(context))
+def _draw_mesh(mesh: OverlayMesh, shader: gpu.types.GPUShader, region_view: bpy.types.RegionView3D) -> None:
+    attributes = {"position": mesh.positions, "normal": mesh.normals, "color": mesh.colors}
+    vertices = gpu.types.GPUVertBuf(_vertex_format(attributes), len(mesh.positions))
+    for name, values in attributes.items():
+        vertices.attr_fill(name, values)
+    batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=mesh.triangles)
+    shader.bind()
+    shader.uniform_float("transform", region_view.perspective_matrix @ mesh.matrix)
+    towards_viewer = (region_view.view_matrix @ mesh.matrix).to_3x3().inverted_safe().col[2].normalized()
+    shader.uniform_float("towards", towards_viewer)
+    shader.uniform_float("offset", DEPTH_OFFSET)
+    batch.draw(shader)
 
 
 def _draw_bones(context: bpy.types.Context, bones: list[OverlayBone]) -> None:
@@ -186,31 +201,25 @@ def _vertex_format(names: Iterable[str]) -> gpu.types.GPUVertFormat:
     return vertex_format
 
 
-def _mesh_shader() -> gpu.types.GPUShader:
-    global _shader
-    if _shader is None:
-        info = gpu.types.GPUShaderCreateInfo()
-        info.push_constant("MAT4", "transform")
-        info.push_constant("VEC3", "towards")
-        info.push_constant("FLOAT", "offset")
-        for slot, name in enumerate(("position", "normal", "color")):
-            info.vertex_in(slot, "VEC3", name)
-        interface = gpu.types.GPUStageInterfaceInfo("fdda_interface")
-        interface.smooth("VEC3", "paint")
-        interface.smooth("FLOAT", "shade")
-        info.vertex_out(interface)
-        info.fragment_out(0, "VEC4", "outcome")
-        info.vertex_source(VERTEX_SHADER)
-        info.fragment_source(FRAGMENT_SHADER)
-        _shader = gpu.shader.create_from_info(info)
-    return _shader
+def _create_mesh_shader() -> gpu.types.GPUShader:
+    info = gpu.types.GPUShaderCreateInfo()
+    info.push_constant("MAT4", "transform")
+    info.push_constant("VEC3", "towards")
+    info.push_constant("FLOAT", "offset")
+    for slot, name in enumerate(("position", "normal", "color")):
+        info.vertex_in(slot, "VEC3", name)
+    interface = gpu.types.GPUStageInterfaceInfo("fdda_interface")
+    interface.smooth("VEC3", "paint")
+    interface.smooth("FLOAT", "shade")
+    info.vertex_out(interface)
+    info.fragment_out(0, "VEC4", "outcome")
+    info.vertex_source(VERTEX_SHADER)
+    info.fragment_source(FRAGMENT_SHADER)
+    return gpu.shader.create_from_info(info)
 
 
-def _draw_legend(get_legend: Callable[[bpy.types.Context], tuple[list[str], float | None]]) -> None:
-    context = bpy.context
-    lines, range_mm = get_legend(context)
-    if not lines:
-        return
+def _draw_lines(context: bpy.types.Context, lines: list[str], range_mm: float | None) -> None:
+    """Draw the lines of the legend, and below them the colors of a heat map."""
     ui_scale = context.preferences.system.ui_scale
     visible_regions = [region for region in context.area.regions if region.width > 1]
     left_x = 24 * ui_scale + sum(region.width for region in visible_regions if region.type == "TOOLS")

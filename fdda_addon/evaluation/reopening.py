@@ -13,9 +13,6 @@ from ..scene.stored_paths import absolute_path
 from . import last_evaluation
 from .loaded_heat_map import loaded_heat_map
 
-_closed: dict[tuple, tuple[last_evaluation.LastEvaluation, str]] = {}
-"""Evaluations and kinds of colors of closed files, by `_character_key`, oldest first."""
-
 
 def _character_key(mesh_object: bpy.types.Object) -> tuple:
     """Return values by which a character and its bound model are recognized after the file was opened again."""
@@ -38,30 +35,23 @@ def _bound_objects() -> list[bpy.types.Object]:
 
 @persistent
 def _on_load_pre(*_: object) -> None:
-    if not bpy.data.filepath:
-        return
     heat_map = loaded_heat_map()
-    for mesh_object in _bound_objects():
+    for mesh_object in _bound_objects() if bpy.data.filepath else []:
         evaluation = last_evaluation.get(mesh_object)
         if evaluation is not None:
-            key = _character_key(mesh_object)
-            _closed.pop(key, None)
-            _closed[key] = evaluation, heat_map.paint_kind(mesh_object) if heat_map else ""
-    while len(_closed) > last_evaluation.MAX_STORED_EVALUATIONS:
-        del _closed[next(iter(_closed))]
+            evaluation.closed_character = _character_key(mesh_object)
+            evaluation.was_painted = heat_map is not None and heat_map.paint_kind(mesh_object) == heat_map.ERRORS
 
 
 @persistent
 def _on_load_post(*_: object) -> None:
-    if not _closed:
-        return
     for mesh_object in _bound_objects():
-        evaluation, painted_colors = _closed.get(_character_key(mesh_object), (None, ""))
+        evaluation = last_evaluation.closed(_character_key(mesh_object))
         if evaluation is None:
             continue
         last_evaluation.restore(mesh_object, evaluation)
         heat_map = loaded_heat_map()
-        if heat_map is not None and painted_colors == heat_map.ERRORS:
+        if heat_map is not None and evaluation.was_painted:
             heat_map.paint_errors(mesh_object)
 
 

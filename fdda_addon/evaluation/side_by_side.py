@@ -18,9 +18,6 @@ BESIDE, OVERLAY, NONE = "BESIDE", "OVERLAY", "NONE"
 DISTANCE_IN_WIDTHS = 1.15
 """Default distance between character and copy, in widths of the character."""
 
-_checked_object_count = -1
-"""Number of objects in the file when comparison objects were last checked."""
-
 
 def find(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     """Find the comparison object of a mesh object; return None if there is none."""
@@ -105,16 +102,15 @@ def _move_aside(comparison_object: bpy.types.Object, mesh_object: bpy.types.Obje
 
 
 @persistent
-def _on_depsgraph_update_post(*_: object) -> None:
+def _on_depsgraph_update_post(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Remove the comparison objects whose mesh objects were removed."""
-    global _checked_object_count
-    if _checked_object_count == len(bpy.data.objects):
+    # Blender reports the scene when an object was added, removed or unlinked.
+    if not depsgraph.id_type_updated("SCENE"):
         return
     for comparison_object in comparison_objects():
         compared_object = comparison_object[COMPARISON_KEY]
         if compared_object is None or not compared_object.users_scene:
             _remove(comparison_object)
-    _checked_object_count = len(bpy.data.objects)
 
 
 HANDLERS = {"depsgraph_update_post": _on_depsgraph_update_post}

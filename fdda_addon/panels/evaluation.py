@@ -205,7 +205,7 @@ def _draw_worst(
     if body is None:
         return
     column = body.column(align=True)
-    for rank, (index, error_mm) in enumerate(_worst_poses(last, view.markers), 1):
+    for rank, (index, error_mm) in enumerate(last.worst_poses(view.markers), 1):
         pose_label = f"Frame {last.first_frame + index}" if last.name else f"Pose {index + 1}"
         row = column.row(align=True)
         row.operator("fdda.jump_to_worst", text=f"{pose_label}: {error_mm:.2f} mm").rank = rank
@@ -219,18 +219,6 @@ def _draw_worst(
     row.operator("fdda.add_worst_markers", text="Add Markers", icon="MARKER_HLT").count = view.markers
     if markers.find(context.scene):
         row.operator("fdda.remove_markers", text="", icon="X")
-
-
-_worst_cache: tuple[object, int, list[tuple[int, float]]] | None = None
-"""Evaluation, count and worst poses of the last call of `_worst_poses`."""
-
-
-def _worst_poses(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
-    """Return index and largest error in mm of the worst poses. They are computed once for each evaluation."""
-    global _worst_cache
-    if _worst_cache is None or _worst_cache[0] is not last or _worst_cache[1] != count:
-        _worst_cache = (last, count, last.worst_poses(count))
-    return _worst_cache[2]
 
 
 def _draw_table_row(layout: bpy.types.UILayout, label: str, texts: list[str]) -> None:
@@ -247,9 +235,3 @@ def _format_mm(value: float) -> str:
 
 
 CLASSES = (FDDA_PT_evaluation,)
-
-
-def unregister() -> None:
-    """Clear the cache."""
-    global _worst_cache
-    _worst_cache = None

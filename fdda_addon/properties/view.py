@@ -17,9 +17,9 @@ def _redraw(_view: "FDDA_PG_view", _context: bpy.types.Context) -> None:
 
 def show_graph(is_shown: bool) -> None:
     """Show or hide the error graph in the timeline."""
-    from ..evaluation import timeline
+    from ..evaluation.timeline import graph
 
-    (timeline.start if is_shown else timeline.stop)()
+    (graph.start if is_shown else graph.stop)()
 
 
 def _active_action(_view: "FDDA_PG_view") -> str:

@@ -131,18 +131,18 @@ def test_mean_and_largest_errors_are_computed_once(active, evaluated_action):
 
 def test_overlay_follows_edited_and_replaced_faces(active, monkeypatch):
     monkeypatch.setattr(overlay, "gpu", SimpleNamespace(types=SimpleNamespace(GPUIndexBuf=lambda type, seq: seq)))
-    monkeypatch.setattr(overlay, "_cached_triangles", {})
+    drawn = overlay.Overlay()
     colors = np.zeros((len(active.data.vertices), 3), np.float32)
 
     def drawn_triangles() -> np.ndarray:
         bpy.context.view_layer.update()
-        return overlay.overlay_mesh(bpy.context, active, colors).triangles
+        return drawn.overlay_mesh(bpy.context, active, colors).triangles
 
     original = drawn_triangles()
     assert drawn_triangles() is original
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.context.view_layer.update()
-    assert overlay.overlay_mesh(bpy.context, active, colors) is None
+    assert drawn.overlay_mesh(bpy.context, active, colors) is None
     bpy.ops.object.mode_set(mode="OBJECT")
     assert drawn_triangles() is not original
     edited = drawn_triangles()

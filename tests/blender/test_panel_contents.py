@@ -253,14 +253,15 @@ def test_durations(seconds, text):
 
 def test_the_worst_frames_are_those_of_the_last_of_several_evaluations():
     from fdda_addon.evaluation.last_evaluation import LastEvaluation
-    from fdda_addon.panels.evaluation import _worst_poses
 
     def evaluation(worst: int) -> LastEvaluation:
         errors = np.zeros((3, 4), np.float32)
         errors[worst] = 0.001
         return LastEvaluation("", "m", 0, 0, {"fdda": errors, "linear": errors}, {}, (), ())
 
-    assert [_worst_poses(evaluation(worst), 2)[0][0] for worst in (1, 2, 0)] == [1, 2, 0]
+    evaluations = [evaluation(worst) for worst in (1, 2, 0)]
+    assert [last.worst_poses(2)[0][0] for last in evaluations] == [1, 2, 0]
+    assert [len(evaluations[0].worst_poses(count)) for count in (3, 1)] == [3, 1]
 
 
 @pytest.mark.parametrize("changes_scene", [True, False])

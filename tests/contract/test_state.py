@@ -14,12 +14,9 @@ STATE = {
     "__init__.py": ("_cli_command",),
     "cli/interruption.py": ("_callback_modules", "_pending_signal"),
     "core/recording/lock.py": ("_held_lock_paths",),
-    "evaluation/heat_map.py": ("_hidden_uids", "_paints"),
+    "evaluation/heat_map.py": ("_colors",),
     "evaluation/last_evaluation.py": ("_evaluations",),
-    "evaluation/overlay.py": ("_cached_triangles", "_draw_handles", "_shader"),
-    "evaluation/reopening.py": ("_closed",),
-    "evaluation/side_by_side.py": ("_checked_object_count",),
-    "evaluation/timeline.py": ("_cached_batches", "_cached_curve", "_draw_handles"),
+    "evaluation/timeline.py": ("graph",),
     "jobs/background.py": ("_runner",),
     "jobs/job.py": ("_running", "_states"),
     "models/model_list.py": ("_info_cache",),
@@ -28,7 +25,6 @@ STATE = {
     "operators/rig.py": ("_measured_costs",),
     "panels/checks.py": ("_changed_meshes", "_checks", "_outdated", "_requested"),
     "panels/curves.py": ("_drawn_key", "_previews"),
-    "panels/evaluation.py": ("_worst_cache",),
     "panels/limits.py": ("_limits_cache",),
     "panels/models.py": ("_problem_values", "_rig_cache"),
     "panels/playback.py": ("_confidence_value",),
@@ -134,4 +130,4 @@ def test_the_only_state_of_playback_is_the_session():
     assert {path: names for path, names in STATE.items() if path.startswith("runtime/")} == {
         "runtime/session.py": ("session",)
     }
-    assert sum(map(len, STATE.values())) <= 52
+    assert sum(map(len, STATE.values())) <= 43
