@@ -2,7 +2,7 @@
 """Reads the modifiers, shape keys and drivers that deform a mesh besides its skin weights (`core.deformation`)."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from operator import attrgetter
 
 import bpy
@@ -62,19 +62,24 @@ def read_b_bones(armature: bpy.types.Armature) -> dict:
             name.removeprefix("bbone_"): None if value is None else _json_value(None, value)
             for name, value in zip(_B_BONE_SETTINGS, values, strict=True)
         }
-        for bone_name, values in b_bone_values(armature).items()
+        for bone_name, values in b_bone_values(armature, armature.bones).items()
     }
 
 
-def b_bone_values(armature: bpy.types.Armature) -> dict[str, tuple]:
-    """Read what `read_b_bones` reads, quickly and without rounding: a value for each of `_B_BONE_SETTINGS`."""
+def b_bone_values(armature: bpy.types.Armature, bones: Iterable[bpy.types.Bone]) -> dict[str, tuple]:
+    """Read what `read_b_bones` reads, quickly and without rounding: a value for each of `_B_BONE_SETTINGS`.
+
+    Args:
+        armature: the armature.
+        bones: its bones to read.
+    """
     # Rigify drives the easing: Blender writes the value of the current pose into the bone.
     animated: dict[str, set[str]] = {}
     for path in animated_paths(armature):
         bone_path, _, name = path.rpartition(".")
         animated.setdefault(bone_path, set()).add(name)
     values_by_bone = {}
-    for bone in armature.bones:
+    for bone in bones:
         if bone.use_deform and bone.bbone_segments > 1:
             values = tuple(map(_copy, _read_b_bone(bone)))
             if names := animated.get(bone.path_from_id()) if animated else None:

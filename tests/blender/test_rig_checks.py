@@ -13,6 +13,7 @@ from fdda_addon.runtime import playback, rig_signature
 from fdda_addon.runtime import session as session_module
 from fdda_addon.runtime.session import session
 from fdda_addon.runtime.transitions import State
+from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
 from .conftest import ELBOW_RIG, assert_plays, pose
 from .test_changed_rigs import assert_rig_shown, drive_b_bone
@@ -67,6 +68,30 @@ def test_a_frame_reads_no_bones_of_driven_armature_data(bound_elbow, elbow_files
     assert np.abs(shown[0] - shown[-1]).max() > 1e-3
 
 
+def test_posing_reads_only_bones_that_can_have_weights(bound_elbow, elbow_files, monkeypatch):
+    armature_object, read_names = bpy.data.objects[ELBOW_RIG], []
+    bound_elbow.fdda.mode = "RIG"
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    for index in range(40):
+        bone = armature_object.data.edit_bones.new(f"control.{index}")
+        bone.tail = (0, 0, 1)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    bound_elbow.fdda.mode = "FDDA"
+    function = rig_signature.bone_signature
+    monkeypatch.setattr(
+        rig_signature,
+        "bone_signature",
+        lambda armature, names: read_names.extend(names) or function(armature, names),
+    )
+    pose(angle=0.3)
+    assert_plays(bound_elbow, elbow_files.model)
+    assert read_names and not [name for name in read_names if name.startswith("control.")]
+    rig = SceneRig(bound_elbow, armature_object)
+    armature_modifier(bound_elbow).use_bone_envelopes = True
+    assert set(armature_object.data.bones.keys()) == set(rig_signature._weighted_names(rig, ("upper",)))
+
+
 @pytest.fixture
 def window(monkeypatch) -> SimpleNamespace:
     """A stand-in for what the session asks of Blender: a window, in which timers run."""
@@ -95,7 +120,9 @@ def test_in_a_window_posing_reads_no_bones_until_it_pauses(bound_elbow, elbow_fi
     monkeypatch.setattr(
         rig_signature,
         "read_signature",
-        lambda rig, *parts: read_parts.append(set(*parts)) or read_signature(rig, *parts),
+        lambda rig, names, parts=rig_signature.PARTS: (
+            read_parts.append(set(parts)) or read_signature(rig, names, parts)
+        ),
     )
     for angle in (0.2, 0.4, 0.6):
         pose(angle=angle)
