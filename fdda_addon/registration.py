@@ -12,13 +12,10 @@ from types import ModuleType
 
 import bpy
 
-_is_registered = False
-
 
 def register() -> None:
     """Register the add-on; do nothing if it is registered already."""
-    global _is_registered
-    if _is_registered:
+    if is_registered():
         return
     from . import operators, panels, properties
     from .runtime import handlers
@@ -30,27 +27,26 @@ def register() -> None:
         if handler not in blender_handlers:
             blender_handlers.append(handler)
     handlers.register()
-    _is_registered = True
     if not bpy.app.binary_path:
         # Blender disables its add-ons before it quits, but the `bpy` module does not.
         atexit.register(unregister)
 
 
 def is_registered() -> bool:
-    """Return whether the add-on is registered."""
-    return _is_registered
+    """Return whether the add-on is registered: whether Blender has its last class."""
+    from . import panels
+
+    return _modules(panels)[-1].CLASSES[-1].is_registered
 
 
 def unregister() -> None:
     """Undo `register`."""
-    global _is_registered
-    if not _is_registered:
+    if not is_registered():
         return
     from . import operators, panels, properties
     from .runtime import handlers
 
     atexit.unregister(unregister)
-    _is_registered = False
     # The `bpy` module of 4.5 hangs at its exit if handlers stay registered.
     for name, handler in handler_table():
         blender_handlers = getattr(bpy.app.handlers, name)
@@ -69,9 +65,21 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
     from .panels import checks
     from .runtime import handlers
     from .scene import stored_paths, undo, unkeyed_changes
+    from .timing import measurements
 
     # Paths must be restored before models are loaded, so `stored_paths` is the first module.
-    modules = (stored_paths, undo, unkeyed_changes, job, checks, handlers, reopening, side_by_side, training)
+    modules = (
+        stored_paths,
+        undo,
+        unkeyed_changes,
+        job,
+        checks,
+        handlers,
+        reopening,
+        side_by_side,
+        training,
+        measurements,
+    )
     return [entry for module in modules for entry in module.HANDLERS.items()]
 
 

@@ -8,7 +8,7 @@ such code is therefore repeated until this code has returned.
 
 import threading
 from _thread import interrupt_main
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -17,10 +17,8 @@ from ..core.stop_signals import handle_stop_signals, restore_handlers
 RETRY_SECONDS = 0.01
 _ADDON_PACKAGE = __name__.rsplit(".", 2)[0]
 _MAIN_MODULE = f"{_ADDON_PACKAGE}.cli.main"
-_FIXED_CALLBACK_MODULES = {f"{_ADDON_PACKAGE}.{name}" for name in ("registration", "properties.binding")}
+_CALLBACK_MODULES = {f"{_ADDON_PACKAGE}.{name}" for name in ("registration", "properties.binding")}
 
-_callback_modules: set[str] = set(_FIXED_CALLBACK_MODULES)
-"""Names of modules with functions that Blender calls."""
 _pending_signal = 0
 """Number of the delayed signal; 0 without one."""
 
@@ -41,12 +39,6 @@ def interruptible() -> Iterator[None]:
         restore_handlers(previous_handlers)
 
 
-def set_callback_modules(modules: Iterable[str]) -> None:
-    """Set the modules with functions that Blender calls. In these no KeyboardInterrupt is raised."""
-    global _callback_modules
-    _callback_modules = {*modules} | _FIXED_CALLBACK_MODULES
-
-
 def raise_pending() -> None:
     """Raise the KeyboardInterrupt of a delayed signal, if there is one. Called after imports."""
     global _pending_signal
@@ -60,12 +52,18 @@ def _repeat_signal() -> None:
         interrupt_main(_pending_signal)
 
 
+def _has_callbacks(module_globals: dict[str, object]) -> bool:
+    """Return whether Blender calls functions of a module; those with handlers list them in `HANDLERS`."""
+    name = str(module_globals.get("__name__"))
+    return name in _CALLBACK_MODULES or (name.startswith(_ADDON_PACKAGE) and "HANDLERS" in module_globals)
+
+
 def _on_signal(signal_number: int, frame: FrameType | None) -> None:
     global _pending_signal
     _pending_signal = signal_number
     while frame is not None and frame.f_globals.get("__name__") != _MAIN_MODULE:
         is_import = frame.f_code.co_filename.startswith("<frozen importlib")
-        if is_import or frame.f_globals.get("__name__") in _callback_modules:
+        if is_import or _has_callbacks(frame.f_globals):
             timer = threading.Timer(RETRY_SECONDS, _repeat_signal)
             timer.daemon = True
             timer.start()

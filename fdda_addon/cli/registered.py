@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from .. import registration
-from .interruption import raise_pending, set_callback_modules
+from .interruption import raise_pending
 
 
 @contextmanager
@@ -13,7 +13,6 @@ def registered() -> Iterator[None]:
     """Register the add-on for a `with` block. It stays registered if it was before."""
     was_registered = registration.is_registered()
     registration.register()
-    set_callback_modules(handler.__module__ for _, handler in registration.handler_table())
     try:
         raise_pending()
         yield

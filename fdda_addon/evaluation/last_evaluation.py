@@ -197,6 +197,11 @@ def closed(character: tuple) -> LastEvaluation | None:
     return next((e for e in _evaluations.values() if e.closed_character == character), None)
 
 
+def clear() -> None:
+    """Remove all evaluations."""
+    _evaluations.clear()
+
+
 def remove(mesh_object: bpy.types.Object) -> None:
     """Remove the last evaluation of an object, because its model has changed."""
     _evaluations.pop(mesh_object.session_uid, None)

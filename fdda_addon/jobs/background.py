@@ -10,14 +10,12 @@ from collections.abc import Callable, Iterator
 
 import bpy
 
-from .job import JobRunner, current, redraw
+from .job import current_runner, redraw
 from .state import ENVIRONMENT, JobState
 
 TICK_SECONDS, TICK_WORK_SECONDS = 0.2, 0.02
 THREAD_JOIN_SECONDS = 10.0
 """Longest time to wait for the end of a canceled thread."""
-
-_runner: JobRunner | None = None
 
 
 def iterate_in_thread(
@@ -70,10 +68,8 @@ def iterate_in_thread(
         thread.join(THREAD_JOIN_SECONDS)
 
 
-def run_in_background(runner: JobRunner) -> None:
-    """Start to iterate a job on the training environment; it continues when windows are closed and files opened."""
-    global _runner
-    _runner = runner
+def run_in_background() -> None:
+    """Start to iterate the job on the training environment; it continues when windows are closed and files opened."""
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=TICK_SECONDS, persistent=True)
 
@@ -85,11 +81,12 @@ def unregister() -> None:
 
 
 def _tick() -> float | None:
-    if current(ENVIRONMENT) is None:
+    runner = current_runner(ENVIRONMENT)
+    if runner is None:
         # The job was stopped.
         return None
-    if _runner.work(TICK_WORK_SECONDS):
-        print(f"FDDA: {_runner.state.outcome}")
+    if runner.work(TICK_WORK_SECONDS):
+        print(f"FDDA: {runner.state.outcome}")
         return None
     redraw()
     return TICK_SECONDS

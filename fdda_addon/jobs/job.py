@@ -16,19 +16,26 @@ from ..core.progress import Progress
 from ..scene import draw_cache
 from .state import CHARACTER, ENVIRONMENT, JobState
 
-_states: dict[str, JobState] = {}
-_running: "dict[str, JobRunner]" = {}
+_runners: "dict[str, JobRunner]" = {}
+"""The last job of each verb; at most one of a kind runs. Another file ends and drops those of the previous file."""
+
+
+def current_runner(works_on: str = CHARACTER) -> "JobRunner | None":
+    """Return the running job of a kind; None if no job runs."""
+    runners = (runner for runner in _runners.values() if runner.state.works_on == works_on)
+    return next((runner for runner in runners if runner.state.is_running), None)
 
 
 def current(works_on: str = CHARACTER) -> JobState | None:
     """Return the state of the running job of a kind; None if no job runs."""
-    runner = _running.get(works_on)
+    runner = current_runner(works_on)
     return runner.state if runner else None
 
 
 def state_of(verb: str) -> JobState | None:
     """Return the state of the last job with a verb in this session; None without one."""
-    return _states.get(verb)
+    runner = _runners.get(verb)
+    return runner.state if runner else None
 
 
 def request_cancel(works_on: str = CHARACTER) -> None:
@@ -44,7 +51,7 @@ def stop(reason: str, works_on: str = CHARACTER) -> None:
         reason: the message that panels show.
         works_on: kind of the job.
     """
-    if runner := _running.get(works_on):
+    if runner := current_runner(works_on):
         try:
             runner.close()
         except FDDAError as error:
@@ -76,8 +83,7 @@ class JobRunner:
         self.result: object = None
         self.is_waiting = False
         self._finish, self._cancel_message, self._ends_itself = finish, cancel_message, ends_itself
-        _states[state.verb] = state
-        _running[state.works_on] = self
+        _runners[state.verb] = self
 
     def work(self, seconds: float) -> bool:
         """Run the job for some seconds, or until it waits; return whether it has ended.
@@ -136,8 +142,8 @@ class JobRunner:
         """Store the outcome and end the job, so that another job may start."""
         state = self.state
         state.is_running, state.ended, state.outcome, state.outcome_level = False, time.monotonic(), outcome, level
-        if _running.get(state.works_on) is self:
-            del _running[state.works_on]
+        # The result may be large, and only the state is asked for later.
+        self.result = None
         redraw()
 
 
@@ -161,7 +167,8 @@ def _stop(reason: str, works_on: str = CHARACTER) -> None:
 def _on_load(*_: object) -> None:
     _stop("another file was opened")
     # States refer to objects of the previous file.
-    _states.clear()
+    for verb in [verb for verb, runner in _runners.items() if not runner.state.is_running]:
+        del _runners[verb]
 
 
 @persistent
@@ -173,8 +180,9 @@ def _on_undo(*_: object) -> None:
 @persistent
 def _on_save(*_: object) -> None:
     # The error may be that the file was not saved.
-    for verb in [verb for verb, state in _states.items() if not state.is_running and state.outcome_level == "ERROR"]:
-        del _states[verb]
+    states = [runner.state for runner in _runners.values()]
+    for verb in [state.verb for state in states if not state.is_running and state.outcome_level == "ERROR"]:
+        del _runners[verb]
     redraw()
 
 

@@ -13,14 +13,11 @@ from ..evaluation import last_evaluation
 from ..runtime import model_files, packed_model, playback
 from ..runtime.binding import bind, unbind
 from ..runtime.opened_model import read_matching_rig
+from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import absolute_path, stored_path_for
 from ..timing import frame_times
 from .entries import active_entry, bound_entry, bound_model_name, is_bound
-
-_info_cache: dict[tuple, ModelInfo] = {}
-"""Metadata of models, by the session id of the text of a packed model, or else by the path, modification time and size
-of a file."""
 
 
 def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGroup:
@@ -229,10 +226,9 @@ def entry_info(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
         ModelError: the model cannot be read or is invalid.
     """
     if entry.packed:
-        key = (entry.packed.session_uid,)
-        if key not in _info_cache:
-            _info_cache[key] = check_model(packed_model.read(entry.packed), entry.packed.name)
-        return _info_cache[key]
+        text = entry.packed
+        name = ("packed model", text.session_uid)
+        return computed_once(name, (), lambda: check_model(packed_model.read(text), text.name))
     path = entry_path(mesh_object, entry)
     try:
         file_status = os.stat(path)
@@ -240,12 +236,8 @@ def entry_info(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
         raise ModelError(
             f"The model '{path}' cannot be read: {os_error_text(error)}; find it, or choose another."
         ) from error
-    key = (path, file_status.st_mtime_ns, file_status.st_size)
-    if key not in _info_cache:
-        for outdated_key in [other_key for other_key in _info_cache if other_key[0] == path]:
-            del _info_cache[outdated_key]
-        _info_cache[key] = read_model_info(path)
-    return _info_cache[key]
+    inputs = (file_status.st_mtime_ns, file_status.st_size)
+    return computed_once(("model", path), inputs, lambda: read_model_info(path))
 
 
 def _has_content(path: Path, data: bytes) -> bool:

@@ -7,8 +7,6 @@ and passes the event on if no model plays. It cannot replace the entry in the Ob
 
 import bpy
 
-_keymap_items: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
-
 
 class FDDA_OT_copy_objects(bpy.types.Operator):
     bl_idname = "fdda.copy_objects"
@@ -44,13 +42,13 @@ def register() -> None:
     if key_configuration is not None:
         keymap = key_configuration.keymaps.new("3D View", space_type="VIEW_3D")
         modifier_key = {"oskey" if bpy.app.build_platform == b"Darwin" else "ctrl": True}
-        _keymap_items.append(
-            (keymap, keymap.keymap_items.new(FDDA_OT_copy_objects.bl_idname, "C", "PRESS", **modifier_key))
-        )
+        keymap.keymap_items.new(FDDA_OT_copy_objects.bl_idname, "C", "PRESS", **modifier_key)
 
 
 def unregister() -> None:
     """Undo `register`."""
-    for keymap, item in _keymap_items:
-        keymap.keymap_items.remove(item)
-    _keymap_items.clear()
+    key_configuration = bpy.context.window_manager.keyconfigs.addon
+    keymap = key_configuration.keymaps.get("3D View") if key_configuration is not None else None
+    for item in list(keymap.keymap_items) if keymap is not None else []:
+        if item.idname == FDDA_OT_copy_objects.bl_idname:
+            keymap.keymap_items.remove(item)

@@ -320,11 +320,12 @@ CLASSES = (
 
 
 def unregister() -> None:
-    """Remove all colors, copies of rigs and graphs."""
+    """Remove all evaluations, colors, copies of rigs and graphs."""
     # Blender has no data while it starts or quits.
     if hasattr(bpy.data, "objects"):
         side_by_side.hide_all()
     show_graph(False)
+    last_evaluation.clear()
     heat_map = loaded_heat_map()
     if heat_map is not None:
         heat_map.clear_all()

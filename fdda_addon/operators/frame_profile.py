@@ -12,19 +12,17 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..core.temporary import temporary_folder_error
+from ..timing import measurements
 from .job import JobOperator
 from .rig_operator import RigOperator
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..timing.frame_profile import FrameProfile
 
-_profiles: "dict[int, FrameProfile]" = {}
-"""Profiles of this session, by session_uid of the mesh object."""
-
 
 def last_profile(mesh_object: bpy.types.Object) -> "FrameProfile | None":
     """Return the last profile of a mesh; None if there is none with its current number of vertices."""
-    profile = _profiles.get(mesh_object.session_uid)
+    profile = measurements.last(FDDA_OT_profile_frame.verb, mesh_object)
     return profile if profile is not None and profile.vertices == len(mesh_object.data.vertices) else None
 
 
@@ -51,7 +49,7 @@ class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
         yield from _with_fast_rig(step, scene_rig.mesh_object.name)
 
     def finish(self, context: bpy.types.Context, result: "FrameProfile") -> str:
-        _profiles[self.rig(context).mesh_object.session_uid] = result
+        measurements.store(self.verb, self.rig(context).mesh_object, result)
         largest_part = max(result.parts, key=lambda part: part.duration.median)
         share = largest_part.duration.median / max(result.total, 1e-9)
         return f"{result.frame.median:.2f} ms per frame; {largest_part.title} takes {share:.0%}."
@@ -83,8 +81,3 @@ def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object
 
 
 CLASSES = (FDDA_OT_profile_frame,)
-
-
-def unregister() -> None:
-    """Forget all profiles."""
-    _profiles.clear()

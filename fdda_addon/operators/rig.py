@@ -7,19 +7,17 @@ from typing import TYPE_CHECKING
 import bpy
 from mathutils import Matrix
 
+from ..timing import measurements
 from .job import JobOperator
 from .rig_operator import RigOperator
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..timing.rig_cost import RigCost
 
-_measured_costs: "dict[int, RigCost]" = {}
-"""Measurements of this session, by session_uid of the mesh object."""
-
 
 def measured_cost(mesh_object: bpy.types.Object) -> "RigCost | None":
     """Return the measured cost of a rig; None if it was not measured with its current number of vertices."""
-    cost = _measured_costs.get(mesh_object.session_uid)
+    cost = measurements.last(FDDA_OT_measure.verb, mesh_object)
     return cost if cost is not None and cost.vertices == len(mesh_object.data.vertices) else None
 
 
@@ -110,7 +108,7 @@ class FDDA_OT_measure(RigOperator, JobOperator, bpy.types.Operator):
         yield from measure(self.rig(context))
 
     def finish(self, context: bpy.types.Context, result: "RigCost") -> str:
-        _measured_costs[self.rig(context).mesh_object.session_uid] = result
+        measurements.store(self.verb, self.rig(context).mesh_object, result)
         return f"{result.rig:.2f} ms per frame with the rig. {result.sentence}"
 
 
@@ -129,4 +127,4 @@ def register() -> None:
 def unregister() -> None:
     """Undo `register`."""
     bpy.types.VIEW3D_MT_armature_add.remove(_draw_add_menu)
-    _measured_costs.clear()
+    measurements.clear()

@@ -55,7 +55,7 @@ class _EnvironmentOperator:
         if runner.work(0):
             return self._end(runner.state)
         # Blender frees the operator before the job ends, so the job must not refer to it.
-        run_in_background(runner)
+        run_in_background()
         return {"FINISHED"}
 
     def execute(self, _context: bpy.types.Context) -> set[str]:

@@ -19,26 +19,69 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 CHECK_INTERVAL_SECONDS = 0.3
 """Time between two checks of a rig that changes continuously."""
 
-_checks: dict[int, "tuple[RigCheck, tuple]"] = {}
-"""Last check of each rig, with the `_change_signature` at that time, by session_uid of the mesh object."""
-_requested: set[int] = set()
-"""Mesh objects that the timer will check, by session_uid."""
-_outdated: set[int] = set()
-"""Mesh objects that may have changed in a way that `_change_signature` does not show, by session_uid."""
-_changed_meshes: set[str] = set()
-"""Names of meshes whose geometry or weights have changed."""
+
+class RigChecks:
+    """The last checks of the rigs of the open file, and what may have changed since.
+
+    Drawing asks for checks, the handlers report changes, and the timer runs the checks. Another file ends all.
+
+    Attributes:
+        checks: by session_uid of the mesh object: the last check, and the `_change_signature` at that time.
+        requested: mesh objects that the timer will check, by session_uid.
+        outdated: mesh objects that may have changed in a way that `_change_signature` does not show, by session_uid.
+        changed_meshes: names of meshes whose geometry or weights have changed.
+    """
+
+    def __init__(self) -> None:
+        self.checks: dict[int, tuple[RigCheck, tuple]] = {}
+        self.requested: set[int] = set()
+        self.outdated: set[int] = set()
+        self.changed_meshes: set[str] = set()
+
+    def request(self, uid: int, delay: float) -> None:
+        """Let the timer check a rig."""
+        self.requested.add(uid)
+        if not bpy.app.timers.is_registered(_run_requested_checks):
+            bpy.app.timers.register(_run_requested_checks, first_interval=delay)
+
+    def store(self, mesh_object: bpy.types.Object, check: "RigCheck", signature: tuple) -> None:
+        """Store the check of a rig."""
+        self.outdated.discard(mesh_object.session_uid)
+        self.changed_meshes.discard(mesh_object.data.name)
+        self.checks[mesh_object.session_uid] = check, signature
+
+    def is_mesh_changed(self, mesh_object: bpy.types.Object) -> bool:
+        """Return whether a mesh has changed since its check; False while it is edited."""
+        # Reading a large mesh takes long enough to be noticed at each stroke of a brush.
+        return mesh_object.mode in {"OBJECT", "POSE"} and mesh_object.data.name in self.changed_meshes
+
+    def drawn_values(self) -> dict[int, tuple]:
+        """Return the values of all checks that panels draw, by session_uid of the mesh object."""
+        return {
+            uid: (id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls)
+            for uid, (check, _) in self.checks.items()
+        }
+
+    def clear(self) -> None:
+        """Forget all checks, and remove the timer."""
+        if bpy.app.timers.is_registered(_run_requested_checks):
+            bpy.app.timers.unregister(_run_requested_checks)
+        for state in (self.checks, self.requested, self.outdated, self.changed_meshes):
+            state.clear()
+
+
+_rigs = RigChecks()
 
 
 @draw_cache.draw_cached
 def last_check(scene_rig: SceneRig) -> "RigCheck | None":
     """Return the last check of a rig; None before the first. Schedule a new check if the rig may have changed."""
     uid = scene_rig.mesh_object.session_uid
-    stored = _checks.get(uid)
-    if stored is None or uid in _outdated or stored[1] != _change_signature(scene_rig) or _is_mesh_changed(scene_rig):
-        _requested.add(uid)
-        if not bpy.app.timers.is_registered(_run_requested_checks):
-            bpy.app.timers.register(_run_requested_checks, first_interval=CHECK_INTERVAL_SECONDS if stored else 0.0)
-    return stored[0] if stored else None
+    check, signature = _rigs.checks.get(uid, (None, ()))
+    is_outdated = check is None or uid in _rigs.outdated or signature != _change_signature(scene_rig)
+    if is_outdated or _rigs.is_mesh_changed(scene_rig.mesh_object):
+        _rigs.request(uid, CHECK_INTERVAL_SECONDS if check else 0.0)
+    return check
 
 
 def check_now(scene_rig: SceneRig) -> "RigCheck":
@@ -50,38 +93,30 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
         settings, problems = recording_settings(scene_rig), ()
     except RigError as error:
         settings, problems = RecordingSettings(poses=0), (str(error),)
-    uid, signature = scene_rig.mesh_object.session_uid, _change_signature(scene_rig)
-    stored = _checks.get(uid)
-    is_rest_unchanged = stored is not None and stored[1][0] == signature[0] and not _is_mesh_changed(scene_rig)
-    result = stored[0].recheck(scene_rig, settings) if is_rest_unchanged else check_recordable_rig(scene_rig, settings)
+    mesh_object, signature = scene_rig.mesh_object, _change_signature(scene_rig)
+    previous_check, previous_signature = _rigs.checks.get(mesh_object.session_uid, (None, ((),)))
+    if previous_signature[0] == signature[0] and not _rigs.is_mesh_changed(mesh_object):
+        result = previous_check.recheck(scene_rig, settings)
+    else:
+        result = check_recordable_rig(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)
-    _outdated.discard(uid)
-    _changed_meshes.discard(scene_rig.mesh_object.data.name)
-    _checks[uid] = (result, signature)
+    _rigs.store(mesh_object, result, signature)
     return result
 
 
 def _run_requested_checks() -> None:
     running_job = job.current()
-    previous_values = _drawn_values()
+    previous_values = _rigs.drawn_values()
     meshes = {o.session_uid: o for o in bpy.data.objects if o.type == "MESH"}
-    for uid in list(_requested):
-        _requested.discard(uid)
+    for uid in list(_rigs.requested):
+        _rigs.requested.discard(uid)
         mesh_object = meshes.get(uid)
         armature_object = mesh_object and armature_of(mesh_object)
         # A job that changes the scene has changed the pose and the modifiers.
         if armature_object and not (running_job and running_job.changes_scene):
             check_now(SceneRig(mesh_object, armature_object))
-    if _drawn_values() != previous_values:
+    if _rigs.drawn_values() != previous_values:
         job.redraw()
-
-
-def _drawn_values() -> dict[int, tuple]:
-    """Return the values of all checks that panels draw, by session_uid of the mesh object."""
-    return {
-        uid: (id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls)
-        for uid, (check, _) in _checks.items()
-    }
 
 
 def _change_signature(scene_rig: SceneRig) -> tuple:
@@ -119,38 +154,29 @@ def _sampling_settings(scene_rig: SceneRig) -> tuple:
     return settings.poses > 0, settings.sample, settings.controls
 
 
-def _is_mesh_changed(scene_rig: SceneRig) -> bool:
-    mesh_object = scene_rig.mesh_object
-    # Reading a large mesh takes long enough to be noticed at each stroke of a brush.
-    if mesh_object.mode not in {"OBJECT", "POSE"} or not _changed_meshes:
-        return False
-    return mesh_object.data.name in _changed_meshes
-
-
 @persistent
 def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     draw_cache.clear()
-    if not _checks:
+    if not _rigs.checks:
         return
-    _outdated.update(_checks)
+    _rigs.outdated.update(_rigs.checks)
     for update in depsgraph.updates:
         # Armatures are left out: Blender reports them as changed with every pose.
         if isinstance(update.id, bpy.types.Mesh):
-            _changed_meshes.add(update.id.name)
+            _rigs.changed_meshes.add(update.id.name)
 
 
 @persistent
 def _on_undo(*_: object) -> None:
     draw_cache.clear()
-    _outdated.update(_checks)
-    _changed_meshes.update(mesh.name for mesh in bpy.data.meshes)
+    _rigs.outdated.update(_rigs.checks)
+    _rigs.changed_meshes.update(mesh.name for mesh in bpy.data.meshes)
 
 
 @persistent
 def _on_load(*_: object) -> None:
-    draw_cache.clear()
-    for state in (_checks, _requested, _outdated, _changed_meshes):
-        state.clear()
+    draw_cache.clear_all()
+    _rigs.clear()
 
 
 HANDLERS = {
@@ -162,7 +188,5 @@ HANDLERS = {
 
 
 def unregister() -> None:
-    """Remove the timer and all checks."""
-    if bpy.app.timers.is_registered(_run_requested_checks):
-        bpy.app.timers.unregister(_run_requested_checks)
+    """Remove the timer, all checks, and what was stored for drawing."""
     _on_load()

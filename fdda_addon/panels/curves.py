@@ -28,8 +28,38 @@ DIGIT_GLYPHS = {
 }  # fmt: skip
 """Glyphs of 3 by 9 pixels. Each digit of a string is a row of 3 bits."""
 
-_previews: object = None
-_drawn_key: tuple = ()
+
+class CurvesImage:
+    """The preview image of the curves that were drawn last. It is made by the first `icon` and freed by `release`."""
+
+    def __init__(self) -> None:
+        self._previews: object = None
+        self._drawn_key: tuple = ()
+
+    def icon(self, curves: dict[str, list[float]]) -> int:
+        """Return the icon of the curves. Paint it again when the curves have new values."""
+        import bpy.utils.previews
+
+        from ..scene.arrays import write_pixels
+
+        if self._previews is None:
+            self._previews = bpy.utils.previews.new()
+            self._previews.new("curves").image_size = (WIDTH, HEIGHT)
+        key = (id(curves), *(len(curve) for curve in curves.values()))
+        preview = self._previews["curves"]
+        if key != self._drawn_key:
+            self._drawn_key = key
+            write_pixels(preview, paint(curves))
+        return preview.icon_id
+
+    def release(self) -> None:
+        """Free the image."""
+        if self._previews is not None:
+            bpy.utils.previews.remove(self._previews)
+            self._previews, self._drawn_key = None, ()
+
+
+image = CurvesImage()
 
 
 def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
@@ -38,28 +68,10 @@ def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
     if min(lengths) < 2:
         return
     layout.label(text="Error (mm) per Pass")
-    layout.template_icon(icon_value=_icon(curves), scale=9)
+    layout.template_icon(icon_value=image.icon(curves), scale=9)
     column = layout.column(align=True)
     for name, (label, icon, _) in LEGEND.items():
         column.label(text=f"{label}: {curves[name][-1]:.3f} mm", icon=icon)
-
-
-def _icon(curves: dict[str, list[float]]) -> int:
-    """Return the icon of the curves. Paint it again when the curves have new values."""
-    import bpy.utils.previews
-
-    from ..scene.arrays import write_pixels
-
-    global _previews, _drawn_key
-    if _previews is None:
-        _previews = bpy.utils.previews.new()
-        _previews.new("curves").image_size = (WIDTH, HEIGHT)
-    key = (id(curves), *(len(curve) for curve in curves.values()))
-    preview = _previews["curves"]
-    if key != _drawn_key:
-        _drawn_key = key
-        write_pixels(preview, paint(curves))
-    return preview.icon_id
 
 
 def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
@@ -127,11 +139,3 @@ def _paint_number(pixels: "np.ndarray", text: str, left: int, bottom: int) -> No
                 x, y = left + 8 * index + 2 * column, bottom + 8 - row
                 if int(bits) >> (2 - column) & 1 and x + 2 <= WIDTH:
                     pixels[y, x : x + 2, :3] = TEXT_COLOR
-
-
-def release() -> None:
-    """Free the preview image."""
-    global _previews, _drawn_key
-    if _previews is not None:
-        bpy.utils.previews.remove(_previews)
-        _previews, _drawn_key = None, ()

@@ -2,6 +2,7 @@
 """Draws the part of the section "Training Poses" that shows and edits the rotation limits of bones."""
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import bpy
@@ -9,7 +10,7 @@ import bpy
 from ..operators.poses import FDDA_OT_set_limit
 from ..properties.recording_options import recorded_actions
 from ..scene.compatibility import is_selected, selection_owner
-from ..scene.draw_cache import draw_cached
+from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks, sampling
 from .bone_names import short_bone_name
@@ -17,14 +18,10 @@ from .section import panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
-    from ..recording.rig_check import RigCheck
 
 AXES = "xyz"
 WIDE_SIDEBAR_PIXELS = 380
 """Sidebar width from which the table shows both ends of a range, pixels at a UI scale of 1."""
-
-_limits_cache: "dict[int, tuple[RigCheck | None, bool]]" = {}
-"""Last check of each rig, and whether a bone had limits then, by session_uid of the mesh object."""
 
 
 class FDDA_UL_bones(bpy.types.UIList):
@@ -99,14 +96,16 @@ def has_any_limits(rig: SceneRig) -> bool:
 
     Headers show it too, and a control rig has thousands of bones, so it is computed once for each check.
     """
+    check, bones = checks.last_check(rig), rig.armature_object.pose.bones
+    if check is None:
+        return _have_limits(bones)
+    return computed_once(("limits", rig.mesh_object.session_uid), (check,), lambda: _have_limits(bones))
+
+
+def _have_limits(bones: Iterable[bpy.types.PoseBone]) -> bool:
     from ..poses.motion_range import DEFAULT, rotation_ranges
 
-    check, uid = checks.last_check(rig), rig.mesh_object.session_uid
-    if check is None or _limits_cache.get(uid, (None,))[0] is not check:
-        bones = rig.armature_object.pose.bones
-        has_limits = any(r.source != DEFAULT or r.is_locked for bone in bones for r in rotation_ranges(bone))
-        _limits_cache[uid] = (check, has_limits)
-    return _limits_cache[uid][1]
+    return any(r.source != DEFAULT or r.is_locked for bone in bones for r in rotation_ranges(bone))
 
 
 @draw_cached

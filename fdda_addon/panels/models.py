@@ -7,17 +7,15 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..models.entries import active_entry, format_file_size, is_bound
+from ..scene.draw_cache import computed_once
 from ..scene.stored_paths import resolve_path
 from . import checks
 from .section import Section, draw_wrapped, panel_rig
-from .timed_value import TimedValue
+from .timed_value import timed_values
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.model import ModelInfo
     from ..core.poses import Channel
-
-_rig_cache: dict[tuple, object] = {}
-"""The last result of `rig_of_model`, by id of the checked rig and joint names of the model."""
 
 
 def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
@@ -26,12 +24,8 @@ def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
 
     if set(rig.joint_names) == set(info.joint_names):
         return rig
-    key = (id(rig), info.joint_names)
-    if key not in _rig_cache:
-        _rig_cache.clear()
-        # The checked rig is stored too, because a new object could get the id of a freed one.
-        _rig_cache[key] = (rig, read_model_rig(scene_rig, info))
-    return _rig_cache[key][1]
+    name, inputs = ("rig of a model", scene_rig.mesh_object.session_uid), (rig, info.joint_names)
+    return computed_once(name, inputs, lambda: read_model_rig(scene_rig, info))
 
 
 def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
@@ -74,7 +68,8 @@ def _entry_key(entry: bpy.types.PropertyGroup) -> str:
     return f"{entry.name}\n{entry.path}\n{entry.packed_bytes}"
 
 
-_problem_values = TimedValue(_find_problems, 0.5)
+PROBLEMS_SECONDS = 0.5
+"""Time between two searches for problems, while the panel is drawn."""
 
 
 class FDDA_UL_models(bpy.types.UIList):
@@ -86,7 +81,9 @@ class FDDA_UL_models(bpy.types.UIList):
         row.prop(item, "name", text="", emboss=False, icon="LINKED" if is_bound(mesh_object, item) else "BLANK1")
         if item.packed:
             row.label(text=format_file_size(item.packed_bytes), icon="PACKAGE")
-        if (problem := (_problem_values.get(mesh_object) or {}).get(_entry_key(item))) is not None:
+        if (
+            problem := (timed_values.get(_find_problems, mesh_object, PROBLEMS_SECONDS) or {}).get(_entry_key(item))
+        ) is not None:
             row.label(icon=problem[0])
 
 
@@ -120,7 +117,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
         self, context: bpy.types.Context, mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup
     ) -> None:
         layout = self.enabled_layout()
-        problems = _problem_values.get(mesh_object)
+        problems = timed_values.get(_find_problems, mesh_object, PROBLEMS_SECONDS)
         problem = (problems or {}).get(_entry_key(entry))
         if is_bound(mesh_object, entry):
             layout.operator("fdda.unbind", icon="UNLINKED")
@@ -147,4 +144,4 @@ CLASSES = (FDDA_UL_models, FDDA_PT_models)
 
 def unregister() -> None:
     """Stop the timer."""
-    _problem_values.stop()
+    timed_values.stop()

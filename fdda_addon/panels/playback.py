@@ -15,7 +15,7 @@ from ..scene.stored_paths import resolve_path
 from ..timing import frame_times
 from .bone_names import short_bone_name
 from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
-from .timed_value import TimedValue
+from .timed_value import timed_values
 from .trained_file import find_trained_file
 
 FULL_CONFIDENCE = 0.995
@@ -45,7 +45,8 @@ def _read_confidence(mesh_object: bpy.types.Object) -> object:
     return partition_confidence(mesh_object) or "No confidence values: the model has none, or the pose cannot be read."
 
 
-_confidence_value = TimedValue(_read_confidence, 0.2)
+CONFIDENCE_SECONDS = 0.2
+"""Time between two evaluations of the confidence, while the panel is drawn."""
 
 
 class FDDA_PT_playback(Section, bpy.types.Panel):
@@ -157,7 +158,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         header.label(text="Confidence in This Pose")
         if body is None:
             return
-        confidence = _confidence_value.get(mesh_object)
+        confidence = timed_values.get(_read_confidence, mesh_object, CONFIDENCE_SECONDS)
         if confidence is None or isinstance(confidence, str):
             draw_wrapped(body, context, confidence or "…")
             return
@@ -232,8 +233,3 @@ def _draw_fast_rig(layout: bpy.types.UILayout, context: bpy.types.Context, mesh_
 
 
 CLASSES = (FDDA_PT_playback,)
-
-
-def unregister() -> None:
-    """Stop the timer."""
-    _confidence_value.stop()

@@ -12,16 +12,15 @@ from ..core.errors import FDDAError
 from ..jobs import job
 from ..properties.character import default_recording, recording_folder
 from ..properties.recording_options import recorded_actions, recording_settings
-from ..scene.draw_cache import draw_cached
+from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
 from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.recording.folder import FolderContent
-
-_content_cache: "dict[int, tuple[tuple, FolderContent]]" = {}
-"""Content of each recording folder, with the values that it depends on, by session_uid of the mesh object."""
+    from ..recording.plan import RecordingSettings
+    from ..recording.rig_check import RigCheck
 
 
 @draw_cached
@@ -38,24 +37,28 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     """Return the content of a recording folder. Read it again after a change of the folder, the rig or the settings."""
     from ..core.recording.folder import read_folder
     from ..core.recording.index import INDEX_NAME
-    from ..recording.plan import make_sampling
 
     check, settings = checks.last_check(rig), recording_settings(rig)
     try:
         modified_ns = os.stat(path / INDEX_NAME).st_mtime_ns
     except OSError:
         modified_ns = -1 if path.exists() else 0
-    uid = rig.mesh_object.session_uid
-    cache_key = (path, modified_ns, id(check), settings)
-    if uid not in _content_cache or _content_cache[uid][0] != cache_key:
-        current_rig, sampling = None, None
-        if check is not None and check.rig is not None:
-            # Converted to JSON and back, so that it equals the sampling that is read from a recording.
-            sampling = json.loads(json.dumps(make_sampling(rig, settings, check.channels).to_json()))
-            current_rig = check.rig
+
+    def read() -> "FolderContent":
         weights = settings.fit_linear, settings.joints
-        _content_cache[uid] = (cache_key, read_folder(path, current_rig, sampling, weights))
-    return _content_cache[uid][1]
+        if check is None or check.rig is None:
+            return read_folder(path, None, None, weights)
+        return read_folder(path, check.rig, _current_sampling(rig, settings, check), weights)
+
+    name = ("recording folder", rig.mesh_object.session_uid)
+    return computed_once(name, (path, modified_ns, check, settings), read)
+
+
+def _current_sampling(rig: SceneRig, settings: "RecordingSettings", check: "RigCheck") -> dict:
+    """Return the sampling of the settings, converted to JSON and back, so that it equals the one of a recording."""
+    from ..recording.plan import make_sampling
+
+    return json.loads(json.dumps(make_sampling(rig, settings, check.channels).to_json()))
 
 
 class FDDA_PT_recording(Section, bpy.types.Panel):

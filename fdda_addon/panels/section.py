@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Base class of all sections of the sidebar, and functions that draw wrapped text, paths and jobs."""
 
-import functools
-
 import blf
 import bpy
 
@@ -102,7 +100,7 @@ def _text_size(preferences: bpy.types.Preferences) -> tuple[float, float]:
     return scale, preferences.ui_styles[0].widget.points * scale
 
 
-@functools.lru_cache(maxsize=256)
+@draw_cached
 def _wrap(text: str, width: float, points: float) -> tuple[str, ...]:
     """Wrap text to a width in pixels, in the font of the interface, without breaking long words."""
     blf.size(0, points)

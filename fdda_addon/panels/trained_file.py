@@ -7,12 +7,9 @@ from pathlib import Path
 
 from ..core.errors import FDDAError
 from ..properties.character import trained_file
-from ..scene.draw_cache import draw_cached
+from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
-
-_mismatch_cache: dict[tuple, str] = {}
-"""How a model file differs from a rig, by path, time and size of the file, and id of the checked rig."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +40,8 @@ def _find_trained_file(rig: SceneRig) -> tuple[TrainedFile | None]:
     if check is None or check.rig is None:
         return (TrainedFile(path),)
     status = os.stat(path)
-    key = (path, status.st_mtime_ns, status.st_size, id(check.rig))
-    if key not in _mismatch_cache:
-        _mismatch_cache.clear()
-        _mismatch_cache[key] = _describe_mismatch(rig, check.rig, path)
-    return (TrainedFile(path, _mismatch_cache[key]),)
+    name, inputs = ("trained file", path), (status.st_mtime_ns, status.st_size, check.rig)
+    return (TrainedFile(path, computed_once(name, inputs, lambda: _describe_mismatch(rig, check.rig, path))),)
 
 
 def _describe_mismatch(scene_rig: SceneRig, rig: object, path: Path) -> str:

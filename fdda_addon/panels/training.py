@@ -13,6 +13,7 @@ from ..jobs import job
 from ..jobs.state import JobState
 from ..properties.character import default_model
 from ..properties.preferences import MODULE, preferences
+from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
@@ -23,12 +24,6 @@ from .trained_file import TrainedFile, find_trained_file
 
 SHOWN_PARTITIONS = 8
 TRAINING_VERBS = ("train", "build_model")
-
-_report_cache: dict[Path, tuple[int, dict | None]] = {}
-"""Modification time and content of each training report, by path. The content is None if the report is invalid."""
-
-_assessment_cache: dict[Path, tuple[dict, Assessment]] = {}
-"""The last assessed report and what it means, by path."""
 
 
 class FDDA_PT_training(Section, bpy.types.Panel):
@@ -208,10 +203,7 @@ def read_assessment(model: Path) -> Assessment | None:
     report = _read_report(path)
     if report is None or report["model"] != model.name:
         return None
-    if path not in _assessment_cache or _assessment_cache[path][0] is not report:
-        _assessment_cache.clear()
-        _assessment_cache[path] = (report, assess_training(report))
-    return _assessment_cache[path][1]
+    return computed_once(("assessment", path), (report,), lambda: assess_training(report))
 
 
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
@@ -264,13 +256,14 @@ def _read_report(path: Path) -> dict | None:
         modified_ns = os.stat(path).st_mtime_ns
     except OSError:
         return None
-    if path not in _report_cache or _report_cache[path][0] != modified_ns:
-        try:
-            report = read_report(path)
-        except TrainingError:
-            report = None
-        _report_cache[path] = (modified_ns, report)
-    return _report_cache[path][1]
+    return computed_once(("report", path), (modified_ns,), lambda: _valid_report(path))
+
+
+def _valid_report(path: Path) -> dict | None:
+    try:
+        return read_report(path)
+    except TrainingError:
+        return None
 
 
 CLASSES = (FDDA_PT_training,)
@@ -278,4 +271,4 @@ CLASSES = (FDDA_PT_training,)
 
 def unregister() -> None:
     """Free the image of the curves."""
-    curves.release()
+    curves.image.release()

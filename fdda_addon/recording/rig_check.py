@@ -17,7 +17,7 @@ from .plan import RecordingSettings, depends_on_time, find_actions, listed_contr
 DEFAULT_SETTINGS = RecordingSettings()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigCheck:
     """Result of the check of a rig.
 

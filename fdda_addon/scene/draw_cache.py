@@ -5,41 +5,74 @@ While an animation plays, Blender redraws the sidebar in every frame. A cached v
 change, loads a file or an undo step, or a job clears the cache. It lasts a second at most, because Blender does not
 report changes of files; while an animation plays, it lasts until the animation stops. Without a window nothing is
 cached: scripts read values right after they have changed something.
+
+What takes longer to compute than a redraw may last depends on few inputs, such as the time of a file. `computed_once`
+stores it, until the inputs change or another file is opened.
 """
 
 import functools
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import bpy
 
 MAX_AGE_SECONDS = 1.0
-
-_caches: list[dict] = []
-_expires_at = 0.0
+Value = TypeVar("Value")
 
 
-def draw_cached(function: Callable) -> Callable:
+@dataclass
+class _DrawCache:
+    """What is stored for drawing.
+
+    Attributes:
+        results: results of `draw_cached` functions, by function and arguments.
+        expires_at: time of `time.monotonic` at which they are dropped.
+        computed: the inputs and values of `computed_once`, by name.
+    """
+
+    results: dict[tuple, object] = field(default_factory=dict)
+    expires_at: float = 0.0
+    computed: dict[tuple, tuple[tuple, object]] = field(default_factory=dict)
+
+
+_cache = _DrawCache()
+
+
+def draw_cached(function: Callable[..., Value]) -> Callable[..., Value]:
     """Cache the results of a function by its arguments, which must be hashable; None is not cached."""
-    cached_results: dict[tuple, object] = {}
-    _caches.append(cached_results)
 
     @functools.wraps(function)
-    def cached_function(*arguments: object) -> object:
-        global _expires_at
+    def cached_function(*arguments: object) -> Value:
         now = time.monotonic()
-        if now > _expires_at or bpy.app.background:
+        if now > _cache.expires_at or bpy.app.background:
             if bpy.app.background or not _is_animation_playing():
                 clear()
-            _expires_at = now + MAX_AGE_SECONDS
-        result = cached_results.get(arguments)
+            _cache.expires_at = now + MAX_AGE_SECONDS
+        key = (function, *arguments)
+        result = _cache.results.get(key)
         if result is None:
             result = function(*arguments)
             if result is not None:
-                cached_results[arguments] = result
+                _cache.results[key] = result
         return result
 
     return cached_function
+
+
+def computed_once(name: tuple, inputs: tuple, compute: Callable[[], Value]) -> Value:
+    """Return a value that is computed again only when its inputs change.
+
+    Args:
+        name: what the value is and whose. One value is stored by name.
+        inputs: everything that the value depends on. Objects without `__eq__` are compared by identity.
+        compute: returns the value.
+    """
+    stored = _cache.computed.get(name)
+    if stored is None or stored[0] != inputs:
+        stored = _cache.computed[name] = inputs, compute()
+    return stored[1]
 
 
 def _is_animation_playing() -> bool:
@@ -48,6 +81,11 @@ def _is_animation_playing() -> bool:
 
 
 def clear() -> None:
-    """Clear the cache, because something may have changed."""
-    for values in _caches:
-        values.clear()
+    """Drop the results of `draw_cached` functions, because something may have changed."""
+    _cache.results.clear()
+
+
+def clear_all() -> None:
+    """Drop everything, because another file was opened or the add-on is disabled."""
+    clear()
+    _cache.computed.clear()

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Stores the last measured frame times of each mesh object for the session, for the sidebar."""
+"""The last measured frame times of each mesh object, for the sidebar."""
 
 from dataclasses import dataclass
 
 import bpy
 
+from . import measurements
+
 MIN_WORTHWHILE_RATIO = 1.5
 """Smallest ratio of the frame times of rig and model at which a model is worth it."""
 
-_frame_times: dict[int, "FrameTimes"] = {}
-"""Frame times, by the session ids of mesh objects."""
+VERB = "measure_model"
+"""The verb that measures frame times (`measurements`)."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +68,15 @@ def compare_times(rig_ms: float, fdda_ms: float, ratio_range: tuple[float, float
 
 def store(mesh_object: bpy.types.Object, times: FrameTimes) -> None:
     """Store the frame times of an object with its bound model."""
-    _frame_times[mesh_object.session_uid] = times
+    measurements.store(VERB, mesh_object, times)
 
 
 def get(mesh_object: bpy.types.Object) -> FrameTimes | None:
     """Return the frame times of an object with its bound model; None if they were not measured."""
-    times = _frame_times.get(mesh_object.session_uid)
+    times = measurements.last(VERB, mesh_object)
     return times if times and times.model == mesh_object.fdda.model else None
 
 
 def remove(mesh_object: bpy.types.Object) -> None:
     """Remove the frame times of an object, because its model has changed."""
-    _frame_times.pop(mesh_object.session_uid, None)
+    measurements.remove(VERB, mesh_object)

@@ -104,7 +104,7 @@ def test_an_expected_error_is_the_outcome_and_another_error_is_raised():
 
 def test_a_timer_runs_a_background_job_to_its_end(work, capsys):
     run = work.start_job()
-    run_in_background(run)
+    run_in_background()
     assert bpy.app.timers.is_registered(background._tick)
     bpy.app.timers.unregister(background._tick)
     assert background._tick() == background.TICK_SECONDS
@@ -116,7 +116,7 @@ def test_a_timer_runs_a_background_job_to_its_end(work, capsys):
 
 def test_disabling_the_add_on_ends_a_background_job(work):
     run = work.start_job()
-    run_in_background(run)
+    run_in_background()
     assert not run.work(0)
     fdda_addon.unregister()
     assert work.canceled.is_set() and not next(iter(work.threads)).is_alive()

@@ -55,5 +55,7 @@ def test_all_handlers_are_persistent_and_in_the_table():
 def test_ctrl_c_is_delayed_in_all_modules_with_handlers():
     """Blender prints exceptions of handlers and continues, so a KeyboardInterrupt in a handler would be lost."""
     with registered():
-        assert {handler.__module__ for _, handler in handler_table()} <= interruption._callback_modules
-        assert all(name in sys.modules for name in interruption._callback_modules)
+        modules = [sys.modules[handler.__module__] for _, handler in handler_table()]
+        assert all(interruption._has_callbacks(vars(module)) for module in modules)
+        assert all(name in sys.modules for name in interruption._CALLBACK_MODULES)
+        assert not interruption._has_callbacks(vars(interruption))

@@ -163,17 +163,18 @@ def test_a_model_file_that_is_replaced_is_reloaded(bound_elbow, elbow_files, sec
 def test_the_section_describes_the_problems_of_models(bound_elbow, elbow_files):
     from fdda_addon.panels import checks
     from fdda_addon.panels import models as section
+    from fdda_addon.panels.timed_value import timed_values
     from fdda_addon.scene.scene_rig import find_rig
 
     bpy.context.view_layer.objects.active = bound_elbow
     checks.check_now(find_rig())
-    assert section._problem_values.compute_now(bound_elbow) == {}
+    assert timed_values.compute_now(section._find_problems, bound_elbow) == {}
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
     checks.check_now(find_rig())
-    ((icon, sentence),) = section._problem_values.compute_now(bound_elbow).values()
+    ((icon, sentence),) = timed_values.compute_now(section._find_problems, bound_elbow).values()
     assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
     bound_elbow.fdda.models[0].path = "//away.onnx"
-    ((icon, sentence),) = section._problem_values.compute_now(bound_elbow).values()
+    ((icon, sentence),) = timed_values.compute_now(section._find_problems, bound_elbow).values()
     assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 

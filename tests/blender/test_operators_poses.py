@@ -113,9 +113,10 @@ def test_an_undo_cancels_the_step_that_is_to_be_added(saved, operator):
         bpy.ops.ed.undo_push(message=name)
     if operator == "redo":
         bpy.ops.ed.undo()
-    bpy.app.timers.register(undo._push_undo, first_interval=60)
+    for timer in undo.STEPS.values():
+        bpy.app.timers.register(timer, first_interval=60)
     getattr(bpy.ops.ed, operator)()
-    assert not bpy.app.timers.is_registered(undo._push_undo)
+    assert not any(map(bpy.app.timers.is_registered, undo.STEPS.values()))
 
 
 def test_a_preview_with_all_rotations_locked_is_refused(saved):

@@ -13,12 +13,15 @@ from fdda_addon.core.recording.folder import FolderState
 from fdda_addon.jobs import job
 from fdda_addon.jobs.job import JobRunner
 from fdda_addon.jobs.state import JobState, format_duration
-from fdda_addon.panels import checks, curves, playback
+from fdda_addon.panels import checks, curves
 from fdda_addon.panels.recording import cached_content
 from fdda_addon.panels.section import panel_rig
+from fdda_addon.panels.timed_value import TimedValues
 from fdda_addon.panels.training import _read_report
 from fdda_addon.properties.character import model_file, recording_folder
+from fdda_addon.recording.rig_check import RigCheck
 from fdda_addon.rig.dependencies import read_dependencies
+from fdda_addon.scene import draw_cache
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing.rig_cost import RigCost, estimate_playback_ms
 
@@ -255,8 +258,8 @@ def test_the_worst_frames_are_those_of_the_last_of_several_evaluations():
     from fdda_addon.evaluation.last_evaluation import LastEvaluation
 
     def evaluation(worst: int) -> LastEvaluation:
-        errors = np.zeros((3, 4), np.float32)
-        errors[worst] = 0.001
+        errors = np.full((3, 4), 1e-4, np.float32)
+        errors[worst] = 1e-3
         return LastEvaluation("", "m", 0, 0, {"fdda": errors, "linear": errors}, {}, (), ())
 
     evaluations = [evaluation(worst) for worst in (1, 2, 0)]
@@ -265,13 +268,43 @@ def test_the_worst_frames_are_those_of_the_last_of_several_evaluations():
 
 
 @pytest.mark.parametrize("changes_scene", [True, False])
-def test_timed_values_are_computed_beside_a_job_unless_the_job_changes_the_scene(fresh, monkeypatch, changes_scene):
-    monkeypatch.setattr(playback._confidence_value, "_compute", lambda mesh_object: "computed")
-    playback._confidence_value.get(fresh.mesh_object)
+def test_timed_values_are_computed_beside_a_job_unless_the_job_changes_the_scene(fresh, changes_scene):
+    values, computed = TimedValues(), []
+    assert values.get(computed.append, fresh.mesh_object, 0) is None
     job_runner = JobRunner(JobState("count", "Counting", changes_scene=changes_scene), iter(()), str, str)
     try:
-        playback._confidence_value._tick()
-        assert playback._confidence_value.get(fresh.mesh_object) == (None if changes_scene else "computed")
+        assert values.tick() is None
+        assert computed == ([] if changes_scene else [fresh.mesh_object])
     finally:
         job_runner.end("", "INFO")
-        playback._confidence_value.stop()
+        values.stop()
+
+
+def test_timed_values_are_computed_when_they_are_due(fresh):
+    values, names = TimedValues(), ["first", "second"]
+
+    def read(_mesh_object: bpy.types.Object) -> str:
+        return names[0]
+
+    assert values.get(read, fresh.mesh_object, 60) is None
+    assert values.tick() is None and values.get(read, fresh.mesh_object, 60) == "first"
+    del names[0]
+    assert 50 < values.tick() <= 60 and values.get(read, fresh.mesh_object, 60) == "first"
+    assert values.compute_now(read, fresh.mesh_object) == "second"
+    assert values.get(read, fresh.mesh_object, 60) == "second"
+    bpy.data.objects.remove(fresh.mesh_object)
+    assert values.tick() is not None, "the request is not due"
+    values.stop()
+    assert values.tick() is None
+
+
+def test_a_value_is_computed_again_when_an_input_changes_or_another_file_is_opened():
+    counts: list[int] = []
+
+    def computed(*inputs: object) -> int:
+        return draw_cache.computed_once(("count", "name"), inputs, lambda: counts.append(0) or len(counts))
+
+    first, second = RigCheck((), None, ()), RigCheck((), None, ())
+    assert [computed(first, 1), computed(first, 1), computed(second, 1), computed(second, 2)] == [1, 1, 2, 3]
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert computed(second, 2) == 4

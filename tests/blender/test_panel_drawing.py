@@ -13,6 +13,7 @@ import pytest
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.operators.meshes import MENU_OPERATORS
 from fdda_addon.panels import MODULES, checks, models, playback
+from fdda_addon.panels.timed_value import timed_values
 from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
 from fdda_addon.scene.scene_rig import SceneRig
 
@@ -80,8 +81,8 @@ def test_a_section_of_a_bound_model_draws(bound_elbow: bpy.types.Object, name: s
     bpy.ops.fdda.evaluate()
     bpy.ops.fdda.measure_model(frames=5)
     bpy.ops.fdda.color_mesh(colors="ERRORS")
-    playback._confidence_value.compute_now(bound_elbow)
-    models._problem_values.compute_now(bound_elbow)
+    timed_values.compute_now(playback._read_confidence, bound_elbow)
+    timed_values.compute_now(models._find_problems, bound_elbow)
     assert text in texts_of(draw_section(name))
 
 
