@@ -22,7 +22,6 @@ from .compression import drop_components, dropped_components_sentence
 from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
 from .export.export import ExportedModel, build_model, measure, measure_surface, write_model
-from .fits.gravity import drop_gravity_input
 from .fits.half_rotations import half_rotations_help
 from .goal import GoalResult, evaluate_goal
 from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
@@ -76,7 +75,6 @@ def train_model(
     checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
     job = _Job(config, sink, should_stop)
     warnings = job.start(recording, strict)
-    recording = drop_gravity_input(recording, split)
     inputs = job.fit_inputs(recording, split, checkpoint)
     partitions = job.collect_partition_data(recording, inputs, split)
     prepared = job.prepare(partitions, recording, split)

@@ -156,20 +156,16 @@ def _count_generations(rig: Rig, ancestor: int, joint: int) -> int:
     return generation_count if joint >= 0 else 0
 
 
-def assume_nearby_influences(
-    rig: Rig, partitions: tuple[Partition, ...], may_sag: bool = True
-) -> tuple[Partition, ...]:
+def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
     """Set the influences of partitions to those that are likely, where influences cannot be detected by moving joints.
 
     These are the main joint, the joints with a weight on a vertex of the partition or on a vertex that shares a face
     with it, their parents, and every control. A surface that sags depends on the direction of gravity, so all
-    ancestors of the main joint are included. Otherwise a common root joint is left out, because it moves the partition
-    as a whole.
+    ancestors of the main joint are included.
 
     Args:
         rig: the rig.
         partitions: of the rig; their influences are ignored.
-        may_sag: the surface may depend on the direction of gravity.
     """
     has_weight = np.zeros((rig.vertex_count, len(rig.joints)), bool)
     rows = np.repeat(np.arange(rig.vertex_count), rig.skin_joints.shape[1])
@@ -186,23 +182,14 @@ def assume_nearby_influences(
         is_near[rig.face_vertices[np.isin(face_of_corner, near_faces)]] = True
         influences = {partition.joint, *np.flatnonzero(has_weight[is_near].any(axis=0)).tolist()}
         influences |= {rig.joints[joint].parent for joint in influences if rig.joints[joint].parent >= 0}
-        if may_sag:
-            ancestor = rig.joints[partition.joint].parent
-            while ancestor >= 0:
-                influences.add(ancestor)
-                ancestor = rig.joints[ancestor].parent
-        elif len({_root_joint(rig, joint) for joint in influences}) == 1:
-            influences -= {_root_joint(rig, partition.joint)}
+        ancestor = rig.joints[partition.joint].parent
+        while ancestor >= 0:
+            influences.add(ancestor)
+            ancestor = rig.joints[ancestor].parent
         joints[partition.joint] = tuple(sorted(influences))
     controls = {partition.joint: tuple(range(len(rig.controls))) for partition in partitions}
     merged = {joint: partition.joint for partition in partitions for joint in partition.merged}
     return make_partitions(rig, joints, controls, merged)
-
-
-def _root_joint(rig: Rig, joint: int) -> int:
-    while rig.joints[joint].parent >= 0:
-        joint = rig.joints[joint].parent
-    return joint
 
 
 def partition_colors(partitions: tuple[Partition, ...], vertex_count: int) -> np.ndarray:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Partitions by main joint."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from fdda_addon.core.partition import main_joints, make_partitions, partition_colors
+from fdda_addon.core.partition import assume_nearby_influences, main_joints, make_partitions, partition_colors
 
 from .limb import INFLUENCING, VERTEX_COUNT, make_rig, partitions_of
 
@@ -29,6 +31,18 @@ def test_each_vertex_is_in_the_partition_of_its_main_joint():
 
 def test_influencing_joints_may_be_left_out():
     assert all(p.influencing == () for p in make_partitions(make_rig()))
+
+
+def test_assumed_influences_are_near_joints_with_all_ancestors():
+    """Joint 2, 'lower', has a face with 'thumb'; the direction of gravity comes from the ancestors up to the root."""
+    rig = make_rig()
+    joints = np.arange(VERTEX_COUNT)[:, None] % 4 * np.array([1, 0, 0, 0])
+    rig = replace(rig, skin_joints=joints.astype(np.int32), skin_weights=np.eye(4, dtype=np.float32)[np.zeros(40, int)])
+    for corners, of_lower in (([0, 4, 8], (0, 1, 2)), ([2, 3, 6], (0, 1, 2, 3))):
+        faces = {"face_starts": np.zeros(1, np.int32), "face_vertices": np.array(corners, np.int32)}
+        partitions = assume_nearby_influences(replace(rig, **faces), make_partitions(rig))
+        of_thumb = (0, 1, 3) if len(of_lower) == 3 else of_lower
+        assert [p.influencing for p in partitions] == [(0,), (0, 1), of_lower, of_thumb]
 
 
 def test_every_partition_has_one_distinct_color():
