@@ -11,12 +11,13 @@ from .flips import check_flips
 from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
 from .rest import check_rest
+from .seams import check_seams
 from .target import check_target
 from .warning import RecordingWarning, format_length, format_list, format_with_noun, joint_name
 
 WARNING_NAMES = (
     *("units", "axes", "large-residuals", "duplicate-poses", "hidden-inputs", "degenerate-poses", "flips"),
-    *("hysteresis", "frame-jumps", "frozen-frames", "target-place"),
+    *("open-seams", "hysteresis", "frame-jumps", "frozen-frames", "target-place"),
     *("dead-controls", "dead-joints", "still-vertices", "small-partitions"),
 )
 """Names of all warnings."""
@@ -48,6 +49,7 @@ def check_recording(recording: Recording) -> list[RecordingWarning]:
         *_check_large_residuals(recording, scan),
         *check_poses(recording),
         *check_flips(recording, scan),
+        *check_seams(recording),
         *check_target(recording),
         *_check_controls(recording),
         *_check_joints(recording),
