@@ -2,9 +2,10 @@
 """Take characters that others made through the whole path: `python benchmarks/third_party.py OUT [FOLDER]`.
 
 Each .glb file of FOLDER is imported, and its largest skinned mesh gets Corrective Smooth; a .blend file is taken as it
-is. The range of motion comes from all actions but the last one by name. These actions and random poses are recorded, a
-model is trained and bound, and the action left out is compared. Prints the table of docs/characters.md, and writes it
-there with --write. A character that cannot be taken through has a row with the reason.
+is. Where importing leaves vertices on each other, a second row has the mesh with these merged, as the warning about
+them advises. All actions but the last one by name are recorded, with random poses that remix their limbs. A model is
+trained and bound, and the action left out is compared. Prints the table of docs/characters.md, and writes it there with
+--write. A character that cannot be taken through has a row with the reason.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +31,11 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rigs  # noqa: E402
 
 FOLDER = ROOT / ".." / "shared" / "data" / "characters" / "third_party"
 MAX_ACTIONS = 8
-"""Largest number of recorded actions, evenly by name; the ranges come from all of them."""
+"""Largest number of recorded actions, evenly by name."""
+MERGE_DISTANCE_RATIO = 1e-5
+"""Largest distance of vertices that are merged, as a part of the size of the mesh."""
+MIN_LINEAR_MM = 0.01
+"""With a smaller mean error of linear skinning, errors have no meaningful ratio."""
 PAGE = ROOT / "docs" / "characters.md"
 START, END = "<!-- make third-party writes this table -->", "<!-- end of the table of make third-party -->"
 AUTHORS = {
@@ -59,8 +65,16 @@ class Character:
     held_out: str
 
 
-def prepare(source: Path, folder: Path) -> Character:
+def prepare(source: Path, folder: Path, merge: bool = False) -> Character | None:
     """Import a character, and save it as a rig in `folder`.
+
+    Args:
+        source: the file.
+        folder: where the rig is saved.
+        merge: whether vertices that lie on each other are merged.
+
+    Returns:
+        The character; None if there is nothing to merge.
 
     Raises:
         FDDAError: it has no rig.
@@ -74,6 +88,8 @@ def prepare(source: Path, folder: Path) -> Character:
             bpy.ops.import_scene.gltf(filepath=str(source), merge_vertices=True)
     fdda_addon.register()
     scene_rig = max(find_rigs(), key=lambda rig: len(rig.mesh_object.data.vertices))
+    if merge and not _merge_vertices(scene_rig.mesh_object.data):
+        return None
     if source.suffix != ".blend":
         _add_corrective_smooth(scene_rig)
     names = sorted(action.name for action in animating_actions(scene_rig.armature_object))
@@ -91,6 +107,19 @@ def prepare(source: Path, folder: Path) -> Character:
         tuple(names[:-1][::step]),
         names[-1] if len(names) > 1 else "",
     )
+
+
+def _merge_vertices(mesh: bpy.types.Mesh) -> int:
+    """Merge the vertices of a mesh that lie on each other; returns by how many it has fewer."""
+    import bmesh  # bpy brings it, so it is there after bpy has loaded.
+
+    edited, count = bmesh.new(), len(mesh.vertices)
+    edited.from_mesh(mesh)
+    size = max(max(axis) - min(axis) for axis in zip(*(vertex.co for vertex in edited.verts), strict=True))
+    bmesh.ops.remove_doubles(edited, verts=edited.verts, dist=MERGE_DISTANCE_RATIO * size)
+    edited.to_mesh(mesh)
+    edited.free()
+    return count - len(mesh.vertices)
 
 
 def _add_corrective_smooth(scene_rig: SceneRig) -> None:
@@ -121,43 +150,55 @@ def measure(character: Character, folder: Path, poses: int, epochs: int) -> dict
     Raises:
         VerbError: a verb has failed.
     """
-    limited, recording, model = folder / "limited.blend", folder / "recording", folder / "model.onnx"
+    rig, recording, model = character.file, folder / "recording", folder / "model.onnx"
     object_options = ("--object", character.object_name)
     actions = [option for name in character.recorded for option in ("--action", name)]
-    if actions:
-        run_verb("limits", character.file, limited, *actions, *object_options)
-    else:
-        limited = character.file
-    run_verb("record", limited, recording, *object_options, "--poses", poses, *actions, "--overwrite")
+    actions += ["--sample", "remix"] if actions else []
+    run_verb("record", rig, recording, *object_options, "--poses", poses, *actions, "--overwrite")
     run_verb("train", recording, model, "--epochs", epochs, "--overwrite")
-    run_verb("bind", limited, model, folder / "bound.blend", *object_options)
+    run_verb("bind", rig, model, folder / "bound.blend", *object_options, "--overwrite")
     held_out = ("--poses", 0, "--action", character.held_out) if character.held_out else ("--poses", 50)
     results = {}
     for verb, options in (("evaluate", held_out), ("benchmark", ())):
         path = folder / f"{verb}.json"
-        run_verb(verb, limited, model, "--json", path, *object_options, *options)
+        run_verb(verb, rig, model, "--json", path, "--overwrite", *object_options, *options)
         results[verb] = json.loads(path.read_text(encoding="utf-8"))
     return results | {"model_mb": model.stat().st_size / 1e6}
 
 
-def row(source: Path, folder: Path, poses: int, epochs: int) -> str:
-    """Take one character through, and return its row of the table."""
-    folder.mkdir(parents=True, exist_ok=True)
+def rows(source: Path, folder: Path, poses: int, epochs: int) -> Iterator[str]:
+    """Take one character through, as it is and then with merged vertices, and yield its rows of the table."""
     author = AUTHORS.get(source.stem, "")
-    try:
-        character = prepare(source, folder)
-    except (FDDAError, RuntimeError) as error:
-        return f"| {source.stem} | {author} | | | refused: {' '.join(str(error).split())} | | |"
-    head = f"| {source.stem} | {author} | {character.vertices:,} | {character.bones} |"
+    for name, merge in ((source.stem, False), (f"{source.stem}, merged", True)):
+        out = folder / name.replace(", ", "_")
+        out.mkdir(parents=True, exist_ok=True)
+        try:
+            character = prepare(source, out, merge)
+        except (FDDAError, RuntimeError) as error:
+            if not merge:
+                yield f"| {name} | {author} | | | refused: {' '.join(str(error).split())} | | | |"
+            return
+        if character is not None:
+            results = _results(character, out, poses, epochs)
+            yield f"| {name} | {author} | {character.vertices:,} | {character.bones} | {results}"
+        if source.suffix == ".blend":
+            return
+
+
+def _results(character: Character, folder: Path, poses: int, epochs: int) -> str:
+    """Return the other cells of a row."""
     try:
         results = measure(character, folder, poses, epochs)
     except VerbError as error:
-        return f"{head} refused: {error} | | |"
+        return f"refused: {error} | | | |"
     errors = results["evaluate"]
-    ratios = [100 * errors["fdda"][key] / max(errors["linear"][key], 1e-9) for key in ("mean", "max")]
+    if errors["linear"]["mean"] < MIN_LINEAR_MM:
+        text = "linear skinning is the rig in this action"
+    else:
+        ratios = [100 * errors["fdda"][key] / errors["linear"][key] for key in ("mean", "max")]
+        text = f"{ratios[0]:.1f} % ({ratios[1]:.0f} %)"
     held_out = f"*{character.held_out}*" if character.held_out else "50 random poses, as it has no two actions"
-    text = f"{ratios[0]:.0f} % ({ratios[1]:.0f} %)"
-    return f"{head} {text} | {held_out} | {results['benchmark']['ratio']:.1f} |"
+    return f"{text} | {held_out} | {results['benchmark']['ratio']:.1f} | {results['model_mb']:.1f} |"
 
 
 def main() -> None:
@@ -180,12 +221,13 @@ def main() -> None:
         f"{options.poses:,} random poses, {options.epochs} epochs, one seed, Blender {bpy.app.version_string}.",
         "",
         "| character | author, license | vertices | bones | mean (largest) error, part of linear skinning's "
-        "| compared on | times as fast |",
-        "|---|---|---|---|---|---|---|",
+        "| compared on | times as fast | model, MB |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for source in sources:
-        lines.append(row(source, options.out / source.stem, options.poses, options.epochs))
-        print(lines[-1], flush=True)
+        for line in rows(source, options.out, options.poses, options.epochs):
+            lines.append(line)
+            print(line, flush=True)
     table = "\n".join(lines)
     print(table)
     if options.write:
