@@ -15,10 +15,12 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
 from ..blocks import block_slices
-from .least_squares import solve_ridge
+from .least_squares import add_ridge, solve_ridge
 
 RIDGE = 1e-6
 """Ridge, as a part of the number of poses. It makes joints that move alike share the fit, and keeps factors small."""
+MAX_PRUNING_LOSS = 0.01
+"""Joints are removed, the least useful first, as long as the error is at most this part larger than with all joints."""
 MIN_EQUATIONS_PER_UNKNOWN = 4
 """Minimum ratio of equations to unknowns of a vertex. With fewer equations the regression explains any residual."""
 MIN_SINGULAR_VALUE_RATIO = 1e-5
@@ -88,7 +90,7 @@ class JointRegression:
         return left_vectors[:, singular_values > MIN_SINGULAR_VALUE_RATIO * singular_values[0]]
 
     def fit(self, residuals: np.ndarray, training: np.ndarray) -> tuple[JointFit, np.ndarray]:
-        """Fit local residuals by ridge regression.
+        """Fit local residuals by ridge regression, and remove joints that hardly help.
 
         Args:
             residuals: (N, Vp, 3) float32 local residuals, mesh units.
@@ -99,18 +101,24 @@ class JointRegression:
         """
         width = self.design.shape[2]
         gram, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
+        total = 0.0
         for block in block_slices(len(training), residuals[0].size):
             poses = training[block]
             rows = self.design[poses].reshape(-1, width)
             gram += rows.T @ rows
-            moments += rows.T @ residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1).astype(np.float64)
+            values = residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1).astype(np.float64)
+            moments += rows.T @ values
+            total += (values**2).sum()
         ridge = np.ones(width)
         ridge[3::4] /= self.metres_per_unit**2
-        solution = solve_ridge(gram, moments, RIDGE * len(training) * ridge)
+        ridge *= RIDGE * len(training)
+        selected = _select_joints(add_ridge(gram, ridge), moments, total)
+        columns = (4 * selected[:, None] + np.arange(4)).ravel()
+        solution = solve_ridge(gram[np.ix_(columns, columns)], moments[columns], ridge[columns])
         remaining = np.empty_like(residuals)
         for poses in block_slices(len(residuals), residuals[0].size):
-            remaining[poses] = residuals[poses] - (self.design[poses] @ solution).transpose(0, 2, 1)
-        return JointFit(self.joints, self._factors(solution.reshape(len(self.joints), 4, -1))), remaining
+            remaining[poses] = residuals[poses] - (self.design[poses][:, :, columns] @ solution).transpose(0, 2, 1)
+        return JointFit(self.joints[selected], self._factors(solution.reshape(len(selected), 4, -1))), remaining
 
     def _factors(self, solution: np.ndarray) -> np.ndarray:
         """Convert factors (Jf, 4, Vp) of the design matrix to factors (4 Jf, Vp) of the skin matrices."""
@@ -121,6 +129,37 @@ class JointRegression:
         factors[0, :3] -= self.center[:, None] * total
         factors[0, 3] -= total
         return factors.reshape(-1, solution.shape[2]).astype(np.float32)
+
+
+def _select_joints(gram: np.ndarray, moments: np.ndarray, total: float) -> np.ndarray:
+    """Select the joints of the fit by backward elimination.
+
+    Args:
+        gram, moments: (4 Jf, 4 Jf) and (4 Jf, Vp) of the normal equations, the ridge included.
+        total: sum of the squared residuals.
+
+    Returns:
+        Ascending indices; the first joint is always selected.
+    """
+    selected = np.arange(len(gram) // 4)
+    inverse, moment_gram = np.linalg.inv(gram), moments @ moments.T
+    error = total - (inverse * moment_gram).sum()
+    max_error = error * (1 + MAX_PRUNING_LOSS) ** 2
+    while len(selected) > 1:
+        # Removing joint j adds the trace of u_j' C_jj^-1 u_j, with C the inverse and u = C times the moments.
+        by_joint = inverse.reshape(-1, len(selected), 4)
+        diagonal = np.einsum("iaib->iab", inverse.reshape(len(selected), 4, len(selected), 4))
+        outer = np.einsum("iaw,wib->iab", (inverse @ moment_gram).reshape(len(selected), 4, -1), by_joint)
+        added_errors = np.trace(np.linalg.solve(diagonal, outer), axis1=1, axis2=2)
+        least_useful = 1 + int(added_errors[1:].argmin())
+        error += added_errors[least_useful]
+        if error > max_error:
+            break
+        removed = 4 * least_useful + np.arange(4)
+        inverse = inverse - inverse[:, removed] @ np.linalg.solve(diagonal[least_useful], inverse[removed])
+        inverse, moment_gram = (np.delete(np.delete(array, removed, 0), removed, 1) for array in (inverse, moment_gram))
+        selected = np.delete(selected, least_useful)
+    return selected
 
 
 def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> JointRegression:

@@ -4,6 +4,11 @@
 import numpy as np
 
 
+def add_ridge(gram: np.ndarray, ridge: np.ndarray | float) -> np.ndarray:
+    """Add a ridge, one value or (n,) values, to the diagonal of an (n, n) Gram matrix; returns float64."""
+    return gram + np.diag(np.broadcast_to(np.asarray(ridge, np.float64), len(gram)))
+
+
 def solve_ridge(gram: np.ndarray, moments: np.ndarray, ridge: np.ndarray | float) -> np.ndarray:
     """Minimize |A x - b|^2 + sum_i ridge_i x_i^2 (Tikhonov regularization).
 
@@ -15,4 +20,4 @@ def solve_ridge(gram: np.ndarray, moments: np.ndarray, ridge: np.ndarray | float
     Returns:
         x, float64, in the shape of `moments`.
     """
-    return np.linalg.solve(gram + np.diag(np.broadcast_to(ridge, len(gram))), moments)
+    return np.linalg.solve(add_ridge(gram, ridge), moments)
