@@ -9,11 +9,10 @@ from ..rig.reading import PoseReader
 from ..scene.control_reader import ControlReader
 from ..scene.scene_rig import SceneRig, armature_of
 from . import model_files
-from .session import session
 
 
 def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
-    """Evaluate the confidence of each partition in the evaluated pose. The model runs once for each new pose.
+    """Evaluate the confidence of each partition in the evaluated pose. The model runs once.
 
     Returns:
         For each partition the name of its main joint and its confidence, 0 to 1, in ascending order of confidence.
@@ -34,15 +33,11 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
         scene_rig = SceneRig(mesh_object, armature_object)
         pose_matrices = PoseReader(scene_rig, joint_names, network.info.rest_matrices).read(*evaluated_objects)
         controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
-        inputs = pose_matrices.tobytes() + controls.tobytes()
-        if session.confidence is None or session.confidence[0] is not network or session.confidence[1] != inputs:
-            confidence = network.confidence(pose_matrices[None], controls[None])
-            named_confidences = None
-            if confidence is not None:
-                names = (joint_names[partition.joint] for partition in network.info.partitions)
-                named_confidences = sorted(zip(names, confidence[0].tolist(), strict=True), key=lambda pair: pair[1])
-            session.confidence = (network, inputs, named_confidences)
-        return session.confidence[2]
+        confidence = network.confidence(pose_matrices[None], controls[None])
+        if confidence is None:
+            return None
+        names = (joint_names[partition.joint] for partition in network.info.partitions)
+        return sorted(zip(names, confidence[0].tolist(), strict=True), key=lambda pair: pair[1])
     except FDDAError:
         # Playback reports this error too, where the user sees it.
         return None

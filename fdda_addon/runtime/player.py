@@ -54,7 +54,6 @@ class Player:
         needs_recreation: whether the armature object has other data, or other bones than those that the player reads.
         new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
         has_moved: whether there were new inputs since the last update of the batches, which resets it.
-        execution: the execution whose arrays hold the positions.
         pose_input_count: number of `pose_inputs`.
         depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer (`evaluated_copies`).
         has_new_copy: whether Blender has copied the object with its shape keys since changes were read.
@@ -87,7 +86,7 @@ class Player:
         self.pose_input_count = 3 + len(self._control_reader.sources)
         self._mask_key, self.mask = mask_key(mesh_object), read_mask(mesh_object)
         self._blend: SkinningBlend | None = None
-        self.execution = self._single_execution = Execution(self.network, 1)
+        self._execution = Execution(self.network, 1)
         self.new_inputs: ModelInputs | None = None
         self.depsgraph_keys: set[tuple[str, int, str]] = set()
         self.has_moved = self.has_new_copy = False
@@ -96,8 +95,8 @@ class Player:
         self._shown_inputs: tuple | None = None
         self._positions: np.ndarray | None = None
         self.warning = self.reported_warning = ""
-        self.execution.poses[0] = info.rest_matrices
-        self._check_finite(self.execution.run())  # The first pose is played after the handlers have run.
+        self._execution.poses[0] = info.rest_matrices
+        self._check_finite(self._execution.run())  # The first pose is played after the handlers have run.
         self.update_driver(mesh_object, buffer)
 
     def update_driver(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> None:
@@ -233,23 +232,21 @@ class Player:
         """Run the model for `new_inputs` alone."""
         # After an exception no inputs count as shown, so the next evaluation tries again.
         self._shown_inputs, shown_inputs = None, self._shown_inputs
-        self.execution = self._single_execution
         if self.new_inputs.strength > 0:
-            self.execution.poses[0] = self.new_inputs.pose_matrices
-            self.execution.controls[0] = self.new_inputs.controls
-            self.execution.run()
-        self.set_positions(self.execution, 0)
+            self._execution.poses[0] = self.new_inputs.pose_matrices
+            self._execution.controls[0] = self.new_inputs.controls
+            self._execution.run()
+        self.set_positions(self._execution.positions[0])
         self._shown_inputs = shown_inputs
 
-    def set_positions(self, execution: Execution, pose_index: int) -> None:
-        """Use the positions of one pose of an execution, without copying them, as the positions of `new_inputs`."""
-        self.execution, self._positions = execution, execution.positions[pose_index]
-        self._check_finite(self._positions)
+    def set_positions(self, positions: np.ndarray) -> None:
+        """Use positions of an execution, (V, 3) float32, as those of `new_inputs`. They are not copied."""
+        self._positions = positions
+        self._check_finite(positions)
         strength = self.new_inputs.strength
         if strength < 1 or self.mask is not None:
-            model_positions = execution.positions[pose_index : pose_index + 1]
             pose_matrices, strengths = self.new_inputs.pose_matrices[None], np.array([strength], np.float32)
-            self._positions = self._blend.apply(model_positions, pose_matrices, strengths)[0]
+            self._positions = self._blend.apply(positions[None], pose_matrices, strengths)[0]
 
     def write_positions(self, buffer: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
         """Write the positions to an evaluated position buffer, even unchanged: an evaluation may have reset them."""

@@ -21,8 +21,6 @@ from .session import session
 
 MIN_BATCH_SIZE = 4
 """Smallest number of players in a batch."""
-MAX_EXECUTIONS_IN_USE = 4
-"""Largest number of executions that a batch keeps because members still show their positions."""
 BATCH_DRIVER_KEY = "fdda_batch_driver"
 """Custom property that marks batch drivers."""
 
@@ -37,7 +35,9 @@ class PlayerBatch:
 
     def __init__(self, network: Network, members: Mapping[int, Player]):
         self.network, self.members = network, dict(members)
-        self._executions: list[Execution] = []
+        self._players = list(self.members.values())
+        # Each member has a row.
+        self._execution = Execution(network, len(self.members))
 
     def batch(self) -> bpy.types.Object:
         """Create the batch driver and make the position buffers of all members depend on it."""
@@ -91,36 +91,26 @@ class PlayerBatch:
         """Run the model for players with new inputs: once for all with a strength above 0, alone for each other one."""
         batched_players = [player for player in players if player.new_inputs.strength > 0]
         if len(batched_players) > 1:
-            execution = self._find_free_execution(len(batched_players))
-            for index, player in enumerate(batched_players):
-                execution.poses[index] = player.new_inputs.pose_matrices
-                execution.controls[index] = player.new_inputs.controls
+            indices = [self._players.index(player) for player in batched_players]
+            for index, player in zip(indices, batched_players, strict=True):
+                self._execution.poses[index] = player.new_inputs.pose_matrices
+                self._execution.controls[index] = player.new_inputs.controls
             try:
-                execution.run()
+                # Members without new inputs keep their rows, and so their positions.
+                self._execution.run()
             except FDDAError:
                 # Each player runs the model alone below, and stores its own error.
                 batched_players = []
-            for index, player in enumerate(batched_players):
-                with player.capture_errors():
-                    player.set_positions(execution, index)
+            else:
+                for index, player in zip(indices, batched_players, strict=True):
+                    with player.capture_errors():
+                        player.set_positions(self._execution.positions[index])
         else:
             batched_players = []
         for player in players:
             if player not in batched_players:
                 with player.capture_errors():
                     player.run_model()
-
-    def _find_free_execution(self, pose_count: int) -> Execution:
-        """Find or create an execution for a number of poses, such that no member shows positions of the execution."""
-        used_ids = {id(player.execution) for player in self.members.values()}
-        for execution in self._executions:
-            if len(execution.poses) == pose_count and id(execution) not in used_ids:
-                return execution
-        self._executions = [execution for execution in self._executions if id(execution) in used_ids][
-            -MAX_EXECUTIONS_IN_USE:
-        ]
-        self._executions.append(Execution(self.network, pose_count))
-        return self._executions[-1]
 
 
 def update(*, frame_changed: bool) -> None:

@@ -78,7 +78,6 @@ class PlaybackSession:
         is_switching: whether an animated mode is being applied.
         apply_effect: applies an effect to a character; `effects` sets it when it is imported.
         check_timer: the timer that checks changed rigs.
-        confidence: the model, its inputs and the result of the last call of `confidence.partition_confidence`.
     """
 
     def __init__(self) -> None:
@@ -93,7 +92,6 @@ class PlaybackSession:
         self.scanned_count = -1
         self.suspension_count = 0
         self.skips_models = self.is_switching = False
-        self.confidence: tuple | None = None
         self.apply_effect: Callable[[Effect, Character, FDDAError | None], None]
         self._count_without_bound = -1
         self.read_bones: dict[tuple, tuple] | None = None
@@ -119,7 +117,6 @@ class PlaybackSession:
         Args:
             keep_checks: keep the passed checks, because names still refer to the same datablocks.
         """
-        self.confidence = None
         self.suspension_count = 0
         for table in (self.characters, self.players, self.batches, self.moved_buffers):
             table.clear()
