@@ -89,6 +89,11 @@ def _summary(fast_rig: "FastRig") -> str:
         f"  the joints move as in the full rig in {fast_rig.pose_count} poses (largest difference "
         f"{fast_rig.largest_difference:.1e} of the size)",
     ]
+    if counts := fast_rig.infinite_joints:
+        lines.append(
+            f"  in up to {max(counts.values())} of these, both rigs give no finite transform to "
+            f"{_names(tuple(counts))}; there they were not compared"
+        )
     for action, counts in fast_rig.lost_channels.items():
         lines.append(
             f"  '{action}': {sum(counts.values()):,} keyed channels have no bone any more: {_names(tuple(counts))}"

@@ -34,7 +34,7 @@ from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
 from ..scene.mask import read_mask
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, check_full_rig
 from .results import Evaluation, PoseErrors
 
 FIRST_HELD_OUT_INDEX = 1 << 33
@@ -167,6 +167,7 @@ def _prepare(scene_rig: SceneRig, model: Path | Network, is_rig_compared: bool) 
         model: path of the model, or the loaded model.
         is_rig_compared: whether the model is compared with the mesh of the rig itself, not with a target.
     """
+    check_full_rig(scene_rig.mesh_object)
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     rig = opened.linear_rig

@@ -79,15 +79,31 @@ def differing_joints(poses: JointPoses, before: np.ndarray, after: np.ndarray, t
             rotations and scales.
 
     Returns:
-        The largest difference of each joint that differs, by name, in the unit of `tolerance`.
+        The largest difference of each joint that differs, by name, in the unit of `tolerance`. It is infinite where
+        only one of the evaluations is finite. Elements that neither has finite count as equal.
     """
-    differences = np.abs(before.astype(np.float64) - after)
+    with np.errstate(invalid="ignore"):
+        differences = np.abs(before.astype(np.float64) - after)
     differences[..., :3, 3] /= poses.size
+    # Some rigs give NaN in extreme poses; the other evaluation must do so too.
+    differences[~np.isfinite(differences)] = np.inf
+    differences[~np.isfinite(before) & ~np.isfinite(after)] = 0.0
     largest = differences.max(axis=(0, 2, 3), initial=0)
-    # NaN compares as different, also where both are NaN: the pose cannot be checked.
-    return {
-        name: float(value) for name, value in zip(poses.joint_names, largest, strict=True) if not value <= tolerance
-    }
+    return {name: float(value) for name, value in zip(poses.joint_names, largest, strict=True) if value > tolerance}
+
+
+def infinite_joints(poses: JointPoses, matrices: np.ndarray) -> dict[str, int]:
+    """Count the poses in which joints have an infinite or undefined place, rotation or scale.
+
+    Args:
+        poses: the poses.
+        matrices: (P, J, 4, 4), as from `evaluate_joints`.
+
+    Returns:
+        The number of poses of each joint that has any, by name.
+    """
+    counts = (~np.isfinite(matrices)).any(axis=(2, 3)).sum(axis=0)
+    return {name: int(count) for name, count in zip(poses.joint_names, counts, strict=True) if count}
 
 
 def rig_size(armature_object: bpy.types.Object) -> float:

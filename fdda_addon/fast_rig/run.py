@@ -22,7 +22,7 @@ from .bone_reader import bone_node, datablock_node
 from .controls import animating_actions, control_bones, keyed_bones
 from .dependency_graph import Node
 from .driver_reader import bone_of_path, driven_node
-from .joint_poses import JointPoses, differing_joints, evaluate_joints, rig_size
+from .joint_poses import JointPoses, differing_joints, evaluate_joints, infinite_joints, rig_size
 from .removal import remove_unneeded
 
 TOLERANCE = 1e-5
@@ -46,6 +46,7 @@ class FastRig:
         lost_channels: number of keyed channels that have lost their bones, by action and bone.
         pose_count: number of poses in which the joints were compared.
         largest_difference: largest difference of a joint in these, as a ratio of the size of the rig.
+        infinite_joints: number of these poses in which both rigs give a joint no finite transform, by its name.
     """
 
     armature_name: str
@@ -60,6 +61,7 @@ class FastRig:
     lost_channels: dict[str, dict[str, int]] = field(default_factory=dict)
     pose_count: int = 0
     largest_difference: float = 0.0
+    infinite_joints: dict[str, int] = field(default_factory=dict)
 
 
 def make_fast_rig(
@@ -126,6 +128,7 @@ def make_fast_rig(
         _lost_channels(poses, removed.bones),
         len(before),
         max(differing_joints(poses, before, after, -1.0).values(), default=0.0),
+        infinite_joints(poses, before),
     )
 
 

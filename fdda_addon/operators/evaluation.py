@@ -17,6 +17,7 @@ from ..models.entries import bound_entry, bound_model_name
 from ..properties.recording_options import target_settings
 from ..properties.view import show_graph
 from ..scene.active_rig import any_mesh_object
+from ..scene.scene_rig import check_full_rig
 from .job import JobOperator
 from .playback import ModelOperator
 from .rig_operator import RigOperator
@@ -269,6 +270,8 @@ class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
         for scene_rig in rigs:
             if scene_rig.mesh_object.mode == "EDIT":
                 raise RigError(f"'{scene_rig.mesh_object.name}' is in edit mode; leave it first.")
+        for scene_rig in rigs if self.placement != "NONE" else ():
+            check_full_rig(scene_rig.mesh_object)
         for scene_rig in rigs:
             side_by_side.show(scene_rig.mesh_object, self.placement, self.distance)
         names = " and ".join(f"'{rig.mesh_object.name}'" for rig in rigs)

@@ -13,7 +13,7 @@ from ..models.entries import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
 from ..scene.active_rig import any_mesh_object
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, check_full_rig
 from .job import JobOperator
 from .rig_operator import RigOperator
 
@@ -270,6 +270,9 @@ class FDDA_OT_set_mode(ModelOperator, bpy.types.Operator):
         rigs = self.bound_rigs(context)
         bindings = [rig.mesh_object.fdda for rig in rigs]
         mode = self.mode if self.mode != "NEXT" else ("FDDA" if bindings[0].mode == "RIG" else "RIG")
+        if mode == "RIG":
+            for rig in rigs:
+                check_full_rig(rig.mesh_object)
         for binding in bindings:
             binding.mode = mode
         context.view_layer.update()

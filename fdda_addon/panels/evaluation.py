@@ -40,6 +40,8 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             return
         if not scene_rig.mesh_object.fdda.is_bound:
             draw_wrapped(layout, context, "Bind a model first, to compare it with the rig.", "INFO")
+        elif scene_rig.mesh_object.fdda.is_fast_rig:
+            draw_wrapped(layout, context, "This is a fast rig: compare the model in the file of the full rig.", "INFO")
         else:
             _draw_side_by_side(layout, context, scene_rig)
             self._draw_evaluate(context, scene_rig)
@@ -50,7 +52,8 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         if last is not None:
             _draw_worst(layout, context, view, last)
         if scene_rig.mesh_object.fdda.is_bound:
-            _draw_film(layout, context)
+            if not scene_rig.mesh_object.fdda.is_fast_rig:
+                _draw_film(layout, context)
             layout.operator("fdda.open_report", icon="URL")
 
     def _draw_evaluate(self, context: bpy.types.Context, scene_rig: object) -> None:

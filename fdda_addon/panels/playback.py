@@ -114,13 +114,16 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         row = layout.row(align=True)
         row.scale_y = 1.4
+        modes = [(mode, text) for mode, text in MODES if mode != "RIG" or not mesh_object.fdda.is_fast_rig]
         if mesh_count(context):
-            for mode, text in MODES:
+            for mode, text in modes:
                 properties = row.operator("fdda.set_mode", text=text, depress=binding.mode == mode)
                 properties.mode, properties.all_meshes = mode, True
         else:
-            row.prop(binding, "mode", expand=True)
-        _draw_speed(layout, context, mesh_object)
+            for mode, text in modes:
+                row.prop_enum(binding, "mode", mode, text=text)
+        if not mesh_object.fdda.is_fast_rig:
+            _draw_speed(layout, context, mesh_object)
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         strength = column.row()
@@ -226,7 +229,10 @@ def _draw_mask(column: bpy.types.UILayout, mesh_object: bpy.types.Object) -> Non
 
 def _draw_fast_rig(layout: bpy.types.UILayout, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
     if mesh_object.fdda.is_fast_rig:
-        text = "This is a fast rig: for rendering, relocate the library to the file of the full rig."
+        text = (
+            "This is a fast rig: it lacks modifiers and bones of the full rig. For rendering, relocate the "
+            "library to the file of the full rig."
+        )
         draw_wrapped(layout, context, text, "INFO")
     elif not draw_job(layout, context, "fast_rig"):
         layout.operator("fdda.fast_rig", text="Fast Rig…", icon="ARMATURE_DATA")

@@ -44,7 +44,9 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
             draw_wrapped(layout, context, message, "INFO")
             layout.operator("fdda.add_sample_arm", text="Add Sample Arm", icon="ADD")
             return
-        _draw_build_model(layout, context, rig)
+        is_fast_rig = rig.mesh_object.fdda.is_fast_rig
+        if not is_fast_rig:
+            _draw_build_model(layout, context, rig)
         _draw_meshes(layout, context, rig)
         _draw_counts(layout, rig)
         check = checks.last_check(rig)
@@ -52,8 +54,9 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
             draw_wrapped(layout.box(), context, problem, "ERROR")
         if check:
             _draw_replaced(layout, rig.mesh_object, check.replaced_modifiers)
-        _draw_cost(layout, context, rig)
-        draw_profile(layout, context, rig)
+        if not is_fast_rig:
+            _draw_cost(layout, context, rig)
+            draw_profile(layout, context, rig)
 
 
 def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

@@ -28,7 +28,7 @@ from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, check_full_rig
 from .appender import PoseAppender, append_poses
 
 PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
@@ -75,6 +75,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         ModelError: the model cannot be read, or is of another rig.
         OutputError: the recording cannot be written.
     """
+    check_full_rig(scene_rig.mesh_object)
     recording = read_recording(path)
     if recording.info.target:
         raise RecordingError(

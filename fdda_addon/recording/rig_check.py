@@ -11,7 +11,7 @@ from ..poses.sampling import default_channels, sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.time_inputs import check_time_inputs
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, check_full_rig
 from .plan import RecordingSettings, depends_on_time, find_actions, listed_controls, read_sample_selection
 
 DEFAULT_SETTINGS = RecordingSettings()
@@ -55,6 +55,10 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: Rig
     result = RigCheck((), None, ())
     problems: list[str] = []
     stack = None
+    try:
+        check_full_rig(scene_rig.mesh_object)
+    except RigError as error:
+        problems.append(str(error))
     if not scene_rig.mesh_object.fdda.is_playing:
         try:
             stack = check_evaluable(scene_rig)

@@ -25,7 +25,7 @@ from ..rig.modifier_stack import check_evaluable
 from ..rig.target_poses import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_states
 from ..rig.time_inputs import check_time_inputs
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, check_full_rig
 from .appender import PoseAppender, append_poses
 from .influence_trials import InfluenceSearch
 from .influences import detect_influences
@@ -102,6 +102,7 @@ class RecordingSession:
             raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
         sampled_rigs = []
         for (scene_rig, path), mesh_controls in zip(rigs, controls, strict=True):
+            check_full_rig(scene_rig.mesh_object)
             stack = check_evaluable(scene_rig)
             sampled_rigs.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
             if not settings.target.name:

@@ -67,6 +67,15 @@ def find_rigs() -> list[SceneRig]:
     return [SceneRig(o, armature_of(o)) for o in rigged_objects] or [find_rig()]
 
 
+def check_full_rig(mesh_object: bpy.types.Object) -> None:
+    """Raise a RigError if a mesh belongs to a fast rig: what is left of its modifiers and bones is no reference."""
+    if mesh_object.fdda.is_fast_rig:
+        raise RigError(
+            f"'{mesh_object.name}' belongs to a fast rig, which lacks modifiers and bones of the full rig; open the "
+            "file of the full rig."
+        )
+
+
 def is_flat(scene_object: bpy.types.Object) -> bool:
     """Return whether an object or one of its parents has a scale of zero along an axis."""
     return abs(scene_object.matrix_world.to_3x3().determinant()) < MIN_VOLUME

@@ -28,7 +28,7 @@ from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
 from ..scene.comparison import hidden_comparison_objects
-from ..scene.scene_rig import SceneRig, armature_modifier
+from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
 from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose
 from .frame_times import FrameTimes, compare_times
 
@@ -149,9 +149,10 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         Progress, and the Benchmark at the end.
 
     Raises:
-        RigError: the rig cannot be evaluated.
+        RigError: as `check_full_rig`, or the rig cannot be evaluated.
         ModelError: the model cannot be read, or was trained for another rig.
     """
+    check_full_rig(scene_rig.mesh_object)
     check_evaluable(scene_rig)
     mesh_object = scene_rig.mesh_object
     opened_model = open_model(scene_rig, model or model_files.network_of(mesh_object))

@@ -15,7 +15,7 @@ from ..core.errors import RigError
 from ..core.progress import Progress
 from ..rig.modifier_stack import check_posable, deforming_modifiers, is_fdda_modifier
 from ..runtime.binding import model_disabled
-from ..scene.scene_rig import SceneRig, armature_modifier
+from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
 from ..scene.temporary_state import temporary_attributes
 from .benchmark import temporary_animation
 from .bone_groups import find_expensive_groups
@@ -38,9 +38,10 @@ def profile_frame(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]:
         Progress, and the FrameProfile at the end.
 
     Raises:
-        RigError: as `check_posable`, or there is no action and no bone that random poses may move.
+        RigError: as `check_full_rig` and `check_posable`, or there is no action and no bone that random poses may move.
     """
     with model_disabled(scene_rig.mesh_object):
+        check_full_rig(scene_rig.mesh_object)
         check_posable(scene_rig)
         yield from _profile_shown_rig(scene_rig)
 

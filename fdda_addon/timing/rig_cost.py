@@ -9,7 +9,7 @@ import numpy as np
 from ..core.progress import Progress
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import model_disabled
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, check_full_rig
 from .benchmark import MAX_RATIO_SPREAD, ratio_spread, skinning_only, temporary_animation, time_frames
 from .frame_times import MIN_WORTHWHILE_RATIO
 
@@ -69,10 +69,11 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
         Progress, and the RigCost at the end.
 
     Raises:
-        RigError: the rig cannot be evaluated.
+        RigError: as `check_full_rig`, or the rig cannot be evaluated.
     """
     mesh_object = scene_rig.mesh_object
     with model_disabled(mesh_object):
+        check_full_rig(mesh_object)
         check_evaluable(scene_rig)
         times: dict[str, list[float]] = {"rig": [], "linear": []}
         with temporary_animation(scene_rig) as frames:

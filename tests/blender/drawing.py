@@ -73,6 +73,11 @@ class Layout:
         check_options("prop", options)
         self.add("field", options.get("text") or owner.bl_rna.properties[name].name)
 
+    def prop_enum(self, owner: bpy.types.bpy_struct, name: str, value: str, **options: object) -> None:
+        check_options("prop_enum", options)
+        assert value in owner.bl_rna.properties[name].enum_items
+        self.add("field", options.get("text") or owner.bl_rna.properties[name].enum_items[value].name)
+
     def prop_search(
         self,
         owner: bpy.types.bpy_struct,

@@ -13,6 +13,7 @@ from fdda_addon.fast_rig import frame_times
 from fdda_addon.fast_rig import removal as fast_rig_removal
 from fdda_addon.fast_rig.bone_reader import bone_node
 from fdda_addon.fast_rig.graph_reader import read_graph
+from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, infinite_joints
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rig
@@ -155,6 +156,56 @@ def test_a_rig_that_does_not_repeat_itself_is_refused(folder, capsys):
         "of the size) of 'elbow_rig' move differently when the same pose is evaluated again" in capsys.readouterr().err
     )
     assert not (folder / "fast.blend").exists()
+
+
+def overflow_above(joint_name: str, threshold: float) -> None:
+    """Scale a joint beyond the largest float where the control has turned further than a threshold, and save."""
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    driver = armature_object.pose.bones[joint_name].driver_add("scale", 0).driver
+    driver.expression = f"3e38 if angle > {threshold} else 1"
+    variable = driver.variables.new()
+    variable.name = "angle"
+    variable.targets[0].id = armature_object
+    variable.targets[0].data_path = 'pose.bones["control"].rotation_euler[0]'
+    bpy.ops.wm.save_mainfile()
+
+
+def test_transforms_that_are_infinite_in_both_rigs_are_equal(folder):
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
+    overflow_above("upper", 0.8)
+    lines = output_of(*fast_rig_arguments(folder, "--frames", 0)).out
+    assert lines[3].strip().startswith("in up to ")
+    assert "of these, both rigs give no finite transform to 'upper', 'lower'" in lines[3]
+    count = int(lines[3].split()[3])
+    assert 0 < count < 100
+
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "fast.blend"))
+    assert bpy.data.objects[ELBOW].fdda.mode == "FDDA" and not bpy.data.objects[ELBOW].fdda.status
+
+
+def test_a_joint_that_is_infinite_in_one_rig_differs():
+    before = np.zeros((2, 2, 4, 4), np.float32)
+    after = before.copy()
+    before[0, 0, 0, 3] = after[0, 0, 0, 3] = np.nan
+    poses = JointPoses(None, ("first", "second"), (), (), 1.0)
+    assert differing_joints(poses, before, after, 1e-5) == {}
+    assert infinite_joints(poses, before) == {"first": 1}
+    after[1, 1, 2, 2] = np.nan
+    assert differing_joints(poses, before, after, 1e-5) == {"second": np.inf}
+
+
+def test_nothing_is_compared_with_what_is_left_of_the_rig(folder, capsys):
+    assert run(*fast_rig_arguments(folder, "--frames", 0)) == 0
+    fast, model = folder / "fast.blend", folder / "model.onnx"
+    for arguments in (
+        ("record", fast, folder / "again", "--object", ELBOW),
+        ("evaluate", fast, model, "--object", ELBOW, "--json", folder / "errors.json"),
+        ("benchmark", fast, model, "--object", ELBOW, "--json", folder / "times.json"),
+        ("benchmark", fast, "--profile", "--object", ELBOW, "--json", folder / "times.json"),
+    ):
+        assert run(*arguments) == 1
+        assert "'elbow' belongs to a fast rig, which lacks modifiers and bones of the full" in capsys.readouterr().err
+    assert sorted(path.name for path in folder.iterdir()) == ["fast.blend", "full.blend", "model.onnx"]
 
 
 def test_refusals(folder, capsys):

@@ -39,6 +39,25 @@ def test_a_fast_rig_is_written_and_the_open_file_stays(saved, elbow_files):
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(saved / "again.blend")), "'elbow' is a fast rig already")
 
 
+def test_a_fast_rig_is_not_compared_with_what_is_left_of_the_rig(bound_elbow):
+    bound_elbow.fdda.is_fast_rig = True
+    bpy.context.view_layer.objects.active = bound_elbow
+    sentence = "'elbow' belongs to a fast rig, which lacks modifiers and bones of the full rig"
+    for operator in (
+        lambda: bpy.ops.fdda.set_mode(mode="RIG"),
+        lambda: bpy.ops.fdda.set_mode(mode="NEXT"),
+        lambda: bpy.ops.fdda.show_rig(placement="BESIDE"),
+        lambda: bpy.ops.fdda.evaluate(source="RANDOM", poses=2),
+        lambda: bpy.ops.fdda.measure_model(frames=5),
+        bpy.ops.fdda.measure,
+        bpy.ops.fdda.profile_frame,
+        bpy.ops.fdda.record,
+    ):
+        refused(operator, sentence)
+    assert bound_elbow.fdda.mode == "FDDA"
+    assert bpy.ops.fdda.set_mode(mode="LINEAR") == {"FINISHED"}
+
+
 def test_the_sentence_of_the_verb_is_the_report(saved):
     """The other Blender refuses an armature that another object uses."""
     other = bpy.data.objects.new("other", bpy.data.objects[ELBOW_RIG].data)

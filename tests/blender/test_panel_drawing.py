@@ -86,6 +86,18 @@ def test_a_section_of_a_bound_model_draws(bound_elbow: bpy.types.Object, name: s
     assert text in texts_of(draw_section(name))
 
 
+def test_a_fast_rig_offers_no_comparison_with_the_rig(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    sections = ("rig", "playback", "evaluation")
+    compared = {"Record, Train & Bind", "Measure Speed", "Frame Profile", "Rig", "Evaluate", "Beside"}
+    full_texts = {text for name in sections for text in texts_of(draw_section(name))}
+    assert compared <= full_texts
+    bound_elbow.fdda.is_fast_rig = True
+    fast_texts = {text for name in sections for text in texts_of(draw_section(name))}
+    assert not compared & fast_texts and {"Skinning", "Model", "Unbind"} <= fast_texts
+    assert "This is a fast rig: compare the model in the file of the full rig." in fast_texts
+
+
 def test_a_removed_modifier_can_be_bound_again(bound_elbow: bpy.types.Object):
     bpy.context.view_layer.objects.active = bound_elbow
     bpy.context.view_layer.update()
