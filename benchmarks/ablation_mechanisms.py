@@ -79,6 +79,7 @@ MECHANISMS = {
     "half-rotation features": Mechanism({"trainer.train.half_rotations_help": lambda *_: False}),
     "input relevance": Mechanism({"trainer.networks.loop.RELEVANCE_EPOCH_FRACTIONS": ()}),
     "component allocation": Mechanism({"trainer.preparation.allocate_components": _allocate_equally}),
+    "low-rank factors": Mechanism({"trainer.compression.may_factorize": lambda *_: False}),
     "dropped components": Mechanism({"trainer.compression.MIN_GAIN_RATIO": -np.inf}),
     "pieces of layers": Mechanism(
         {"trainer.export.network_nodes._chunk_size": lambda layer_sizes, *_: max(layer_sizes)}, is_export=True

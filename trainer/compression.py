@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes a trained model smaller: drops the components that its networks do not predict."""
+"""Makes a trained model smaller: drops components that networks do not predict, and factorizes large partitions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -8,8 +8,9 @@ import numpy as np
 
 from .data.split import MARGIN_POSE_WEIGHT, Split
 from .fits.basis import Basis
+from .fits.low_rank import factorize, may_factorize
 from .networks.networks import Network
-from .preparation import PreparedPartition
+from .preparation import PartitionData, PreparedPartition
 from .process import Cancelled
 
 MIN_GAIN_RATIO = 0.1
@@ -147,8 +148,6 @@ def _change_basis(
 ) -> tuple[PreparedPartition, Network]:
     """Replace the K components of a partition by K' orthonormal combinations of them.
 
-    A network without outputs has one layer.
-
     Args:
         partition, network: partition with its trained network.
         change: (K, K') float64, orthonormal columns.
@@ -173,8 +172,64 @@ def _change_basis(
         dropped_count=len(change) - change.shape[1],
         dropped_rms=float(np.sqrt(dropped_square)),
     )
-    if not change.shape[1]:
-        return changed, Network((np.zeros((len(network.weights[0]), 0), np.float32),), (np.zeros(0, np.float32),))
-    change = change.astype(np.float32)
+    return changed, _change_outputs(network, change)
+
+
+def _change_outputs(network: Network, change: np.ndarray) -> Network:
+    """Return a network with other outputs, (K, K') combinations; without outputs it has one layer."""
     weights, biases = network.weights, network.biases
-    return changed, Network((*weights[:-1], weights[-1] @ change), (*biases[:-1], biases[-1] @ change))
+    if not change.shape[1]:
+        return Network((np.zeros((len(weights[0]), 0), np.float32),), (np.zeros(0, np.float32),))
+    change = change.astype(np.float32)
+    return Network((*weights[:-1], weights[-1] @ change), (*biases[:-1], biases[-1] @ change))
+
+
+def factorize_partitions(
+    prepared: Sequence[PreparedPartition],
+    networks: Sequence[Network],
+    partitions: Sequence[PartitionData],
+    split: Split,
+    tolerance: float,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[list[PreparedPartition], list[Network]]:
+    """Factorize the partitions where that saves parameters (`low_rank`).
+
+    Args:
+        prepared, networks: partitions with their trained networks.
+        partitions: data of the partitions.
+        split: split of the poses.
+        tolerance: rms error that the components may leave, mesh units.
+        should_stop: called before each partition.
+
+    Returns:
+        The partitions, and the networks with outputs for the changed bases.
+
+    Raises:
+        Cancelled: `should_stop` returned True.
+    """
+    factorized = []
+    for arguments in zip(prepared, networks, partitions, strict=True):
+        if should_stop():
+            raise Cancelled
+        factorized.append(_factorize_partition(*arguments, split, tolerance))
+    return [partition for partition, _ in factorized], [network for _, network in factorized]
+
+
+def _factorize_partition(
+    prepared: PreparedPartition, network: Network, partition: PartitionData, split: Split, tolerance: float
+) -> tuple[PreparedPartition, Network]:
+    if not may_factorize(prepared.fit, prepared.basis):
+        return prepared, network
+    fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
+    weights, regression = split.weights(), partition.read_regression()
+    factors = factorize(fit, basis, coefficients, regression, split.training, weights, tolerance)
+    if factors is None:
+        return prepared, network
+    factorized = replace(
+        prepared,
+        fit=factors.fit,
+        basis=factors.basis,
+        coefficients=(coefficients @ factors.change_of_basis.T).astype(np.float32),
+        vertex_factors=factors.vertex_factors,
+    )
+    return factorized, _change_outputs(network, factors.change_of_basis.T)

@@ -29,7 +29,7 @@ class PartitionData:
         read_residuals: returns the (N, Vp, 3) float32 local residuals, mesh units. It is called once, so that only one
             partition's residuals are in memory at a time.
         vertex_count: Vp.
-        read_regression: returns the linear regression that is fitted first; called once. None without joints.
+        read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
         min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
     """
 
@@ -58,6 +58,7 @@ class PreparedPartition:
         validation: (n,) indices of the validation poses.
         validation_residuals: (n, 3 Vp) float32, their residuals after the fit, mesh units.
         mm_per_unit: millimeters per mesh unit.
+        vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
         dropped_count: number of components that were dropped after the training (`compression`).
         dropped_rms: rms distance over training poses and vertices that they represent, mesh units.
     """
@@ -75,6 +76,7 @@ class PreparedPartition:
     validation: np.ndarray
     validation_residuals: np.ndarray
     mm_per_unit: float = 1000.0
+    vertex_factors: np.ndarray | None = None
     dropped_count: int = 0
     dropped_rms: float = 0.0
 

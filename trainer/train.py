@@ -18,7 +18,7 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import report_text
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
-from .compression import drop_components, dropped_components_sentence
+from .compression import drop_components, dropped_components_sentence, factorize_partitions
 from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
 from .export.export import ExportedModel, build_model, measure, measure_surface, write_model
@@ -79,7 +79,7 @@ def train_model(
     partitions = job.collect_partition_data(recording, inputs, split)
     prepared = job.prepare(partitions, recording, split)
     result = job.train_networks(prepared, inputs, split, checkpoint)
-    prepared, networks = job.drop_components(prepared, result, split)
+    prepared, networks = job.compress(prepared, result, partitions, recording, split)
     trained_model = make_trained_model(recording, inputs, split, prepared, networks, config.activation)
     exported = job.export(recording, trained_model, split, warm_start)
     report = job.measure(recording, trained_model, split, exported, result, model_path)
@@ -192,16 +192,22 @@ class _Job:
             initial=initial_networks(checkpoint, prepared, columns) if checkpoint else None,
         )
 
-    def drop_components(
-        self, prepared: list[PreparedPartition], result: TrainingResult, split: Split
+    def compress(
+        self,
+        prepared: list[PreparedPartition],
+        result: TrainingResult,
+        partitions: list[PartitionData],
+        recording: Recording,
+        split: Split,
     ) -> tuple[list[PreparedPartition], list[Network]]:
-        """Drop components that the networks do not predict."""
+        """Drop components that the networks do not predict, and factorize large partitions."""
         remaining, networks = drop_components(
             prepared, result.networks, split, self.config.activation, self.should_stop
         )
         if text := dropped_components_sentence(prepared, remaining):
             self.log(text)
-        return remaining, networks
+        tolerance = self.config.tolerance_mm / (1000 * recording.rig.metres_per_unit)
+        return factorize_partitions(remaining, networks, partitions, split, tolerance, self.should_stop)
 
     def export(
         self, recording: Recording, trained_model: TrainedModel, split: Split, warm_start: bool

@@ -45,11 +45,11 @@ def test_switching_off_the_linear_fit_changes_the_model(results):
 
 
 def test_the_trainer_is_as_before_after_an_error():
-    before = JointRegression.fit, compression.MIN_GAIN_RATIO, train.build_model
+    before = JointRegression.fit, compression.may_factorize, train.build_model
     for mechanism in MECHANISMS.values():
         with pytest.raises(ZeroDivisionError), mechanism.switched_off():
             raise ZeroDivisionError
-    assert before == (JointRegression.fit, compression.MIN_GAIN_RATIO, train.build_model)
+    assert before == (JointRegression.fit, compression.may_factorize, train.build_model)
 
 
 def test_the_table_has_a_row_for_each_mechanism(results):

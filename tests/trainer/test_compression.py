@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""After the training, components that the networks do not predict are dropped."""
+"""After the training, components that the networks do not predict are dropped, and large partitions are factorized."""
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -17,17 +18,19 @@ from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network as ModelNetwork
 from trainer import compression
 from trainer.__main__ import main
-from trainer.compression import _change_basis, drop_components, dropped_components_sentence
+from trainer.compression import _change_basis, drop_components, dropped_components_sentence, factorize_partitions
 from trainer.config import TrainingConfig
-from trainer.data.split import Split, split_poses
+from trainer.data.split import Split, split_poses, split_recording
+from trainer.inputs.network_inputs import make_inputs
 from trainer.networks.checkpoint import read_checkpoint
 from trainer.networks.loop import train
 from trainer.networks.networks import Network
-from trainer.preparation import PartitionData, PreparedPartition, prepare_partition
+from trainer.preparation import PartitionData, PreparedPartition, partition_data, prepare_partition, prepare_partitions
 from trainer.process import Cancelled
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
+from .test_low_rank import INFLUENCING, JOINTS, POSES, VERTICES, sliding_residuals
 
 CONFIG = TrainingConfig(epochs=60, hidden=(16, 16), batch_size=16)
 VERTEX_COUNT = 40
@@ -123,12 +126,16 @@ def test_a_component_for_extreme_poses_stays(kind):
     assert error < 1.1 * mean_error(data, prepared[0], networks[0], extremes) < 0.2 * np.abs(residuals[extremes]).mean()
 
 
-def test_dropping_can_be_cancelled_between_partitions():
+def test_compression_can_be_cancelled_between_partitions():
     data = make_data(noise=0), make_data(noise=0)
     prepared, networks, split = train_partitions(*data)
-    answers = iter([False, True])
-    with pytest.raises(Cancelled):
-        drop_components(prepared, networks, split, CONFIG.activation, lambda: next(answers))
+    for compress in (
+        lambda should_stop: drop_components(prepared, networks, split, CONFIG.activation, should_stop),
+        lambda should_stop: factorize_partitions(prepared, networks, data, split, 1e-5, should_stop),
+    ):
+        answers = iter([False, True])
+        with pytest.raises(Cancelled):
+            compress(lambda answers=answers: next(answers))
 
 
 def test_a_dropped_component_that_is_small_needs_no_remedy():
@@ -185,3 +192,32 @@ def test_a_model_without_components_plays_and_its_training_continues(recording, 
     assert main([str(recording), str(model), *QUICK_OPTIONS, "--warm-start"]) == 0
     continued = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert continued["fdda"]["held_out"]["mean"] < 0.5 * report["fdda"]["held_out"]["mean"]
+
+
+def test_factorized_networks_predict_the_projected_residuals(tmp_path):
+    rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
+    with RecordingWriter(tmp_path / "tube", rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
+        writer.append(pose_chain(rig, angles), sliding_residuals(rig, angles))
+    recording = read_recording(tmp_path / "tube")
+    split = split_recording(recording, CONFIG)
+    data = partition_data(recording, recording.partitions, make_inputs(recording.rig, recording.partitions))
+    prepared, rng = prepare_partitions(data, split, 0.04, 0), np.random.default_rng(0)
+    networks = []
+    for partition in prepared:
+        sizes = (len(partition.columns), 8, len(partition.basis.components))
+        weights = [rng.normal(size=shape).astype(np.float32) for shape in pairwise(sizes)]
+        biases = [rng.normal(size=size).astype(np.float32) for size in sizes[1:]]
+        networks.append(Network(tuple(weights), tuple(biases)))
+    factorized, changed_networks = factorize_partitions(prepared, networks, data, split, 4e-5)
+    for before, after, network, changed in zip(prepared, factorized, networks, changed_networks, strict=True):
+        assert after.vertex_factors is not None and before.vertex_factors is None
+        predicted, expected = (
+            (n.evaluate(p.inputs, "silu").astype(np.float64) @ p.basis.components).reshape(POSES, -1, 3)
+            for p, n in ((after, changed), (before, network))
+        )
+        vertex_factors = after.vertex_factors.astype(np.float64)
+        expected = np.einsum("nvc,rv,rw->nwc", expected, vertex_factors, vertex_factors, optimize=True)
+        np.testing.assert_allclose(predicted, expected, atol=1e-4 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            after.coefficients @ after.basis.components @ after.basis.components.T, after.coefficients, atol=1e-5
+        )

@@ -44,8 +44,8 @@ class _PartitionRows:
         self.half_rotation_joints = self.prepared.fit.joints[is_half_rotation]
         self.joints = np.append(self.skin.joints, self.prepared.fit.joints[~is_half_rotation])
         self.padding = -len(self.joints) % 3
-        linear_row_count = 3 * (self.component_count + len(self.half_rotation_joints))
-        self.row_count = linear_row_count + MATRIX_COLUMNS * len(self.joints) + self.padding
+        self._linear_only_count = 3 * (self.component_count + len(self.half_rotation_joints))
+        self.row_count = self._linear_only_count + MATRIX_COLUMNS * len(self.joints) + self.padding
 
     def matrix(self) -> np.ndarray:
         """Compute the (row_count, Vp) float64 constant matrix."""
@@ -66,6 +66,20 @@ class _PartitionRows:
         padding_rows = np.zeros((self.padding, vertex_count))
         row_blocks = [component_rows, fit_rows[~has_translation, :3], joint_rows[:, :3], joint_rows[:, 3], padding_rows]
         return np.concatenate([rows.reshape(-1, vertex_count) for rows in row_blocks])
+
+    def factorized_matrix(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return two factors of the constant matrix; the first leaves the rows of the skin joints unchanged."""
+        is_skin_joint = np.arange(len(self.joints)) < len(self.skin.joints)
+        is_skin = np.zeros(self.row_count, bool)
+        is_skin[self._linear_only_count : self.row_count - self.padding] = np.append(
+            np.repeat(is_skin_joint, 3), is_skin_joint
+        )
+        matrix, skin_row_count = self.matrix(), is_skin.sum()
+        vertex_factors = self.prepared.vertex_factors.astype(np.float64)
+        left_factor = np.zeros((self.row_count, skin_row_count + len(vertex_factors)))
+        left_factor[is_skin, :skin_row_count] = np.eye(skin_row_count)
+        left_factor[~is_skin, skin_row_count:] = matrix[~is_skin] @ vertex_factors.T
+        return left_factor, np.concatenate([matrix[is_skin], vertex_factors])
 
 
 def add_skinning(
@@ -88,7 +102,8 @@ def add_skinning(
     | each joint j of the fit | t P_j | B_j^-1 u_vj, for m including the mean residual |
 
     The linear parts of all matrices come first, then the translations of the joints. Components and half rotations have
-    no translation.
+    no translation. In a large partition all constants except those of the skin joints are factorized (`low_rank`). The
+    rows are then multiplied by a matrix with few columns first.
 
     Args:
         graph: graph to which the nodes are added.
@@ -122,11 +137,17 @@ def _add_product(graph: GraphBuilder, rows: str, partition: _PartitionRows, colu
     Returns:
         Name of the (N, 3, columns) positions.
     """
+    suffix = partition.index
+    if partition.prepared.vertex_factors is None:
+        matrix = partition.matrix()
+    else:
+        left_factor, matrix = partition.factorized_matrix()
+        rows = graph.add("MatMul", [rows, graph.floats(f"left_factor_{suffix}", left_factor)], f"low_rank_{suffix}")
     # Each of the partition's vertices has a column of the matrix.
-    indices = np.searchsorted(partition.vertices, np.maximum(columns, partition.vertices[0]))
-    matrix = np.where(columns >= 0, partition.matrix()[:, indices], 0)
-    matrix = graph.floats(f"matrix_{partition.index}", matrix)
-    return graph.add("MatMul", [rows, matrix], f"block_{partition.index}")
+    vertices = partition.vertices
+    indices = np.searchsorted(vertices, np.maximum(columns, vertices[0]))
+    matrix = graph.floats(f"matrix_{suffix}", np.where(columns >= 0, matrix[:, indices], 0))
+    return graph.add("MatMul", [rows, matrix], f"block_{suffix}")
 
 
 def _add_rows(

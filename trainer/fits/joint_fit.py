@@ -77,6 +77,11 @@ class JointRegression:
         """Return the regression on the main joint alone, which is constant in its own space."""
         return JointRegression(self.joints[:1], self.center, self.design[:, :, :4], self.metres_per_unit)
 
+    def design_of(self, joints: np.ndarray) -> np.ndarray:
+        """Return the (N, 3, 4 n) float64 columns of n of the joints, in the given order."""
+        indices = np.argsort(self.joints)[np.searchsorted(np.sort(self.joints), joints)]
+        return self.design[:, :, (4 * indices[:, None] + np.arange(4)).ravel()]
+
     def is_determined(self) -> bool:
         """Return whether there are enough poses for the fit to generalize."""
         poses, _, width = self.design.shape
