@@ -84,5 +84,5 @@ MECHANISMS = {
     "pieces of layers": Mechanism(
         {"trainer.export.network_nodes._chunk_size": lambda layer_sizes, *_: max(layer_sizes)}, is_export=True
     ),
-    "vertex order in blocks": Mechanism({"trainer.export.vertex_order.BLOCK_SIZES": (1,)}, is_export=True),
+    "vertex order in blocks": Mechanism({"trainer.export.vertex_order.MIN_BLOCK_VERTICES": np.inf}, is_export=True),
 }

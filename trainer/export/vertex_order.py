@@ -12,9 +12,11 @@ import numpy as np
 
 from ..graph_builder import GraphBuilder
 
-GATHER_NS, COPY_NS, EXTRA_NODES_NS = 9, 0.4, 3000
-"""Measured times to gather a slice, to copy a vertex, and to run the additional nodes for blocks, nanoseconds."""
-BLOCK_SIZES = (1, 4, 8, 16, 32)
+BLOCK_SIZE = 16
+"""Number of vertices per block of a large mesh."""
+MIN_BLOCK_VERTICES = 20_000
+"""Blocks are used from this number of vertices on, if most vertices lie in whole blocks. In smaller meshes the
+additional nodes take longer than they save: docs/experiments.md, What each mechanism brings."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class VertexOrder:
 
 
 def vertex_order(vertices_of_partitions: list[np.ndarray]) -> VertexOrder:
-    """Choose the block size that takes the least time. Each partition has its vertices in whole blocks first.
+    """Choose the block size. Each partition has its vertices in whole blocks first.
 
     Args:
         vertices_of_partitions: (Vp,) vertex indices of each partition, ascending.
@@ -75,17 +77,8 @@ def vertex_order(vertices_of_partitions: list[np.ndarray]) -> VertexOrder:
     partition_by_vertex = np.empty(vertex_count, np.int64)
     for index, vertices in enumerate(vertices_of_partitions):
         partition_by_vertex[vertices] = index
-
-    def gather_time_ns(block_size: int) -> float:
-        if block_size == 1:
-            return GATHER_NS * vertex_count
-        whole_count = _is_in_whole_block(partition_by_vertex, block_size).sum() // block_size
-        gathers = vertex_count // block_size + block_size * (-(-vertex_count // block_size) - whole_count)
-        copies = vertex_count * (3 if vertex_count % block_size else 2)
-        return GATHER_NS * gathers + COPY_NS * copies + EXTRA_NODES_NS
-
-    block_size = min(BLOCK_SIZES, key=gather_time_ns)
-    is_whole, columns = _is_in_whole_block(partition_by_vertex, block_size), []
+    is_whole, columns = _is_in_whole_block(partition_by_vertex, BLOCK_SIZE), []
+    block_size = BLOCK_SIZE if vertex_count >= MIN_BLOCK_VERTICES and is_whole.mean() > 0.5 else 1
     for vertices in vertices_of_partitions:
         padding = np.full(-len(vertices) % block_size, -1)
         columns.append(np.concatenate([vertices[is_whole[vertices]], vertices[~is_whole[vertices]], padding]))
