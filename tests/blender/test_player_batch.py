@@ -14,7 +14,7 @@ from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.network import Execution
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
-from .conftest import ELBOW, assert_plays, predicted_positions, run, train
+from .conftest import ELBOW, assert_plays, evaluated_positions, predicted_positions, run, train
 
 ROOT = Path(__file__).resolve().parents[2]
 CROWD = 20
@@ -98,6 +98,24 @@ def test_posing_one_character_of_a_crowd_is_one_network_call(bound_elbow, elbow_
     for frame in (3, 4, 5):
         bpy.context.scene.frame_set(frame)
         for mesh_object in crowd:
+            assert_plays(mesh_object, elbow_files.model)
+
+
+def test_posing_two_characters_of_a_crowd_keeps_the_positions_of_the_others(bound_elbow, elbow_files, calls):
+    crowd = crowd_of(bound_elbow, 6)
+    animate(crowd)
+    crowd[1].fdda.strength, crowd[4].fdda.strength = 0.5, 0.0
+    for frame in (1, 2, 3):
+        bpy.context.scene.frame_set(frame)
+    positions_before = [evaluated_positions(mesh_object) for mesh_object in crowd]
+    calls.clear()
+    for index in (0, 3):
+        armature_modifier(crowd[index]).object.pose.bones["lower"].rotation_euler[0] = -0.3
+    bpy.context.view_layer.update()
+    assert calls == [6]
+    for index, mesh_object in enumerate(crowd):
+        assert np.array_equal(evaluated_positions(mesh_object), positions_before[index]) is (index not in (0, 3))
+        if mesh_object.fdda.strength == 1:
             assert_plays(mesh_object, elbow_files.model)
 
 
