@@ -168,6 +168,7 @@ def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
     from ..core.poses import MAX_MARGIN
     from ..core.recording.index import read_index, read_info
+    from ..poses.sample_selection import REMIX_HINT
     from ..runtime.binding import model_disabled
     from .files import open_file
     from .progress import ProgressPrinter
@@ -213,6 +214,8 @@ def run(options: argparse.Namespace) -> None:
     rigs = _find_rigs(options)
     if not options.refine:
         _print_control_bones(rigs[0][0], options)
+        if options.action and options.poses != 0 and not options.sample and not options.detect_influences:
+            print(REMIX_HINT)
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:
         for scene_rig, _ in rigs:
@@ -233,10 +236,8 @@ def run(options: argparse.Namespace) -> None:
                     print(line)
             if repeatability := read_info(index).repeatability:
                 print(repeatability.sentence())
-        result_text = (
-            "influences" if options.detect_influences else f"{step.total} poses{' added' if options.refine else ''}"
-        )
-        print(f"{recording}: {result_text} in {seconds:.1f} s")
+        poses_text = f"{step.total} poses{' added' if options.refine else ''}"
+        print(f"{recording}: {'influences' if options.detect_influences else poses_text} in {seconds:.1f} s")
 
 
 def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":

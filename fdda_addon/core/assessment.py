@@ -63,7 +63,7 @@ def assess_training(report: Mapping) -> Assessment:
         warnings.append("Skinning alone already equals the rig, so a model brings nothing here.")
     elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
         warnings.append(
-            "The model is hardly closer than skinning alone: set Rotation Limits, raise Random Poses, and record again."
+            f"{_describe_no_gain(model, skinning)}: set Rotation Limits, raise Random Poses, and record again."
         )
     elif tail := _unimproved_tail(model, skinning):
         warnings.append(f"{tail}: press Add Poses at Worst Errors, then Continue Training.")
@@ -91,8 +91,8 @@ def assess_evaluation(
         )
     elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
         warnings.append(
-            "The model is hardly closer than skinning alone: these poses are unlike the recorded ones. Check this "
-            "action in Training Poses, record and train again."
+            f"{_describe_no_gain(model, skinning)}: these poses are unlike the recorded ones. Check this action in "
+            "Training Poses, record and train again."
         )
     elif tail := _unimproved_tail(model, skinning):
         warnings.append(
@@ -113,6 +113,18 @@ def describe_errors(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorSt
     return (
         f"{format_mm(model.mean)} mm from the rig on average, {comparison}; at most {format_mm(model.max)} mm, "
         f"skinning alone {format_mm(skinning.max)} mm."
+    )
+
+
+def farther_than_skinning_sentence(
+    model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors"
+) -> str:
+    """Return a sentence about a model that is farther from the rig than skinning alone; empty if it is closer."""
+    if model.mean <= skinning.mean or skinning.mean < MIN_SKINNING_ERROR_MM:
+        return ""
+    return (
+        f"The model is farther from the rig than linear skinning here, {format_mm(model.mean)} instead of "
+        f"{format_mm(skinning.mean)} mm on average: record an action with such poses, or play them without the model."
     )
 
 
@@ -182,6 +194,11 @@ def _unimproved_tail(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorS
         if _ratio(model_mm, skinning_mm) > MAX_GOOD_RATIO:
             return f"{label} {format_mm(model_mm)} mm, which hardly beats skinning alone ({format_mm(skinning_mm)} mm)"
     return ""
+
+
+def _describe_no_gain(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:
+    is_farther = model.mean > skinning.mean
+    return f"The model is {'farther from the rig' if is_farther else 'hardly closer'} than skinning alone"
 
 
 def _ratio(model_mm: float, skinning_mm: float) -> float:

@@ -112,7 +112,8 @@ def test_a_negative_learning_rate_fails(elbow_files, tmp_path, capfd):
 def test_record_prints_plain_lines_without_a_terminal(elbow_files, tmp_path, capfd):
     assert run("record", elbow_files.rig, tmp_path / "r", "--poses", 20, "--seed", 4, "--action", "elbow_wave") == 0
     captured = capfd.readouterr()
-    estimate, summary = captured.out.splitlines()
+    hint, estimate, summary = captured.out.splitlines()
+    assert hint.startswith("Hint: ")
     assert estimate.startswith("50 poses of 300 vertices: less than 1 MB on the disk, about ")
     assert summary.startswith(f"{tmp_path / 'r'}: 50 poses in ")
     lines = captured.err.splitlines()

@@ -7,13 +7,14 @@ import bpy
 import numpy as np
 import pytest
 
+from fdda_addon.cli.evaluate import table
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.poses import sample_pose, widen_ranges
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearSkinning
-from fdda_addon.evaluation.results import Evaluation
+from fdda_addon.evaluation.results import Evaluation, PoseErrors
 from fdda_addon.evaluation.run import FIRST_HELD_OUT_INDEX, EvaluationSettings, NamedPose, evaluate, evaluate_action
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.rig.reading import read_rig
@@ -35,6 +36,16 @@ def report(elbow_files, tmp_path_factory) -> dict:
     options = ["--poses", 12, "--seed", 3, "--action", "elbow_wave", "--range-scale", 1.5, "--range-scale", 2]
     assert run("evaluate", elbow_files.rig, elbow_files.model, "--json", path, *options) == 0
     return json.loads(path.read_text())
+
+
+def test_the_table_says_where_the_model_is_farther_than_linear_skinning():
+    arrays = np.zeros((2, 1, 4, 4), np.float32), np.zeros((2, 3, 3), np.float32), np.zeros((2, 0), np.float32)
+    near, far = np.full((2, 3), 0.001, np.float32), np.full((2, 3), 0.002, np.float32)
+    walk, run_errors = PoseErrors("walk", *arrays, fdda=far, linear=near), PoseErrors("run", *arrays, near, far)
+    lines = table(Evaluation((), (), walk, [walk, run_errors])).splitlines()
+    (index,) = (index for index, line in enumerate(lines) if "farther from the rig than linear skinning" in line)
+    assert "2.0 instead of 1.0 mm on average" in lines[index]
+    assert lines.index("walk, 2 poses") < index < lines.index("run, 2 poses")
 
 
 def test_the_report_has_its_documented_keys(report):

@@ -123,3 +123,20 @@ def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
     bpy.data.actions[WAVE].fdda.record = True
     assert recording_settings(waving).sample == ("remix",)
     assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
+
+
+@pytest.mark.parametrize(
+    "options, has_hint",
+    [
+        (["--action", WAVE], True),
+        (["--action", WAVE, "--sample", "remix"], False),
+        (["--action", WAVE, "--poses", 0], False),
+        ([], False),
+    ],
+)
+def test_recording_actions_with_random_poses_suggests_to_remix(waving, tmp_path, capsys, options, has_hint):
+    path = tmp_path / "rig.blend"
+    save_copy(path)
+    poses = [] if "--poses" in options else ["--poses", 12]
+    assert run("record", path, tmp_path / "recording", *poses, *options) == 0
+    assert ("with --sample remix they combine limbs" in capsys.readouterr().out) == has_hint

@@ -11,7 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.assessment import assess_evaluation, assess_training, format_mm, rising_from_epoch
+from fdda_addon.core.assessment import (
+    assess_evaluation,
+    assess_training,
+    farther_than_skinning_sentence,
+    format_mm,
+    rising_from_epoch,
+)
 from fdda_addon.core.metrics import ErrorStatistics
 
 REPORTS = Path(__file__).with_name("reports")
@@ -97,10 +103,23 @@ def test_an_evaluation_is_assessed_with_what_to_do_next():
     assert "open Confidence in This Pose" in beyond.warnings[0] and beyond.next_step == ""
     unlike = assess_evaluation(statistics(1.9, 19.0, 24.0), skinning)
     assert unlike.warnings[0].startswith("The model is hardly closer than skinning alone: these poses are unlike")
+    worse = assess_evaluation(statistics(2.1, 19.0, 24.0), skinning)
+    assert worse.warnings[0].startswith("The model is farther from the rig than skinning alone: these poses are unlike")
     other = assess_evaluation(statistics(0.1, 1.0, 2.0), skinning, is_bound=False)
     assert other.warnings == ("Another model is bound now: press Evaluate again.",)
     still = assess_evaluation(statistics(0.0, 0.0, 0.0), statistics(0.0, 0.0, 0.0))
     assert still.warnings[0].startswith("Skinning alone already equals the rig") and "inf" not in still.sentence
+
+
+def test_a_model_that_is_farther_than_skinning_is_named():
+    skinning = statistics(0.394, 4.0, 60.0)
+    assert farther_than_skinning_sentence(statistics(0.549, 3.0, 50.0), skinning) == (
+        "The model is farther from the rig than linear skinning here, 0.55 instead of 0.39 mm on average: record an "
+        "action with such poses, or play them without the model."
+    )
+    assert farther_than_skinning_sentence(statistics(0.39, 9.0, 90.0), skinning) == ""
+    # Ratios of errors that nobody sees mean nothing.
+    assert farther_than_skinning_sentence(statistics(0.009, 0.1, 0.2), statistics(0.001, 0.1, 0.2)) == ""
 
 
 @pytest.mark.parametrize(
