@@ -3,6 +3,8 @@
 
 ALL, AUTO = "all", "auto"
 """Values of the option `joints` besides a number of joints."""
+KEY_JOINTS_STAGE = "key joints"
+"""Name of the stage of `Progress` in which key joints are chosen."""
 
 
 def parse_joints(text: str) -> str:

@@ -82,7 +82,7 @@ def recording_steps(pose_count: int, fits_weights: bool = False, has_target: boo
     """Return the steps of a recording."""
     steps = []
     if fits_weights:
-        steps.append(JobStep("fitting the skinning", ("poses to fit", "fit"), 10.0))
+        steps.append(JobStep("fitting the skinning", ("poses to fit", "key joints", "fit"), 10.0))
     if has_target:
         steps.append(JobStep("checking the object", ("target",), None, 1))
     steps.append(JobStep("testing bones", ("influences",)))

@@ -12,6 +12,7 @@ CHARACTER, ENVIRONMENT = "character", "environment"
 of Blender and continues."""
 STAGE_UNITS = {
     "fit": "vertices fitted",
+    "key joints": "bones compared with others",
     "probes": "poses compared with the rig",
     "target": "poses of the target checked",
     "epochs": "training passes",
@@ -25,7 +26,7 @@ STAGE_UNITS = {
 }
 """Labels of the steps of a stage, where they differ from the name of the stage."""
 PREPARING_STAGES = {
-    *("influences", "starting", "partitions prepared", "poses to fit", "fit", "target", "probes"),
+    *("influences", "starting", "partitions prepared", "poses to fit", "key joints", "fit", "target", "probes"),
     *("full rig", "repeated poses", "fast rig"),
 }
 """Stages that are always followed by another stage of the same job."""

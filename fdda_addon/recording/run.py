@@ -55,8 +55,9 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         settings: settings of the recording.
 
     Yields:
-        Progress of the stages "influences" and "poses". If weights are fitted, the stages "poses to fit" and "fit" come
-        first. The first progress of "poses" has a note with the estimated time and disk space.
+        Progress of the stages "influences" and "poses". If weights are fitted, the stages "poses to fit", "key joints"
+        if these are chosen, and "fit" come first. The first progress of "poses" has a note with the estimated time and
+        disk space.
 
     Raises:
         RigError: the rig cannot be recorded.

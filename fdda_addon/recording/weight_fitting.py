@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import RecordingError, RigError, TrainingError
-from ..core.joint_option import ALL
+from ..core.joint_option import ALL, KEY_JOINTS_STAGE
 from ..core.key_joints import KeyJointReport
 from ..core.messages import MessageType
 from ..core.poses import CONTROL, Channel
@@ -154,7 +154,8 @@ def fit_weights(
         evaluator: evaluator of the poses.
 
     Yields:
-        Progress of the stages "poses to fit" and "fit". It has a note if no joint can be removed.
+        Progress of the stages "poses to fit", "key joints" if these are chosen, and "fit". It has a note if no joint
+        can be removed.
 
     Raises:
         RigError: the weights of the rig are needed, and there are none.
@@ -207,7 +208,10 @@ def _run_fit(folder: Path, rig: Rig, request: FitRequest) -> Generator[Progress,
             if message is None:
                 time.sleep(WAIT_SECONDS)
             elif message.type is MessageType.PROGRESS:
-                progress = Progress("fit", int(message.values["done"]), vertex_count)
+                done = int(message.values["done"])
+                progress = Progress("fit", done, vertex_count)
+                if message.values.get("stage") == KEY_JOINTS_STAGE:
+                    progress = Progress(KEY_JOINTS_STAGE, done, int(message.values["total"]))
             elif message.type is MessageType.FINISHED:
                 values = message.values
                 return SkinFit.from_json(values["fit"]) if values["fit"] else _read_report(values)

@@ -236,6 +236,14 @@ def test_a_root_that_follows_another_is_moved_with_it(tmp_path):
     assert influences and influences.isdisjoint({"world", "bone.0"})
 
 
+def test_the_search_shows_its_progress(tmp_path):
+    steps = list(record(build_limb(), tmp_path / "recording", SETTINGS))
+    searches = [step for step in steps if step.stage == "key joints"]
+    assert searches and all(0 <= step.done <= step.total for step in searches)
+    stages = list(dict.fromkeys(step.stage for step in steps))
+    assert stages[:2] == ["poses to fit", "fit"] or stages[:2] == ["poses to fit", "key joints"]
+
+
 def test_a_resumed_recording_keeps_its_joints(tmp_path, monkeypatch):
     others = [dataclasses.replace(SETTINGS, joints=joints) for joints in ("all", "3")]
     check_resuming(build_limb(), tmp_path, SETTINGS, others, "--joints auto", monkeypatch)

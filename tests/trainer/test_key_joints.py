@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.joint_option import KEY_JOINTS_STAGE
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fitted_weights, read_key_joints
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning
@@ -253,6 +254,9 @@ def test_weights_are_fitted_to_key_joints(tmp_path):
     assert set(np.unique(joints[weights > 0])) <= set(key_joints.tolist())
     assert needed_inputs.shape == (poses.rig.vertex_count, len(key_joints))
     assert sink.messages[-1][1]["fit"] == fit.to_json()
+    searches = [values for _, values in sink.messages if values.get("stage") == KEY_JOINTS_STAGE]
+    assert {values["total"] for values in searches} == {len(names)}
+    assert 0 <= min(values["done"] for values in searches) < max(values["done"] for values in searches) <= len(names)
 
 
 @pytest.mark.parametrize("stopped_call", [1, 4])

@@ -46,6 +46,7 @@ def choose_key_joints(
     static_joints: np.ndarray,
     metres_per_unit: float,
     should_stop: Callable[[], bool] = lambda: False,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Choice:
     """Choose key joints by random poses.
 
@@ -61,6 +62,7 @@ def choose_key_joints(
         static_joints: (J,) bool, joints that are kept in any case.
         metres_per_unit: as in `Rig`.
         should_stop: called often.
+        on_progress: called often, with the number of decided joints and of those that may be removed.
 
     Raises:
         Cancelled: `should_stop` returned True.
@@ -87,7 +89,13 @@ def choose_key_joints(
     tolerance = TOLERANCE_RATIO * poses.rig.size
     is_unseen = is_still & (_measure_unseen_motions(all_poses, random_count, moments) > tolerance)
     search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
-    result = search.search(None if requested == AUTO else int(requested), should_stop)
+
+    def on_step(done: int, total: int) -> None:
+        if should_stop():
+            raise Cancelled
+        on_progress(done, total)
+
+    result = search.search(None if requested == AUTO else int(requested), on_step)
 
     acts = _acting_joints(rig.skin_joints, rig.skin_weights, joint_count)
     patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))

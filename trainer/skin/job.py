@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdda_addon.core.joint_option import ALL
+from fdda_addon.core.joint_option import ALL, KEY_JOINTS_STAGE
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted_weights, write_key_joints
@@ -68,7 +68,7 @@ def fit_folder(
     """
     started = time.perf_counter()
     poses = read_fit_poses(folder)
-    choice = _choose(poses, request, metres_per_unit, should_stop) if request.joints != ALL else None
+    choice = _choose(poses, request, metres_per_unit, sink, should_stop) if request.joints != ALL else None
     if choice and len(choice.joints) == len(poses.rig.joints):
         values = {"fit": None, "key_joints": choice.report.to_json()}
         sink.send(MessageType.FINISHED, seconds=time.perf_counter() - started, **values)
@@ -95,10 +95,19 @@ def fit_folder(
 
 
 def _choose(
-    poses: FitPoses, request: KeyJointRequest, metres_per_unit: float, should_stop: Callable[[], bool]
+    poses: FitPoses,
+    request: KeyJointRequest,
+    metres_per_unit: float,
+    sink: MessageSink,
+    should_stop: Callable[[], bool],
 ) -> Choice:
+    def on_progress(done: int, total: int) -> None:
+        sink.send(MessageType.PROGRESS, stage=KEY_JOINTS_STAGE, done=done, total=total)
+
     is_static = np.arange(len(poses.rig.joints)) == request.static_joint
-    return choose_key_joints(poses, request.random_poses, request.joints, is_static, metres_per_unit, should_stop)
+    return choose_key_joints(
+        *(poses, request.random_poses, request.joints, is_static, metres_per_unit, should_stop, on_progress)
+    )
 
 
 def measure(poses: FitPoses, fitted: Rig) -> FitReport:

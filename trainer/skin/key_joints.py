@@ -21,7 +21,6 @@ import numpy as np
 from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.skinning import skin_matrices
 
-from ..process import Cancelled
 from .input_blocks import MIN_SPREAD, InputBlocks, predict
 
 TOLERANCE_RATIO = 2.5e-4
@@ -160,20 +159,20 @@ class KeyJointSearch:
             motions[joint, joint] = np.inf
         return motions
 
-    def search(self, count: int | None = None, should_stop: Callable[[], bool] = lambda: False) -> KeyJoints:
+    def search(
+        self, count: int | None = None, on_step: Callable[[int, int], None] = lambda done, total: None
+    ) -> KeyJoints:
         """Remove joints whose unexplained motion is within the tolerance, or until `count` joints are left.
 
-        At least one joint is left besides those that are never removed.
-
-        Raises:
-            Cancelled: `should_stop` returned True.
+        At least one joint is left besides those that are never removed. `on_step` is called often, with the number of
+        decided joints and of those that may be removed; it may raise an exception.
         """
         queue = [self._queue_entry(joint, 0.0) for joint in np.flatnonzero(~self._is_required).tolist()]
         heapq.heapify(queue)
+        total = len(queue)
         min_count, waiting = max(count or 1, int(self._is_required.sum()) + 1), set()
         while queue and self._is_kept.sum() > min_count:
-            if should_stop():
-                raise Cancelled
+            on_step(total - len(queue) - len(waiting), total)
             *_, joint = heapq.heappop(queue)
             if self._carries_children(joint):
                 waiting.add(joint)
