@@ -2,6 +2,7 @@
 """Patches: small parts of partitions, on which few joints act even where a partition is as large as the body."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,18 +27,32 @@ class Patches:
     starts: np.ndarray
     partition_starts: np.ndarray
 
-    def max_changes(self, residuals: np.ndarray, base_residuals: np.ndarray) -> np.ndarray:
-        """Compute the largest change of a local residual in each patch.
+    @cached_property
+    def partition_of_patch(self) -> np.ndarray:
+        """(Q,) index of the partition of each patch."""
+        counts = np.diff(np.append(self.partition_starts, len(self.starts)))
+        return np.repeat(np.arange(len(counts)), counts)
+
+    def sort(self, vectors: np.ndarray) -> np.ndarray:
+        """Sort (..., V, 3) vectors of vertices by patch."""
+        return np.take(vectors, self.vertices, axis=-2)
+
+    def select(self, patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Select the vertices of patches.
 
         Args:
-            residuals: (N, V, 3) float32 local residuals, axes of the main joint, mesh units.
-            base_residuals: local residuals to compare with, of N poses or of one pose.
+            patches: (K,) ascending indices of patches.
 
         Returns:
-            (N, Q) float32, mesh units.
+            Ascending indices in sorted vectors, and (K,) the index of the first one of each patch.
         """
-        distances = np.linalg.norm(residuals - base_residuals, axis=2)
-        return np.maximum.reduceat(distances[:, self.vertices], self.starts, axis=1)
+        sizes = np.diff(np.append(self.starts, len(self.vertices)))[patches]
+        starts = np.cumsum(sizes) - sizes
+        return np.repeat(self.starts[patches] - starts, sizes) + np.arange(sizes.sum()), starts
+
+    def any_of_partition(self, of_patches: np.ndarray) -> np.ndarray:
+        """Return (N, P) bool: whether (N, Q) bool values are true for any patch of a partition."""
+        return np.logical_or.reduceat(of_patches, self.partition_starts, axis=1)
 
     def nearby_joints(self, rig: Rig) -> np.ndarray:
         """Find the joints with a weight on a vertex of a patch, or on a vertex that an edge connects with it.
@@ -59,6 +74,19 @@ class Patches:
             has_weight = rig.skin_weights[weighted, slot] > 0
             nearby[rig.skin_joints[weighted[has_weight], slot], patch_of_vertex[near[has_weight]]] = True
         return nearby
+
+
+def largest_norms(vectors: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Compute the largest norm in each of K patches.
+
+    Args:
+        vectors: (..., V, 3) vectors of vertices, sorted by patch.
+        starts: (K,) index of the first vertex of each patch.
+
+    Returns:
+        (..., K).
+    """
+    return np.maximum.reduceat(np.linalg.norm(vectors, axis=-1), starts, axis=-1)
 
 
 def divide_into_patches(rig: Rig, partitions: tuple[Partition, ...], max_vertices: int = MAX_PATCH_VERTICES) -> Patches:

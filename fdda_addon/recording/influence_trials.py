@@ -30,6 +30,11 @@ from .joint_override import JointOverride, override_joints
 
 JOINT = "joint"
 """Kind of an input that is a joint; the other kind is `CONTROL`."""
+MIN_DRAWN_POSES = 20
+"""Smallest number of drawn poses. In a trial, each input moves to its value in the one that is farthest from the base
+pose: large motions show more influences, so few trials are enough."""
+MIN_CHANNEL_RANGE = 1e-12
+"""Range of a channel that does not move, so that nothing is divided by zero; in the unit of the channel."""
 MIN_TRANSFORM_CHANGE = 1e-5
 """Smallest change of a joint's relative transform between poses that counts as motion (no unit, or meters)."""
 
@@ -45,7 +50,7 @@ class InfluenceSearch:
         stop_playback: ends the playback of `show_pose`.
         has_other_bones: bones other than the joints may deform the surface, because it is that of a target, or because
             the joints are key joints.
-        poses: number of times that each joint is moved.
+        poses: number of base poses, from each of which every joint is moved: the rest pose, then random poses.
         tolerance: a joint influences a partition when it changes a local residual by more than this ratio of the
             rig's size.
     """
@@ -57,6 +62,11 @@ class InfluenceSearch:
     poses: int = INFLUENCE_POSES
     tolerance: float = INFLUENCE_TOLERANCE
     has_other_bones: bool = False
+
+    @property
+    def drawn_poses(self) -> int:
+        """Number of poses that are drawn, as base poses and for the values to which inputs move."""
+        return max(MIN_DRAWN_POSES, self.poses)
 
 
 class Trials(Protocol):
@@ -80,11 +90,11 @@ def prepared_trials(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch) -> I
     if not follows_control_bones(scene_rig, rig, search.channels):
         yield _ChannelTrials(scene_rig, rig, search)
     else:
-        states = _sample_states(scene_rig, rig, search, 2 * search.poses)
+        states = _sample_states(scene_rig, rig, search, search.drawn_poses)
         clear_pose(scene_rig.armature_object)
         with override_joints(scene_rig, rig.joints, search.has_other_bones) as override:
             leaders = _find_leading_roots(rig, states, override.rest) if search.has_other_bones else {}
-            yield _OverrideTrials(scene_rig, rig, states, override, leaders)
+            yield _OverrideTrials(scene_rig, rig, states, override, leaders, search.poses)
     clear_pose(scene_rig.armature_object)
 
 
@@ -124,20 +134,20 @@ class _ChannelTrials:
                 channel_indices.setdefault((CONTROL, moved_bones[channel.name][0]), []).append(channel_index)
         self.inputs = sorted(channel_indices, key=lambda item: (item[0] == CONTROL, item[1]))
         self._channels_of_inputs = [channel_indices[moved_input] for moved_input in self.inputs]
-        self._joint_count = len(joints)
-        # The base pose is the rest pose in half of the trials, and a random pose in the others.
+        poses = np.stack([search.draw_values(index) for index in range(search.drawn_poses)])
         rest_values = np.array([channel.rest for channel in channels])
-        self._base_poses = [rest_values] * (search.poses - search.poses // 2) + [
-            search.draw_values(index) for index in range(search.poses // 2)
+        self._base_poses = np.stack([rest_values, *poses[: search.poses - 1]])
+        ranges = np.maximum(np.ptp(poses, axis=0), MIN_CHANNEL_RANGE)
+        distances = np.square((poses - self._base_poses[:, None]) / ranges)  # (base pose, pose, channel)
+        self._moved_poses = [
+            poses[distances[..., indices].sum(axis=2).argmax(axis=1)] for indices in self._channels_of_inputs
         ]
 
     def show(self, trial: int, moved: Sequence[int]) -> None:
         values = self._base_poses[trial].copy()
         for number in moved:
-            kind, index = self.inputs[number]
-            sample_offset = index if kind != CONTROL else self._joint_count + index
-            moved_values = self._search.draw_values((sample_offset + 1) * self._search.poses + trial)
-            values[self._channels_of_inputs[number]] = moved_values[self._channels_of_inputs[number]]
+            indices = self._channels_of_inputs[number]
+            values[indices] = self._moved_poses[number][trial, indices]
         self._poser.set(values)
 
 
@@ -151,6 +161,7 @@ class _OverrideTrials:
         states: "list[_PoseState]",
         override: JointOverride,
         leading_roots: dict[int, int],
+        trial_count: int,
     ):
         self._followers: dict[int, list[int]] = {}
         for follower, leader in leading_roots.items():
@@ -176,16 +187,40 @@ class _OverrideTrials:
         self.undetectable_controls -= frozenset(self._movable_controls)
         self.inputs = [(JOINT, index) for index in moving_joints if index not in leading_roots]
         self.inputs += [(CONTROL, index) for index in sorted([*self._movable_controls, *self._bone_of_control])]
-        trial_count = len(states) // 2
         rest_state = _PoseState(override.rest, states[0].controls, dict.fromkeys(bones, Matrix()))
-        self._base_states = [rest_state] * (trial_count - trial_count // 2) + states[: trial_count // 2]
-        self._moved_states = states[trial_count:]
+        self._base_states = [rest_state, *states][:trial_count]
+        values = np.stack([self._input_values(state) for state in states])
+        self._moved_states = []
+        for base_state in self._base_states:
+            distances = np.square(values - self._input_values(base_state)).sum(axis=2)
+            self._moved_states.append([states[index] for index in distances.argmax(axis=0)])
+
+    def _input_values(self, state: "_PoseState") -> np.ndarray:
+        """Return the values of all inputs in a state, (N, 16); lengths relative to the size of the rig."""
+        values = np.zeros((len(self.inputs), 4, 4))
+        for number, (kind, index) in enumerate(self.inputs):
+            if kind == JOINT:
+                values[number] = state.joints[index]
+            elif index in self._bone_of_control:
+                values[number] = np.array(state.bones[self._bone_of_control[index]])
+            else:
+                values[number, 0, 0] = state.controls[index]
+        values[:, :3, 3] /= self._rig.size
+        return values.reshape(-1, 16)
 
     def show(self, trial: int, moved: Sequence[int]) -> None:
-        inputs = [self.inputs[number] for number in moved]
-        joints = [index for kind, index in inputs if kind == JOINT]
-        inputs += [(JOINT, follower) for index in joints for follower in self._followers.get(index, ())]
-        state = self._base_states[trial].with_inputs_of(self._moved_states[trial], inputs, self._bone_of_control)
+        state = self._base_states[trial].copy()
+        for number in moved:
+            kind, index = self.inputs[number]
+            moved_state = self._moved_states[trial][number]
+            if kind == JOINT:
+                joints = [index, *self._followers.get(index, ())]
+                state.joints[joints] = moved_state.joints[joints]
+            elif index in self._bone_of_control:
+                bone = self._bone_of_control[index]
+                state.bones[bone] = moved_state.bones[bone]
+            else:
+                state.controls[index] = moved_state.controls[index]
         self._override.set(state.joints)
         for index in self._movable_controls:
             set_control(self._scene_rig, self._rig.controls[index].name, float(state.controls[index]))
@@ -207,19 +242,8 @@ class _PoseState:
     controls: np.ndarray
     bones: dict[str, Matrix]
 
-    def with_inputs_of(
-        self, other: "_PoseState", inputs: list[tuple[str, int]], bone_of_control: dict[int, str]
-    ) -> "_PoseState":
-        """Return a copy in which some joints, controls and control bones have their values in another state."""
-        joints, controls, bones = self.joints.copy(), self.controls.copy(), dict(self.bones)
-        for kind, index in inputs:
-            if kind != CONTROL:
-                joints[index] = other.joints[index]
-            elif index in bone_of_control:
-                bones[bone_of_control[index]] = other.bones[bone_of_control[index]]
-            else:
-                controls[index] = other.controls[index]
-        return _PoseState(joints, controls, bones)
+    def copy(self) -> "_PoseState":
+        return _PoseState(self.joints.copy(), self.controls.copy(), dict(self.bones))
 
 
 def _find_leading_roots(rig: Rig, states: list[_PoseState], rest: np.ndarray) -> dict[int, int]:

@@ -2,7 +2,8 @@
 """Detects the joints and controls that influence each partition (Bailey et al. 2018, section 3.3).
 
 The paper moves one joint at a time. Here joints that do not act on the same patches of the mesh (`core.patches`) are
-moved at the same time (`core.group_testing`), from the rest pose and from random poses.
+moved at the same time (`core.group_testing`), from the rest pose and from random poses, each to a value far from its
+own in that pose.
 """
 
 from collections.abc import Generator
@@ -34,7 +35,7 @@ def detect_influences(
     The caller restores the pose of the armature and the values of sampled controls.
 
     Yields:
-        Progress of the stage "influences". Its total grows when groups are tested again.
+        Progress of the stage "influences". Its total grows when inputs are divided into groups again.
 
     Returns:
         The partitions with their influencing joints and controls.
@@ -46,9 +47,8 @@ def detect_influences(
         for number, (kind, index) in enumerate(trials.inputs):
             if kind == JOINT:
                 nearby[number] = joints_near_patches[index]
-        evaluation = _GroupEvaluation(rig, partitions, patches, evaluator, search.tolerance, trials)
-        influences_on_patches = yield from _test_groups(nearby, trials.inputs, evaluation, search.poses)
-    influences = np.logical_or.reduceat(influences_on_patches, patches.partition_starts, axis=1)
+        evaluation = _GroupEvaluation(rig, partitions, patches, evaluator, search, trials)
+        influences = yield from _test_groups(nearby, trials.inputs, evaluation, search.poses)
     # The first control of a bone stands for all controls of its transform.
     controls_of_bones = {indices[0]: indices for indices in controls_by_bone(rig.controls).values()}
     by_kind: dict[str, dict[int, tuple[int, ...]]] = {JOINT: {}, CONTROL: {}}
@@ -66,17 +66,14 @@ def detect_influences(
 def _test_groups(
     nearby: np.ndarray, inputs: list[tuple[str, int]], evaluation: "_GroupEvaluation", trial_count: int
 ) -> Generator[Progress, None, np.ndarray]:
-    """Test groups of N inputs until all answers are attributed; return the influences on Q patches, (N, Q) bool."""
+    """Test groups of N inputs in each trial; return the influences on P partitions, (N, P) bool."""
     if not inputs:
-        return nearby
-    testing = GroupTesting(nearby, np.array([kind for kind, _ in inputs]), trial_count)
-    divisions = [testing.divide_inputs() for _ in range(trial_count)]
-    evaluation.expect(trial_count + sum(map(len, divisions)))
-    for trial, groups in enumerate(divisions):
-        testing.add_changes(trial, groups, (yield from evaluation.evaluate(trial, groups)))
-    while (test := testing.next_groups()) is not None:
-        evaluation.expect(len(test[1]))
-        testing.add_changes(*test, (yield from evaluation.evaluate(*test)))
+        return evaluation.patches.any_of_partition(nearby)
+    testing = GroupTesting(nearby, np.array([kind for kind, _ in inputs]), evaluation.patches)
+    for trial in range(trial_count):
+        testing.start_trial()
+        while groups := testing.next_groups():
+            testing.add_changes(groups, (yield from evaluation.evaluate(trial, groups)))
     return testing.influences
 
 
@@ -89,25 +86,26 @@ class _GroupEvaluation:
         partitions: tuple[Partition, ...],
         patches: Patches,
         evaluator: PoseEvaluator,
-        tolerance: float,
+        search: InfluenceSearch,
         trials: Trials,
     ):
-        self._patches, self._evaluator, self._trials = patches, evaluator, trials
+        self.patches, self._evaluator, self._trials = patches, evaluator, trials
         self._skinning = LinearSkinning(rig, partitions)
         # Far from the origin, rounding moves vertices, so the threshold must be larger.
         self._threshold = max(
-            tolerance * rig.size, 2 * FLOAT32_ROUNDING_RATIO * float(np.abs(rig.rest_positions).max())
+            search.tolerance * rig.size, 2 * FLOAT32_ROUNDING_RATIO * float(np.abs(rig.rest_positions).max())
         )
         self._batch_size = max(1, min(MAX_BATCH_GROUPS, BATCH_BYTES // (12 * rig.vertex_count)))
         self._base_residuals: dict[int, np.ndarray] = {}
-        self._done = self._total = 0
-
-    def expect(self, count: int) -> None:
-        """Add a number of evaluations to the total of the progress."""
-        self._total += count
+        self._done, self._counts = 0, [0] * search.poses
 
     def evaluate(self, trial: int, groups: list[np.ndarray]) -> Generator[Progress, None, np.ndarray]:
-        """Evaluate groups in a trial; return the change of each patch relative to the threshold, (G, Q) float32."""
+        """Evaluate groups in a trial; return the change of each vertex relative to the threshold, sorted by patch.
+
+        Returns:
+            (G, V, 3) float32, axes of the main joints.
+        """
+        self._counts[trial] += len(groups) + (trial not in self._base_residuals)
         if trial not in self._base_residuals:
             self._trials.show(trial, ())
             self._base_residuals[trial] = self._residuals([self._evaluator.evaluate()[:2]])
@@ -117,15 +115,17 @@ class _GroupEvaluation:
             self._trials.show(trial, group.tolist())
             evaluated_poses.append(self._evaluator.evaluate()[:2])
             if len(evaluated_poses) == self._batch_size or number == len(groups):
-                residuals = self._residuals(evaluated_poses)
-                changes.append(self._patches.max_changes(residuals, self._base_residuals[trial]))
+                batch = self._residuals(evaluated_poses) - self._base_residuals[trial]
+                changes.append(self.patches.sort(batch) / self._threshold)
                 evaluated_poses = []
             yield self._progress()
-        return np.concatenate(changes) / self._threshold
+        return np.concatenate(changes)
 
     def _progress(self) -> Progress:
         self._done += 1
-        return Progress("influences", self._done, self._total)
+        # The trials to come are as long as the longest so far.
+        total = sum(self._counts) + self._counts.count(0) * max(self._counts)
+        return Progress("influences", self._done, total)
 
     def _residuals(self, evaluated_poses: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         return self._skinning.local_residuals(*(np.stack(arrays) for arrays in zip(*evaluated_poses, strict=True)))

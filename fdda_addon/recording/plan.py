@@ -48,7 +48,7 @@ class RecordingSettings:
             margin.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
-        influence_poses: number of times that each joint is moved alone to find the partitions that it influences.
+        influence_poses: number of base poses from which joints are moved, to find the partitions that they influence.
         influence_tolerance: a joint influences a residual that it changes by more than this ratio of the rig's size.
         resume: continue an interrupted recording.
         overwrite: replace a recording in the folder.

@@ -15,13 +15,11 @@ from blend_fixtures.characters.bones import (
     add_bones,
     limit,
 )
-from fdda_addon.core.group_testing import GroupTesting
-from fdda_addon.core.partition import INFLUENCE_TOLERANCE
-from fdda_addon.core.patches import Patches
+from fdda_addon.core import group_testing
+from fdda_addon.core.patches import largest_norms
 from fdda_addon.recording import influences
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.scene_rig import find_rig
 
 TRIALS = 4
@@ -94,28 +92,29 @@ def chains_on_controls() -> None:
 def find_influences(
     monkeypatch: pytest.MonkeyPatch, folder: Path, is_grouped: bool, sample: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (N, Q) influences on patches, and the changes in each evaluation as ratios of the tolerance."""
+    """Return the (N, P) influences, and the changes of partitions in each evaluation as ratios of the tolerance."""
     changes, found = [], []
 
-    def max_changes(*arguments) -> np.ndarray:
-        changes.append(original_changes(*arguments))
-        return changes[-1]
+    def evaluate(evaluation, *arguments):
+        group_changes = yield from original_evaluate(evaluation, *arguments)
+        norms = largest_norms(group_changes, evaluation.patches.starts)
+        changes.append(np.maximum.reduceat(norms, evaluation.patches.partition_starts, axis=1))
+        return group_changes
 
     def test_groups(*arguments):
         found.append((yield from original_test_groups(*arguments)))
         return found[0]
 
-    original_changes, original_test_groups = Patches.max_changes, influences._test_groups
-    rig = find_rig()
+    original_evaluate, original_test_groups = influences._GroupEvaluation.evaluate, influences._test_groups
     with monkeypatch.context() as patches:
-        patches.setattr(Patches, "max_changes", max_changes)
+        patches.setattr(influences._GroupEvaluation, "evaluate", evaluate)
         patches.setattr(influences, "_test_groups", test_groups)
         if not is_grouped:
-            patches.setattr(GroupTesting, "divide_inputs", lambda self: np.arange(len(self.influences))[:, None])
+            patches.setattr(group_testing, "MAX_INPUTS_PER_GROUP", 1000)
         settings = RecordingSettings(poses=1, influence_poses=TRIALS, detect_influences=True, sample=sample)
-        for _ in record(rig, folder, settings):
+        for _ in record(find_rig(), folder, settings):
             pass
-    return found[0], np.concatenate(changes) / (INFLUENCE_TOLERANCE * read_rig(rig).size)
+    return found[0], np.concatenate(changes)
 
 
 @pytest.mark.parametrize(
