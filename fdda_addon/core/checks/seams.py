@@ -3,7 +3,7 @@
 
 Importers of game formats split a vertex wherever its normal or UV differs, so that faces lie side by side without being
 connected. Modifiers that smooth then move each piece alone. Its tangents depend on tiny differences, and the surface
-jumps and opens in cracks, which no network can learn (docs/experiments.md, Characters that others made).
+jumps and opens in cracks, which no network can learn (docs/characters.md, Characters that others made).
 """
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from ..partition import main_joints
 from ..recording.reader import Recording
 from ..rig import Rig
+from ..surface import adjacent_corners
 from .warning import RecordingWarning, format_length
 
 POSITION_DIGITS = 5
@@ -18,7 +19,7 @@ POSITION_DIGITS = 5
 WEIGHT_DIGITS = 4
 """Skin weights are equal to this number of decimal digits."""
 MIN_GAP_RATIO = 1e-3
-"""Smallest gap between two vertices, as a ratio of the rig's size."""
+"""Smallest change of a gap between two vertices, as a ratio of the rig's size."""
 MAX_TORN_RATIO = 0.01
 """Largest ratio of vertices that come apart without a warning."""
 MAX_POSES = 50
@@ -26,45 +27,79 @@ MAX_POSES = 50
 
 
 def check_seams(recording: Recording) -> list[RecordingWarning]:
-    """Return the warning "open-seams" if vertices that lie on each other at rest come apart in the poses."""
+    """Return the warning "open-seams" if cuts open in the poses; none if the faces of the recording are unknown.
+
+    Gaps that are the same in all poses can be learned, so they do not count.
+    """
     rig, pose_count = recording.rig, len(recording.residuals)
-    vertices, groups = _coincident_vertices(rig)
-    if len(vertices) <= MAX_TORN_RATIO * rig.vertex_count:
+    pairs = _seam_pairs(rig)
+    if len(np.unique(pairs)) <= MAX_TORN_RATIO * rig.vertex_count:
         return []
-    counts, gaps = np.bincount(groups), np.zeros(len(vertices))
+    changes, gaps, first_gaps = np.zeros(len(pairs)), np.zeros(len(pairs)), None
     for pose in np.unique(np.linspace(0, pose_count - 1, MAX_POSES).round().astype(np.int64)):
-        residuals = np.array(recording.residuals[pose])[vertices].astype(np.float64)
-        means = np.stack([np.bincount(groups, values) for values in residuals.T], axis=1) / counts[:, None]
-        np.maximum(gaps, 2 * np.linalg.norm(residuals - means[groups], axis=1), out=gaps)
-    torn_count = int((gaps > MIN_GAP_RATIO * rig.size).sum())
+        residuals = np.array(recording.residuals[pose])
+        pose_gaps = residuals[pairs[:, 0]].astype(np.float64) - residuals[pairs[:, 1]]
+        first_gaps = pose_gaps if first_gaps is None else first_gaps
+        np.maximum(gaps, np.linalg.norm(pose_gaps, axis=1), out=gaps)
+        np.maximum(changes, np.linalg.norm(pose_gaps - first_gaps, axis=1), out=changes)
+    is_torn = changes > MIN_GAP_RATIO * rig.size
+    torn_count = len(np.unique(pairs[is_torn]))
     if torn_count <= MAX_TORN_RATIO * rig.vertex_count:
         return []
     text = (
-        f"{torn_count:,} of {rig.vertex_count:,} vertices lie on other vertices and come apart from them, by up to "
-        f"{format_length(rig, float(gaps.max()))}: the mesh is cut there, smoothing moves each piece alone, and no "
-        "network can learn that well; merge them (Edit Mode, Mesh > Merge > By Distance), and record again."
+        f"{torn_count:,} of {rig.vertex_count:,} vertices lie on others along cuts of the mesh and come apart by up to "
+        f"{format_length(rig, float(gaps[is_torn].max()))}: smoothing moves each piece alone, and no network can learn "
+        "that well; unless they should open, as lids do, merge them (Edit Mode, Mesh > Merge > By Distance, with Sharp "
+        "Edges on), and record again."
     )
     return [RecordingWarning("open-seams", text)]
 
 
-def _coincident_vertices(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Find vertices that lie on others which have the same skin weights.
+def _seam_pairs(rig: Rig) -> np.ndarray:
+    """Find the vertices of open edges, which belong to one face, that lie on other open edges.
 
     Returns:
-        (n,) int64 indices of the vertices, and (n,) int64 index of the group of each, from 0.
+        (n, 2) int64, pairs of vertices that lie on each other and have the same skin weights.
     """
-    keys = np.concatenate(
-        [
-            (rig.rest_positions / max(rig.size, np.finfo(np.float32).tiny)).round(POSITION_DIGITS),
-            np.where(rig.skin_weights > 0, rig.skin_joints, -1),
-            rig.skin_weights.round(WEIGHT_DIGITS),
-            main_joints(rig.skin_joints, rig.skin_weights)[:, None],
-        ],
-        axis=1,
-        dtype=np.float64,
-    )
+    groups = _coincident_groups(rig) if len(rig.face_starts) else np.zeros(0, np.int64)
+    if not (groups >= 0).any():
+        return np.zeros((0, 2), np.int64)
+    following = rig.face_vertices[adjacent_corners(rig.face_starts, rig.face_vertices)[1]]
+    edges = np.stack([rig.face_vertices, following], axis=1).astype(np.int64)
+    edges, face_counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    edges = edges[(face_counts == 1) & (groups[edges] >= 0).all(axis=1)]
+    edges = np.take_along_axis(edges, np.argsort(groups[edges], axis=1), axis=1)
+    places = groups[edges]
+    order = np.lexsort(places.T)
+    edges, places = edges[order], places[order]
+    # Each edge is paired with the first edge in the same place.
+    _, first_edges, place_of_edge = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    return np.stack([edges[first_edges[place_of_edge.ravel()]], edges], axis=2).reshape(-1, 2)
+
+
+def _coincident_groups(rig: Rig) -> np.ndarray:
+    """Group the vertices that lie on others which have the same skin weights.
+
+    Returns:
+        (V,) int64, index of the group of each vertex; -1 for a vertex that lies on no other.
+    """
+    positions = (rig.rest_positions / max(rig.size, np.finfo(np.float32).tiny)).round(POSITION_DIGITS)
+    groups = np.full(rig.vertex_count, -1)
+    vertices = np.flatnonzero(_equal_rows(positions)[1] > 1)
+    if len(vertices):
+        joints, weights = rig.skin_joints[vertices], rig.skin_weights[vertices]
+        order = np.argsort(np.where(weights > 0, joints, -1), axis=1)
+        joints, weights = (np.take_along_axis(values, order, axis=1) for values in (joints, weights))
+        main = main_joints(rig.skin_joints[vertices], rig.skin_weights[vertices])
+        columns = (positions[vertices], np.where(weights > 0, joints, -1), weights.round(WEIGHT_DIGITS), main[:, None])
+        indices, counts = _equal_rows(np.concatenate(columns, axis=1, dtype=np.float64))
+        groups[vertices] = np.where(counts > 1, indices, -1)
+    return groups
+
+
+def _equal_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each of n rows, the index of its value among the different rows, and the number of equal rows."""
     # Adding zero turns -0 into 0.
-    _, groups, counts = np.unique(keys + 0.0, axis=0, return_inverse=True, return_counts=True)
-    groups = groups.ravel()
-    vertices = np.flatnonzero(counts[groups] > 1)
-    return vertices, np.unique(groups[vertices], return_inverse=True)[1].ravel()
+    _, indices, counts = np.unique(rows + 0.0, axis=0, return_inverse=True, return_counts=True)
+    indices = indices.ravel()
+    return indices, counts[indices]
