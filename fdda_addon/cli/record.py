@@ -168,9 +168,9 @@ def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
     from ..core.poses import MAX_MARGIN
     from ..core.recording.index import read_index, read_info
-    from ..poses.sample_selection import REMIX_HINT
     from ..runtime.binding import model_disabled
     from .files import open_file
+    from .pose_notes import print_control_bones, print_remix_hint
     from .progress import ProgressPrinter
     from .target import target_settings
 
@@ -213,9 +213,8 @@ def run(options: argparse.Namespace) -> None:
     open_file(options.rig)
     rigs = _find_rigs(options)
     if not options.refine:
-        _print_control_bones(rigs[0][0], options)
-        if options.action and options.poses != 0 and not options.sample and not options.detect_influences:
-            print(REMIX_HINT)
+        print_control_bones(rigs[0][0], options)
+        print_remix_hint(rigs[0][0], options)
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:
         for scene_rig, _ in rigs:
@@ -251,18 +250,6 @@ def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
     if len(names) > 1:
         return mesh_folders([find_rig(name) for name in names], options.recording)
     return [(find_rig(*names), options.recording)]
-
-
-def _print_control_bones(scene_rig: "SceneRig", options: argparse.Namespace) -> None:
-    """Print how many inputs the control bones are, and which locations have no range."""
-    from ..poses.control_bones import describe_control_bones, split_control_bones
-    from ..recording.plan import RecordingSettings, listed_controls
-
-    texts = [text for text in options.control if text.startswith(("collection:", "bone:"))]
-    if texts:
-        names, _ = split_control_bones(scene_rig, texts)
-        settings = RecordingSettings(controls=tuple(texts), sample=tuple(options.sample), actions=tuple(options.action))
-        print(describe_control_bones(scene_rig.armature_object, names, listed_controls(scene_rig, settings)))
 
 
 def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":

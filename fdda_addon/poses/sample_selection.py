@@ -18,10 +18,6 @@ from .remix import read_remix
 
 REMIX = "remix"
 """Entry for the bones of the recorded actions, whose limbs are combined from different frames (`core.remix`)."""
-REMIX_HINT = (
-    "Hint: random poses move each bone by itself; with --sample remix they combine limbs of the actions, and the model "
-    "follows unseen actions more closely."
-)
 SELECTED_BONES, COLLECTION_PREFIX, ACTION_PREFIX, BONE_PREFIX = "selected", "collection:", "action:", "bone:"
 """Forms of an entry: the selected bones, and the prefixes of a bone collection, an action and a single bone."""
 

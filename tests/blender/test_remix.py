@@ -125,16 +125,42 @@ def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
     assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
 
 
+STILL, TURN = "one frame", "turn the dial"
+
+
+def add_actions_without_motion(armature_object: bpy.types.Object) -> None:
+    """Add an action of one frame, and one that moves a property and keeps a bone where it is."""
+    for name, frames in ((STILL, [1]), (TURN, [1, 10])):
+        armature_object.animation_data.action = bpy.data.actions.new(name)
+        for frame in frames:
+            armature_object.pose.bones["lower"].rotation_euler[0] = 0.5
+            armature_object.pose.bones["lower"].keyframe_insert("rotation_euler", frame=frame)
+            if name == TURN:
+                armature_object["dial"] = frame / 10
+                armature_object.keyframe_insert('["dial"]', frame=frame)
+        armature_object.animation_data.action = None
+        bpy.data.actions[name].use_fake_user = True
+    clear_pose(armature_object)
+
+
 @pytest.mark.parametrize(
     "options, has_hint",
     [
         (["--action", WAVE], True),
+        (["--action", WAVE, "--action", STILL], True),
         (["--action", WAVE, "--sample", "remix"], False),
         (["--action", WAVE, "--poses", 0], False),
         ([], False),
+        # There is no motion of bones to combine.
+        (["--action", STILL], False),
+        (["--action", TURN], False),
+        # Poses that are chosen already cannot change.
+        (["--action", WAVE, "--resume"], False),
+        (["--action", WAVE, "--shard", "1/2"], False),
     ],
 )
 def test_recording_actions_with_random_poses_suggests_to_remix(waving, tmp_path, capsys, options, has_hint):
+    add_actions_without_motion(waving.armature_object)
     path = tmp_path / "rig.blend"
     save_copy(path)
     poses = [] if "--poses" in options else ["--poses", 12]
