@@ -140,7 +140,7 @@ def run_verb(*arguments: object) -> str:
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if result.returncode:
         errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
-        raise VerbError(errors[-1].removeprefix("Error: ") if errors else result.stderr.strip()[-200:])
+        raise VerbError(errors[-1].removeprefix("Error: ") if errors else " ".join(result.stderr[-200:].split()))
     return result.stdout
 
 
@@ -212,6 +212,7 @@ def main() -> None:
     group.add_argument("--only", nargs="+", help="names of characters, without their extension")
     group.add_argument("--write", action="store_true", help="write the table to docs/characters.md")
     options = parser.parse_args()
+    out = options.out.resolve()  # The verbs run in another working directory.
     sources = sorted(path for path in options.folder.glob("*") if path.suffix in {".glb", ".gltf", ".blend"})
     if options.only:
         sources = [path for path in sources if path.stem in options.only]
@@ -225,7 +226,7 @@ def main() -> None:
         "|---|---|---|---|---|---|---|---|",
     ]
     for source in sources:
-        for line in rows(source, options.out, options.poses, options.epochs):
+        for line in rows(source, out, options.poses, options.epochs):
             lines.append(line)
             print(line, flush=True)
     table = "\n".join(lines)

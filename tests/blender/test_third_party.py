@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The table of characters that others made."""
 
+import shutil
 import subprocess
 import sys
 
@@ -13,3 +14,14 @@ def test_the_table_of_some_characters_does_not_replace_that_of_all(tmp_path):
     result = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert result.returncode == 2 and "not allowed with argument --write" in result.stderr
     assert third_party.PAGE.read_bytes() == page
+
+
+def test_the_folders_are_relative_to_the_working_directory(tmp_path):
+    (tmp_path / "characters").mkdir()
+    shutil.copy(third_party.ROOT / "blend_fixtures" / "elbow.blend", tmp_path / "characters")
+    arguments = [third_party.__file__, "out", "characters", "--poses", "20", "--epochs", "1"]
+    result = subprocess.run([sys.executable, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    row = result.stdout.splitlines()[-1]
+    assert row.startswith("| elbow |  | 300 |") and "refused" not in row and "%" in row
+    assert (tmp_path / "out" / "elbow" / "model.onnx").is_file()
