@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+from .defaults import TOLERANCE_MM
+
 if TYPE_CHECKING:  # Blender starts without numpy.
     from .metrics import ErrorStatistics
 
@@ -85,7 +87,7 @@ def assess_evaluation(
     warnings = []
     if not is_bound:
         warnings.append("Another model is bound now: press Evaluate again.")
-    elif skinning.mean < MIN_SKINNING_ERROR_MM:
+    elif skinning.mean < MIN_SKINNING_ERROR_MM and not _is_farther(model, skinning):
         warnings.append(
             "Skinning alone already equals the rig in these poses, so they do not show what the model does."
         )
@@ -120,11 +122,11 @@ def farther_than_skinning_sentence(
     model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors"
 ) -> str:
     """Return a sentence about a model that is farther from the rig than skinning alone; empty if it is closer."""
-    if model.mean <= skinning.mean or skinning.mean < MIN_SKINNING_ERROR_MM:
+    if not _is_farther(model, skinning):
         return ""
     return (
         f"The model is farther from the rig than linear skinning here, {format_mm(model.mean)} instead of "
-        f"{format_mm(skinning.mean)} mm on average: record an action with such poses, or play them without the model."
+        f"{format_mm(skinning.mean)} mm on average: record more such poses, or play them without the model."
     )
 
 
@@ -196,8 +198,14 @@ def _unimproved_tail(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorS
     return ""
 
 
+def _is_farther(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> bool:
+    """Return whether a model is farther from the rig than skinning alone, by more than its tolerance allows."""
+    is_rig = skinning.mean < MIN_SKINNING_ERROR_MM
+    return model.mean > (TOLERANCE_MM if is_rig else skinning.mean)
+
+
 def _describe_no_gain(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:
-    is_farther = model.mean > skinning.mean
+    is_farther = _is_farther(model, skinning)
     return f"The model is {'farther from the rig' if is_farther else 'hardly closer'} than skinning alone"
 
 
