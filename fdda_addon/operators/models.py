@@ -6,6 +6,7 @@ import bpy
 from ..core.errors import ModelError
 from ..models.entries import format_file_size
 from ..scene.active_rig import any_mesh_object
+from ..scene.scene_rig import remaining_rig_note
 from .playback import ModelFileOperator, ModelOperator
 
 
@@ -93,8 +94,10 @@ class FDDA_OT_remove_model(ModelListOperator, bpy.types.Operator):
 
         scene_rig, entry = self.active_entry(context)
         mesh_object = scene_rig.mesh_object
+        was_bound = mesh_object.fdda.is_bound
         name = model_list.remove_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
-        return f"Removed {name}."
+        note = remaining_rig_note(mesh_object) if was_bound else ""
+        return f"Removed {name}. {note}".rstrip()
 
 
 class FDDA_OT_pack_model(ModelListOperator, bpy.types.Operator):

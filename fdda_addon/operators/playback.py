@@ -13,7 +13,7 @@ from ..models.entries import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
 from ..scene.active_rig import any_mesh_object
-from ..scene.scene_rig import SceneRig, check_full_rig
+from ..scene.scene_rig import SceneRig, check_full_rig, remaining_rig_note
 from .job import JobOperator
 from .rig_operator import RigOperator
 
@@ -235,14 +235,15 @@ class FDDA_OT_unbind(ModelOperator, bpy.types.Operator):
         from ..models import model_list
         from ..runtime.binding import unbind
 
-        names = []
+        names, notes = [], []
         for scene_rig in self.bound_rigs(context):
             mesh_object = scene_rig.mesh_object
             model_list.add_bound_model(mesh_object)
             names.append(bound_model_name(mesh_object))
             side_by_side.hide(mesh_object)
             unbind(mesh_object)
-        return f"Unbound {' and '.join(names)}."
+            notes += filter(None, [remaining_rig_note(mesh_object)])
+        return " ".join([f"Unbound {' and '.join(names)}.", *notes])
 
 
 class FDDA_OT_set_mode(ModelOperator, bpy.types.Operator):

@@ -10,7 +10,7 @@ from ..models.entries import active_entry, bound_model_name
 from ..rig.modifier_stack import is_fdda_modifier
 from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
-from ..scene.scene_rig import SceneRig, armature_of
+from ..scene.scene_rig import SceneRig, armature_of, remaining_rig_note
 from ..scene.stored_paths import resolve_path
 from ..timing import frame_times
 from .bone_names import short_bone_name
@@ -66,6 +66,8 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             draw_wrapped(layout, context, reason, "INFO")
             return
         mesh_object = scene_rig.mesh_object
+        if note := remaining_rig_note(mesh_object):
+            draw_wrapped(layout, context, note, "ERROR")
         if not mesh_object.fdda.is_bound:
             self._draw_unbound(context, scene_rig)
             return

@@ -76,6 +76,17 @@ def check_full_rig(mesh_object: bpy.types.Object) -> None:
         )
 
 
+def remaining_rig_note(mesh_object: bpy.types.Object) -> str:
+    """Say what deforms a mesh of a fast rig in which no model plays; empty if a model plays, or for a full rig."""
+    binding = mesh_object.fdda
+    if not binding.is_fast_rig or (binding.is_bound and binding.mode != "RIG"):
+        return ""
+    return (
+        f"'{mesh_object.name}' belongs to a fast rig: without a model, only what is left of its bones and modifiers "
+        "deforms it. Bind a model, or open the file of the full rig."
+    )
+
+
 def is_flat(scene_object: bpy.types.Object) -> bool:
     """Return whether an object or one of its parents has a scale of zero along an axis."""
     return abs(scene_object.matrix_world.to_3x3().determinant()) < MIN_VOLUME

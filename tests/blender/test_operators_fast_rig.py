@@ -58,6 +58,18 @@ def test_a_fast_rig_is_not_compared_with_what_is_left_of_the_rig(bound_elbow):
     assert bpy.ops.fdda.set_mode(mode="LINEAR") == {"FINISHED"}
 
 
+REMAINING = "'elbow' belongs to a fast rig: without a model, only what is left of its bones and modifiers deforms it."
+
+
+@pytest.mark.parametrize("is_fast_rig", [False, True])
+def test_a_fast_rig_without_a_model_says_what_deforms_the_mesh(saved, is_fast_rig, capfd):
+    bpy.data.objects[ELBOW].fdda.is_fast_rig = is_fast_rig
+    assert bpy.ops.fdda.unbind() == {"FINISHED"}
+    assert (REMAINING in capfd.readouterr().out) == is_fast_rig
+    assert bpy.ops.fdda.bind() == bpy.ops.fdda.remove_model() == {"FINISHED"}
+    assert capfd.readouterr().out.count(REMAINING) == is_fast_rig
+
+
 def test_the_sentence_of_the_verb_is_the_report(saved):
     """The other Blender refuses an armature that another object uses."""
     other = bpy.data.objects.new("other", bpy.data.objects[ELBOW_RIG].data)

@@ -98,6 +98,25 @@ def test_a_fast_rig_offers_no_comparison_with_the_rig(bound_elbow: bpy.types.Obj
     assert "This is a fast rig: compare the model in the file of the full rig." in fast_texts
 
 
+def test_a_fast_rig_in_which_no_model_plays_says_so(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    note = "'elbow' belongs to a fast rig: without a model, only what is left of its bones and modifiers deforms it."
+
+    def says_so() -> bool:
+        return any(text.startswith(note) for text in texts_of(draw_section("playback")))
+
+    bound_elbow.fdda.is_fast_rig = True
+    assert not says_so()
+    # The user hides the modifier, which shows the rig in a full rig.
+    bound_elbow.modifiers["FDDA"].show_viewport = False
+    bpy.context.view_layer.update()
+    assert bound_elbow.fdda.mode == "RIG" and says_so()
+    bpy.ops.fdda.unbind()
+    assert says_so()
+    bound_elbow.fdda.is_fast_rig = False
+    assert not says_so()
+
+
 def test_a_removed_modifier_can_be_bound_again(bound_elbow: bpy.types.Object):
     bpy.context.view_layer.objects.active = bound_elbow
     bpy.context.view_layer.update()
