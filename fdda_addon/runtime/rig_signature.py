@@ -7,7 +7,6 @@ weights takes long, so a signature is compared first, which is quick to read (`r
 
 from collections.abc import Iterable
 from dataclasses import replace
-from operator import attrgetter
 
 import bpy
 import numpy as np
@@ -16,6 +15,7 @@ from ..core.errors import ModelError
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
 from ..rig.deformation import b_bone_values, read_modifiers_and_drivers
 from ..rig.reading import read_model_rig
+from ..scene.arrays import ElementProperty, read
 from ..scene.mesh import rest_positions
 from ..scene.scene_rig import SceneRig, armature_modifier
 from .network import Network
@@ -24,66 +24,65 @@ from .session import session
 STABLE_MODES = ("OBJECT", "POSE")
 """Modes of an object in which its mesh does not change; in the other modes the user is editing the mesh."""
 
-_read_bone = attrgetter(
-    "use_deform",
-    "envelope_distance",
-    "envelope_weight",
-    "head_radius",
-    "tail_radius",
-    "use_envelope_multiply",
-    "bbone_segments",
+_BONE_PROPERTIES = (
+    ElementProperty("bbone_segments", np.int32),
+    ElementProperty("matrix_local", np.float32, (16,)),
+    ElementProperty("use_deform", np.bool_),
+)
+_ENVELOPE_PROPERTIES = (
+    ElementProperty("envelope_distance", np.float32),
+    ElementProperty("envelope_weight", np.float32),
+    ElementProperty("head_radius", np.float32),
+    ElementProperty("tail_radius", np.float32),
+    ElementProperty("use_envelope_multiply", np.bool_),
 )
 
 BONES, PARENTS, OBJECT, MESH = PARTS = ("bones", "parents", "object", "mesh")
 """Parts of a rig that Blender reports separately. Posing by hand is reported as a change of the bones."""
 
 
-def read_signature(scene_rig: SceneRig, joint_names: Iterable[str], parts: Iterable[str] = PARTS) -> dict[str, tuple]:
+def read_signature(scene_rig: SceneRig, parts: Iterable[str] = PARTS) -> dict[str, tuple]:
     """Read the signature of a rig: what is quick to read. If it and the mesh are unchanged, the whole rig is unchanged.
 
     Args:
         scene_rig: the rig.
-        joint_names: names of the joints of the model.
         parts: which parts to read.
 
     Returns:
-        By part. Rest matrices and skinning properties of the bones that are joints or can have weights; the parents of
-        all bones; the vertex groups, modifiers and drivers of the object (`rig.deformation`); a digest of the rest
-        positions of the mesh.
+        By part. Names, rest matrices and skinning properties of all bones; their parents; the vertex groups, modifiers
+        and drivers of the object (`rig.deformation`); a digest of the rest positions of the mesh.
     """
     mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
     readers = {
-        BONES: lambda: _read_bones_once(armature, _weighted_names(scene_rig, joint_names)),
-        PARENTS: lambda: tuple((bone.name, bone.parent.name if bone.parent else "") for bone in armature.bones),
+        BONES: lambda: _read_bones_once(armature, _has_envelopes(scene_rig)),
+        PARENTS: lambda: tuple(bone.parent.name if bone.parent else "" for bone in armature.bones),
         OBJECT: lambda: (*mesh_object.vertex_groups.keys(), str(read_modifiers_and_drivers(scene_rig))),
         MESH: lambda: (rest_digest(mesh_object.data),),
     }
     return {part: readers[part]() for part in parts}
 
 
-def _weighted_names(scene_rig: SceneRig, joint_names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the joints and of the bones that can have weights: a control rig has many other bones."""
+def _has_envelopes(scene_rig: SceneRig) -> bool:
     modifier = armature_modifier(scene_rig.mesh_object)
-    if modifier is not None and modifier.use_bone_envelopes:
-        return tuple(scene_rig.armature_object.data.bones.keys())
-    return tuple(dict.fromkeys((*joint_names, *scene_rig.mesh_object.vertex_groups.keys())))
+    return modifier is not None and modifier.use_bone_envelopes
 
 
-def _read_bones_once(armature: bpy.types.Armature, names: tuple[str, ...]) -> tuple:
-    """Read bones; in a check of several characters that share armature and names only once."""
+def _read_bones_once(armature: bpy.types.Armature, has_envelopes: bool) -> tuple:
+    """Read the bones; in a check of several characters that share the armature only once."""
     read_bones = {} if session.read_bones is None else session.read_bones
-    key = armature.session_uid, names
+    key = armature.session_uid, has_envelopes
     if key not in read_bones:
-        read_bones[key] = bone_signature(armature, names)
+        read_bones[key] = bone_signature(armature, has_envelopes)
     return read_bones[key]
 
 
-def bone_signature(armature: bpy.types.Armature, names: Iterable[str]) -> tuple:
-    """Read rest matrices and skinning properties of the bones with these names; other names are left out."""
-    bones = [bone for bone in map(armature.bones.get, names) if bone is not None]
-    # Most armatures have no B-Bones, whose settings are slow to read.
-    b_bones = b_bone_values(armature, bones) if any(bone.bbone_segments > 1 for bone in bones) else {}
-    return tuple((bone.name, bone.matrix_local.copy(), _read_bone(bone)) for bone in bones), b_bones
+def bone_signature(armature: bpy.types.Armature, has_envelopes: bool) -> tuple:
+    """Read names, rest matrices and skinning properties of all bones, their envelopes only where these have effect."""
+    properties = (*_BONE_PROPERTIES, *(_ENVELOPE_PROPERTIES if has_envelopes else ()))
+    names, (segments, *values) = armature.bones.keys(), [read(armature.bones, element) for element in properties]
+    # Few bones are B-Bones, whose settings are slow to read.
+    b_bones = [armature.bones[names[index]] for index in np.flatnonzero(segments > 1)]
+    return (*names, *(value.tobytes() for value in values), b_bone_values(armature, b_bones))
 
 
 def rest_digest(mesh: bpy.types.Mesh) -> str:

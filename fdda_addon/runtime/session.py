@@ -65,8 +65,8 @@ class PlaybackSession:
         moved_buffers: by model: the position buffers of the players that moved in the last frame.
         passed_checks: by the session id of a mesh object: its mesh, the rig that its model requires, and the signature
             of the rig that passed (`rig_signature`).
-        read_bones: the bones that a check has read, by the session id of the armature and the names of the bones; None
-            while nothing is checked.
+        read_bones: the bones that a check has read, by the session id of the armature and whether envelopes were read;
+            None while nothing is checked.
         modes: stacks of overriding modes, by the session ids of objects. The last mode of a stack is in effect.
         networks: the loaded models, by their paths or by the session ids of their text datablocks; with each, the time
             of modification and the size of its file.
@@ -94,7 +94,7 @@ class PlaybackSession:
         self.skips_models = self.is_switching = False
         self.apply_effect: Callable[[Effect, Character, FDDAError | None], None]
         self._count_without_bound = -1
-        self.read_bones: dict[tuple, tuple] | None = None
+        self.read_bones: dict[tuple[int, bool], tuple] | None = None
         self._last_change = 0.0
         # Blender compares timers by identity, and each access makes another bound method.
         self.check_timer = self._check_after_pause

@@ -16,6 +16,7 @@ from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
 from .conftest import ELBOW_RIG, assert_plays, pose
+from .rig_changes import add_bone, change_in_edit_mode, edit_bones
 from .test_changed_rigs import assert_rig_shown, drive_b_bone
 from .test_evaluations import add_shape_key
 from .test_player_batch import crowd_of
@@ -68,28 +69,47 @@ def test_a_frame_reads_no_bones_of_driven_armature_data(bound_elbow, elbow_files
     assert np.abs(shown[0] - shown[-1]).max() > 1e-3
 
 
-def test_posing_reads_only_bones_that_can_have_weights(bound_elbow, elbow_files, monkeypatch):
-    armature_object, read_names = bpy.data.objects[ELBOW_RIG], []
-    bound_elbow.fdda.mode = "RIG"
-    bpy.context.view_layer.objects.active = armature_object
-    bpy.ops.object.mode_set(mode="EDIT")
-    for index in range(40):
-        bone = armature_object.data.edit_bones.new(f"control.{index}")
-        bone.tail = (0, 0, 1)
-    bpy.ops.object.mode_set(mode="OBJECT")
-    bound_elbow.fdda.mode = "FDDA"
-    function = rig_signature.bone_signature
-    monkeypatch.setattr(
-        rig_signature,
-        "bone_signature",
-        lambda armature, names: read_names.extend(names) or function(armature, names),
-    )
+def test_a_bone_without_weights_that_becomes_a_b_bone_shows_the_rig(bound_elbow, elbow_files, capsys):
+    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], lambda: add_bone("control"))
     pose(angle=0.3)
     assert_plays(bound_elbow, elbow_files.model)
-    assert read_names and not [name for name in read_names if name.startswith("control.")]
+    bpy.data.objects[ELBOW_RIG].data.bones["control"].bbone_segments = 3
+    pose(angle=0.4)
+    assert_rig_shown(bound_elbow, "the bone 'control' was no B-Bone when it was recorded", capsys)
+
+
+@pytest.mark.parametrize("change", ["use_deform", "rest pose", "name"])
+def test_a_changed_bone_without_weights_lets_the_rig_be_read_again(bound_elbow, elbow_files, change, monkeypatch):
+    """Whether a bone has an effect is for `read_model_rig` to tell: it chooses the joints and their parents."""
+    armature_object, reads = bpy.data.objects[ELBOW_RIG], []
+    change_in_edit_mode(armature_object, lambda: add_bone("control"))
+    pose(angle=0.3)
+    read = rig_signature.read_model_rig
+    monkeypatch.setattr(rig_signature, "read_model_rig", lambda *arguments: reads.append(1) or read(*arguments))
+    pose(angle=0.35)
+    assert not reads
+    if change == "rest pose":
+        change_in_edit_mode(armature_object, lambda: edit_bones()["control"].head.__setitem__(0, 2.0))
+    else:
+        setattr(armature_object.data.bones["control"], change, False if change == "use_deform" else "renamed")
+    pose(angle=0.4)
+    assert reads
+    assert_plays(bound_elbow, elbow_files.model)
+
+
+def test_envelopes_are_compared_only_where_they_have_an_effect(bound_elbow):
+    armature_object = bpy.data.objects[ELBOW_RIG]
     rig = SceneRig(bound_elbow, armature_object)
-    armature_modifier(bound_elbow).use_bone_envelopes = True
-    assert set(armature_object.data.bones.keys()) == set(rig_signature._weighted_names(rig, ("upper",)))
+
+    def bones() -> tuple:
+        return rig_signature.read_signature(rig, ["bones"])["bones"]
+
+    for has_effect in (False, True):
+        armature_modifier(bound_elbow).use_bone_envelopes = has_effect
+        before = bones()
+        assert bones() == before
+        armature_object.data.bones["lower"].envelope_distance += 0.1
+        assert (bones() != before) is has_effect
 
 
 @pytest.fixture
@@ -120,9 +140,7 @@ def test_in_a_window_posing_reads_no_bones_until_it_pauses(bound_elbow, elbow_fi
     monkeypatch.setattr(
         rig_signature,
         "read_signature",
-        lambda rig, names, parts=rig_signature.PARTS: (
-            read_parts.append(set(parts)) or read_signature(rig, names, parts)
-        ),
+        lambda rig, *parts: read_parts.append(set(*parts)) or read_signature(rig, *parts),
     )
     for angle in (0.2, 0.4, 0.6):
         pose(angle=angle)
