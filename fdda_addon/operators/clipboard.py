@@ -48,7 +48,7 @@ def register() -> None:
 def unregister() -> None:
     """Undo `register`."""
     key_configuration = bpy.context.window_manager.keyconfigs.addon
-    keymap = key_configuration.keymaps.get("3D View") if key_configuration is not None else None
-    for item in list(keymap.keymap_items) if keymap is not None else []:
-        if item.idname == FDDA_OT_copy_objects.bl_idname:
+    # Other add-ons may have made a key map of the same name for another editor.
+    for keymap in key_configuration.keymaps if key_configuration is not None else ():
+        for item in [i for i in keymap.keymap_items if i.idname == FDDA_OT_copy_objects.bl_idname]:
             keymap.keymap_items.remove(item)

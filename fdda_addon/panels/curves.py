@@ -34,7 +34,8 @@ class CurvesImage:
 
     def __init__(self) -> None:
         self._previews: object = None
-        self._drawn_key: tuple = ()
+        # The curves are stored too, because a new object could get the id of a freed one.
+        self._drawn: tuple[dict[str, list[float]] | None, list[int]] = None, []
 
     def icon(self, curves: dict[str, list[float]]) -> int:
         """Return the icon of the curves. Paint it again when the curves have new values."""
@@ -45,10 +46,9 @@ class CurvesImage:
         if self._previews is None:
             self._previews = bpy.utils.previews.new()
             self._previews.new("curves").image_size = (WIDTH, HEIGHT)
-        key = (id(curves), *(len(curve) for curve in curves.values()))
-        preview = self._previews["curves"]
-        if key != self._drawn_key:
-            self._drawn_key = key
+        preview, lengths = self._previews["curves"], [len(curve) for curve in curves.values()]
+        if self._drawn[0] is not curves or self._drawn[1] != lengths:
+            self._drawn = curves, lengths
             write_pixels(preview, paint(curves))
         return preview.icon_id
 
@@ -56,7 +56,7 @@ class CurvesImage:
         """Free the image."""
         if self._previews is not None:
             bpy.utils.previews.remove(self._previews)
-            self._previews, self._drawn_key = None, ()
+            self._previews, self._drawn = None, (None, [])
 
 
 image = CurvesImage()

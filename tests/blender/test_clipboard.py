@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fdda_addon
+from fdda_addon.operators import clipboard
 from fdda_addon.runtime import playback
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
@@ -86,3 +87,22 @@ def test_copying_in_edit_mode_shows_an_error(bound_elbow):
     bpy.ops.object.mode_set(mode="EDIT")
     with pytest.raises(RuntimeError, match="Objects can only be copied in Object Mode"):
         bpy.ops.fdda.copy_objects()
+
+
+def test_the_shortcut_is_removed_beside_a_key_map_of_the_same_name():
+    """Many add-ons make a key map "3D View" without its editor."""
+    keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps
+    clipboard.unregister()
+    while (keymap := keymaps.get("3D View")) is not None:
+        keymaps.remove(keymap)
+    other_keymap = keymaps.new("3D View")
+    other_keymap.keymap_items.new("view3d.copybuffer", "C", "PRESS")
+    try:
+        for _ in range(2):
+            clipboard.register()
+            names = [item.idname for keymap in keymaps if keymap.name == "3D View" for item in keymap.keymap_items]
+            assert sorted(names) == ["fdda.copy_objects", "view3d.copybuffer"]
+            clipboard.unregister()
+    finally:
+        keymaps.remove(other_keymap)
+        clipboard.register()

@@ -4,6 +4,7 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -21,7 +22,7 @@ from fdda_addon.panels.training import _read_report
 from fdda_addon.properties.character import model_file, recording_folder
 from fdda_addon.recording.rig_check import RigCheck
 from fdda_addon.rig.dependencies import read_dependencies
-from fdda_addon.scene import draw_cache
+from fdda_addon.scene import arrays, draw_cache
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing.rig_cost import RigCost, estimate_playback_ms
 
@@ -182,6 +183,23 @@ class TestTraining:
     @pytest.mark.parametrize("values", [[0.0, 0.0], [0.5, 0.5], [1e-9, 1e9]])
     def test_curves_of_any_values_can_be_drawn(self, values):
         assert np.isfinite(curves.paint({"training": values, "validation": values})).all()
+
+    def test_curves_of_another_training_with_as_many_epochs_are_painted(self, monkeypatch):
+        """The curves of the last training may be freed, and the next may get their id."""
+        image, painted = curves.CurvesImage(), []
+        preview = SimpleNamespace(icon_id=1)
+        monkeypatch.setattr(image, "_previews", {"curves": preview})
+        monkeypatch.setattr(arrays, "write_pixels", lambda _preview, values: painted.append(values))
+        monkeypatch.setattr(curves, "paint", lambda shown: list(shown["training"]))
+        live = {"training": [0.9, 0.5], "validation": [1.0, 0.6]}
+        for _ in range(2):
+            image.icon(live)
+        live["training"].append(0.4)
+        image.icon(live)
+        del live
+        for number in range(20):
+            image.icon({"training": [0.9, 0.5, float(number)], "validation": [1.0, 0.6]})
+        assert painted == [[0.9, 0.5], [0.9, 0.5, 0.4], *([0.9, 0.5, float(number)] for number in range(20))]
 
     def test_a_report_is_read_and_a_damaged_one_passed_over(self, elbow_files, tmp_path):
         report = _read_report(elbow_files.model.with_name("report.json"))

@@ -18,7 +18,8 @@ from .conftest import ELBOW, assert_plays, evaluated_positions, predicted_positi
 
 ROOT = Path(__file__).resolve().parents[2]
 CROWD = 20
-COLD_START_SECONDS = 1.0
+COLD_START_PROCESSOR_SECONDS = 0.5
+"""About 0.17 on an idle machine. The time on the clock depends on what else the machine does."""
 
 
 def crowd_of(first: bpy.types.Object, count: int) -> list[bpy.types.Object]:
@@ -219,12 +220,12 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_first_frame_of_a_dense_mesh_takes_less_than_a_second(dense):
+def test_the_first_frame_of_a_dense_mesh_takes_less_than_half_a_second_of_the_processor(dense):
     command = [sys.executable, str(ROOT / "benchmarks" / "measure.py"), "cold-start", str(dense)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     measured = json.loads(done.stdout.strip().splitlines()[-1])
     assert not measured["onnxruntime_at_start_up"]
-    assert measured["is_right"] and measured["seconds"] < COLD_START_SECONDS
+    assert measured["is_right"] and measured["processor_seconds"] < COLD_START_PROCESSOR_SECONDS
 
 
 def test_a_crowd_without_one_of_its_joints_shows_the_rig(bound_elbow, calls):
