@@ -19,6 +19,10 @@ LIKELIHOOD_RATIO = 50.0
 """Equal changes make their common input more likely by this factor, relative to two inputs with similar changes."""
 MIN_PROBABILITY = 1e-3
 """Smallest probability in the comparison of two explanations, because probabilities are estimates."""
+MIN_CONTRADICTION = 2.0
+"""Smallest unexplained change that contradicts decisions, relative to the threshold, because small changes add up."""
+MAX_SUSPECTS = 4
+"""Largest number of suspects for one unexplained change. Where many inputs act on a patch, there are always some."""
 
 
 class ChangeDecoder:
@@ -60,14 +64,12 @@ class ChangeDecoder:
             for index in group.tolist():
                 for vertices, input_change in self._changes_of_inputs.get(index, ()):
                     change[vertices] -= input_change
-        norms = largest_norms(changes, self._patches.starts)
-        for group, group_norms in zip(groups, norms, strict=True):
+        for group, norms in zip(groups, self._original_norms[-len(groups) :], strict=True):
             if len(group) == 1:
-                self.acts[group[0]] |= group_norms > 1
-                self.ruled_out[group[0]] |= ~self.acts[group[0]] & (group_norms <= 1)
+                self.acts[group[0]], self.ruled_out[group[0]] = norms > 1, norms <= 1
         self._members = np.concatenate([self._members, members])
         self._changes = np.concatenate([self._changes, changes])
-        self._norms = np.concatenate([self._norms, norms])
+        self._norms = np.concatenate([self._norms, largest_norms(changes, self._patches.starts)])
 
     def decode(self, probabilities: np.ndarray) -> None:
         """Attribute changes to inputs until no further change has a single cause.
@@ -88,11 +90,37 @@ class ChangeDecoder:
         A small part of what a group changed needs no other cause, because changes add up only nearly.
         """
         causes = np.zeros_like(self.acts)
-        is_unexplained = self._norms > np.maximum(1, MAX_RELATIVE_DIFFERENCE * self._original_norms)
+        is_unexplained = self._is_unexplained(1)
         for members, is_group_unexplained in zip(self._members, is_unexplained, strict=True):
             suspects = np.where(self.undecided[members] & is_group_unexplained, probabilities[members], 0)
             causes[members] |= (suspects > 0) & (suspects >= suspects.max(axis=0) / 2)
         return causes
+
+    def contradictions(self) -> np.ndarray:
+        """Return (N, Q) float32: unexplained changes, at inputs that may cause them although they were ruled out.
+
+        All inputs of such a group are decided, and known causes leave more than a small part of its change. Another
+        input has hidden the cause in another group, as a driver that switches does: all its groups changed the patch.
+
+        Returns:
+            The largest change relative to the threshold; 0 where nothing contradicts.
+        """
+        contradictions = np.zeros(self.acts.shape, np.float32)
+        was_alone = self._members[self._members.sum(axis=1) == 1].any(axis=0)
+        in_unchanged = self._members.T.astype(np.float32) @ (self._original_norms <= 1) > 0
+        is_unexplained = self._is_unexplained(MIN_CONTRADICTION)
+        for members, is_group_unexplained, norms in zip(self._members, is_unexplained, self._norms, strict=True):
+            patches = np.flatnonzero(is_group_unexplained & ~self.undecided[members].any(axis=0))
+            inputs = np.flatnonzero(members & ~was_alone)
+            selection = np.ix_(inputs, patches)
+            is_hidden = self.ruled_out[selection] & ~in_unchanged[selection]
+            is_hidden &= is_hidden.sum(axis=0) <= MAX_SUSPECTS
+            contradictions[selection] = np.maximum(contradictions[selection], is_hidden * norms[patches])
+        return contradictions
+
+    def _is_unexplained(self, min_change: float) -> np.ndarray:
+        """Return (G, Q) bool: changes of groups of which known causes leave more than a small part."""
+        return self._norms > np.maximum(min_change, MAX_RELATIVE_DIFFERENCE * self._original_norms)
 
     def _decide(self, index: int, probabilities: np.ndarray) -> None:
         """Decide on which patches an input acts, where its groups allow it."""

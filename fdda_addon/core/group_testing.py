@@ -4,8 +4,8 @@
 In each trial, all inputs are divided into groups twice. Inputs that probably act on the same patch are in different
 groups, and no two inputs are together twice. The number of groups is the largest number of inputs that probably act on
 one patch: it grows with the depth of the graph of shared patches, and at least with the square root of the number of
-inputs. Then `core.change_decoder` attributes the changes, and undecided inputs are divided again. What a trial has
-found makes the divisions of the next trial better.
+inputs. Then `core.change_decoder` attributes the changes, and undecided inputs are divided again. Inputs whose
+effects others hide are tested alone in the end. What a trial has found makes the divisions of the next trial better.
 """
 
 import math
@@ -28,7 +28,8 @@ DIVISIONS, MIN_DIVISIONS, MAX_DIVISIONS = 2, 3, 8
 MIN_TESTS = 64
 """Undecided inputs are divided more often than `MIN_DIVISIONS` until the trial has had this number of tests."""
 MIN_UNDECIDED_PROBABILITY = 0.3
-"""Smallest probability of an undecided pair of input and patch: two groups of the input changed the patch."""
+"""Smallest probability of an undecided pair of input and patch in the third division: two groups of the input changed
+the patch. It grows with each further division, until inputs are tested alone where every input acts."""
 ACTING_CONFLICT = 0.05
 """Weight of a conflict with an input that is known to act. Its change is subtracted, but nearly only."""
 TOGETHER_CONFLICT = 100.0
@@ -68,6 +69,7 @@ class GroupTesting:
         """Start a trial, in which the base pose and the values of all inputs are others."""
         self._decoder = ChangeDecoder(len(self._prior), self._patches)
         self._division_count = self._test_count = 0
+        self._may_suspect = True
 
     @property
     def _probabilities(self) -> np.ndarray:
@@ -84,16 +86,27 @@ class GroupTesting:
         is_member = undecided.any(axis=1)
         is_long = self._division_count >= MIN_DIVISIONS and self._test_count >= MIN_TESTS
         if not is_member.any() or is_long or self._division_count == MAX_DIVISIONS:
-            self._complete_trial()
-            return []
+            suspects = self._suspects() if self._may_suspect else []
+            self._may_suspect = False
+            if not len(suspects):
+                self._complete_trial()
+            return [np.array([index]) for index in suspects]
         self._division_count += 1
         if self._division_count <= DIVISIONS:
             likely = self._probabilities
             group_count = max(likely.sum(axis=0).max(), GROUPS_PER_ROOT * math.sqrt(len(likely)))
             return self._color(is_member, likely @ likely.T, math.ceil(group_count))
-        likely = np.where(undecided, np.maximum(self._probabilities, MIN_UNDECIDED_PROBABILITY), 0)
+        min_probability = min(1.0, MIN_UNDECIDED_PROBABILITY * (self._division_count - DIVISIONS))
+        likely = np.where(undecided, np.maximum(self._probabilities, min_probability), 0)
         conflicts = likely @ np.where(self._decoder.acts, ACTING_CONFLICT, likely).T
         return self._color(is_member, conflicts + conflicts.T, math.ceil(max(likely.sum(axis=0).max(), 2)))
+
+    def _suspects(self) -> np.ndarray:
+        """Return inputs to test alone, because changes contradict what was decided; at most as many as tests so far."""
+        found = self.influences | self._patches.any_of_partition(self._decoder.acts)
+        changes = np.where(found[:, self._patches.partition_of_patch], 0, self._decoder.contradictions()).max(axis=1)
+        suspects = np.argsort(-changes, kind="stable")[: self._test_count]
+        return suspects[changes[suspects] > 0]
 
     def add_changes(self, groups: list[np.ndarray], changes: np.ndarray) -> None:
         """Add the changes that groups cause: (G, V, 3) float32 as of `Patches.sort`, relative to the threshold."""

@@ -52,6 +52,30 @@ def chains_with_distant_influences() -> None:
         driver.expression = "angle"
 
 
+def chains_with_switches() -> None:
+    """Let a shape key of each chain follow the first of five bones of other chains that is rotated."""
+    chains()
+    mesh_object, armature_object = bpy.data.objects["creature"], bpy.data.objects["creature_rig"]
+    mesh_object.shape_key_add(name="Basis", from_mix=False)
+    points = np.array([vertex.co for vertex in mesh_object.data.vertices])
+    for chain in range(meshes.CHAINS):
+        key = mesh_object.shape_key_add(name=f"key {chain}", from_mix=False)
+        key.slider_min = -1.0
+        for point, is_moved in zip(key.data, np.abs(points[:, 1] - chain * 0.05) < 0.02, strict=True):
+            point.co.z += 0.05 if is_moved else 0.0
+        driver = key.driver_add("value").driver
+        for number in range(5):
+            variable = driver.variables.new()
+            variable.name = f"angle_{number}"
+            variable.targets[0].id = armature_object
+            bone = f"finger.{(chain + number + 1) % meshes.CHAINS:02}.{(2 * chain + 3 * number) % 8:02}"
+            variable.targets[0].data_path = f'pose.bones["{bone}"].rotation_euler[0]'
+        expression = "angle_4"
+        for number in reversed(range(4)):
+            expression = f"(angle_{number} if abs(angle_{number}) > 0.001 else {expression})"
+        driver.expression = expression
+
+
 def chains_that_copy_each_other() -> None:
     """Let each bone of a chain add the rotation of the same bone of the previous chain to its own."""
     chains()
@@ -118,17 +142,22 @@ def find_influences(
 
 
 @pytest.mark.parametrize(
-    ("build", "sample"),
+    ("build", "sample", "max_needless"),
     [
-        (chains, ()),
-        (chains_with_distant_influences, ()),
-        (chains_that_copy_each_other, ()),
-        (chains_on_controls, ("collection:Controls",)),
+        (chains, (), 0),
+        (chains_with_distant_influences, (), 0),
+        (chains_with_switches, (), 2),
+        (chains_that_copy_each_other, (), 0),
+        (chains_on_controls, ("collection:Controls",), 0),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
 def test_groups_find_what_single_joints_find(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, build: Callable[[], None], sample: tuple[str, ...]
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    build: Callable[[], None],
+    sample: tuple[str, ...],
+    max_needless: int,
 ):
     monkeypatch.setattr(meshes, "CHAINS", 6)
     monkeypatch.setattr(meshes, "BONES_PER_CHAIN", 8)
@@ -138,6 +167,6 @@ def test_groups_find_what_single_joints_find(
     assert expected.any() and len(single_changes) == TRIALS * len(expected)
     largest_changes = single_changes.reshape(TRIALS, *expected.shape).max(axis=0)
     assert np.array_equal(largest_changes > 1, expected)
-    differs = found != expected
-    assert not (differs & (np.abs(largest_changes - 1) > MAX_TOLERANCE_RATIO - 1)).any()
+    assert not (expected & ~found & (largest_changes > MAX_TOLERANCE_RATIO)).any()
+    assert (found & ~expected & (largest_changes < 2 - MAX_TOLERANCE_RATIO)).sum() <= max_needless
     assert len(group_changes) < 0.9 * len(single_changes)
