@@ -19,6 +19,7 @@ from .action_range import (
     axis_angle_to_quaternion,
     curves_by_bone,
     evaluate_curves,
+    has_width,
     keyed_numbers,
 )
 
@@ -37,7 +38,7 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
         actions: the actions.
 
     Raises:
-        RigError: the actions move no bone.
+        RigError: the actions move no bone, or have one pose.
     """
     clips = [(action_frames(action), curves_by_bone(scene_rig.armature_object, action)) for action in actions]
     bones = [bone for bone in scene_rig.armature_object.pose.bones if any(bone.name in curves for _, curves in clips)]
@@ -51,13 +52,18 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
                     channel = Channel(bone.name, kind, axis, *_bounds(values[:, axis]))
                     has_noise = kind == ROTATION_VECTOR and not bone.lock_rotation[axis]
                     columns.append((channel, values[:, axis], limbs[bone.name], has_noise))
+    names = ", ".join(f"'{action.name}'" for action in actions)
     if not columns:
-        names = ", ".join(f"'{action.name}'" for action in actions)
         raise RigError(f"There is no pose to remix: {names} moves no bone of '{scene_rig.armature_object.name}'.")
     limbs_by_path = {bone.path_from_id(): limbs[bone.name] for bone in bones}
     for (owner, path), values in _number_values(scene_rig, actions).items():
         limb = limbs_by_path.get(path[: path.find('"]') + 2], len(bones))
         columns.append((Channel(f"{owner}/{path}", CONTROL, 0, *_bounds(values)), values, limb, False))
+    if not any(has_width(_bounds(values)) for _, values, _, _ in columns):
+        raise RigError(
+            f"There is only one pose to remix: nothing of '{scene_rig.armature_object.name}' moves in {names}; record "
+            "other actions."
+        )
     channels, values, channel_limbs, has_noise = zip(*columns, strict=True)
     return Remix(channels, np.stack(values, axis=1), np.array(channel_limbs, np.int64), np.array(has_noise, bool))
 

@@ -18,7 +18,7 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import run
 
-WAVE = "wave"
+WAVE, STILL, TURN = "wave", "one frame", "turn the dial"
 
 
 @pytest.fixture
@@ -114,20 +114,6 @@ def test_an_action_that_moves_no_bone_is_refused(waving):
         read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=("still",)))
 
 
-def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "waving.blend"))
-    settings = waving.mesh_object.fdda.settings
-    settings.sample = "REMIX"
-    with pytest.raises(RigError, match="is set to Limbs from the Checked Actions, but no action is checked"):
-        recording_settings(waving)
-    bpy.data.actions[WAVE].fdda.record = True
-    assert recording_settings(waving).sample == ("remix",)
-    assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
-
-
-STILL, TURN = "one frame", "turn the dial"
-
-
 def add_actions_without_motion(armature_object: bpy.types.Object) -> None:
     """Add an action of one frame, and one that moves a property and keeps a bone where it is."""
     for name, frames in ((STILL, [1]), (TURN, [1, 10])):
@@ -141,6 +127,24 @@ def add_actions_without_motion(armature_object: bpy.types.Object) -> None:
         armature_object.animation_data.action = None
         bpy.data.actions[name].use_fake_user = True
     clear_pose(armature_object)
+
+
+def test_a_single_pose_is_refused(waving):
+    add_actions_without_motion(waving.armature_object)
+    with pytest.raises(RigError, match="There is only one pose to remix: nothing of 'elbow_rig' moves in 'one frame'"):
+        read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=(STILL,)))
+    read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=(STILL, WAVE)))
+
+
+def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "waving.blend"))
+    settings = waving.mesh_object.fdda.settings
+    settings.sample = "REMIX"
+    with pytest.raises(RigError, match="is set to Limbs from the Checked Actions, but no action is checked"):
+        recording_settings(waving)
+    bpy.data.actions[WAVE].fdda.record = True
+    assert recording_settings(waving).sample == ("remix",)
+    assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
 
 
 @pytest.mark.parametrize(
