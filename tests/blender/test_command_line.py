@@ -117,7 +117,7 @@ def test_record_prints_plain_lines_without_a_terminal(elbow_files, tmp_path, cap
     assert estimate.startswith("50 poses of 300 vertices: less than 1 MB on the disk, about ")
     assert summary.startswith(f"{tmp_path / 'r'}: 50 poses in ")
     lines = captured.err.splitlines()
-    assert lines[0].startswith("influences: 1 of 30, ") and lines[10].startswith("influences: 30 of 30, ")
+    assert lines[0].startswith("influences: 1 of 12, ") and lines[10].startswith("influences: 12 of 12, ")
     assert lines[11].startswith("poses: 0 of 50, ") and lines[-1].startswith("poses: 50 of 50, ")
     assert "\r" not in captured.err and "\x1b" not in captured.err
     recording = read_recording(tmp_path / "r")
