@@ -207,12 +207,8 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         files = [(rig.mesh_object, *self._files(rig.mesh_object)) for rig in self.rigs(context)]
-        steps = [
-            step
-            for files_of_mesh in files
-            for step in self.training_plan(files_of_mesh[0], _pose_count(files_of_mesh[1]))
-        ]
-        self.state.plan = JobPlan(steps)
+        plans = (self.training_plan(mesh_object, _pose_count(recording)) for mesh_object, recording, _ in files)
+        self.state.plan = JobPlan([step for plan in plans for step in plan])
         for number, (mesh_object, recording, model) in enumerate(files):
             self.state.begin_object(mesh_object.name if len(files) > 1 else "")
             self.state.plan.begin_training(number)
