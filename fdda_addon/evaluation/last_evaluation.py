@@ -193,8 +193,8 @@ def get(mesh_object: bpy.types.Object) -> LastEvaluation | None:
 
 
 def closed(character: tuple) -> LastEvaluation | None:
-    """Return the evaluation of a character of a closed file; None if none is stored."""
-    return next((e for e in _evaluations.values() if e.closed_character == character), None)
+    """Return the newest evaluation of a character of a closed file; None if none is stored."""
+    return next((e for e in reversed(_evaluations.values()) if e.closed_character == character), None)
 
 
 def clear() -> None:

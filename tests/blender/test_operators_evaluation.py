@@ -255,6 +255,19 @@ def test_an_evaluation_and_its_colors_survive_opening_the_file_again(active, elb
         heat_map.clear_all()
 
 
+def test_the_newer_of_two_evaluations_of_a_character_returns():
+    """The older one stays stored if it could not return, because its model was missing when the file was opened."""
+    character, evaluations = ("shot.blend", "elbow"), []
+    for uid in (-2, -1):
+        evaluations.append(last_evaluation.LastEvaluation("", "m", 0, 0, {}, {}, (), (), closed_character=character))
+        last_evaluation.restore(SimpleNamespace(session_uid=uid), evaluations[-1])
+    try:
+        assert last_evaluation.closed(character) is evaluations[1]
+    finally:
+        for uid in (-2, -1):
+            last_evaluation.remove(SimpleNamespace(session_uid=uid))
+
+
 def test_only_the_latest_evaluations_are_stored(active):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
     assert last_evaluation.get(active) is not None
