@@ -82,7 +82,8 @@ def bone_signature(armature: bpy.types.Armature, has_envelopes: bool) -> tuple:
     names, (segments, *values) = armature.bones.keys(), [read(armature.bones, element) for element in properties]
     # Few bones are B-Bones, whose settings are slow to read.
     b_bones = [armature.bones[names[index]] for index in np.flatnonzero(segments > 1)]
-    return (*names, *(value.tobytes() for value in values), b_bone_values(armature, b_bones))
+    b_bone_settings = b_bone_values(armature, b_bones) if b_bones else {}
+    return (*names, *(value.tobytes() for value in values), b_bone_settings)
 
 
 def rest_digest(mesh: bpy.types.Mesh) -> str:
