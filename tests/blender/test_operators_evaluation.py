@@ -13,6 +13,7 @@ from fdda_addon.evaluation import heat_map, last_evaluation, markers, overlay
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate, evaluate_action
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.binding import model_disabled
+from fdda_addon.runtime.model_files import allow_path
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, pose
@@ -237,6 +238,7 @@ def test_the_view_goes_to_the_worst_vertex(active, evaluated_action):
 
 def test_an_evaluation_and_its_colors_survive_opening_the_file_again(active, elbow_files, tmp_path):
     path = tmp_path / "shot.blend"
+    allow_path(elbow_files.model)  # It stays in another folder, and earlier tests may have ended the choice.
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     bpy.ops.fdda.evaluate(source="RANDOM", poses=3)
     last, name = last_evaluation.get(active), active.name
