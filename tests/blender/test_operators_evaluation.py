@@ -257,6 +257,25 @@ def test_an_evaluation_and_its_colors_survive_opening_the_file_again(active, elb
         heat_map.clear_all()
 
 
+@pytest.mark.parametrize("colors", ["ERRORS", "PARTITIONS"])
+def test_colors_are_hidden_in_edit_mode_and_by_another_topology(active, colors):
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
+    assert not heat_map.is_hidden(active), "there are no colors"
+    bpy.ops.fdda.color_mesh(colors=colors)
+    try:
+        assert heat_map.paint_kind(active) == colors and not heat_map.is_hidden(active)
+        bpy.ops.object.mode_set(mode="EDIT")
+        assert heat_map.is_hidden(active)
+        bpy.ops.object.mode_set(mode="OBJECT")
+        assert not heat_map.is_hidden(active)
+        modifier = active.modifiers.new("Subdivision", "SUBSURF")
+        assert heat_map.is_hidden(active)
+        active.modifiers.remove(modifier)
+        assert not heat_map.is_hidden(active)
+    finally:
+        heat_map.clear_all()
+
+
 def test_the_newer_of_two_evaluations_of_a_character_returns():
     """The older one stays stored if it could not return, because its model was missing when the file was opened."""
     character, evaluations = ("shot.blend", "elbow"), []
