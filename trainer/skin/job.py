@@ -105,9 +105,8 @@ def _choose(
         sink.send(MessageType.PROGRESS, stage=KEY_JOINTS_STAGE, done=done, total=total)
 
     is_static = np.arange(len(poses.rig.joints)) == request.static_joint
-    return choose_key_joints(
-        *(poses, request.random_poses, request.joints, is_static, metres_per_unit, should_stop, on_progress)
-    )
+    requested = request.random_poses, request.joints
+    return choose_key_joints(poses, *requested, is_static, metres_per_unit, should_stop, on_progress)
 
 
 def measure(poses: FitPoses, fitted: Rig) -> FitReport:
