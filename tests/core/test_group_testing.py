@@ -167,7 +167,7 @@ def limited_sum_of_group(changes: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("inputs", [60, 200])
 def test_influences_are_found_although_inputs_hide_each_other(inputs, change_of_group):
     missed, needless, tests = 0, 0, 0
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         truth = rng.random((inputs, 60)) < 5 / inputs
         sizes = truth * np.exp(rng.uniform(1, 5, (4, *truth.shape)))
@@ -177,14 +177,14 @@ def test_influences_are_found_although_inputs_hide_each_other(inputs, change_of_
         )
         missed, needless, tests = missed + (truth & ~found).sum(), needless + (found & ~truth).sum(), tests + test_count
     assert missed <= 1
-    assert needless <= 8
-    assert tests < 4 * 4 * inputs
+    assert needless <= 4
+    assert tests < 2 * 4 * inputs
 
 
 def test_influences_of_inputs_that_change_patches_equally_are_found():
     """Two bones of the same range drive one shape key: their changes are equal, and differ from trial to trial."""
     missed = 0
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         truth = np.repeat(rng.random((60, 60)) < 0.03, 2, axis=0)
         changes = vector_changes(rng, truth * np.exp(rng.uniform(1, 5, (4, *truth.shape))))
