@@ -30,6 +30,9 @@ MIN_TESTS = 64
 MIN_UNDECIDED_PROBABILITY = 0.3
 """Smallest probability of an undecided pair of input and patch in the third division: two groups of the input changed
 the patch. It grows with each further division, until inputs are tested alone where every input acts."""
+MAX_TESTS_ALONE = 64
+"""Largest number of inputs that are tested alone at the end of a trial, because others may have hidden them. It is all
+inputs of most rigs, and limits the time for rigs of hundreds."""
 ACTING_CONFLICT = 0.05
 """Weight of a conflict with an input that is known to act. Its change is subtracted, but nearly only."""
 TOGETHER_CONFLICT = 100.0
@@ -102,10 +105,10 @@ class GroupTesting:
         return self._color(is_member, conflicts + conflicts.T, math.ceil(max(likely.sum(axis=0).max(), 2)))
 
     def _suspects(self) -> np.ndarray:
-        """Return inputs to test alone, because changes contradict what was decided; at most as many as tests so far."""
+        """Return inputs to test alone, because changes contradict what was decided: the largest changes first."""
         found = self.influences | self._patches.any_of_partition(self._decoder.acts)
         changes = np.where(found[:, self._patches.partition_of_patch], 0, self._decoder.contradictions()).max(axis=1)
-        suspects = np.argsort(-changes, kind="stable")[: self._test_count]
+        suspects = np.argsort(-changes, kind="stable")[:MAX_TESTS_ALONE]
         return suspects[changes[suspects] > 0]
 
     def add_changes(self, groups: list[np.ndarray], changes: np.ndarray) -> None:
