@@ -15,7 +15,7 @@ HELPERS = ("half.1", "half.2", "push.1", "push.2")
 
 def limb_with_helpers() -> tuple[bpy.types.Object, bpy.types.Object]:
     """Build a limb with delta mush of three main bones; each joint has a half-rotating bone and a driven bone."""
-    mesh_object, armature_object = limb(len(MAIN_BONES), 40.0, twist=50.0)
+    mesh_object, armature_object = limb(len(MAIN_BONES), 15.0, twist=20.0)
     ends = np.linspace(START, END, len(MAIN_BONES) + 1).tolist()
     for number in (1, 2):
         x_position, parent = ends[number], f"bone.{number - 1}"

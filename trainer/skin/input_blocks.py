@@ -97,8 +97,8 @@ class InputBlocks:
         """Return the block that explains most of the remaining motion in training poses.
 
         Args:
-            remaining: (n / 2, 12) motion that the excluded blocks do not explain.
-            excluded: blocks that are used already.
+            remaining: (n / 2, 12) motion that the used blocks do not explain.
+            excluded: blocks to leave out, those that are used already among them.
         """
         is_usable = self._is_usable & (self.widths > 0)
         is_usable[list(excluded)] = False

@@ -13,7 +13,7 @@ relative to it, so that they do not change when an animation moves it, as a char
 """
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,11 +23,9 @@ from fdda_addon.core.skinning import skin_matrices
 
 from .input_blocks import MIN_SPREAD, InputBlocks, predict
 
-TOLERANCE_RATIO = 2.5e-4
+TOLERANCE_RATIO = 1e-4
 """A joint is removed if the motion that remains unexplained is at most this part of the character's size (rms over
-poses and vertices, times skin weights)."""
-EXPLAINED_RATIO = 0.05
-"""A joint is also removed if this part of its motion remains unexplained: networks fit better than least squares."""
+poses and vertices, times skin weights). Models have errors of this size."""
 MAX_INPUTS = 4
 """Largest number of inputs that explain a joint, besides its anchor."""
 MIN_RELATIVE_GAIN = 0.01
@@ -66,7 +64,8 @@ class _Explanation:
     Attributes:
         anchor, inputs: the anchor, and the other inputs that explain the joint.
         unexplained: motion that remains, mesh units.
-        cost: `unexplained` relative to the largest value with which the joint can be removed.
+        cost: `unexplained` relative to the tolerance; the whole motion in place of it for joints that random poses
+            move by channels of their own.
     """
 
     anchor: int
@@ -248,20 +247,24 @@ class KeyJointSearch:
         moved = self._skin[:, joint] @ self._moment_roots[joint]
         motion = (self._inverse_skin[:, anchor] @ moved).reshape(len(moved), 12)
         motion = motion - motion[::2].mean(axis=0)
-        inputs, error = self._find_inputs(motion)
+        # What moves a root usually moves the whole character, so a root is an input only if no others are enough.
+        roots = [kept for kept in np.flatnonzero(self._is_kept).tolist() if self._blocks.parent(kept) < 0]
+        inputs, error = self._find_inputs(motion, roots)
+        if error > self.tolerance:
+            inputs, error = self._find_inputs(motion)
         total = _rms(motion[1::2])
         if self._is_sampled[joint]:
             # Animators pose this joint, so what explains it in these poses may not explain it in others.
             return _Explanation(anchor, inputs, total, total / self.tolerance)
-        return _Explanation(anchor, inputs, error, error / max(self.tolerance, EXPLAINED_RATIO * total))
+        return _Explanation(anchor, inputs, error, error / self.tolerance)
 
-    def _find_inputs(self, motion: np.ndarray) -> tuple[tuple[int, ...], float]:
+    def _find_inputs(self, motion: np.ndarray, excluded: Iterable[int] = ()) -> tuple[tuple[int, ...], float]:
         """Find inputs that explain the (n, 12) motion; return them and the rms of the remaining motion, mesh units."""
         training, held_out = motion[::2], motion[1::2]
         inputs: tuple[int, ...] = ()
         best, remaining = (inputs, _rms(held_out)), training
         while len(inputs) < MAX_INPUTS and best[1] > self.tolerance / 4:
-            chosen = self._blocks.best_block(remaining, inputs)
+            chosen = self._blocks.best_block(remaining, (*inputs, *excluded))
             if chosen is None:
                 break
             inputs = (*inputs, chosen)
