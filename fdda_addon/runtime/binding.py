@@ -54,7 +54,8 @@ def bind(
     binding = mesh_object.fdda
     binding.model = stored_path_for(mesh_object, model_path)
     binding.packed = packed_text
-    binding.use_in_render = use_in_render
+    # Without the model, renders of a fast rig would show what is left of its modifiers.
+    binding.use_in_render = use_in_render or binding.is_fast_rig
     binding.is_bound = True
     binding.mode = "FDDA"
 

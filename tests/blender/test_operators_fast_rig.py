@@ -66,7 +66,9 @@ def test_a_fast_rig_without_a_model_says_what_deforms_the_mesh(saved, is_fast_ri
     bpy.data.objects[ELBOW].fdda.is_fast_rig = is_fast_rig
     assert bpy.ops.fdda.unbind() == {"FINISHED"}
     assert (REMAINING in capfd.readouterr().out) == is_fast_rig
-    assert bpy.ops.fdda.bind() == bpy.ops.fdda.remove_model() == {"FINISHED"}
+    assert bpy.ops.fdda.bind() == {"FINISHED"}
+    assert bpy.data.objects[ELBOW].fdda.use_in_render == is_fast_rig
+    assert bpy.ops.fdda.remove_model() == {"FINISHED"}
     assert capfd.readouterr().out.count(REMAINING) == is_fast_rig
 
 
