@@ -28,8 +28,8 @@ import bpy
 ROUNDS = 6
 SECONDS = 3.0
 SETTLE_SECONDS = 1.5
-MIN_FRAMES = 3
-"""A measurement lasts until it has this many frames."""
+MIN_FRAMES, MAX_EXTENSIONS = 3, 9
+"""Number of frames that a measurement needs, and how often it is extended by its own duration to reach it."""
 TABS = ("FDDA", "View", "")
 """Tabs of the sidebar; the empty name means that the sidebar is closed."""
 UNREACHABLE_FPS = 1000
@@ -137,8 +137,11 @@ def measure(seconds: float, times_by_tab: dict[str, dict]) -> Iterator[float]:
             frame_end_times.clear()
             code_times.clear()
             yield seconds
-            while len(frame_end_times) < MIN_FRAMES:
-                yield seconds
+            for _ in range(MAX_EXTENSIONS):
+                if len(frame_end_times) < MIN_FRAMES:
+                    yield seconds
+            if len(frame_end_times) < MIN_FRAMES:
+                raise SystemExit(f"Blender evaluated {len(frame_end_times)} frames; give more SECONDS.")
             frame_count, measured_code = len(frame_end_times), dict(code_times)
             toggle_animation()
             tab_times["frames"] += [(b - a) * 1000 for a, b in pairwise(frame_end_times)]
