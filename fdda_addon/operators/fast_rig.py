@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operator that makes a fast rig of the saved file, in another Blender."""
 
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -89,9 +90,10 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
     def finish(self, _context: bpy.types.Context, result: object) -> str:
         lines = [line.strip() for line in str(result).splitlines()]
         # The first and the last line begin with the path of the file.
-        path, _, summary = lines[0].partition(".blend: ")
-        texts = [line.rpartition(".blend: ")[2] for line in lines[1:]]
-        sentences = [f"{Path(path).name}.blend: {summary}.", *(f"{text[:1].upper()}{text[1:]}." for text in texts)]
+        start = re.match(r".*\.blend: ", lines[0], re.IGNORECASE)
+        prefix = start[0] if start else ""
+        summary, *texts = (line.removeprefix(prefix) for line in lines)
+        sentences = [f"{Path(prefix).name}{summary}.", *(f"{text[:1].upper()}{text[1:]}." for text in texts)]
         return " ".join(sentences)
 
     def _check_saved(self, scene_rig: SceneRig) -> None:

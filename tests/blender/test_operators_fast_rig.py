@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.progress import Progress
 from fdda_addon.fast_rig.process import VerbProcess
 from fdda_addon.jobs import job
-from fdda_addon.operators.fast_rig import _write_models
+from fdda_addon.operators.fast_rig import FDDA_OT_fast_rig, _write_models
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
 from .test_operators_playback import refused
@@ -104,6 +104,13 @@ def test_unsaved_files_and_missing_choices_are_refused(saved):
 def test_a_point_in_the_name_of_the_file_is_kept(saved):
     assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.v2")) == {"FINISHED"}
     assert (saved / "fast.v2.blend").is_file() and not (saved / "fast.blend").exists()
+
+
+@pytest.mark.parametrize("name", ["fast.blend", "FAST.BLEND"])
+def test_the_report_has_a_sentence_for_each_line_of_the_verb(name):
+    output = f"/folder/{name}: 'rig' has 2 of 3 bones\n  removed 1 object\n/folder/{name}: a frame took 1 ms\n"
+    expected = f"{name}: 'rig' has 2 of 3 bones. Removed 1 object. A frame took 1 ms."
+    assert FDDA_OT_fast_rig.finish(None, None, output) == expected
 
 
 def test_meshes_whose_clean_names_are_equal_keep_their_models(saved, tmp_path_factory):
