@@ -13,6 +13,7 @@ import pytest
 import fdda_addon
 from blend_fixtures.characters.base import cage, link, skin
 from blend_fixtures.characters.meshes import body_and_sleeve
+from fdda_addon.cli.pose_notes import REMIX_HINT
 from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.index import read_index
@@ -161,8 +162,9 @@ def test_each_mesh_has_a_model_and_a_report_of_its_own(two):
 def test_record_prints_its_requirements_and_results(two, commands):
     out, err = commands["record"].out, commands["record"].err
     poses = f"{POSES + 30} poses"
-    assert out[0].startswith(f"{poses} of 600 vertices: less than 1 MB on the disk, about ")
-    assert [line.partition(" in ")[0] for line in out[1:]] == [f"{two.recordings / n}: {poses}" for n in (BODY, SLEEVE)]
+    assert out[0] == REMIX_HINT
+    assert out[1].startswith(f"{poses} of 600 vertices: less than 1 MB on the disk, about ")
+    assert [line.partition(" in ")[0] for line in out[2:]] == [f"{two.recordings / n}: {poses}" for n in (BODY, SLEEVE)]
     stages = list(dict.fromkeys(line.partition(":")[0] for line in err))
     assert stages == ["influences of 'elbow'", "influences of 'sleeve'", "poses"]
 
