@@ -212,8 +212,9 @@ def main() -> None:
     group.add_argument("--only", nargs="+", help="names of characters, without their extension")
     group.add_argument("--write", action="store_true", help="write the table to docs/characters.md")
     options = parser.parse_args()
-    out = options.out.resolve()  # The verbs run in another working directory.
-    sources = sorted(path for path in options.folder.glob("*") if path.suffix in {".glb", ".gltf", ".blend"})
+    # The verbs run in another working directory, and Blender 4.5 takes the one of the shell for its own.
+    out, folder = options.out.resolve(), options.folder.resolve()
+    sources = sorted(path for path in folder.glob("*") if path.suffix in {".glb", ".gltf", ".blend"})
     if options.only:
         sources = [path for path in sources if path.stem in options.only]
     if not sources:
