@@ -8,7 +8,6 @@ from ..core.assessment import farther_than_skinning_sentence
 from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED, FILM_TIMED_FRAMES
 from ..core.errors import WrongUsageError
 from ..core.file_kind import EVALUATION, PICTURE, VIDEO
-from ..core.metrics import error_statistics
 from ..core.output import atomic_write_all, check_outputs, to_json_text
 from ..core.progress import Progress
 from ..evaluation.results import Evaluation
@@ -177,7 +176,7 @@ def table(evaluation: Evaluation) -> str:
             for name in ("mean", "rms", "p99", "p999", "max")
         )
         lines.append(f"{'  FDDA / linear skinning':<24}{ratios}")
-        if text := farther_than_skinning_sentence(error_statistics(errors.fdda), error_statistics(errors.linear)):
+        if text := farther_than_skinning_sentence(values["fdda"]["mean"], values["linear"]["mean"]):
             lines.append(f"  {text}")
         if values["normals"]:
             lines += _surface_lines(values["normals"], values["edges"])

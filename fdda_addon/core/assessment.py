@@ -65,7 +65,8 @@ def assess_training(report: Mapping) -> Assessment:
         warnings.append("Skinning alone already equals the rig, so a model brings nothing here.")
     elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
         warnings.append(
-            f"{_describe_no_gain(model, skinning)}: set Rotation Limits, raise Random Poses, and record again."
+            f"{_describe_no_gain(model.mean, skinning.mean)}: set Rotation Limits, raise Random Poses, and record "
+            "again."
         )
     elif tail := _unimproved_tail(model, skinning):
         warnings.append(f"{tail}: press Add Poses at Worst Errors, then Continue Training.")
@@ -87,14 +88,14 @@ def assess_evaluation(
     warnings = []
     if not is_bound:
         warnings.append("Another model is bound now: press Evaluate again.")
-    elif skinning.mean < MIN_SKINNING_ERROR_MM and not _is_farther(model, skinning):
+    elif skinning.mean < MIN_SKINNING_ERROR_MM and not _is_farther(model.mean, skinning.mean):
         warnings.append(
             "Skinning alone already equals the rig in these poses, so they do not show what the model does."
         )
     elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
         warnings.append(
-            f"{_describe_no_gain(model, skinning)}: these poses are unlike the recorded ones. Check this action in "
-            "Training Poses, record and train again."
+            f"{_describe_no_gain(model.mean, skinning.mean)}: these poses are unlike the recorded ones. Check this "
+            "action in Training Poses, record and train again."
         )
     elif tail := _unimproved_tail(model, skinning):
         warnings.append(
@@ -118,15 +119,18 @@ def describe_errors(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorSt
     )
 
 
-def farther_than_skinning_sentence(
-    model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors"
-) -> str:
-    """Return a sentence about a model that is farther from the rig than skinning alone; empty if it is closer."""
-    if not _is_farther(model, skinning):
+def farther_than_skinning_sentence(model_mm: float, skinning_mm: float) -> str:
+    """Return a sentence about a model that is farther from the rig than skinning alone; empty if it is closer.
+
+    Args:
+        model_mm: mean error of the model, mm.
+        skinning_mm: mean error of skinning alone, mm.
+    """
+    if not _is_farther(model_mm, skinning_mm):
         return ""
     return (
-        f"The model is farther from the rig than linear skinning here, {format_mm(model.mean)} instead of "
-        f"{format_mm(skinning.mean)} mm on average: record more such poses, or play them without the model."
+        f"The model is farther from the rig than linear skinning here, {format_mm(model_mm)} instead of "
+        f"{format_mm(skinning_mm)} mm on average: record more such poses, or play them without the model."
     )
 
 
@@ -198,15 +202,14 @@ def _unimproved_tail(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorS
     return ""
 
 
-def _is_farther(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> bool:
+def _is_farther(model_mm: float, skinning_mm: float) -> bool:
     """Return whether a model is farther from the rig than skinning alone, by more than its tolerance allows."""
-    is_rig = skinning.mean < MIN_SKINNING_ERROR_MM
-    return model.mean > (TOLERANCE_MM if is_rig else skinning.mean)
+    return model_mm > (TOLERANCE_MM if skinning_mm < MIN_SKINNING_ERROR_MM else skinning_mm)
 
 
-def _describe_no_gain(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:
-    is_farther = _is_farther(model, skinning)
-    return f"The model is {'farther from the rig' if is_farther else 'hardly closer'} than skinning alone"
+def _describe_no_gain(model_mm: float, skinning_mm: float) -> str:
+    comparison = "farther from the rig" if _is_farther(model_mm, skinning_mm) else "hardly closer"
+    return f"The model is {comparison} than skinning alone"
 
 
 def _ratio(model_mm: float, skinning_mm: float) -> float:

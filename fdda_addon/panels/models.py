@@ -81,9 +81,8 @@ class FDDA_UL_models(bpy.types.UIList):
         row.prop(item, "name", text="", emboss=False, icon="LINKED" if is_bound(mesh_object, item) else "BLANK1")
         if item.packed:
             row.label(text=format_file_size(item.packed_bytes), icon="PACKAGE")
-        if (
-            problem := (timed_values.get(_find_problems, mesh_object, PROBLEMS_SECONDS) or {}).get(_entry_key(item))
-        ) is not None:
+        problems = timed_values.get(_find_problems, mesh_object, PROBLEMS_SECONDS) or {}
+        if (problem := problems.get(_entry_key(item))) is not None:
             row.label(icon=problem[0])
 
 

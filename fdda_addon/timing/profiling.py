@@ -40,8 +40,8 @@ def profile_frame(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]:
     Raises:
         RigError: as `check_full_rig` and `check_posable`, or there is no action and no bone that random poses may move.
     """
+    check_full_rig(scene_rig.mesh_object)
     with model_disabled(scene_rig.mesh_object):
-        check_full_rig(scene_rig.mesh_object)
         check_posable(scene_rig)
         yield from _profile_shown_rig(scene_rig)
 

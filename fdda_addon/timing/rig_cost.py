@@ -72,8 +72,8 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
         RigError: as `check_full_rig`, or the rig cannot be evaluated.
     """
     mesh_object = scene_rig.mesh_object
+    check_full_rig(mesh_object)
     with model_disabled(mesh_object):
-        check_full_rig(mesh_object)
         check_evaluable(scene_rig)
         times: dict[str, list[float]] = {"rig": [], "linear": []}
         with temporary_animation(scene_rig) as frames:

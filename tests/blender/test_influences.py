@@ -32,28 +32,8 @@ def chains() -> None:
     meshes.five_hundred_bones()
 
 
-def chains_with_distant_influences() -> None:
-    """Let the first bone of each chain drive a shape key of the next chain."""
-    chains()
-    mesh_object, armature_object = bpy.data.objects["creature"], bpy.data.objects["creature_rig"]
-    mesh_object.shape_key_add(name="Basis", from_mix=False)
-    points = np.array([vertex.co for vertex in mesh_object.data.vertices])
-    for chain in range(meshes.CHAINS):
-        key = mesh_object.shape_key_add(name=f"key {chain}", from_mix=False)
-        key.slider_min = -1.0
-        next_y = (chain + 1) % meshes.CHAINS * 0.05
-        for point, is_moved in zip(key.data, np.abs(points[:, 1] - next_y) < 0.02, strict=True):
-            point.co.z += 0.05 if is_moved else 0.0
-        driver = key.driver_add("value").driver
-        variable = driver.variables.new()
-        variable.name = "angle"
-        variable.targets[0].id = armature_object
-        variable.targets[0].data_path = f'pose.bones["finger.{chain:02}.00"].rotation_euler[0]'
-        driver.expression = "angle"
-
-
-def chains_with_switches() -> None:
-    """Let a shape key of each chain follow the first of five bones of other chains that is rotated."""
+def chains_with_driven_keys(bones_of_chain: Callable[[int], list[str]], expression: str) -> None:
+    """Let a shape key of each chain follow the rotations of bones, the variables `angle_0`, `angle_1`, … ."""
     chains()
     mesh_object, armature_object = bpy.data.objects["creature"], bpy.data.objects["creature_rig"]
     mesh_object.shape_key_add(name="Basis", from_mix=False)
@@ -64,16 +44,31 @@ def chains_with_switches() -> None:
         for point, is_moved in zip(key.data, np.abs(points[:, 1] - chain * 0.05) < 0.02, strict=True):
             point.co.z += 0.05 if is_moved else 0.0
         driver = key.driver_add("value").driver
-        for number in range(5):
+        for number, bone in enumerate(bones_of_chain(chain)):
             variable = driver.variables.new()
             variable.name = f"angle_{number}"
             variable.targets[0].id = armature_object
-            bone = f"finger.{(chain + number + 1) % meshes.CHAINS:02}.{(2 * chain + 3 * number) % 8:02}"
             variable.targets[0].data_path = f'pose.bones["{bone}"].rotation_euler[0]'
-        expression = "angle_4"
-        for number in reversed(range(4)):
-            expression = f"(angle_{number} if abs(angle_{number}) > 0.001 else {expression})"
         driver.expression = expression
+
+
+def chains_with_distant_influences() -> None:
+    """Let the first bone of each chain drive a shape key of the next chain."""
+    chains_with_driven_keys(lambda chain: [f"finger.{(chain - 1) % meshes.CHAINS:02}.00"], "angle_0")
+
+
+def chains_with_switches() -> None:
+    """Let a shape key of each chain follow the first of five bones of other chains that is rotated."""
+
+    def bones_of_chain(chain: int) -> list[str]:
+        return [
+            f"finger.{(chain + number + 1) % meshes.CHAINS:02}.{(2 * chain + 3 * number) % 8:02}" for number in range(5)
+        ]
+
+    expression = "angle_4"
+    for number in reversed(range(4)):
+        expression = f"(angle_{number} if abs(angle_{number}) > 0.001 else {expression})"
+    chains_with_driven_keys(bones_of_chain, expression)
 
 
 def chains_that_copy_each_other() -> None:

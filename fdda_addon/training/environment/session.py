@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Results of the last check of the trainer's Python in this session, which panels draw without running a check."""
 
-from ...scene.draw_cache import clear, draw_cached
+from ...scene import draw_cache
 from .check_result import CheckResult
 from .folder import FolderState, environment_folder, folder_state
 
@@ -15,10 +15,10 @@ def store_result(new_result: CheckResult | None, new_notice: CheckResult | None 
     """Store results, and let panels read the state of the environment's folder again."""
     global check_result, notice
     check_result, notice = new_result, new_notice
-    clear()
+    draw_cache.clear()
 
 
-@draw_cached
+@draw_cache.draw_cached
 def environment_state() -> FolderState:
     """Return the state of the add-on's environment, cached for drawing."""
     return folder_state(environment_folder())
