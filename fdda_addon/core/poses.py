@@ -96,7 +96,7 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
         (C,) float64, each in the unit of its channel.
     """
     rng = np.random.default_rng([seed, index])
-    low, high = np.array([(channel.low, channel.high) for channel in channels]).T
+    low, high = np.array([channel.low for channel in channels]), np.array([channel.high for channel in channels])
     offsets = rng.standard_normal(len(channels)) * spread
     while len(outside := np.flatnonzero(np.abs(offsets) > 1)):
         offsets[outside] = rng.standard_normal(len(outside)) * spread

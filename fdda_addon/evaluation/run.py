@@ -197,11 +197,11 @@ def _random_poses(
     count: int,
     pose_setter: PoseSetter = DIRECT_POSE_SETTER,
 ) -> Iterator[None]:
-    poser, rest_values = Poser(scene_rig, channels), np.array([channel.rest for channel in channels])
+    poser = Poser(scene_rig, channels)
     with pose_setter.prepared():
         for index in range(first_index, first_index + count):
             values = sample_pose(channels, seed, index)
-            pose_setter.set_pose(blend_from_rest(poser.set, rest_values, values))
+            pose_setter.set_pose(blend_from_rest(poser.set, channels, values))
             yield
 
 
@@ -210,7 +210,7 @@ def _named_pose(scene_rig: SceneRig, pose: NamedPose, pose_setter: PoseSetter) -
     channels = tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3))
     values = np.array([angle for angles in pose.rotations.values() for angle in angles])
     with pose_setter.prepared():
-        pose_setter.set_pose(blend_from_rest(Poser(scene_rig, channels).set, np.zeros(len(values)), values))
+        pose_setter.set_pose(blend_from_rest(Poser(scene_rig, channels).set, channels, values))
         yield
 
 

@@ -147,8 +147,7 @@ class PosePlan:
         """Return a function that blends from the rest pose to a random pose by a factor of 0 to 1."""
         is_in_range = index < self.in_range_count or index >= REPEATABILITY_INDEX_OFFSET
         sampler = self._sampler if is_in_range else replace(self._sampler, remix=None)
-        values = sampler.draw_pose(channels, index)
-        return blend_from_rest(set_pose, np.array([channel.rest for channel in channels]), values)
+        return blend_from_rest(set_pose, channels, sampler.draw_pose(channels, index))
 
     def _make_setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
         """Return a function that sets channel values; channels that are not in the plan belong to the armature."""

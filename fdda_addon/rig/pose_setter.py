@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Sets poses of a rig whose surface, or whose target, follows from the pose or the frame alone."""
 
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..core.defaults import REPEATABILITY_POSES, REST_THRESHOLD_MM
+from ..core.poses import Channel
 from ..core.recording.target import RecordedTarget
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
@@ -42,17 +43,23 @@ NO_TARGET = TargetSettings()
 """The surface of the rig itself is evaluated."""
 
 
-def blend_from_rest(set_values: Callable[[np.ndarray], None], rest: np.ndarray, values: np.ndarray) -> PoseFunction:
+def blend_from_rest(
+    set_values: Callable[[np.ndarray], None], channels: Sequence[Channel], values: np.ndarray
+) -> PoseFunction:
     """Return a function that sets a fraction of a pose.
 
     Args:
-        set_values: sets the values of channels.
-        rest: (C,) values of the rest pose.
+        set_values: sets the values of the channels.
+        channels: C channels.
         values: (C,) values of the pose.
     """
 
     def set_fraction(fraction: float) -> None:
-        set_values(values if fraction == 1 else rest + fraction * (values - rest))
+        if fraction == 1:
+            set_values(values)
+        else:
+            rest = np.array([channel.rest for channel in channels])
+            set_values(rest + fraction * (values - rest))
 
     return set_fraction
 

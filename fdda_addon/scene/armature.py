@@ -25,6 +25,10 @@ def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.nd
 
 _REST_CHANNEL_VALUES = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
 """The values of `POSE_CHANNELS` in the rest pose."""
+_STORED_CHANNELS = dict(
+    zip((LOCATION, ROTATION, SCALE), (POSE_CHANNELS[0], POSE_CHANNELS[1], POSE_CHANNELS[4]), strict=True)
+)
+"""The property in which Blender stores the channels of a kind; rotations of bones whose mode is one of Euler angles."""
 
 
 class PoseMatrixReader:
@@ -86,10 +90,23 @@ class Poser:
 
     def __init__(self, scene_rig: SceneRig, channels: tuple[Channel, ...]):
         self._scene_rig = scene_rig
-        self._channels: dict[str, dict[str, list[tuple[int, int]]]] = {}
-        """Index and axis of each channel, by its kind and by the name of its bone or control."""
+        bones = scene_rig.armature_object.pose.bones
+        bone_indices = {bone.name: bone_index for bone_index, bone in enumerate(bones)}
+        stored_as_euler = {bone.name for bone in bones if bone.rotation_mode not in {"QUATERNION", "AXIS_ANGLE"}}
+        self._controls: list[tuple[str, int]] = []
+        """Name and index of each channel of a control."""
+        self._rotations: dict[tuple[str, str], list[tuple[int, int]]] = {}
+        """Index and axis of the channels that are converted to the rotation mode of their bone, by kind and bone."""
+        elements: dict[str, list[tuple[int, int, int]]] = {}
         for index, channel in enumerate(channels):
-            self._channels.setdefault(channel.kind, {}).setdefault(channel.name, []).append((index, channel.axis))
+            if channel.kind == CONTROL:
+                self._controls.append((channel.name, index))
+            elif channel.kind == ROTATION_VECTOR or (channel.kind == ROTATION and channel.name not in stored_as_euler):
+                self._rotations.setdefault((channel.kind, channel.name), []).append((index, channel.axis))
+            else:
+                elements.setdefault(channel.kind, []).append((bone_indices[channel.name], channel.axis, index))
+        self._elements = [(_STORED_CHANNELS[kind], *np.array(indices).T) for kind, indices in elements.items()]
+        """Each stored property with the bones, axes and indices of its channels."""
 
     def set(self, values: np.ndarray) -> None:
         """Set the channels, without an evaluation.
@@ -97,27 +114,22 @@ class Poser:
         Args:
             values: (C,) values in the order of the channels, each in its unit.
         """
-        bones = self._scene_rig.armature_object.pose.bones
-        for name, channels in self._channels.get(ROTATION, {}).items():
+        armature_object = self._scene_rig.armature_object
+        bones = armature_object.pose.bones
+        for element, bone_indices, axes, indices in self._elements:
+            stored = read(bones, element)
+            stored[bone_indices, axes] = values[indices]
+            write(bones, element, stored)
+        for (kind, name), channels in self._rotations.items():
             angles = [0.0, 0.0, 0.0]
             for index, axis in channels:
                 angles[axis] = values[index]
-            if bones[name].rotation_mode in {"QUATERNION", "AXIS_ANGLE"}:
-                _rotate(bones[name], Euler(angles).to_quaternion())
-            else:
-                bones[name].rotation_euler = angles
-        for name, channels in self._channels.get(ROTATION_VECTOR, {}).items():
-            vector = [0.0, 0.0, 0.0]
-            for index, axis in channels:
-                vector[axis] = values[index]
-            _rotate(bones[name], Quaternion(vector))
-        for kind in (LOCATION, SCALE):
-            for name, channels in self._channels.get(kind, {}).items():
-                bone_values = getattr(bones[name], kind)
-                for index, axis in channels:
-                    bone_values[axis] = values[index]
-        for name, channels in self._channels.get(CONTROL, {}).items():
-            set_control(self._scene_rig, name, float(values[channels[0][0]]))
+            _rotate(bones[name], Euler(angles).to_quaternion() if kind == ROTATION else Quaternion(angles))
+        if self._elements:
+            # Blender does not notice values that are written as an array.
+            armature_object.update_tag(refresh={"DATA"})
+        for name, index in self._controls:
+            set_control(self._scene_rig, name, float(values[index]))
 
 
 def _rotate(bone: bpy.types.PoseBone, rotation: Quaternion) -> None:
