@@ -45,6 +45,7 @@ class RecordedMesh:
     Attributes:
         scene_rig: the rig as scene objects.
         rig: the rig as arrays; `fit_weights` replaces its skin weights, and may remove joints.
+        original_rig: the rig with its own skin weights and all joints.
         path: folder of the recording.
         channels: channels of the random poses that belong to the mesh or its armature.
         limits: channels of the recording, including shared channels of other meshes.
@@ -67,6 +68,10 @@ class RecordedMesh:
     needed_inputs: np.ndarray | None = None
     partitions: tuple[Partition, ...] = ()
     evaluator: TimedEvaluator = field(init=False)
+    original_rig: Rig = field(init=False)
+
+    def __post_init__(self):
+        self.original_rig = self.rig
 
     @property
     def name(self) -> str:

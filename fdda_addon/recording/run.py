@@ -35,6 +35,7 @@ from .pose_plan import PosePlan
 from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
 from .recorded_mesh import RecordedMesh, TimedEvaluator
 from .repeatability import measure_repeatability
+from .seam_check import check_seams
 from .target_check import check_target_moves
 from .time_check import check_follows_pose
 from .weight_fitting import FittedWeights, check_has_weights, fit_weights, make_fit_request
@@ -192,6 +193,8 @@ class RecordingSession:
                 )
         if mesh.partitions:
             return
+        if seam_warning := check_seams(mesh, self.poses, player):
+            yield Progress("influences", 0, 1, seam_warning)
         partitions = make_merged_partitions(mesh.rig, min_vertices)
         if mesh.target and mesh.target.follows != POSE:
             # A target that depends on time does not follow a moved joint immediately: influences cannot be detected.

@@ -6,6 +6,8 @@ connected. Modifiers that smooth then move each piece alone. Its tangents depend
 jumps and opens in cracks, which no network can learn (docs/characters.md, Characters that others made).
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from ..partition import main_joints
@@ -27,18 +29,26 @@ MAX_POSES = 50
 
 
 def check_seams(recording: Recording) -> list[RecordingWarning]:
-    """Return the warning "open-seams" if cuts open in the poses; none if the faces of the recording are unknown.
+    """Return the warnings of `find_open_seams` for evenly spaced poses of a recording."""
+    poses = np.unique(np.linspace(0, len(recording.residuals) - 1, MAX_POSES).round().astype(np.int64))
+    return find_open_seams(recording.rig, (np.array(recording.residuals[pose]) for pose in poses))
+
+
+def find_open_seams(rig: Rig, residuals: Iterable[np.ndarray]) -> list[RecordingWarning]:
+    """Return the warning "open-seams" if cuts open in the poses; none if the faces of the rig are unknown.
 
     Gaps that are the same in all poses can be learned, so they do not count.
+
+    Args:
+        rig: the rig.
+        residuals: (V, 3) of each pose, axes of the main joint, mesh units. A mesh without cuts needs none of them.
     """
-    rig, pose_count = recording.rig, len(recording.residuals)
     pairs = _seam_pairs(rig)
     if len(np.unique(pairs)) <= MAX_TORN_RATIO * rig.vertex_count:
         return []
     changes, gaps, first_gaps = np.zeros(len(pairs)), np.zeros(len(pairs)), None
-    for pose in np.unique(np.linspace(0, pose_count - 1, MAX_POSES).round().astype(np.int64)):
-        residuals = np.array(recording.residuals[pose])
-        pose_gaps = residuals[pairs[:, 0]].astype(np.float64) - residuals[pairs[:, 1]]
+    for pose_residuals in residuals:
+        pose_gaps = pose_residuals[pairs[:, 0]].astype(np.float64) - pose_residuals[pairs[:, 1]]
         first_gaps = pose_gaps if first_gaps is None else first_gaps
         np.maximum(gaps, np.linalg.norm(pose_gaps, axis=1), out=gaps)
         np.maximum(changes, np.linalg.norm(pose_gaps - first_gaps, axis=1), out=changes)
