@@ -98,7 +98,7 @@ class Character:
         train.build_model = keep_arguments
         try:
             with mechanism.switched_off():
-                train.train_model(self.folder / "recording", model, config, _SilentSink(), overwrite=True)
+                train.train_model(self.folder / "recording", model, config, _SilentSink())
         finally:
             train.build_model = build_model
 

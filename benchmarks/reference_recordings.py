@@ -72,11 +72,13 @@ class ReferencePartition:
     """A partition of the recordings.
 
     Attributes:
+        name: name of the main joint.
         data: features and residuals in the form that the trainer reads.
         joint: index of the main joint.
         poses: (N, J, 4, 4) float64 pose matrices of all joints, meters.
     """
 
+    name: str
     data: PartitionData
     joint: int
     poses: np.ndarray
@@ -122,14 +124,12 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
     features = inputs.compute_features(poses.astype(np.float32), np.zeros((len(poses), 0)))
     residuals = residuals * np.float32(METERS_PER_CM)
     data = PartitionData(
-        name,
         features[:, inputs.columns[0]],
         lambda: residuals,
-        residuals.shape[1],
         # The rest pose is not known: the identity replaces it.
         lambda: make_joint_regression(parents, partition, poses, np.zeros(3)),
     )
-    return ReferencePartition(data, partition.joint, poses)
+    return ReferencePartition(name, data, partition.joint, poses)
 
 
 def measure(
@@ -169,10 +169,10 @@ def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bo
     rows = []
     for partition, prepared_partition, network in zip(partitions, prepared, result.networks, strict=True):
         mean, largest, linear = measure(partition, prepared_partition, network, config.activation, measured)
-        published = PUBLISHED_ERRORS_CM[prepared_partition.name]
+        published = PUBLISHED_ERRORS_CM[partition.name]
         rows.append(
             {
-                "partition": prepared_partition.name,
+                "partition": partition.name,
                 "components": len(prepared_partition.basis.components),
                 "linear_mean": linear,
                 "mean": mean,

@@ -117,7 +117,7 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
     wall_start, processor_start = time.perf_counter(), time.process_time()
     split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
     inputs = make_study_inputs(study_data, fit_inputs(study_data.whole_training, split, config))
-    data = partition_data(recording, recording.partitions, inputs)
+    data = partition_data(recording, inputs)
     prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor_start, "wall": time.perf_counter() - wall_start}
@@ -131,7 +131,7 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
         "model_bytes": len(exported.content),
         "parameters": sum(a.size for network in trained.networks for a in (*network.weights, *network.biases)),
         "partitions": {
-            prepared[index].name: {
+            recording.rig.joint_names[trained_model.partitions[index].joint]: {
                 "basis_left": {
                     "validation": float(prepared[index].validation_truncation.mean()) * 1000,
                     "held_out": _truncation_error_mm(trained_model, index, study_data.held_out),

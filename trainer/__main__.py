@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     escape_unencodable_output()
     options = _parser().parse_args(arguments)
     sink: MessageSink = JsonMessageSink() if options.messages else TextMessageSink()
-    stop_request = StopRequest()
+    stop_request = StopRequest(sink)
     return run_with_messages(lambda: _train(options, sink, stop_request), sink)
 
 
@@ -49,11 +49,11 @@ def _train(options: argparse.Namespace, sink: MessageSink, stop_request: StopReq
             check_batch(recordings, options.model, options.overwrite)
         else:
             check_training_outputs(options.model, options.overwrite)
-        with stop_request.exit_immediately(sink):
+        with stop_request.exit_immediately():
             from .train import train_model
     except ModuleNotFoundError as error:
         raise missing_package_error("Training", error) from error
-    settings = (config, sink, stop_request, options.warm_start, options.strict, options.overwrite)
+    settings = (config, sink, stop_request.exit_immediately, options.warm_start, options.strict)
     if recordings:
         train_models(recordings, options.model, *settings)
     else:

@@ -3,7 +3,7 @@
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from fdda_addon.core.errors import OutputError, RecordingError
@@ -70,37 +70,27 @@ def train_models(
     folder: Path,
     config: TrainingConfig,
     sink: MessageSink,
-    should_stop: Callable[[], bool] = lambda: False,
+    stoppable: Callable[[], AbstractContextManager] = nullcontext,
     warm_start: bool = False,
     strict: bool = False,
-    overwrite: bool = False,
 ) -> None:
     """Train a model on each recording. Finished models are kept when a later training fails.
 
     Args:
-        recordings: folders of complete recordings.
+        recordings: folders of complete recordings, which `check_batch` has checked.
         folder: folder of the models; the model of recording NAME is FOLDER/NAME/NAME.onnx.
-        config, sink, should_stop, warm_start, strict, overwrite: as in `train_model`.
+        config, sink, stoppable, warm_start, strict: as in `train_model`.
 
     Raises:
-        Cancelled: `should_stop` returned True.
-        FDDAError: as in `check_batch` and `train_model`.
+        FDDAError: as in `train_model`.
     """
     from .train import train_model
 
     started = time.perf_counter()
-    check_batch(recordings, folder, overwrite)
     item_sink = _BatchItemSink(sink)
     for recording in recordings:
         model = _model_path(recording, folder)
-        model.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            train_model(recording, model, config, item_sink, should_stop, warm_start, strict, overwrite)
-        finally:
-            # A folder with files is not removed, because rmdir fails there.
-            for created_folder in (model.parent, folder):
-                with suppress(OSError):
-                    created_folder.rmdir()
+        train_model(recording, model, config, item_sink, stoppable, warm_start, strict)
     sink.send(
         MessageType.FINISHED,
         model=str(folder),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Makes a trained model smaller: drops components that networks do not predict, and factorizes large partitions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from .fits.basis import Basis
 from .fits.low_rank import factorize, may_factorize
 from .networks.networks import Network
 from .preparation import PartitionData, PreparedPartition
-from .process import Cancelled
 
 MIN_GAIN_RATIO = 0.1
 """A component stays if it lowers the mean error by more than this part of the error, times its part of the parameters
@@ -25,7 +24,6 @@ def drop_components(
     networks: Sequence[Network],
     split: Split,
     activation: str,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[PreparedPartition], list[Network]]:
     """Drop the components that lower the mean error too little, or raise it.
 
@@ -40,18 +38,12 @@ def drop_components(
         prepared, networks: partitions with their trained networks.
         split: split of the poses.
         activation: as in `TrainingConfig`.
-        should_stop: called before each partition.
 
     Returns:
         The partitions and networks with the remaining components; a partition may lose all.
-
-    Raises:
-        Cancelled: `should_stop` returned True.
     """
     changes, gains, total_error = [], [], 0.0
     for partition, network in zip(prepared, networks, strict=True):
-        if should_stop():
-            raise Cancelled
         changes.append(_principal_directions(network.evaluate(partition.inputs[split.training], activation)))
         error, partition_gains = _component_gains(partition, network, changes[-1], split, activation)
         total_error += error
@@ -190,7 +182,6 @@ def factorize_partitions(
     partitions: Sequence[PartitionData],
     split: Split,
     tolerance: float,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[PreparedPartition], list[Network]]:
     """Factorize the partitions where that saves parameters (`low_rank`).
 
@@ -199,19 +190,14 @@ def factorize_partitions(
         partitions: data of the partitions.
         split: split of the poses.
         tolerance: rms error that the components may leave, mesh units.
-        should_stop: called before each partition.
 
     Returns:
         The partitions, and the networks with outputs for the changed bases.
-
-    Raises:
-        Cancelled: `should_stop` returned True.
     """
-    factorized = []
-    for arguments in zip(prepared, networks, partitions, strict=True):
-        if should_stop():
-            raise Cancelled
-        factorized.append(_factorize_partition(*arguments, split, tolerance))
+    factorized = [
+        _factorize_partition(*arguments, split, tolerance)
+        for arguments in zip(prepared, networks, partitions, strict=True)
+    ]
     return [partition for partition, _ in factorized], [network for _, network in factorized]
 
 

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from fdda_addon.core.features import MIN_FEATURE_SPREAD, float32_rounding
-from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 
 from .blocks import block_slices
+from .config import TrainingConfig
 from .data.split import Split
 from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
 from .fits.half_rotations import regression_matrices
@@ -24,19 +24,15 @@ class PartitionData:
     """Features and residuals of one partition, from a recording or another source.
 
     Attributes:
-        name: name of the main joint.
         features: (N, F) float32, the features that are offered to the network; F may be 0.
         read_residuals: returns the (N, Vp, 3) float32 local residuals, mesh units. It is called once, so that only one
             partition's residuals are in memory at a time.
-        vertex_count: Vp.
         read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
         min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
     """
 
-    name: str
     features: np.ndarray
     read_residuals: Callable[[], np.ndarray]
-    vertex_count: int
     read_regression: Callable[[], JointRegression] | None = None
     min_spread: np.ndarray | float = MIN_FEATURE_SPREAD
 
@@ -46,7 +42,6 @@ class PreparedPartition:
     """A partition that is ready to train.
 
     Attributes:
-        name: name of the main joint.
         vertex_count: Vp.
         columns: (F',) int32, the offered features that vary over the training poses: the inputs of the network.
         feature_mean, feature_scale: (F',) float32, mean and standard deviation over the training poses.
@@ -63,7 +58,6 @@ class PreparedPartition:
         dropped_rms: rms distance over training poses and vertices that they represent, mesh units.
     """
 
-    name: str
     vertex_count: int
     columns: np.ndarray
     feature_mean: np.ndarray
@@ -93,13 +87,12 @@ class PreparedPartition:
 
 
 def partition_data(
-    recording: Recording, partitions: Sequence[Partition], inputs: NetworkInputs, use_half_rotations: bool = False
+    recording: Recording, inputs: NetworkInputs, use_half_rotations: bool = False
 ) -> list[PartitionData]:
     """Create the data of a recording's partitions.
 
     Args:
         recording: recording with the poses.
-        partitions: partitions of the recording.
         inputs: input features of the networks.
         use_half_rotations: whether residuals are also regressed on half-rotation matrices.
     """
@@ -110,14 +103,12 @@ def partition_data(
     min_spread = np.where(inputs.length_mask(), min_length_spread, MIN_FEATURE_SPREAD)
     return [
         PartitionData(
-            rig.joints[partition.joint].name,
             features[:, columns],
             lambda partition=partition: recording.residuals[:, partition.vertices],
-            len(partition.vertices),
             lambda partition=partition: joint_regression(rig, partition, matrices),
             min_spread[columns],
         )
-        for partition, columns in zip(partitions, inputs.columns, strict=True)
+        for partition, columns in zip(recording.partitions, inputs.columns, strict=True)
     ]
 
 
@@ -143,7 +134,8 @@ def prepare_partition(
     mean = training[:, columns].mean(axis=0).astype(np.float32)
     scale = scale[columns].astype(np.float32)
     residuals = np.asarray(partition.read_residuals(), np.float32)
-    fit = JointFit(np.zeros(0, np.int64), np.zeros((0, partition.vertex_count), np.float32))
+    vertex_count = residuals.shape[1]
+    fit = JointFit(np.zeros(0, np.int64), np.zeros((0, vertex_count), np.float32))
     if partition.read_regression:
         regression = partition.read_regression()
         regression = regression if len(columns) else regression.main_joint_only()
@@ -154,8 +146,7 @@ def prepare_partition(
     rng, weights = np.random.default_rng([seed, 2]), split.weights()
     basis = make_basis(residuals[split.training], tolerance, rng, weights)
     return PreparedPartition(
-        partition.name,
-        partition.vertex_count,
+        vertex_count,
         columns,
         mean,
         scale,
@@ -163,7 +154,7 @@ def prepare_partition(
         fit,
         basis,
         basis.project(residuals),
-        float(np.sqrt(_mean_square(residuals, basis.mean, split.training) / partition.vertex_count)),
+        float(np.sqrt(_mean_square(residuals, basis.mean, split.training) / vertex_count)),
         split.validation,
         residuals[split.validation],
         mm_per_unit,
@@ -173,27 +164,24 @@ def prepare_partition(
 def prepare_partitions(
     partitions: Sequence[PartitionData],
     split: Split,
-    tolerance_mm: float,
-    seed: int,
+    config: TrainingConfig,
     metres_per_unit: float = 1.0,
-    last_hidden_units: int = 0,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> list[PreparedPartition]:
     """Prepare partitions that share one tolerance (`allocate_components`).
 
     Args:
-        partitions, split, tolerance_mm, seed, metres_per_unit: as in `prepare_partition`.
-        last_hidden_units: number of units in the last hidden layer.
+        partitions, split, metres_per_unit: as in `prepare_partition`.
+        config: settings of the training.
         on_progress: called after each partition with the number of partitions that are prepared.
     """
-    prepared = []
+    prepared, fine_tolerance_mm = [], config.tolerance_mm / FINE_TOLERANCE_FACTOR
     for partition in partitions:
-        fine_tolerance_mm = tolerance_mm / FINE_TOLERANCE_FACTOR
-        prepared.append(prepare_partition(partition, split, fine_tolerance_mm, seed, metres_per_unit))
+        prepared.append(prepare_partition(partition, split, fine_tolerance_mm, config.seed, metres_per_unit))
         on_progress(len(prepared))
     errors, vertex_counts = [p.basis.error_by_count for p in prepared], [p.vertex_count for p in prepared]
-    tolerance = tolerance_mm / (1000 * metres_per_unit)
-    counts = allocate_components(errors, vertex_counts, tolerance, last_hidden_units + 1)
+    tolerance = config.tolerance_mm / (1000 * metres_per_unit)
+    counts = allocate_components(errors, vertex_counts, tolerance, config.hidden[-1] + 1)
     return [partition.with_components(count) for partition, count in zip(prepared, counts, strict=True)]
 
 

@@ -5,7 +5,6 @@ import errno
 import os
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,10 +21,10 @@ from fdda_addon.core.messages import STOP_FILE_VARIABLE, MessageType
 from fdda_addon.core.native_library import runtime_advice
 from fdda_addon.core.stop_signals import INTERRUPTED, handle_stop_signals
 
-from .progress import MessageSink
+from .progress import OUTPUT_LOCK, MessageSink
 
 POLL_SECONDS = 0.1
-"""Minimum time between checks for the stop file."""
+"""Time between checks for a stop request."""
 MEMORY_ERROR_TEXTS = ("can't allocate memory", "not enough memory", "bad allocation", "bad_alloc", "WinError 1455")
 """Texts in errors of torch and ONNX Runtime when memory runs out. Windows error 1455: the paging file is too small."""
 # OpenMP threads that wait actively make training ten times slower on a busy machine, and no faster on an idle machine.
@@ -35,50 +34,36 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 2) // 2)))
 
 
-class Cancelled(Exception):  # noqa: N818 - a request, not an error
-    """Raised when a job stops because a stop was requested."""
-
-
 class StopRequest:
-    """A request to stop, by a signal (Ctrl-C, SIGTERM, …) or by the add-on's stop file.
+    """A request to stop the process, by a signal (Ctrl-C, SIGTERM, …) or by the add-on's stop file."""
 
-    Calling the object returns whether a stop is requested.
-    """
-
-    def __init__(self):
-        self.is_requested = False
+    def __init__(self, sink: MessageSink):
+        """Receive requests from now on; `sink` receives the last message of a stopped process."""
+        self._sink, self._is_requested = sink, False
         self._stop_file = os.environ.get(STOP_FILE_VARIABLE, "")
-        self._next_poll = 0.0
         handle_stop_signals(self._request)
 
     def _request(self, *_) -> None:
-        self.is_requested = True
-
-    def __call__(self) -> bool:
-        if not self.is_requested and self._stop_file and (now := time.monotonic()) >= self._next_poll:
-            self._next_poll = now + POLL_SECONDS
-            self.is_requested = os.path.exists(self._stop_file)
-            if self.is_requested:
-                # The stop file is deleted here, because the process that created it may have ended.
-                with suppress(OSError):
-                    os.unlink(self._stop_file)
-        return self.is_requested
+        self._is_requested = True
 
     @contextmanager
-    def exit_immediately(self, sink: MessageSink) -> Iterator[None]:
-        """Let a stop request end the process immediately, for example while torch loads, which can take half a minute.
-
-        Raises:
-            Cancelled: a stop was requested before the call.
-        """
-        if self():
-            raise Cancelled
+    def exit_immediately(self) -> Iterator[None]:
+        """Let a stop request, an earlier one too, end the process at once. The block must not write files."""
         is_done = threading.Event()
 
         def watch() -> None:
-            while not is_done.wait(POLL_SECONDS):
-                if self():
-                    os._exit(_send_last_message(sink, INTERRUPTED, MessageType.CANCELLED))
+            is_last_look = False
+            while not is_last_look:
+                is_last_look = is_done.wait(POLL_SECONDS)
+                if self._stop_file and os.path.exists(self._stop_file):
+                    self._request()
+                    # The stop file is deleted here, because the process that created it may have ended.
+                    with suppress(OSError):
+                        os.unlink(self._stop_file)
+                if self._is_requested:
+                    # The lock is not released, so that no message follows the last one.
+                    OUTPUT_LOCK.acquire()
+                    os._exit(_send_last_message(self._sink, INTERRUPTED, MessageType.CANCELLED))
 
         watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()
@@ -93,14 +78,11 @@ def run_with_messages(run_job: Callable[[], None], sink: MessageSink) -> int:
     """Run a job and send one last message, except after a broken pipe; returns the exit status.
 
     Args:
-        run_job: runs the job. It sends the last message itself when it succeeds, and raises `Cancelled` when it is
-            stopped.
+        run_job: runs the job. It sends the last message itself when it succeeds.
         sink: receives the messages.
     """
     try:
         run_job()
-    except Cancelled:
-        return _send_last_message(sink, INTERRUPTED, MessageType.CANCELLED)
     except BrokenPipeError:
         _close_output()
         return 1

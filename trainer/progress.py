@@ -2,6 +2,7 @@
 """Output of the trainer's progress: JSON messages for the add-on, or text for a person."""
 
 import sys
+import threading
 from typing import Protocol
 
 from fdda_addon.core.messages import WARNING_LINE, Message, MessageType
@@ -20,6 +21,8 @@ LINE_EPOCH_INTERVAL = 0.1
 """Part of the epochs between two lines of progress, if stdout is not a terminal."""
 BAR_WIDTH = 30
 """Characters of the progress bar."""
+OUTPUT_LOCK = threading.RLock()
+"""Held while a message is written, because the thread that waits for a stop request writes one, too."""
 
 
 class MessageSink(Protocol):
@@ -34,7 +37,8 @@ class JsonMessageSink:
 
     def send(self, message_type: MessageType, **values) -> None:
         """Send a message."""
-        print(Message(message_type, values).encode(), flush=True)
+        with OUTPUT_LOCK:
+            print(Message(message_type, values).encode(), flush=True)
 
 
 class TextMessageSink:
@@ -47,14 +51,15 @@ class TextMessageSink:
 
     def send(self, message_type: MessageType, **values) -> None:
         """Send a message."""
-        if message_type is MessageType.PROGRESS:
-            self._show_progress(**values)
-            return
-        if self.has_open_line:
-            print()
-            self.has_open_line = False
-        if line := LINE_FORMATS.get(message_type):
-            print(line.format(**values), flush=True)
+        with OUTPUT_LOCK:
+            if message_type is MessageType.PROGRESS:
+                self._show_progress(**values)
+                return
+            if self.has_open_line:
+                print()
+                self.has_open_line = False
+            if line := LINE_FORMATS.get(message_type):
+                print(line.format(**values), flush=True)
 
     def _show_progress(self, epoch: int, epochs: int, validation_mm: float, **_: float) -> None:
         if self.is_terminal:

@@ -2,7 +2,8 @@
 """Runs a training: all steps from the recording to the written files."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,13 +29,12 @@ from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
 from .inputs.surface_frames import SurfaceFrameFeatures
 from .model import TrainedModel, make_trained_model
 from .networks.checkpoint import Checkpoint, write_checkpoint
-from .networks.curves import Progress
+from .networks.curves import Curves
 from .networks.loop import TrainingResult, choose_device, train
 from .networks.networks import Network
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
-from .outputs import check_training_outputs, training_outputs
+from .outputs import training_outputs
 from .preparation import PartitionData, PreparedPartition, partition_data, prepare_partitions
-from .process import Cancelled
 from .progress import MessageSink
 from .report.contents import make_report
 from .report.error_analysis import analyze_errors
@@ -46,51 +46,47 @@ def train_model(
     model_path: Path,
     config: TrainingConfig,
     sink: MessageSink,
-    should_stop: Callable[[], bool] = lambda: False,
+    stoppable: Callable[[], AbstractContextManager] = nullcontext,
     warm_start: bool = False,
     strict: bool = False,
-    overwrite: bool = False,
 ) -> None:
     """Train a model, and write it with its checkpoint and its report beside it.
 
     Args:
         recording_path: folder of a complete recording.
-        model_path: the .onnx file. All files are written at the end.
+        model_path: the .onnx file; `check_training_outputs` has checked it. All files are written at the end.
         config: settings of the training.
         sink: receives the messages from `STARTED` to `FINISHED`. Errors are raised, not sent.
-        should_stop: called often. If it returns True, the training stops and writes nothing.
+        stoppable: makes the context in which the process may be ended, because it writes nothing there.
         warm_start: start from the checkpoint of the model, on a recording that may have grown since.
         strict: treat warnings about the recording as errors.
-        overwrite: overwrite files of another kind.
 
     Raises:
-        Cancelled: `should_stop` returned True.
-        FDDAError: the recording, the settings or the output path cannot be used.
+        FDDAError: the recording or the settings cannot be used, or a file cannot be written.
     """
     start_time = time.perf_counter()
-    check_training_outputs(model_path, overwrite)
-    recording = read_recording(recording_path)
-    split = split_recording(recording, config)
-    holdout = holdout_fingerprint(recording, split)
-    checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
-    job = _Job(config, sink, should_stop)
-    warnings = job.start(recording, strict)
-    inputs = job.fit_inputs(recording, split, checkpoint)
-    partitions = job.collect_partition_data(recording, inputs, split)
-    prepared = job.prepare(partitions, recording, split)
-    result = job.train_networks(prepared, inputs, split, checkpoint)
-    prepared, networks = job.compress(prepared, result, partitions, recording, split)
-    trained_model = make_trained_model(recording, inputs, split, prepared, networks, config.activation)
-    exported = job.export(recording, trained_model, split, warm_start)
-    report = job.measure(recording, trained_model, split, exported, result, model_path)
-    history = _history(recording, exported, checkpoint)
-    goal_result = _evaluate_goal(config, history, report, recording_path, model_path)
-    # The time is in the report only, so that equal recordings and settings give equal models.
-    report["training"] = {**report["training"], "seconds": round(time.perf_counter() - start_time, 2)}
-    report["warnings"] = [warning.to_json() for warning in warnings]
-    page = render_html(report)
-    job.raise_if_stopped()
-    # The training cannot be stopped while it writes, because model, checkpoint and report belong together.
+    with stoppable():
+        recording = read_recording(recording_path)
+        split = split_recording(recording, config)
+        holdout = holdout_fingerprint(recording, split)
+        checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
+        job = _Job(config, sink, recording, split, checkpoint)
+        warnings = job.start(strict)
+        inputs = job.fit_inputs()
+        partitions = job.collect_partition_data(inputs)
+        prepared = job.prepare(partitions)
+        result = job.train_networks(prepared, inputs)
+        prepared, networks = job.compress(prepared, result.networks, partitions)
+        trained_model = make_trained_model(recording, inputs, split, prepared, networks, config.activation)
+        exported = job.export(trained_model)
+        report = job.measure(trained_model, exported, result.curves, model_path.name)
+        history = _history(recording, exported, checkpoint)
+        goal_result = _evaluate_goal(config, history, report, recording_path, model_path)
+        # The time is in the report only, so that equal recordings and settings give equal models.
+        report["training"] = {**report["training"], "seconds": round(time.perf_counter() - start_time, 2)}
+        report["warnings"] = [warning.to_json() for warning in warnings]
+        page = render_html(report)
+    model_path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
         write_checkpoint(checkpoint_file, trained_model.checkpoint(holdout, config.hidden, history))
@@ -101,20 +97,18 @@ def train_model(
 
 @dataclass(frozen=True)
 class _Job:
-    """The steps of a training that send messages and can be stopped; arguments as in `train_model`."""
+    """The steps of a training that send messages; `checkpoint` is that of a warm start, others as in `train_model`."""
 
     config: TrainingConfig
     sink: MessageSink
-    should_stop: Callable[[], bool]
-
-    def raise_if_stopped(self) -> None:
-        if self.should_stop():
-            raise Cancelled
+    recording: Recording
+    split: Split
+    checkpoint: Checkpoint | None
 
     def log(self, text: str) -> None:
         self.sink.send(MessageType.LOG, text=text)
 
-    def start(self, recording: Recording, strict: bool) -> list[RecordingWarning]:
+    def start(self, strict: bool) -> list[RecordingWarning]:
         """Send what is trained on which device, check the recording, and return its warnings.
 
         Raises:
@@ -122,130 +116,99 @@ class _Job:
         """
         self.sink.send(
             MessageType.STARTED,
-            partitions=len(recording.partitions),
-            poses=len(recording.pose_matrices),
-            vertices=recording.rig.vertex_count,
+            partitions=len(self.recording.partitions),
+            poses=len(self.recording.pose_matrices),
+            vertices=self.recording.rig.vertex_count,
             device=str(choose_device()),
         )
-        self.log(training_size_sentence(recording))
-        warnings = check_recording(recording)
+        self.log(training_size_sentence(self.recording))
+        warnings = check_recording(self.recording)
         for warning in warnings:
             self.sink.send(MessageType.WARNING, **warning.to_json())
         if strict:
             raise_first_warning(warnings)
-        self.raise_if_stopped()
         return warnings
 
-    def fit_inputs(self, recording: Recording, split: Split, checkpoint: Checkpoint | None) -> NetworkInputs:
+    def fit_inputs(self) -> NetworkInputs:
         """Fit the inputs of the networks. A warm start keeps the inputs of the checkpoint."""
-        states = checkpoint.input_states if checkpoint else fit_inputs(recording, split, self.config, self.should_stop)
-        inputs = make_inputs(recording.rig, recording.partitions, states)
+        if self.checkpoint:
+            states = self.checkpoint.input_states
+        else:
+            states = fit_inputs(self.recording, self.split, self.config)
+        inputs = make_inputs(self.recording.rig, self.recording.partitions, states)
         for block in inputs.blocks:
             if block.log_text:
                 self.log(block.log_text)
         return inputs
 
-    def collect_partition_data(self, recording: Recording, inputs: NetworkInputs, split: Split) -> list[PartitionData]:
+    def collect_partition_data(self, inputs: NetworkInputs) -> list[PartitionData]:
         """Collect the data of all partitions, and decide whether half-rotation features help."""
         # Surface frames make half-rotation features unnecessary.
         use_half_rotations = not inputs.states.get(SurfaceFrameFeatures.name) and half_rotations_help(
-            recording, split.training, self.should_stop
+            self.recording, self.split.training
         )
         if use_half_rotations:
             self.log("The rig blends rotations: residuals are fitted to half-rotation features, too.")
-        return partition_data(recording, recording.partitions, inputs, use_half_rotations)
+        return partition_data(self.recording, inputs, use_half_rotations)
 
-    def prepare(self, partitions: list[PartitionData], recording: Recording, split: Split) -> list[PreparedPartition]:
+    def prepare(self, partitions: list[PartitionData]) -> list[PreparedPartition]:
         """Fit the linear part of each partition, and compute its components."""
-
-        def send_progress(prepared_count: int) -> None:
-            self.sink.send(MessageType.PREPARING, done=prepared_count, total=len(partitions))
-            self.raise_if_stopped()
-
         return prepare_partitions(
             partitions,
-            split,
-            self.config.tolerance_mm,
-            self.config.seed,
-            recording.rig.metres_per_unit,
-            self.config.hidden[-1],
-            send_progress,
+            self.split,
+            self.config,
+            self.recording.rig.metres_per_unit,
+            lambda done: self.sink.send(MessageType.PREPARING, done=done, total=len(partitions)),
         )
 
-    def train_networks(
-        self, prepared: list[PreparedPartition], inputs: NetworkInputs, split: Split, checkpoint: Checkpoint | None
-    ) -> TrainingResult:
+    def train_networks(self, prepared: list[PreparedPartition], inputs: NetworkInputs) -> TrainingResult:
         """Train the networks from random weights, or from a checkpoint."""
+        config, initial = self.config, None
+        if self.checkpoint:
+            columns = [offered[partition.columns] for offered, partition in zip(inputs.columns, prepared, strict=True)]
+            config, initial = warm_start_config(config), initial_networks(self.checkpoint, prepared, columns)
 
-        def send_progress(progress: Progress) -> None:
-            errors = {"training_mm": progress.training_mm, "validation_mm": progress.validation_mm}
-            rounded_errors = {name: round(error, 6) for name, error in errors.items()}
-            self.sink.send(MessageType.PROGRESS, epoch=progress.epoch, epochs=progress.epochs, **rounded_errors)
+        def send_progress(epoch: int, training_mm: float, validation_mm: float) -> None:
+            errors = {"training_mm": round(training_mm, 6), "validation_mm": round(validation_mm, 6)}
+            self.sink.send(MessageType.PROGRESS, epoch=epoch, epochs=config.epochs, **errors)
 
-        columns = [offered[partition.columns] for offered, partition in zip(inputs.columns, prepared, strict=True)]
-        return train(
-            prepared,
-            split,
-            warm_start_config(self.config) if checkpoint else self.config,
-            on_epoch=send_progress,
-            should_stop=self.should_stop,
-            initial=initial_networks(checkpoint, prepared, columns) if checkpoint else None,
-        )
+        return train(prepared, self.split, config, on_epoch=send_progress, initial=initial)
 
     def compress(
-        self,
-        prepared: list[PreparedPartition],
-        result: TrainingResult,
-        partitions: list[PartitionData],
-        recording: Recording,
-        split: Split,
+        self, prepared: list[PreparedPartition], networks: Sequence[Network], partitions: list[PartitionData]
     ) -> tuple[list[PreparedPartition], list[Network]]:
         """Drop components that the networks do not predict, and factorize large partitions."""
-        remaining, networks = drop_components(
-            prepared, result.networks, split, self.config.activation, self.should_stop
-        )
+        remaining, networks = drop_components(prepared, networks, self.split, self.config.activation)
         if text := dropped_components_sentence(prepared, remaining):
             self.log(text)
-        tolerance = self.config.tolerance_mm / (1000 * recording.rig.metres_per_unit)
-        return factorize_partitions(remaining, networks, partitions, split, tolerance, self.should_stop)
+        tolerance = self.config.tolerance_mm / (1000 * self.recording.rig.metres_per_unit)
+        return factorize_partitions(remaining, networks, partitions, self.split, tolerance)
 
-    def export(
-        self, recording: Recording, trained_model: TrainedModel, split: Split, warm_start: bool
-    ) -> ExportedModel:
+    def export(self, trained_model: TrainedModel) -> ExportedModel:
         """Build the model, and compare it with PyTorch on the held-out poses."""
-        self.raise_if_stopped()
         training_info = {
             **self.config.to_json(),
             "torch": str(torch.__version__),
             "onnxruntime": onnxruntime.__version__,
             "device": str(choose_device()),
-            "training_poses": len(split.training),
-            "validation_poses": len(split.validation),
-            "held_out_poses": len(split.held_out),
-            "warm_start": warm_start,
+            "training_poses": len(self.split.training),
+            "validation_poses": len(self.split.validation),
+            "held_out_poses": len(self.split.held_out),
+            "warm_start": self.checkpoint is not None,
         }
-        self.log(f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
-        exported = build_model(recording, trained_model, split.held_out, training_info)
-        self.raise_if_stopped()
-        return exported
+        self.log(f"Exporting the model, and measuring it on {len(self.split.held_out)} poses.")
+        return build_model(self.recording, trained_model, self.split.held_out, training_info)
 
     def measure(
-        self,
-        recording: Recording,
-        trained_model: TrainedModel,
-        split: Split,
-        exported: ExportedModel,
-        result: TrainingResult,
-        model_path: Path,
+        self, trained_model: TrainedModel, exported: ExportedModel, curves: Sequence[Curves], model_name: str
     ) -> dict:
         """Measure the model on training and held-out poses; returns the content of the report."""
+        recording, split = self.recording, self.split
         training_sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
         training_errors = measure(exported.session, recording, training_sample)
         surface = measure_surface(exported.session, recording, split.held_out)
         analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
-        return make_report(
-            recording, trained_model, exported, training_errors, surface, result.curves, model_path.name, analyses
-        )
+        return make_report(recording, trained_model, exported, training_errors, surface, curves, model_name, analyses)
 
 
 def _history(recording: Recording, exported: ExportedModel, checkpoint: Checkpoint | None) -> list[dict]:

@@ -12,7 +12,6 @@ from trainer.data.split import split_poses
 from trainer.networks.loop import _Loop, train
 from trainer.networks.networks import ACTIVATION_FUNCTIONS, PartitionNetworks
 from trainer.preparation import PartitionData, prepare_partition
-from trainer.process import Cancelled
 
 from .chain import chain_angles
 
@@ -25,7 +24,7 @@ def make_partition_data(inputs: int, vertices: int, seed: int, poses: int = 150)
     rng = np.random.default_rng(seed)
     values = np.tanh(features @ rng.normal(size=(inputs, 4))) @ rng.normal(size=(4, 3 * vertices)) * 0.002
     residuals = values.reshape(poses, vertices, 3).astype(np.float32)
-    return PartitionData(f"p{inputs}", features, lambda: residuals, vertices)
+    return PartitionData(features, lambda: residuals)
 
 
 def train_partitions(partitions, config=CONFIG, **options):
@@ -94,10 +93,10 @@ def test_one_seed_gives_the_same_weights_and_another_does_not():
 
 
 def test_a_partition_without_inputs_keeps_its_mean():
-    without_features = PartitionData(
-        "still", np.zeros((150, 0), np.float32), make_partition_data(2, 6, 4).read_residuals, 6
+    without_features, constant = (
+        PartitionData(features, make_partition_data(2, 6, 4).read_residuals)
+        for features in (np.zeros((150, 0), np.float32), np.ones((150, 12), np.float32))
     )
-    constant = PartitionData("constant", np.ones((150, 12), np.float32), make_partition_data(2, 6, 4).read_residuals, 6)
     prepared, trained = train_partitions([without_features, make_partition_data(2, 6, 5), constant])
     assert [len(p.basis.components) > 0 for p in prepared] == [False, True, False]
     assert trained.curves[0].validation_mm == []
@@ -108,13 +107,13 @@ def test_the_progress_shows_what_a_constant_partition_misses_in_unseen_poses_alo
     learned, split = make_partition_data(2, 6, 5), split_poses(np.arange(150), CONFIG.validation_fraction, CONFIG.seed)
     residuals = np.zeros((150, 6, 3), np.float32)
     residuals[split.validation] = 0.01
-    constant = PartitionData("constant", np.ones((150, 0), np.float32), lambda: residuals, 6)
+    constant = PartitionData(np.ones((150, 0), np.float32), lambda: residuals)
     progress = []
-    _, trained = train_partitions([learned, constant], on_epoch=progress.append)
-    last, curve = progress[-1], trained.curves[0]
-    assert last.training_mm == pytest.approx(curve.training_mm[-1] / 2)
+    _, trained = train_partitions([learned, constant], on_epoch=lambda *errors: progress.append(errors))
+    (epoch, training_mm, validation_mm), curve = progress[-1], trained.curves[0]
+    assert epoch == CONFIG.epochs and training_mm == pytest.approx(curve.training_mm[-1] / 2)
     # Each coordinate of half of the vertices is off by 10 mm.
-    assert last.validation_mm == pytest.approx(curve.validation_mm[-1] / 2 + 10 * 3**0.5 / 2)
+    assert validation_mm == pytest.approx(curve.validation_mm[-1] / 2 + 10 * 3**0.5 / 2)
 
 
 def test_irrelevant_inputs_are_suppressed(monkeypatch):
@@ -158,15 +157,3 @@ def test_a_warm_start_keeps_the_outputs():
     for data, first_network, second_network in zip(prepared, first.networks, restarted.networks, strict=True):
         expected, actual = (network.evaluate(data.inputs, "silu") for network in (first_network, second_network))
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
-
-
-def test_a_stop_request_cancels_the_training():
-    calls = []
-
-    def should_stop_after_five_calls() -> bool:
-        calls.append(True)
-        return len(calls) > 5
-
-    with pytest.raises(Cancelled):
-        train_partitions([make_partition_data(2, 5, 7)], should_stop=should_stop_after_five_calls)
-    assert len(calls) == 6

@@ -26,7 +26,6 @@ from trainer.networks.checkpoint import read_checkpoint
 from trainer.networks.loop import train
 from trainer.networks.networks import Network
 from trainer.preparation import PartitionData, PreparedPartition, partition_data, prepare_partition, prepare_partitions
-from trainer.process import Cancelled
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
@@ -43,7 +42,7 @@ def make_data(noise: float, signal: float = 0.01, poses: int = 200) -> Partition
     patterns = rng.normal(size=(2, VERTEX_COUNT, 3))
     amplitudes = np.stack([signal * np.sin(2 * features[:, 0]), noise * rng.normal(size=poses)], axis=1)
     residuals = np.einsum("np,pvc->nvc", amplitudes, patterns).astype(np.float32)
-    return PartitionData("elbow", features, lambda: residuals, VERTEX_COUNT)
+    return PartitionData(features, lambda: residuals)
 
 
 def train_partitions(*data: PartitionData) -> tuple[list[PreparedPartition], list[Network], Split]:
@@ -116,7 +115,7 @@ def test_a_component_for_extreme_poses_stays(kind):
     amplitudes = np.concatenate([0.01 * np.cos(2 * features), 0.1 * bursts], axis=1)
     patterns = rng.normal(size=(2, VERTEX_COUNT, 3))
     residuals = np.einsum("np,pvc->nvc", amplitudes, patterns).astype(np.float32)
-    data = PartitionData("elbow", features, lambda: residuals, VERTEX_COUNT)
+    data = PartitionData(features, lambda: residuals)
     inner, extremes = split_poses(np.arange(200), 0.2, 0, 0.2), np.arange(200, 300)
     split = Split(np.append(inner.training, extremes), inner.validation, inner.held_out, **{kind: extremes})
     prepared = [prepare_partition(data, split, 0.01, 0)]
@@ -124,18 +123,6 @@ def test_a_component_for_extreme_poses_stays(kind):
     (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
     error = mean_error(data, partition, network, extremes)
     assert error < 1.1 * mean_error(data, prepared[0], networks[0], extremes) < 0.2 * np.abs(residuals[extremes]).mean()
-
-
-def test_compression_can_be_cancelled_between_partitions():
-    data = make_data(noise=0), make_data(noise=0)
-    prepared, networks, split = train_partitions(*data)
-    for compress in (
-        lambda should_stop: drop_components(prepared, networks, split, CONFIG.activation, should_stop),
-        lambda should_stop: factorize_partitions(prepared, networks, data, split, 1e-5, should_stop),
-    ):
-        answers = iter([False, True])
-        with pytest.raises(Cancelled):
-            compress(lambda answers=answers: next(answers))
 
 
 def test_a_dropped_component_that_is_small_needs_no_remedy():
@@ -200,8 +187,8 @@ def test_factorized_networks_predict_the_projected_residuals(tmp_path):
         writer.append(pose_chain(rig, angles), sliding_residuals(rig, angles))
     recording = read_recording(tmp_path / "tube")
     split = split_recording(recording, CONFIG)
-    data = partition_data(recording, recording.partitions, make_inputs(recording.rig, recording.partitions))
-    prepared, rng = prepare_partitions(data, split, 0.04, 0), np.random.default_rng(0)
+    data = partition_data(recording, make_inputs(recording.rig, recording.partitions))
+    prepared, rng = prepare_partitions(data, split, TrainingConfig()), np.random.default_rng(0)
     networks = []
     for partition in prepared:
         sizes = (len(partition.columns), 8, len(partition.basis.components))

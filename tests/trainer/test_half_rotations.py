@@ -25,7 +25,6 @@ from trainer.export.graph import build_graph
 from trainer.fits.half_rotations import half_rotation_matrices, half_rotations_help, regression_matrices
 from trainer.fits.joint_fit import JointFit, joint_regression
 from trainer.model import TrainedModel
-from trainer.process import Cancelled
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, rotation, write_chain
 from .conftest import QUICK_OPTIONS
@@ -192,11 +191,6 @@ def test_a_rig_that_blends_matrices_has_no_half_rotations(tmp_path):
     assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK_OPTIONS]) == 0
     names = {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
     assert "surface_frame_features" in names and "half_rotation_matrices" not in names
-
-
-def test_a_stop_request_cancels_the_measurement(recording):
-    with pytest.raises(Cancelled):
-        half_rotations_help(recording, np.arange(POSES), should_stop=lambda: True)
 
 
 def without_half_rotations(trained_model: TrainedModel) -> TrainedModel:

@@ -12,10 +12,8 @@ from fdda_addon.core.joint_option import KEY_JOINTS_STAGE
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fitted_weights, read_key_joints
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning
-from trainer.process import Cancelled
 from trainer.skin.choice import choose_key_joints
-from trainer.skin.job import KeyJointRequest, fit_folder
-from trainer.skin.key_joints import KeyJointSearch
+from trainer.skin.job import fit_folder
 
 BONES, RING = 4, 16
 """Number of main joints of the chain, and of vertices around each joint."""
@@ -259,8 +257,7 @@ def test_weights_are_fitted_to_key_joints(tmp_path):
     with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
         for arrays in zip(poses.pose_matrices, poses.positions, poses.controls, strict=True):
             writer.append(*arrays)
-    request = KeyJointRequest("auto", 120)
-    fit = fit_folder(tmp_path, "smooth", sink, lambda: False, request=request)
+    fit = fit_folder(tmp_path, "smooth", sink, joints="auto", random_poses=120)
     joints, weights = read_fitted_weights(tmp_path, poses.rig)
     key_joints, needed_inputs = read_key_joints(tmp_path, poses.rig)
     assert fit.key_joints.joints == len(key_joints) < len(names)
@@ -272,29 +269,12 @@ def test_weights_are_fitted_to_key_joints(tmp_path):
     assert 0 <= min(values["done"] for values in searches) < max(values["done"] for values in searches) <= len(names)
 
 
-@pytest.mark.parametrize("stopped_call", [1, 4])
-def test_a_stop_ends_the_choice_at_once(tmp_path, monkeypatch, stopped_call):
-    poses = chain_poses(followers=("half", "still"))
-    with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
-        for arrays in zip(poses.pose_matrices, poses.positions, strict=True):
-            writer.append(*arrays)
-    calls = []
-
-    def should_stop() -> bool:
-        calls.append(None)
-        return len(calls) == stopped_call
-
-    monkeypatch.setattr(KeyJointSearch, "_result", lambda _: pytest.fail("the search went on"))
-    with pytest.raises(Cancelled):
-        fit_folder(tmp_path, "smooth", Sink(), should_stop, request=KeyJointRequest("auto", 160))
-
-
 def test_a_fit_without_removable_joints_writes_nothing(tmp_path):
     sink = Sink()
     poses = chain_poses(followers=("free",))
     with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
         for arrays in zip(poses.pose_matrices, poses.positions, strict=True):
             writer.append(*arrays)
-    assert fit_folder(tmp_path, "smooth", sink, lambda: False, request=KeyJointRequest("auto", 160)) is None
+    assert fit_folder(tmp_path, "smooth", sink, joints="auto", random_poses=160) is None
     assert not (tmp_path / "fitted_joints.npy").exists()
     assert sink.messages[-1][1]["key_joints"]["joints"] == 2 * BONES

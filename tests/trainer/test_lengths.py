@@ -77,7 +77,7 @@ def prepared(recording) -> list:
     config = TrainingConfig(seed=0)
     rig, split = recording.rig, split_recording(recording, config)
     inputs = make_inputs(rig, recording.partitions)
-    partitions = partition_data(recording, recording.partitions, inputs)
+    partitions = partition_data(recording, inputs)
     return [prepare_partition(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
 
 
@@ -100,7 +100,7 @@ def test_features_that_vary_like_rounded_keys_are_no_inputs(results_by_unit):
         replace(partition, influencing=(0, *partition.influencing)) for partition in recording.partitions
     )
     for partition in prepared(replace(recording, pose_matrices=matrices, partitions=partitions)):
-        assert len(partition.columns) == 0 or partition.columns.min() >= FEATURES_PER_JOINT, partition.name
+        assert len(partition.columns) == 0 or partition.columns.min() >= FEATURES_PER_JOINT
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)

@@ -2,6 +2,7 @@
 """The fit of skin weights recovers the true weights, keeps its constraints, and improves poor weights."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,16 +13,15 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.messages import STOP_FILE_VARIABLE, Message, MessageType
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted_weights
 from fdda_addon.core.recording.writer import array_header
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skin_fit import SkinFit
 from fdda_addon.core.skinning import LinearSkinning
-from trainer.process import Cancelled
 from trainer.skin.__main__ import main
 from trainer.skin.job import fit_folder, measure
-from trainer.skin.solver import SkinSolver, simplex_weights
+from trainer.skin.solver import fit_skin, simplex_weights
 
 from .. import systems
 from .chain import rotation
@@ -89,9 +89,7 @@ def make_fit_poses(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POS
 
 def fit_rig(poses: FitPoses, kind: str) -> Rig:
     """Return the rig with the fitted weights."""
-    joints, weights = np.zeros((VERTICES, 4), np.int32), np.zeros((VERTICES, 4), np.float32)
-    for block, *fitted in SkinSolver(poses).fit(kind):
-        joints[block], weights[block] = fitted
+    joints, weights = fit_skin(poses, kind)
     return replace(poses.rig, skin_joints=joints, skin_weights=weights)
 
 
@@ -221,11 +219,15 @@ def test_the_process_reports_the_errors(kind, tmp_path, capsys):
 
 
 def test_a_stopped_fit_writes_nothing(tmp_path):
-    write_fit_folder(tmp_path, make_fit_poses(random_rig(2)))
-    before = set(tmp_path.iterdir())
-    with pytest.raises(Cancelled):
-        fit_folder(tmp_path, "smooth", SilentSink(), lambda: True)
-    assert set(tmp_path.iterdir()) == before
+    folder, stop_file = tmp_path / "poses", tmp_path / "stop"
+    folder.mkdir()
+    stop_file.touch()
+    before = set(write_fit_folder(folder, make_fit_poses(random_rig(2))).iterdir())
+    command = [sys.executable, "-m", "trainer.skin", str(folder), "smooth"]
+    environment = {**os.environ, STOP_FILE_VARIABLE: str(stop_file)}
+    process = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+    assert process.returncode == 130 and Message.decode(process.stdout) == Message(MessageType.CANCELLED)
+    assert set(folder.iterdir()) == before and not stop_file.exists()
 
 
 def test_a_missing_scipy_is_named(tmp_path):
@@ -311,7 +313,7 @@ def test_too_few_poses_are_refused(tmp_path):
 
 def test_fitted_weights_of_another_rig_are_refused(tmp_path):
     rig = random_rig(2)
-    fit_folder(write_fit_folder(tmp_path, make_fit_poses(rig)), "hard", SilentSink(), lambda: False)
+    fit_folder(write_fit_folder(tmp_path, make_fit_poses(rig)), "hard", SilentSink())
     with pytest.raises(RecordingError, match=r"the fitted weights have the shapes \(300, 4\) and \(300, 4\)"):
         read_fitted_weights(tmp_path, replace(rig, rest_positions=rig.rest_positions[1:]))
     np.save(tmp_path / "fitted_weights.npy", np.full((VERTICES, 4), -0.25, np.float32))

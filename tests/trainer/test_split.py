@@ -124,7 +124,7 @@ def test_features_are_standardized_by_the_training_poses_alone():
     features = np.random.default_rng(0).normal(size=(40, 2)).astype(np.float32)
     features[30:] += 10
     split = Split(np.arange(30), np.arange(30, 35), np.arange(35, 40))
-    data = PartitionData("a", features, lambda: np.zeros((40, 5, 3), np.float32), 5)
+    data = PartitionData(features, lambda: np.zeros((40, 5, 3), np.float32))
     prepared = prepare_partition(data, split, 0.1, 0)
     np.testing.assert_allclose(prepared.feature_mean, features[:30].mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(prepared.feature_scale, features[:30].std(axis=0), atol=1e-5)

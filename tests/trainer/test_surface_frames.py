@@ -21,7 +21,6 @@ from trainer.inputs.surface_frame_fit import MIN_EXPLAINED_VARIANCE, select_surf
 from trainer.inputs.surface_frame_vectors import NO_SURFACE_FRAMES, SurfaceFrames
 from trainer.inputs.surface_frames import SurfaceFrameFeatures
 from trainer.networks.checkpoint import read_checkpoint
-from trainer.process import Cancelled
 
 from .chain import rotation, write_chain
 from .conftest import QUICK_OPTIONS
@@ -147,12 +146,6 @@ def test_a_vertex_whose_fit_is_nan_selects_nothing(recording, monkeypatch):
 
     monkeypatch.setattr(surface_frame_fit, "_fit_lengths", fit_with_nan)
     assert select_frames(recording) is NO_SURFACE_FRAMES
-
-
-def test_a_stop_request_cancels_the_selection(recording):
-    split = split_recording(recording, TrainingConfig())
-    with pytest.raises(Cancelled):
-        select_surface_frames(recording, split, tolerance_mm=0.04, should_stop=lambda: True)
 
 
 def test_a_dozen_poses_are_too_few(tmp_path):

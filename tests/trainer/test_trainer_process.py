@@ -195,10 +195,11 @@ def test_a_stopped_training_writes_nothing(recording, tmp_path, monkeypatch, sto
     assert list(folder.iterdir()) == []
 
 
-def test_a_stop_request_before_the_start_cancels_the_training(recording, tmp_path, monkeypatch, capsys):
+def test_a_stop_request_before_the_start_cancels_the_training(recording, tmp_path, monkeypatch):
     monkeypatch.setenv(STOP_FILE_VARIABLE, str(recording))
-    assert main([str(recording), str(tmp_path / "m.onnx"), "--messages"]) == 130
-    assert decode_messages(capsys.readouterr().out)[-1] == Message(MessageType.CANCELLED)
+    process = start_trainer(recording, tmp_path / "m.onnx", "--messages")
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130 and Message.decode(output) == Message(MessageType.CANCELLED)
     assert list(tmp_path.iterdir()) == []
 
 

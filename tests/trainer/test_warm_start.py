@@ -51,9 +51,8 @@ def model(trained, tmp_path):
 def prepare_recording(path, config, checkpoint):
     recording = read_recording(path)
     split = split_recording(recording, config)
-    partitions = recording.partitions
-    inputs = make_inputs(recording.rig, partitions, checkpoint.input_states)
-    data = partition_data(recording, partitions, inputs)
+    inputs = make_inputs(recording.rig, recording.partitions, checkpoint.input_states)
+    data = partition_data(recording, inputs)
     prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     return (
         split,

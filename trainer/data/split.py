@@ -44,29 +44,11 @@ class Split:
 
 
 def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float = 0.0) -> Split:
-    """Split poses at random.
-
-    Args:
-        poses: (n,) indices of the poses that may be used.
-        validation_fraction, held_out_fraction, seed: as in `TrainingConfig`; with a fraction of 0 no pose is held out.
-
-    Raises:
-        TrainingError: there are too few poses.
-    """
-    _check_pose_count(len(poses))
-    return _split(poses, validation_fraction, seed, held_out_fraction)
-
-
-def _check_pose_count(count: int) -> None:
-    if count < MIN_POSES:
-        raise TrainingError(f"The recording has {count} poses and training takes at least {MIN_POSES}; record more.")
-
-
-def _split(items: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float) -> Split:
-    shuffled_items = np.random.default_rng([seed, 1]).permutation(items)
-    validation_count = max(1, round(len(items) * validation_fraction))
-    held_out_count = max(1, round(len(items) * held_out_fraction)) if held_out_fraction else 0
-    parts = np.split(shuffled_items, [held_out_count, held_out_count + validation_count])
+    """Split (n,) indices of poses at random; with a fraction of 0 no pose is held out."""
+    shuffled_poses = np.random.default_rng([seed, 1]).permutation(poses)
+    validation_count = max(1, round(len(poses) * validation_fraction))
+    held_out_count = max(1, round(len(poses) * held_out_fraction)) if held_out_fraction else 0
+    parts = np.split(shuffled_poses, [held_out_count, held_out_count + validation_count])
     return Split(np.sort(parts[2]), np.sort(parts[1]), np.sort(parts[0]))
 
 
@@ -99,12 +81,13 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
             f"least {MIN_POSES}; hold them for more frames (record --max-settle-frames), or take all with "
             "--include-unsettled."
         )
-    _check_pose_count(int((~always_trains).sum()))
+    if (count := int((~always_trains).sum())) < MIN_POSES:
+        raise TrainingError(f"The recording has {count} poses and training takes at least {MIN_POSES}; record more.")
     is_random, margin_poses = is_random & is_usable, margin_poses[is_usable[margin_poses]]
     fractions = config.validation_fraction, config.seed, config.held_out_fraction
-    splits = [_split(np.flatnonzero(is_random), *fractions)] if is_random.any() else []
+    splits = [split_poses(np.flatnonzero(is_random), *fractions)] if is_random.any() else []
     if blocks := _frame_blocks(sources):
-        selected = _split(np.arange(len(blocks)), *fractions)
+        selected = split_poses(np.arange(len(blocks)), *fractions)
         parts = (selected.training, selected.validation, selected.held_out)
         splits.append(Split(*(_poses_in_blocks(blocks, part) for part in parts)))
     training, validation, held_out = (

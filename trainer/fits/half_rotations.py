@@ -7,8 +7,6 @@ angle, and needs no square root. Blending of rotations: Kavan and others, Geomet
 Quaternion Blending, 2008.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from fdda_addon.core.features import joint_features
@@ -17,7 +15,6 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
 
 from ..graph_builder import GraphBuilder
-from ..process import Cancelled
 from .joint_fit import joint_regression
 
 AXIS_COUNT, MATRIX_COLUMNS = 3, 4
@@ -73,18 +70,12 @@ def regression_matrices(pose_matrices: np.ndarray, rig: Rig, use_half_rotations:
     return np.concatenate([skin, half_rotations.astype(np.float32)], axis=1)
 
 
-def half_rotations_help(
-    recording: Recording, training: np.ndarray, should_stop: Callable[[], bool] = lambda: False
-) -> bool:
+def half_rotations_help(recording: Recording, training: np.ndarray) -> bool:
     """Return whether half-rotation features lower the error enough to justify their nodes in the graph.
 
     Args:
         recording: recording with the residuals.
         training: (n,) indices of the training poses. Half of the evaluated poses are fitted, the others are measured.
-        should_stop: called before each partition.
-
-    Raises:
-        Cancelled: `should_stop` returned True.
     """
     rig = recording.rig
     poses = training[:: -(-len(training) // MAX_POSES)]
@@ -93,8 +84,6 @@ def half_rotations_help(
     candidates = [regression_matrices(pose_matrices, rig, use_half_rotations) for use_half_rotations in (False, True)]
     errors = np.zeros(2)
     for partition in recording.partitions:
-        if should_stop():
-            raise Cancelled
         vertices = partition.vertices[:: -(-len(partition.vertices) // MAX_VERTICES_PER_PARTITION)]
         residuals = np.array(recording.residuals[poses[:, None], vertices])
         for index, matrices in enumerate(candidates):

@@ -2,7 +2,7 @@
 """The protocol of input features. docs/development.md, A new input, explains how to add a block."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -70,12 +70,8 @@ class FeatureBlock(ABC):
     is_direct: ClassVar[bool] = False
 
     @classmethod
-    def fit(cls, recording: Recording, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]) -> State:
-        """Fit the block to a recording; returns its state, arrays that a checkpoint stores.
-
-        Raises:
-            Cancelled: `should_stop` returned True.
-        """
+    def fit(cls, recording: Recording, split: Split, config: TrainingConfig) -> State:
+        """Fit the block to a recording; returns its state, arrays that a checkpoint stores."""
         return {}
 
     @classmethod

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The input features of the networks: the features of all blocks in a row."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Self
@@ -67,15 +67,9 @@ def _starts(blocks: Sequence[FeatureBlock]) -> list[int]:
     return np.cumsum([0, *(len(block.length_mask) for block in blocks)]).tolist()
 
 
-def fit_inputs(
-    recording: Recording, split: Split, config: TrainingConfig, should_stop: Callable[[], bool] = lambda: False
-) -> dict[str, State]:
-    """Fit all blocks to a recording; returns the state of each block by its name.
-
-    Raises:
-        Cancelled: `should_stop` returned True.
-    """
-    return {block.name: block.fit(recording, split, config, should_stop) for block in BLOCKS}
+def fit_inputs(recording: Recording, split: Split, config: TrainingConfig) -> dict[str, State]:
+    """Fit all blocks to a recording; returns the state of each block by its name."""
+    return {block.name: block.fit(recording, split, config) for block in BLOCKS}
 
 
 def make_inputs(rig: Rig, partitions: Sequence[Partition], states: dict[str, State] | None = None) -> NetworkInputs:

@@ -7,7 +7,7 @@ of the skinned surface at increasing amounts of smoothing. For a rig that smooth
 remainder.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,6 @@ from fdda_addon.core.skinning import skin_matrices
 from ..data.split import Split
 from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
 from ..fits.least_squares import solve_ridge
-from ..process import Cancelled
 from .smoothed_surface import FaceCorners, SmoothedSurface, find_face_corners
 from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
@@ -72,9 +71,7 @@ class _EvaluatedPoses:
     column_spaces: dict[int, np.ndarray]
 
 
-def select_surface_frames(
-    recording: Recording, split: Split, tolerance_mm: float, should_stop: Callable[[], bool] = lambda: False
-) -> SurfaceFrames:
+def select_surface_frames(recording: Recording, split: Split, tolerance_mm: float) -> SurfaceFrames:
     """Select the vertices of each partition that explain most of its residuals, and fit their surface frames.
 
     Args:
@@ -82,13 +79,9 @@ def select_surface_frames(
         split: split of its poses; only training poses are evaluated.
         tolerance_mm: as in `TrainingConfig`. Vertices that the joints alone place within the tolerance are no
             candidates.
-        should_stop: called before each partition.
 
     Returns:
         The surface frames; `NO_SURFACE_FRAMES` for a rig that does not smooth.
-
-    Raises:
-        Cancelled: `should_stop` returned True.
     """
     rig = recording.rig
     if not len(rig.face_starts):
@@ -100,8 +93,6 @@ def select_surface_frames(
     min_mean_square = (tolerance_mm / (1000 * rig.metres_per_unit)) ** 2
     candidates, column_spaces = [], {}
     for index, partition in enumerate(recording.partitions):
-        if should_stop():
-            raise Cancelled
         regression = joint_regression(rig, partition, skin)
         if regression.is_determined():
             column_space = regression.column_space()

@@ -9,7 +9,7 @@ surface frame is a weighted sum of tangents and normals of the face corners at a
 weights to the recording. docs/experiments.md compares the errors with and without them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -41,8 +41,8 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
     name = "surface_frames"
 
     @classmethod
-    def fit(cls, recording: Recording, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]) -> State:
-        surface_frames = select_surface_frames(recording, split, config.tolerance_mm, should_stop)
+    def fit(cls, recording: Recording, split: Split, config: TrainingConfig) -> State:
+        surface_frames = select_surface_frames(recording, split, config.tolerance_mm)
         return dict(vars(surface_frames)) if len(surface_frames) else {}
 
     @classmethod

@@ -19,13 +19,3 @@ class Curves:
     validation_mm: list[float] = field(default_factory=list)
     worst_mm: list[float] = field(default_factory=list)
     best_epoch: int = 0
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Errors after an epoch: means over the partitions, weighted by their vertices, mm. Epoch 1 is the first."""
-
-    epoch: int
-    epochs: int
-    training_mm: float
-    validation_mm: float

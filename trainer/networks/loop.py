@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 import torch
@@ -13,8 +12,7 @@ from fdda_addon.core.errors import TrainingError
 from ..config import TrainingConfig
 from ..data.split import Split
 from ..preparation import PreparedPartition
-from ..process import Cancelled
-from .curves import Curves, Progress
+from .curves import Curves
 from .networks import Network, PartitionNetworks
 from .optimizer import OneCycleAdamW
 
@@ -48,8 +46,7 @@ def train(
     split: Split,
     config: TrainingConfig,
     device: torch.device | None = None,
-    on_epoch: Callable[[Progress], None] | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
+    on_epoch: Callable[[int, float, float], None] = lambda *_: None,
     initial: Sequence[Network | None] | None = None,
 ) -> TrainingResult:
     """Train the networks of all partitions together.
@@ -59,12 +56,11 @@ def train(
         split: split of the poses.
         config: settings of the training. Equal settings and data give equal weights on one machine.
         device: device to train on; None for `choose_device()`.
-        on_epoch: called after every epoch.
-        should_stop: called before every step.
+        on_epoch: called after every epoch with its number and the training and validation error: means over all
+            partitions, weighted by their vertices, mm. Epoch 1 is the first.
         initial: for each partition the network to start from, or None for random weights.
 
     Raises:
-        Cancelled: `should_stop` returned True.
         TrainingError: the training diverged.
     """
     device = device or choose_device()
@@ -77,7 +73,8 @@ def train(
         loop = _Loop([partitions[index] for index in learning_indices], split, config, device)
         if initial is not None:
             loop.start_from([initial[index] for index in learning_indices])
-        loop.run([curves[index] for index in learning_indices], on_epoch, should_stop, partitions)
+        constant = [partition for partition in partitions if not len(partition.basis.components)]
+        loop.run([curves[index] for index in learning_indices], on_epoch, constant)
         for index, network in zip(learning_indices, loop.best_networks(), strict=True):
             networks[index] = network
     return TrainingResult(tuple(networks), curves)
@@ -165,17 +162,15 @@ class _Loop:
     def run(
         self,
         curves: list[Curves],
-        on_epoch: Callable[[Progress], None] | None,
-        should_stop: Callable[[], bool],
-        all_partitions: Sequence[PreparedPartition],
+        on_epoch: Callable[[int, float, float], None],
+        constant: list[PreparedPartition],
     ) -> None:
         """Train for all epochs.
 
         Args:
             curves: learning curves of the P partitions; each epoch adds its errors.
-            on_epoch, should_stop: as in `train`.
-            all_partitions: the P partitions and the partitions without components. The reported progress is a mean
-                over all of them.
+            on_epoch: as in `train`.
+            constant: the partitions without components, whose only error is that of their bases.
         """
         config, step_count = self.config, -(-self.inputs.shape[1] // self.config.batch_size)
         optimizer = OneCycleAdamW(
@@ -186,11 +181,16 @@ class _Loop:
             WARM_UP_FRACTION,
         )
         order_generator = torch.Generator().manual_seed(config.seed + 1)
+        vertex_counts = [partition.vertex_count for partition in (*self.partitions, *constant)]
+        constant_mm = (
+            [partition.basis.truncation_rms * partition.mm_per_unit for partition in constant],
+            [partition.validation_truncation.mean() * partition.mm_per_unit for partition in constant],
+        )
         rescaling_epochs = {round(fraction * config.epochs) for fraction in RELEVANCE_EPOCH_FRACTIONS} - {0}
         for epoch in range(1, config.epochs + 1):
             if epoch - 1 in rescaling_epochs:
                 self.rescale_inputs_by_relevance()
-            training_mm = self._train_epoch(optimizer, order_generator, should_stop)
+            training_mm = self._train_epoch(optimizer, order_generator)
             validation_mm, worst_mm = self._validate()
             self._update_best(validation_mm, epoch, curves)
             if not torch.isfinite(validation_mm).all():
@@ -203,20 +203,17 @@ class _Loop:
                 curve.training_mm.append(training_error)
                 curve.validation_mm.append(validation_error)
                 curve.worst_mm.append(worst_error)
-            if on_epoch:
-                truncations = [(p.basis.truncation_rms, p.validation_truncation.mean()) for p in all_partitions]
-                means = map(_mean_over_vertices, errors_mm[:2], zip(*truncations, strict=True), repeat(all_partitions))
-                on_epoch(Progress(epoch, config.epochs, *means))
+            means = (
+                float(np.average(errors + constant_errors, weights=vertex_counts))
+                for errors, constant_errors in zip(errors_mm[:2], constant_mm, strict=True)
+            )
+            on_epoch(epoch, *means)
 
-    def _train_epoch(
-        self, optimizer: OneCycleAdamW, order_generator: torch.Generator, should_stop: Callable[[], bool]
-    ) -> torch.Tensor:
+    def _train_epoch(self, optimizer: OneCycleAdamW, order_generator: torch.Generator) -> torch.Tensor:
         """Train on all poses once, in random order; returns (P,) mean errors, mm."""
         pose_count, total_mm = self.inputs.shape[1], torch.zeros(len(self.partitions), device=self.device)
         pose_order = torch.randperm(pose_count, generator=order_generator).to(self.device)
         for batch_poses in pose_order.split(self.config.batch_size):
-            if should_stop():
-                raise Cancelled
             squared_errors = self._step(optimizer, batch_poses)
             total_mm += (squared_errors * self.to_mm.square() + self.truncation_mm.square()).sqrt().sum(dim=1)
         return total_mm / pose_count
@@ -274,21 +271,3 @@ def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: torch.device) -
     for index, array in enumerate(arrays):
         padded[index, :, : array.shape[1]] = array[poses]
     return torch.from_numpy(padded).to(device)
-
-
-def _mean_over_vertices(
-    errors_mm: list[float], truncations: Sequence[float], all_partitions: Sequence[PreparedPartition]
-) -> float:
-    """Return the mean error over all vertices, mm.
-
-    Args:
-        errors_mm: errors of the partitions with networks, mm.
-        truncations: errors of the bases of all partitions, in units of their residuals. Constant partitions have no
-            other error.
-        all_partitions: all partitions.
-    """
-    errors, learned_errors = [], iter(errors_mm)
-    for partition, truncation in zip(all_partitions, truncations, strict=True):
-        has_network = len(partition.basis.components) > 0
-        errors.append(next(learned_errors) if has_network else float(truncation) * partition.mm_per_unit)
-    return float(np.average(errors, weights=[partition.vertex_count for partition in all_partitions]))

@@ -28,18 +28,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--random-poses", type=int, default=0, help="number of random poses, which come first")
     parser.add_argument("--static-joint", type=int, default=-1, help="index of the joint that never moves; -1: none")
     options = parser.parse_args(arguments)
-    sink, stop_request = JsonMessageSink(), StopRequest()
+    sink = JsonMessageSink()
+    stop_request = StopRequest(sink)
     return run_with_messages(lambda: _fit(options, sink, stop_request), sink)
 
 
 def _fit(options: argparse.Namespace, sink: MessageSink, stop_request: StopRequest) -> None:
-    try:
-        with stop_request.exit_immediately(sink):
-            from .job import KeyJointRequest, fit_folder
-    except ModuleNotFoundError as error:
-        raise missing_package_error("Fitting skin weights", error) from error
-    request = KeyJointRequest(options.joints, options.random_poses, options.static_joint)
-    fit_folder(options.folder, options.kind, sink, stop_request, options.metres_per_unit, request)
+    with stop_request.exit_immediately():
+        try:
+            from .job import fit_folder
+        except ModuleNotFoundError as error:
+            raise missing_package_error("Fitting skin weights", error) from error
+        fit_folder(sink=sink, **vars(options))
 
 
 if __name__ == "__main__":

@@ -15,10 +15,9 @@ from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import are_invertible, skin_matrices
 
-from ..process import Cancelled
 from .input_blocks import LENGTH_RATIO, InputBlocks
-from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments
-from .solver import SkinSolver
+from .key_joints import TOLERANCE_RATIO, KeyJointSearch, joint_moments
+from .solver import fit_skin
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,6 @@ def choose_key_joints(
     requested: str,
     static_joints: np.ndarray,
     metres_per_unit: float,
-    should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Choice:
     """Choose key joints by random poses.
@@ -61,11 +59,9 @@ def choose_key_joints(
         requested: "auto", or the number of key joints.
         static_joints: (J,) bool, joints that are kept in any case.
         metres_per_unit: as in `Rig`.
-        should_stop: called often.
         on_progress: called often, with the number of decided joints and of those that may be removed.
 
     Raises:
-        Cancelled: `should_stop` returned True.
         RecordingError: a joint has a scale of zero in some random pose.
     """
     poses = all_poses.subset(slice(0, random_count))
@@ -77,11 +73,11 @@ def choose_key_joints(
     rig, joint_count = poses.rig, len(poses.rig.joints)
     patches = divide_into_patches(rig, make_partitions(rig))
     representatives = patches.vertices[patches.starts]
-    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives, should_stop)
-    moments = _larger_moments(
-        joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count),
-        joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count),
-    )
+    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives)
+    moments = joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count)
+    fitted_moments = joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count)
+    # The last element is the mean square weight.
+    moments = np.where((moments[:, 3, 3] >= fitted_moments[:, 3, 3])[:, None, None], moments, fitted_moments)
     without_vertices = poses.is_dependency & (np.trace(moments, axis1=1, axis2=2) == 0)
     moments[without_vertices] = _moments_at_heads(rig)[without_vertices]
     blocks = InputBlocks(poses)
@@ -89,26 +85,26 @@ def choose_key_joints(
     tolerance = TOLERANCE_RATIO * poses.rig.size
     is_unseen = is_still & (_measure_unseen_motions(all_poses, random_count, moments) > tolerance)
     search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
-
-    def on_step(done: int, total: int) -> None:
-        if should_stop():
-            raise Cancelled
-        on_progress(done, total)
-
-    result = search.search(None if requested == AUTO else int(requested), on_step)
-
+    result = search.search(None if requested == AUTO else int(requested), on_progress)
     acts = _acting_joints(rig.skin_joints, rig.skin_weights, joint_count)
     patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))
     acts[patches.vertices] |= np.repeat(_acting_joints(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0)
     columns = np.concatenate([result.joints, np.arange(joint_count, blocks.count)])
     needed_inputs = (acts.astype(np.float32) @ result.inputs[:, columns].astype(np.float32)) > 0
-    report = _make_report(result, is_still, requested, metres_per_unit)
-    return Choice(result.joints, result.joints[result.is_weighted], needed_inputs, report)
+    is_removed = ~np.isin(np.arange(joint_count), result.joints)
+    report = KeyJointReport(
+        requested,
+        len(result.joints),
+        joint_count,
+        1000 * metres_per_unit * float(result.unexplained.max()),
+        1000 * metres_per_unit * tolerance,
+        int(result.is_independent.sum()),
+        int((is_removed & is_still).sum()),
+    )
+    return Choice(result.joints, result.weighted_joints, needed_inputs, report)
 
 
-def _fit_vertices(
-    poses: FitPoses, vertices: np.ndarray, should_stop: Callable[[], bool]
-) -> tuple[np.ndarray, np.ndarray]:
+def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit the weights of (n,) vertices to poses; returns (n, 4) joints and (n, 4) weights."""
     rig = poses.rig
     selected_rig = replace(
@@ -117,14 +113,7 @@ def _fit_vertices(
         skin_joints=rig.skin_joints[vertices],
         skin_weights=rig.skin_weights[vertices],
     )
-    selected = replace(poses, rig=selected_rig, positions=poses.positions[:, vertices])
-    fitted = []
-    for _, *arrays in SkinSolver(selected).fit("smooth"):
-        if should_stop():
-            raise Cancelled
-        fitted.append(arrays)
-    joints, weights = (np.concatenate(blocks) for blocks in zip(*fitted, strict=True))
-    return joints, weights
+    return fit_skin(replace(poses, rig=selected_rig, positions=poses.positions[:, vertices]), "smooth")
 
 
 def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndarray) -> np.ndarray:
@@ -152,11 +141,6 @@ def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndar
     return distances
 
 
-def _larger_moments(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return for each joint the moment of the larger weights, (J, 4, 4); the last element is the mean square weight."""
-    return np.where((first[:, 3, 3] >= second[:, 3, 3])[:, None, None], first, second)
-
-
 def _moments_at_heads(rig: Rig) -> np.ndarray:
     """Return (J, 4, 4) moments of points around the heads of joints, for joints that move the mesh without weights."""
     offsets = LENGTH_RATIO * rig.size * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
@@ -172,17 +156,3 @@ def _acting_joints(joints: np.ndarray, weights: np.ndarray, joint_count: int) ->
         rows = np.flatnonzero(weights[:, slot] > 0)
         acts[rows, joints[rows, slot]] = True
     return acts
-
-
-def _make_report(result: KeyJoints, is_still: np.ndarray, requested: str, metres_per_unit: float) -> KeyJointReport:
-    joint_count = len(result.unexplained)
-    is_removed = ~np.isin(np.arange(joint_count), result.joints)
-    return KeyJointReport(
-        requested,
-        len(result.joints),
-        joint_count,
-        1000 * metres_per_unit * float(result.unexplained.max()),
-        1000 * metres_per_unit * result.tolerance,
-        int(result.is_independent.sum()),
-        int((is_removed & is_still).sum()),
-    )

@@ -2,8 +2,7 @@
 """Fits skin weights to a folder of poses, and measures the improvement."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,41 +12,23 @@ from fdda_addon.core.messages import MessageType
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted_weights, write_key_joints
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skin_fit import INFLUENCES, FitReport, SkinFit
+from fdda_addon.core.skin_fit import FitReport, SkinFit
 from fdda_addon.core.skinning import LinearSkinning
 
 from ..blocks import block_slices
-from ..process import Cancelled
 from ..progress import MessageSink
-from .choice import Choice, choose_key_joints
-from .solver import SkinSolver
-
-
-@dataclass(frozen=True)
-class KeyJointRequest:
-    """Which joints the weights are fitted to.
-
-    Attributes:
-        joints: the option `joints`: "all", "auto", or a number.
-        random_poses: number of random poses, which come first; key joints are chosen by these.
-        static_joint: index of the static joint; -1 if there is none.
-    """
-
-    joints: str = ALL
-    random_poses: int = 0
-    static_joint: int = -1
-
-
-ALL_JOINTS = KeyJointRequest()
+from .choice import choose_key_joints
+from .solver import fit_skin
 
 
 def fit_folder(
     folder: Path,
     kind: str,
     sink: MessageSink,
-    should_stop: Callable[[], bool],
     metres_per_unit: float = 1.0,
-    request: KeyJointRequest = ALL_JOINTS,
+    joints: str = ALL,
+    random_poses: int = 0,
+    static_joint: int = -1,
 ) -> SkinFit | None:
     """Fit skin weights to a folder of poses, and write them into it. Every other pose is held out to measure the error.
 
@@ -55,58 +36,50 @@ def fit_folder(
         folder: written by `FitPosesWriter`.
         kind: one of `core.skin_fit.FIT_KINDS`.
         sink: receives progress, and last the result.
-        should_stop: called often; nothing has been written when it stops the fit.
         metres_per_unit: as in `Rig`.
-        request: the joints that may have weights.
+        joints: the joints that may have weights: the option `joints`, "all", "auto", or a number.
+        random_poses: number of random poses, which come first; key joints are chosen by these.
+        static_joint: index of the static joint; -1 if there is none.
 
     Returns:
         The result; None if key joints were requested, but no joint can be removed. Then nothing is written.
 
     Raises:
-        Cancelled: `should_stop` returned True.
         FDDAError: the folder is damaged or cannot be written.
     """
     started = time.perf_counter()
     poses = read_fit_poses(folder)
-    choice = _choose(poses, request, metres_per_unit, sink, should_stop) if request.joints != ALL else None
+    choice = None
+    if joints != ALL:
+        is_static = np.arange(len(poses.rig.joints)) == static_joint
+        choice = choose_key_joints(
+            poses,
+            random_poses,
+            joints,
+            is_static,
+            metres_per_unit,
+            lambda done, total: sink.send(MessageType.PROGRESS, stage=KEY_JOINTS_STAGE, done=done, total=total),
+        )
     if choice and len(choice.joints) == len(poses.rig.joints):
         values = {"fit": None, "key_joints": choice.report.to_json()}
         sink.send(MessageType.FINISHED, seconds=time.perf_counter() - started, **values)
         return None
-    vertex_count = poses.rig.vertex_count
     training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
-    fitted_poses = training.with_joints(choice.weighted_joints) if choice else training
-    joints, weights = (np.zeros((vertex_count, INFLUENCES), dtype) for dtype in (np.int32, np.float32))
-    for block, *fitted in SkinSolver(fitted_poses).fit(kind):
-        if should_stop():
-            raise Cancelled
-        joints[block], weights[block] = fitted
-        sink.send(MessageType.PROGRESS, done=block.stop, total=vertex_count)
+    fitted_joints, weights = fit_skin(
+        training.with_joints(choice.weighted_joints) if choice else training,
+        kind,
+        lambda done: sink.send(MessageType.PROGRESS, done=done, total=poses.rig.vertex_count),
+    )
     if choice:
-        joints = choice.weighted_joints[joints].astype(np.int32)
-    skinned = replace(poses.rig, skin_joints=joints, skin_weights=weights, metres_per_unit=metres_per_unit)
+        fitted_joints = choice.weighted_joints[fitted_joints].astype(np.int32)
+    skinned = replace(poses.rig, skin_joints=fitted_joints, skin_weights=weights, metres_per_unit=metres_per_unit)
     reports = measure(held_out, skinned), measure(training, skinned)
     result = SkinFit(kind, len(poses.positions), *reports, choice.report if choice else None)
-    write_fitted_weights(folder, joints, weights)
+    write_fitted_weights(folder, fitted_joints, weights)
     if choice:
         write_key_joints(folder, choice.joints, choice.needed_inputs)
     sink.send(MessageType.FINISHED, seconds=time.perf_counter() - started, fit=result.to_json())
     return result
-
-
-def _choose(
-    poses: FitPoses,
-    request: KeyJointRequest,
-    metres_per_unit: float,
-    sink: MessageSink,
-    should_stop: Callable[[], bool],
-) -> Choice:
-    def on_progress(done: int, total: int) -> None:
-        sink.send(MessageType.PROGRESS, stage=KEY_JOINTS_STAGE, done=done, total=total)
-
-    is_static = np.arange(len(poses.rig.joints)) == request.static_joint
-    requested = request.random_poses, request.joints
-    return choose_key_joints(poses, *requested, is_static, metres_per_unit, should_stop, on_progress)
 
 
 def measure(poses: FitPoses, fitted: Rig) -> FitReport:

@@ -42,19 +42,17 @@ class KeyJoints:
 
     Attributes:
         joints: (K,) indices of the key joints, ascending.
-        is_weighted: (K,) bool, key joints that may have skin weights; the others are kept for their children alone.
+        weighted_joints: key joints that may have skin weights; the others are kept for their children alone.
         inputs: (J, J + C) bool, the key joints and controls that explain each removed joint.
         unexplained: (J,) motion that the inputs do not explain, rms, mesh units; 0 for key joints.
         is_independent: (J,) bool, removed joints that would not be removed automatically.
-        tolerance: largest unexplained motion of a joint that is removed automatically, mesh units.
     """
 
     joints: np.ndarray
-    is_weighted: np.ndarray
+    weighted_joints: np.ndarray
     inputs: np.ndarray
     unexplained: np.ndarray
     is_independent: np.ndarray
-    tolerance: float
 
 
 @dataclass(frozen=True)
@@ -98,11 +96,7 @@ def joint_moments(rest_positions: np.ndarray, joints: np.ndarray, weights: np.nd
 
 
 class KeyJointSearch:
-    """Removes joints greedily, first those that the others explain best.
-
-    Attributes:
-        tolerance: as in `KeyJoints`.
-    """
+    """Removes joints greedily, first those that the others explain best."""
 
     def __init__(
         self, poses: FitPoses, moments: np.ndarray, blocks: InputBlocks, is_static: np.ndarray, is_unseen: np.ndarray
@@ -117,7 +111,7 @@ class KeyJointSearch:
             is_unseen: (J,) bool, joints that only actions move. Neither are removed.
         """
         self._size = max(poses.rig.size, 1e-9)
-        self.tolerance = TOLERANCE_RATIO * self._size
+        self._tolerance = TOLERANCE_RATIO * self._size
         self._blocks, self._is_kept = blocks, np.ones(len(moments), bool)
         self._is_required = is_static | is_unseen
         self._skin = skin_matrices(poses.pose_matrices, poses.rig.rest_matrices).astype(np.float64)
@@ -250,20 +244,20 @@ class KeyJointSearch:
         # What moves a root usually moves the whole character, so a root is an input only if no others are enough.
         roots = [kept for kept in np.flatnonzero(self._is_kept).tolist() if self._blocks.parent(kept) < 0]
         inputs, error = self._find_inputs(motion, roots)
-        if error > self.tolerance:
+        if error > self._tolerance:
             inputs, error = self._find_inputs(motion)
         total = _rms(motion[1::2])
         if self._is_sampled[joint]:
             # Animators pose this joint, so what explains it in these poses may not explain it in others.
-            return _Explanation(anchor, inputs, total, total / self.tolerance)
-        return _Explanation(anchor, inputs, error, error / self.tolerance)
+            return _Explanation(anchor, inputs, total, total / self._tolerance)
+        return _Explanation(anchor, inputs, error, error / self._tolerance)
 
     def _find_inputs(self, motion: np.ndarray, excluded: Iterable[int] = ()) -> tuple[tuple[int, ...], float]:
         """Find inputs that explain the (n, 12) motion; return them and the rms of the remaining motion, mesh units."""
         training, held_out = motion[::2], motion[1::2]
         inputs: tuple[int, ...] = ()
         best, remaining = (inputs, _rms(held_out)), training
-        while len(inputs) < MAX_INPUTS and best[1] > self.tolerance / 4:
+        while len(inputs) < MAX_INPUTS and best[1] > self._tolerance / 4:
             chosen = self._blocks.best_block(remaining, (*inputs, *excluded))
             if chosen is None:
                 break
@@ -289,10 +283,10 @@ class KeyJointSearch:
             inputs[joint, [*({explanation.anchor} - free_roots), *explanation.inputs]] = True
             unexplained[joint], is_independent[joint] = explanation.unexplained, explanation.cost > 1
         joints = np.flatnonzero(self._is_kept)
-        is_weighted = self._may_have_weights[joints]
-        if not is_weighted.any():
-            is_weighted[:] = True
-        return KeyJoints(joints, is_weighted, inputs, unexplained, is_independent, self.tolerance)
+        weighted_joints = joints[self._may_have_weights[joints]]
+        return KeyJoints(
+            joints, weighted_joints if len(weighted_joints) else joints, inputs, unexplained, is_independent
+        )
 
 
 def _rms(motion: np.ndarray) -> float:

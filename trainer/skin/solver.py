@@ -10,7 +10,7 @@ Skinning Decomposition with Rigid Bones, 2012. The least-squares solver is `scip
 1974).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import nnls
@@ -40,39 +40,55 @@ MIN_RIDGE_RATIO = 1e-12
 """Minimum ridge, as a part of the errors. A smaller ridge would be less than the rounding errors of the products."""
 
 
-class SkinSolver:
-    """Fits the weights of a rig's vertices to poses."""
+def fit_skin(
+    poses: FitPoses, kind: str, on_progress: Callable[[int], None] = lambda done: None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit the weights of a rig's V vertices to poses.
+
+    Args:
+        poses: the poses.
+        kind: "hard" for one joint per vertex, "smooth" for at most four.
+        on_progress: called often with the number of fitted vertices.
+
+    Returns:
+        (V, 4) int32 joints, the heaviest first, and (V, 4) float32 weights. Each row sums to 1; unused slots are 0.
+    """
+    solver, vertex_count = _Solver(poses), poses.rig.vertex_count
+    joints, weights = (np.zeros((vertex_count, INFLUENCES), dtype) for dtype in (np.int32, np.float32))
+    max_candidates = RIG_CANDIDATES + SINGLE_CANDIDATES + ADDED_CANDIDATES
+    vertex_elements = max(16 * max_candidates**2, *solver.skin_rows.shape)
+    for block in block_slices(vertex_count, vertex_elements):
+        joints[block], weights[block] = _Block(solver, block).fit(kind)
+        on_progress(block.stop)
+    return joints, weights
+
+
+class _Solver:
+    """What all vertices share.
+
+    Attributes:
+        poses, pose_count, joint_count: the n poses of J joints.
+        skin_rows: (3 n, 4 J) float64, skin matrices of all poses.
+        gram, gram_blocks: (4 J, 4 J) and (J, J, 16), products of the skin matrices.
+        character_size: largest extent of the rig, mesh units.
+        tie_squared_error: squared errors that differ by less count as equal.
+        joint_heads: (J, 3) float64, mesh units.
+    """
 
     def __init__(self, poses: FitPoses):
-        """Compute the Gram matrix of all joints' skin matrices, which all vertices share."""
-        self._poses = poses
+        self.poses = poses
         rig = poses.rig
-        self._pose_count, self._joint_count = len(poses.pose_matrices), len(rig.joints)
+        self.pose_count, self.joint_count = len(poses.pose_matrices), len(rig.joints)
         skin = skin_matrices(poses.pose_matrices, rig.rest_matrices)[:, :, :3].astype(np.float64)
-        self._skin_rows = np.ascontiguousarray(
-            skin.transpose(0, 2, 1, 3).reshape(3 * self._pose_count, 4 * self._joint_count)
+        self.skin_rows = np.ascontiguousarray(
+            skin.transpose(0, 2, 1, 3).reshape(3 * self.pose_count, 4 * self.joint_count)
         )
-        self._gram = self._skin_rows.T @ self._skin_rows
-        gram_blocks = self._gram.reshape(self._joint_count, 4, self._joint_count, 4).transpose(0, 2, 1, 3)
-        self._gram_blocks = np.ascontiguousarray(gram_blocks).reshape(self._joint_count, self._joint_count, 16)
-        self._character_size = max(rig.size, 1e-9)
-        self.tie_squared_error = self._pose_count * (TIE_RATIO * self._character_size) ** 2
-        self._joint_heads = rig.rest_matrices[:, :3, 3].astype(np.float64)
-
-    def fit(self, kind: str) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """Fit all vertices, block by block.
-
-        Args:
-            kind: "hard" for one joint per vertex, "smooth" for at most four.
-
-        Yields:
-            The vertices of the block, (B, 4) int32 joints, the heaviest first, and (B, 4) float32 weights. Each row
-            sums to 1; unused slots are 0.
-        """
-        max_candidates = RIG_CANDIDATES + SINGLE_CANDIDATES + ADDED_CANDIDATES
-        vertex_elements = max(16 * max_candidates**2, 4 * self._joint_count, 3 * self._pose_count)
-        for block in block_slices(self._poses.rig.vertex_count, vertex_elements):
-            yield block, *_Block(self, block).fit(kind)
+        self.gram = self.skin_rows.T @ self.skin_rows
+        gram_blocks = self.gram.reshape(self.joint_count, 4, self.joint_count, 4).transpose(0, 2, 1, 3)
+        self.gram_blocks = np.ascontiguousarray(gram_blocks).reshape(self.joint_count, self.joint_count, 16)
+        self.character_size = max(rig.size, 1e-9)
+        self.tie_squared_error = self.pose_count * (TIE_RATIO * self.character_size) ** 2
+        self.joint_heads = rig.rest_matrices[:, :3, 3].astype(np.float64)
 
 
 class _Block:
@@ -90,21 +106,21 @@ class _Block:
     Moments, squares and errors are sums over the poses, in square mesh units.
     """
 
-    def __init__(self, solver: SkinSolver, vertices: slice):
+    def __init__(self, solver: _Solver, vertices: slice):
         self._solver = solver
-        poses, rig = solver._poses, solver._poses.rig
+        poses, rig = solver.poses, solver.poses.rig
         rest_positions = rig.rest_positions[vertices].astype(np.float64)
         self.rest = np.concatenate([rest_positions, np.ones((len(rest_positions), 1))], axis=1)
         recorded = poses.positions[:, vertices].astype(np.float64).transpose(0, 2, 1).reshape(-1, len(rest_positions))
-        self.moments = solver._skin_rows.T @ recorded
+        self.moments = solver.skin_rows.T @ recorded
         self.recorded_squares = (recorded**2).sum(axis=0)
         self.joint_moments = self._project_to_joints(self.moments)
         outer = (self.rest[:, :, None] * self.rest[:, None]).reshape(-1, 16)
-        skinned_squares = outer @ solver._gram_blocks[range(solver._joint_count), range(solver._joint_count)].T
+        skinned_squares = outer @ solver.gram_blocks[range(solver.joint_count), range(solver.joint_count)].T
         self.single_errors = np.maximum(skinned_squares - 2 * self.joint_moments + self.recorded_squares[:, None], 0)
-        distances = np.linalg.norm(rest_positions[:, None] - solver._joint_heads, axis=2)
-        self.tie_preference = np.minimum(distances / solver._character_size, 1)
-        self._rig_weights = np.zeros((len(rest_positions), solver._joint_count))
+        distances = np.linalg.norm(rest_positions[:, None] - solver.joint_heads, axis=2)
+        self.tie_preference = np.minimum(distances / solver.character_size, 1)
+        self._rig_weights = np.zeros((len(rest_positions), solver.joint_count))
         vertex_rows = np.repeat(np.arange(len(rest_positions)), rig.skin_joints.shape[1])
         np.add.at(
             self._rig_weights, (vertex_rows, rig.skin_joints[vertices].ravel()), rig.skin_weights[vertices].ravel()
@@ -119,19 +135,19 @@ class _Block:
     def _scores(self) -> np.ndarray:
         """Return (B, J) rms errors of single joints, mesh units, plus a small preference that decides ties."""
         return (
-            np.sqrt(self.single_errors / self._solver._pose_count)
-            + TIE_RATIO * self._solver._character_size * self.tie_preference
+            np.sqrt(self.single_errors / self._solver.pose_count)
+            + TIE_RATIO * self._solver.character_size * self.tie_preference
         )
 
     def fit(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """Fit the block; returns (B, 4) int32 joints and (B, 4) float32 weights as in `SkinSolver.fit`."""
+        """Fit the block; returns (B, 4) int32 joints and (B, 4) float32 weights as in `fit_skin`."""
         scores = self._scores
         if kind == "hard":
             return _pad_influences(scores.argmin(axis=1)[:, None], np.ones((len(scores), 1)))
         scores[self._rig_candidates()] = self.tie_preference[self._rig_candidates()] - 2
         candidates = np.argsort(scores, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES]
         weights, squared_errors = self._solve(candidates)
-        for _ in range(EXCHANGE_ROUNDS if candidates.shape[1] < self._solver._joint_count else 0):
+        for _ in range(EXCHANGE_ROUNDS if candidates.shape[1] < self._solver.joint_count else 0):
             slot_order = np.sort(
                 np.argsort(-weights, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES], axis=1
             )
@@ -149,13 +165,13 @@ class _Block:
 
     def _steepest_joints(self, candidates: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return (B, n) further joints: those where adding weight lowers the error fastest."""
-        dense_weights = np.zeros((len(candidates), self._solver._joint_count))
+        dense_weights = np.zeros((len(candidates), self._solver.joint_count))
         np.put_along_axis(dense_weights, candidates, weights, axis=1)
         combined = (dense_weights[:, :, None] * self.rest[:, None]).reshape(len(dense_weights), -1).T
-        slopes = self._project_to_joints(self._solver._gram @ combined - self.moments)
+        slopes = self._project_to_joints(self._solver.gram @ combined - self.moments)
         np.put_along_axis(slopes, candidates, np.inf, axis=1)
         return np.argsort(slopes, axis=1, kind="stable")[
-            :, : min(ADDED_CANDIDATES, self._solver._joint_count - candidates.shape[1])
+            :, : min(ADDED_CANDIDATES, self._solver.joint_count - candidates.shape[1])
         ]
 
     def _prune(
@@ -220,7 +236,7 @@ class _Block:
         For weights w that sum to 1, w' E w is the squared error of skinning with w, in square mesh units.
         """
         outer = (self.rest[vertices, :, None] * self.rest[vertices, None]).reshape(-1, 16)
-        gram_blocks = self._solver._gram_blocks[candidates[:, :, None], candidates[:, None, :]]
+        gram_blocks = self._solver.gram_blocks[candidates[:, :, None], candidates[:, None, :]]
         joint_moments = np.take_along_axis(self.joint_moments[vertices], candidates, axis=1)
         skinned_products = np.einsum("vjkm,vm->vjk", gram_blocks, outer)
         return (
