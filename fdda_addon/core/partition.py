@@ -48,6 +48,14 @@ def main_joints(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray
     return np.take_along_axis(skin_joints, slots[:, None], axis=1)[:, 0].astype(np.int32)
 
 
+def joints_with_weight(skin_joints: np.ndarray, skin_weights: np.ndarray, joint_count: int) -> np.ndarray:
+    """Return (V, J) bool, the joints with a weight above 0 on each vertex; arguments as in `main_joints`."""
+    has_weight = np.zeros((len(skin_joints), joint_count), bool)
+    vertices, slots = np.nonzero(skin_weights > 0)
+    has_weight[vertices, skin_joints[vertices, slots]] = True
+    return has_weight
+
+
 def make_partitions(
     rig: Rig,
     influencing: dict[int, tuple[int, ...]] | None = None,
@@ -167,10 +175,7 @@ def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tup
         rig: the rig.
         partitions: of the rig; their influences are ignored.
     """
-    has_weight = np.zeros((rig.vertex_count, len(rig.joints)), bool)
-    rows = np.repeat(np.arange(rig.vertex_count), rig.skin_joints.shape[1])
-    is_used = rig.skin_weights.ravel() > 0
-    has_weight[rows[is_used], rig.skin_joints.ravel()[is_used]] = True
+    has_weight = joints_with_weight(rig.skin_joints, rig.skin_weights, len(rig.joints))
     face_of_corner = np.repeat(
         np.arange(len(rig.face_starts)), np.diff(np.append(rig.face_starts, len(rig.face_vertices)))
     )

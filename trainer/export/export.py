@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Builds the ONNX model, checks it against the trained networks, and measures its errors."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -195,17 +195,15 @@ def check_parity(
     return max_difference
 
 
-def model_info(
-    recording: Recording, trained_model: TrainedModel, held_out_errors: np.ndarray, training_info: dict
+def _model_info(
+    recording: Recording,
+    trained_model: TrainedModel,
+    held_out_errors: np.ndarray,
+    parity: float,
+    training_info: dict,
+    constant_bytes: int,
 ) -> ModelInfo:
-    """Create the metadata of a model; the parity is 0 until it is measured.
-
-    Args:
-        recording: recording of the training.
-        trained_model: the result of the training.
-        held_out_errors: (n, V) errors of the held-out poses, meters.
-        training_info: settings and versions.
-    """
+    """Create the metadata of a model; `parity` is the result of `check_parity`, others are as in `build_model`."""
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
     partitions = zip(trained_model.partitions, trained_model.component_counts(), strict=True)
     return ModelInfo(
@@ -220,13 +218,14 @@ def model_info(
         *(bound[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         trained_model.training_range.controls,
         error_statistics(held_out_errors).to_json(),
-        0.0,
+        1000 * parity,
         {
             **training_info,
             OBJECT_KEY: recording.info.object_name,
             LIMITS_KEY: recording.info.sampling.to_json()["limits"],
         },
         rig.metres_per_unit,
+        constant_bytes,
     )
 
 
@@ -267,11 +266,8 @@ def build_model(
     held_out_errors = measure(session, recording, held_out_poses)
     rms = float(np.sqrt(np.square(held_out_errors.fdda).mean()))
     parity = check_parity(session, recording, trained_model, held_out_poses, rms)
-    info = replace(
-        model_info(recording, trained_model, held_out_errors.fdda, training_info),
-        parity_mm=parity * 1000,
-        constant_bytes=sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer),
-    )
+    constant_bytes = sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer)
+    info = _model_info(recording, trained_model, held_out_errors.fdda, parity, training_info, constant_bytes)
     # The checksum comes first, so that a truncated file still has it.
     model.metadata_props.add(key=CHECKSUM_KEY, value=read_onnx(model.SerializeToString()).checksum)
     model.metadata_props.add(key=METADATA_KEY, value=info.to_json())

@@ -7,7 +7,8 @@ Lewis, Direct Delta Mush Skinning and Variants, 2019, show how much of delta mus
 that preserves volume, half-rotation features are also regressors (`half_rotations`).
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Set
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -170,8 +171,8 @@ def _select_joints(gram: np.ndarray, moments: np.ndarray, total: float) -> np.nd
 def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> JointRegression:
     """Create the regression of a rig's partition; `matrices` as in `make_joint_regression`."""
     center = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
-    regression = make_joint_regression(rig.parents, partition, matrices, center, static_joints(rig))
-    return replace(regression, metres_per_unit=rig.metres_per_unit)
+    static = {index for index, name in enumerate(rig.joint_names) if name == STATIC_JOINT}
+    return make_joint_regression(rig.parents, partition, matrices, center, static, rig.metres_per_unit)
 
 
 def make_joint_regression(
@@ -179,7 +180,8 @@ def make_joint_regression(
     partition: Partition,
     matrices: np.ndarray,
     center: np.ndarray,
-    static: frozenset[int] = frozenset(),
+    static: Set[int] = frozenset(),
+    metres_per_unit: float = 1.0,
 ) -> JointRegression:
     """Create the regression on all joints whose motion relative to the main joint depends on influencing joints alone.
 
@@ -189,7 +191,8 @@ def make_joint_regression(
         matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) followed by half-rotation
             matrices (`half_rotations.regression_matrices`). The rest pose may be any fixed pose.
         center: (3,) center of the partition where all skin matrices are the identity, mesh units.
-        static: joints that never move.
+        static: joints that never move; they influence nothing.
+        metres_per_unit: as in `Rig`.
     """
     influencing, main, count = set(partition.influencing), partition.joint, len(parents)
     paths = [joints_on_path(parents, main, joint) for joint in range(count)]
@@ -202,12 +205,7 @@ def make_joint_regression(
     relative[:, :, :, 3] -= is_skin * matrices[:, main, None, :3, 3]
     local = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ relative
     local[:, :, :, 3] += is_skin * (local[:, :, :, :3] @ center - center)
-    return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1))
-
-
-def static_joints(rig: Rig) -> frozenset[int]:
-    """Return the joints of a rig that never move; they influence nothing."""
-    return frozenset(index for index, joint in enumerate(rig.joints) if joint.name == STATIC_JOINT)
+    return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), metres_per_unit)
 
 
 def joints_on_path(parents: np.ndarray, first: int, second: int) -> set[int]:

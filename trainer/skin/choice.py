@@ -9,7 +9,7 @@ import numpy as np
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
 from fdda_addon.core.key_joints import KeyJointReport
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.partition import joints_with_weight, make_partitions
 from fdda_addon.core.patches import divide_into_patches
 from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import Rig
@@ -86,9 +86,11 @@ def choose_key_joints(
     is_unseen = is_still & (_measure_unseen_motions(all_poses, random_count, moments) > tolerance)
     search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
     result = search.search(None if requested == AUTO else int(requested), on_progress)
-    acts = _acting_joints(rig.skin_joints, rig.skin_weights, joint_count)
+    acts = joints_with_weight(rig.skin_joints, rig.skin_weights, joint_count)
     patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))
-    acts[patches.vertices] |= np.repeat(_acting_joints(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0)
+    acts[patches.vertices] |= np.repeat(
+        joints_with_weight(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0
+    )
     columns = np.concatenate([result.joints, np.arange(joint_count, blocks.count)])
     needed_inputs = (acts.astype(np.float32) @ result.inputs[:, columns].astype(np.float32)) > 0
     is_removed = ~np.isin(np.arange(joint_count), result.joints)
@@ -147,12 +149,3 @@ def _moments_at_heads(rig: Rig) -> np.ndarray:
     points = rig.rest_matrices[:, None, :3, 3] + offsets
     points = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
     return np.einsum("jpa,jpb->jab", points, points) / len(offsets)
-
-
-def _acting_joints(joints: np.ndarray, weights: np.ndarray, joint_count: int) -> np.ndarray:
-    """Return (V, J) bool, the joints with a weight on each vertex."""
-    acts = np.zeros((len(joints), joint_count), bool)
-    for slot in range(joints.shape[1]):
-        rows = np.flatnonzero(weights[:, slot] > 0)
-        acts[rows, joints[rows, slot]] = True
-    return acts

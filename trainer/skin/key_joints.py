@@ -119,13 +119,12 @@ class KeyJointSearch:
         variances, axes = np.linalg.eigh(moments)
         self._moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
         self._is_sampled, self._is_still = poses.is_sampled, blocks.widths[: len(moments)] == 0
-        self._parents: list[int] = poses.rig.parents.tolist()
-        self._depths: list[int] = []
-        for parent in self._parents:
-            self._depths.append(self._depths[parent] + 1 if parent >= 0 else 0)
+        self._ancestors: list[list[int]] = []
+        for parent in poses.rig.parents.tolist():
+            self._ancestors.append([parent, *self._ancestors[parent]] if parent >= 0 else [])
         has_weights = np.zeros(len(moments), bool)
         has_weights[poses.rig.skin_joints[poses.rig.skin_weights > 0]] = True
-        is_root = np.array(self._parents) < 0
+        is_root = poses.rig.parents < 0
         self._has_own_weights = has_weights | is_root | self._is_required
         self._is_weightless_root = is_root & ~has_weights & ~is_static
         self._is_anchor_of_descendants = self._is_still & ~is_static
@@ -145,9 +144,7 @@ class KeyJointSearch:
             relative = inverse_skin @ (self._skin[poses, joint] @ self._moment_roots[joint])[:, None]
             motions[joint] = np.sqrt(relative.var(axis=0).sum(axis=(1, 2)))
             is_ancestor = np.zeros(joint_count, bool)
-            ancestor = self._parents[joint]
-            while ancestor >= 0:
-                is_ancestor[ancestor], ancestor = True, self._parents[ancestor]
+            is_ancestor[self._ancestors[joint]] = True
             motions[joint, self._is_weightless_root | (self._is_anchor_of_descendants & ~is_ancestor)] = np.inf
             motions[joint, joint] = np.inf
         return motions
@@ -193,7 +190,7 @@ class KeyJointSearch:
     @property
     def _may_have_weights(self) -> np.ndarray:
         """Return (J,) bool; the others are kept for their children alone, because they move as their parents do."""
-        return self._has_own_weights | (self._blocks.widths[: len(self._parents)] > 0)
+        return self._has_own_weights | (self._blocks.widths[: len(self._ancestors)] > 0)
 
     def _carries_children(self, joint: int) -> bool:
         """Return whether a joint has children that are kept, and is a root or does not move."""
@@ -208,7 +205,7 @@ class KeyJointSearch:
         children come first.
         """
         step = int(cost / COST_STEP)
-        return cost > 1, bool(self._is_sampled[joint]), step, -self._depths[joint], joint
+        return cost > 1, bool(self._is_sampled[joint]), step, -len(self._ancestors[joint]), joint
 
     def _explain_without(self, joint: int, children: list[int]) -> dict[int, _Explanation]:
         """Explain a removed joint, and the removed joints that it explained, or its children."""
@@ -229,10 +226,8 @@ class KeyJointSearch:
         kept = np.flatnonzero(is_candidate if is_candidate.any() else self._is_kept)
         anchor = int(kept[self._anchor_motions[joint, kept].argmin()])
         best = self._explain_from(joint, anchor)
-        ancestor = self._parents[joint]
-        while ancestor >= 0 and not is_candidate[ancestor]:
-            ancestor = self._parents[ancestor]
-        if ancestor in (-1, anchor) or best.cost <= COST_STEP:
+        ancestor = next((ancestor for ancestor in self._ancestors[joint] if is_candidate[ancestor]), anchor)
+        if ancestor == anchor or best.cost <= COST_STEP:
             return best
         return min(best, self._explain_from(joint, ancestor), key=lambda explanation: explanation.cost)
 
