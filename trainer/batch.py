@@ -6,10 +6,10 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-from fdda_addon.core.errors import OutputError, RecordingError
+from fdda_addon.core.errors import OutputError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_folder_writable
-from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import open_recording
 
 from .config import TrainingConfig
 from .outputs import check_training_outputs, training_outputs
@@ -39,7 +39,7 @@ def check_batch(recordings: list[Path], folder: Path, overwrite: bool = False) -
         overwrite: as in `check_training_outputs`.
 
     Raises:
-        RecordingError: a recording is incomplete.
+        RecordingError: a recording is incomplete or damaged.
         OutputError: `folder` is the path of a model file, or a file cannot be written.
     """
     if folder.suffix == ".onnx":
@@ -53,12 +53,7 @@ def check_batch(recordings: list[Path], folder: Path, overwrite: bool = False) -
         if model.parent.is_dir():
             check_training_outputs(model, overwrite)
     for recording in recordings:
-        index = read_index(recording)
-        if index["complete"] < index["poses"]:
-            raise RecordingError(
-                f"The recording '{recording}' is incomplete: {index['complete']} of {index['poses']} poses; finish it "
-                "with record --resume."
-            )
+        open_recording(recording)
 
 
 def _model_path(recording: Path, folder: Path) -> Path:

@@ -40,15 +40,6 @@ class TrainedModel:
     training_range: TrainingRange
     activation: str
 
-    def feature_statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (F,) float64 mean and scale of each feature; 0 and 1 where no network takes it."""
-        size = len(self.training_range.low)
-        mean, scale = np.zeros(size), np.ones(size)
-        for index, prepared in enumerate(self.prepared):
-            columns = self.feature_columns(index)
-            mean[columns], scale[columns] = prepared.feature_mean, prepared.feature_scale
-        return mean, scale
-
     def feature_columns(self, partition: int) -> np.ndarray:
         """Return (F',) indices of the features that a partition's network takes, in its order."""
         return self.inputs.columns[partition][self.prepared[partition].columns]

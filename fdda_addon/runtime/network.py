@@ -24,8 +24,6 @@ from ..core.rig import Rig
 MIN_MULTITHREADED_VERTICES = 100_000
 """Smallest number of vertices for which several threads run the model; starting them takes time too."""
 MAX_THREADS = 4
-MAX_KEPT_EXECUTIONS = 4
-"""Largest number of executions that `Network.positions` keeps, one for each number of poses."""
 
 
 class Network:
@@ -73,7 +71,7 @@ class Network:
             raise ModelError(
                 f"ONNX Runtime refuses the model '{path}' ({_first_line(error)}); train it again."
             ) from error
-        self._executions: dict[int, Execution] = {}
+        self._execution: Execution | None = None
 
     def positions(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray:
         """Deform the mesh.
@@ -84,17 +82,15 @@ class Network:
 
         Returns:
             (N, V, 3) float32, mesh-object space, mesh units. The next call with the same number of poses overwrites
-            this array, so that playback allocates no memory for each frame.
+            this array.
 
         Raises:
             ModelError: the model fails, or the values of its controls are missing.
         """
         pose_count = len(pose_matrices)
-        if pose_count not in self._executions:
-            if len(self._executions) >= MAX_KEPT_EXECUTIONS:
-                self._executions.clear()
-            self._executions[pose_count] = Execution(self, pose_count)
-        execution = self._executions[pose_count]
+        if self._execution is None or pose_count != len(self._execution.poses):
+            self._execution = Execution(self, pose_count)
+        execution = self._execution
         execution.poses[:] = pose_matrices
         if self.info.controls:
             execution.controls[:] = self._check_controls(controls, pose_count)

@@ -54,7 +54,7 @@ class Player:
         needs_recreation: whether the armature object has other data, or other bones than those that the player reads.
         new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
         has_moved: whether there were new inputs since the last update of the batches, which resets it.
-        pose_input_count: number of `pose_inputs`.
+        pose_input_count: number of driver variables whose datablocks `play` reads (`driver_inputs`).
         depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer (`evaluated_copies`).
         has_new_copy: whether Blender has copied the object with its shape keys since changes were read.
         lock: the lock that is held from `read_pose` to `write_positions`.
@@ -101,16 +101,16 @@ class Player:
 
     def update_driver(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> None:
         """Make Blender evaluate the position buffer whenever an input of the model has changed."""
-        pose_inputs, dependencies = self.pose_inputs(mesh_object, buffer), self.dependency_inputs(mesh_object)
+        pose_inputs, dependencies = self.driver_inputs(mesh_object, buffer)
         driver.set_driver_inputs(buffer, [driver.playback_input(buffer), *pose_inputs, *dependencies])
 
-    def pose_inputs(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> list[driver.DriverInput]:
-        """Return the driver variables whose datablocks `play` reads."""
-        return driver.pose_inputs(buffer, self.scene_rig(mesh_object), self._control_reader.sources)
-
-    def dependency_inputs(self, mesh_object: bpy.types.Object) -> list[driver.DriverInput]:
-        """Return the driver variables that only add dependencies."""
-        return driver.dependency_inputs(self.scene_rig(mesh_object), self.network.info.joint_names)
+    def driver_inputs(
+        self, mesh_object: bpy.types.Object, buffer: bpy.types.Object
+    ) -> tuple[list[driver.DriverInput], list[driver.DriverInput]]:
+        """Return the driver variables whose datablocks `play` reads, and those that only add dependencies."""
+        scene_rig = self.scene_rig(mesh_object)
+        dependencies = driver.dependency_inputs(scene_rig, self.network.info.joint_names)
+        return driver.pose_inputs(buffer, scene_rig, self._control_reader.sources), dependencies
 
     def fits_object(self, mesh_object: bpy.types.Object) -> bool:
         """Return whether the object has the same armature, mesh and number of vertices."""

@@ -9,7 +9,7 @@ move.
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from itertools import islice
+from itertools import chain, islice
 
 import bpy
 
@@ -45,15 +45,8 @@ class PlayerBatch:
         batch_driver = bpy.data.objects.new("FDDA batch", None)
         # A fake user protects the batch driver from Purge Unused Data.
         batch_driver.is_runtime_data, batch_driver.use_fake_user, batch_driver[BATCH_DRIVER_KEY] = True, True, True
-        members = [(player, objects[player.object_uid], objects[uid]) for uid, player in self.members.items()]
-        pose_inputs = [
-            pose_input
-            for player, mesh_object, buffer in members
-            for pose_input in player.pose_inputs(mesh_object, buffer)
-        ]
-        dependencies = [
-            dependency for player, mesh_object, _ in members for dependency in player.dependency_inputs(mesh_object)
-        ]
+        inputs = [p.driver_inputs(objects[p.object_uid], objects[uid]) for uid, p in self.members.items()]
+        pose_inputs, dependencies = (chain.from_iterable(member_inputs) for member_inputs in zip(*inputs, strict=True))
         driver.set_driver_inputs(batch_driver, [driver.playback_input(batch_driver), *pose_inputs, *dependencies])
         for uid in self.members:
             driver.set_driver_inputs(objects[uid], [("SINGLE_PROP", batch_driver, "location[0]")])

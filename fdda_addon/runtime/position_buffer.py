@@ -31,9 +31,9 @@ def is_buffer(scene_object: bpy.types.Object) -> bool:
     return scene_object.is_runtime_data and BUFFER_KEY in scene_object
 
 
-def remove_buffer(buffer: bpy.types.Object | None) -> None:
+def remove_buffer(buffer: bpy.types.Object) -> None:
     """Remove a position buffer and its mesh from the file; a linked buffer stays."""
-    if buffer is not None and buffer.library is None:
+    if buffer.library is None:
         mesh = buffer.data
         bpy.data.objects.remove(buffer)
         if mesh.users == 0:

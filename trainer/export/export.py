@@ -74,15 +74,15 @@ def reference_positions(
     rig, training_range = trained_model.rig, trained_model.training_range
     features = trained_model.inputs.compute_features(pose_matrices, controls)
     confidence = training_range.compute_confidence(features)
-    mean, scale = trained_model.feature_statistics()
-    clamped = np.clip(features, training_range.low, training_range.high)
-    inputs = ((clamped - mean) / scale).astype(np.float32)
+    clamped = np.clip(features, training_range.low, training_range.high).astype(np.float64)
     matrices = regression_matrices(pose_matrices, rig, len(trained_model.half_rotation_joints()) > 0)
     local, offsets = (np.zeros((len(features), rig.vertex_count, 3), np.float32) for _ in range(2))
     for index, (partition, prepared, network) in enumerate(
         zip(trained_model.partitions, trained_model.prepared, trained_model.networks, strict=True)
     ):
-        coefficients = network.evaluate(inputs[:, trained_model.feature_columns(index)], trained_model.activation)
+        inputs = clamped[:, trained_model.feature_columns(index)] - prepared.feature_mean
+        inputs = (inputs / prepared.feature_scale).astype(np.float32)
+        coefficients = network.evaluate(inputs, trained_model.activation)
         residuals = prepared.basis.reconstruct(coefficients) * confidence[:, index, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
         offsets[:, partition.vertices] = prepared.fit.compute_offsets(matrices) * confidence[:, index, None, None]

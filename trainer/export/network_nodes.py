@@ -43,10 +43,8 @@ def add_networks(
     """Add the nodes that evaluate the networks.
 
     Args:
-        graph: graph to which the nodes are added.
         features: layout of the features.
         clamped: name of the (N, B, 3) clamped features.
-        trained_model: model to export.
 
     Returns:
         The coefficients; None if no partition has components.
@@ -122,7 +120,6 @@ def _add_last_layer(graph: GraphBuilder, values: str, layers: dict[int, np.ndarr
     """Add the last layers.
 
     Args:
-        graph: graph to which the nodes are added.
         values: name of the (L, N, H) values of the hidden units.
         layers: (H, K) weights of each last layer, by partition index.
     """

@@ -106,11 +106,9 @@ def add_skinning(
     rows are then multiplied by a matrix with few columns first.
 
     Args:
-        graph: graph to which the nodes are added.
         features: features in the graph, with the table of pose matrices.
         coefficients: coefficients of the networks, multiplied by the confidence; None without components.
         outside: name of the (N, 3 B') values that `add_range` returns. One of their elements is a constant 1.
-        trained_model: model to export.
     """
     partitions = [_PartitionRows(trained_model, index) for index in range(len(trained_model.partitions))]
     rows = _add_rows(graph, features, coefficients, outside, partitions)
@@ -129,7 +127,6 @@ def _add_product(graph: GraphBuilder, rows: str, partition: _PartitionRows, colu
     """Add the product of the (N, 3, rows) rows of a partition with its matrix.
 
     Args:
-        graph: graph to which the nodes are added.
         rows: name of the rows.
         partition: the partition.
         columns: the vertex of each column of its positions; -1 for a column of zeros.

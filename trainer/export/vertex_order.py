@@ -37,7 +37,6 @@ class VertexOrder:
         """Add nodes that reorder (N, ·, 3) positions in the order of the columns to (N, V, 3) positions in mesh order.
 
         Args:
-            graph: graph to which the nodes are added.
             ordered_positions, output_name: names of the input and of the output.
         """
         all_columns, block_size = np.concatenate(self.columns), self.block_size

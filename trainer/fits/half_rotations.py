@@ -99,7 +99,6 @@ def add_half_rotations(
     """Add the half-rotation matrices Q_j A_j of H joints.
 
     Args:
-        graph: graph to which the nodes are added.
         vectors: name of the (N, ·, 3) vectors.
         rotation_columns: (H, 4) indices of vectors for each joint: the three columns of R_j, and a zero vector.
         table: name of the (N, ·, 12) matrices, each stored as four columns of three numbers.

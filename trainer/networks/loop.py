@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
 from fdda_addon.core.errors import TrainingError
 
@@ -267,7 +268,5 @@ class _Loop:
 
 def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: torch.device) -> torch.Tensor:
     """Stack (n, width) arrays of the selected poses into one (P, n, max width) float32 tensor, padded with 0."""
-    padded = np.zeros((len(arrays), len(poses), max(array.shape[1] for array in arrays)), np.float32)
-    for index, array in enumerate(arrays):
-        padded[index, :, : array.shape[1]] = array[poses]
-    return torch.from_numpy(padded).to(device)
+    columns = [torch.from_numpy(array[poses].T) for array in arrays]
+    return pad_sequence(columns, batch_first=True).transpose(1, 2).contiguous().to(device)
