@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Graph nodes that compute the features of a pose, clamp them to the training range, and compute the confidence.
 
-The graph computes features as vectors R^-1 (d - t) of three elements, where R and t are the axes and the translation of
-a space. A vector is either a column of a joint's matrix, in the space of the carried joint, or a point, in the space of
-a main joint. The carried joint is the joint as its parent carries it along. All vectors together take one gather of
-spaces, two gathers of points, and one product.
+The graph computes features of joints as vectors R^-1 (d - t) of three elements, where R and t are the axes and the
+translation of a space. A vector is a column of a joint's matrix, in the space of the joint as its parent carries it
+along. All vectors together take one gather of spaces, two gathers of points, and one product.
 
 The features of surface frames come after the vectors. Half-rotation matrices are computed from the same vectors.
 """
@@ -70,59 +69,37 @@ class Features:
 def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
     """Add the nodes that compute the features of the networks and of the confidence."""
     inputs, is_needed = trained_model.inputs, _needed_features(trained_model)
-    parts: dict[tuple[bool, bool], list] = {(is_direct, is_local): [] for is_direct, is_local in np.ndindex(2, 2)}
-    for block, columns in zip(inputs.blocks, inputs.block_slices, strict=True):
-        if columns.stop > columns.start:
-            vectors, position = block.add_nodes(graph, is_needed[columns])
-            parts[block.is_direct, isinstance(vectors, LocalVectors)].append((columns, vectors, position))
-    local_parts = [*parts[True, True], (slice(0), ZERO_VECTOR, np.zeros(0, np.int64)), *parts[False, True]]
-    local_vectors = _join([vectors for _, vectors, _ in local_parts])
-    name, table = _add_local_vectors(graph, trained_model, local_vectors)
-    table, pose_rows = _add_half_rotations(graph, trained_model, len(local_vectors.joints), is_needed, name, table)
-    values = [vectors.name for _, vectors, _ in parts[True, False]]
-    values += [name, *(vectors.name for _, vectors, _ in parts[False, False])]
-    count, direct_count, all_positions = 0, 0, np.full(len(is_needed), -1, np.int64)
-    for columns, vectors, position in [*parts[True, False], *local_parts, *parts[False, False]]:
+    parts = [
+        (columns, block.is_direct, *block.add_nodes(graph, is_needed[columns]))
+        for block, columns in zip(inputs.blocks, inputs.block_slices, strict=True)
+        if columns.stop > columns.start
+    ]
+    parts.sort(key=lambda part: (not part[1], isinstance(part[2], LocalVectors)))
+    (local_vectors,) = (vectors for *_, vectors, _ in parts if isinstance(vectors, LocalVectors))
+    local_name, table = _add_local_vectors(graph, trained_model, local_vectors)
+    added_space_count = len(local_vectors.joints)
+    table, pose_rows = _add_half_rotations(graph, trained_model, added_space_count, is_needed, local_name, table)
+    names, count, direct_count, all_positions = [], 0, 0, np.full(len(is_needed), -1, np.int64)
+    for columns, _, vectors, position in parts:
         all_positions[columns] = np.where(position < 0, -1, position + VECTOR_SIZE * count)
         count += vectors.count
-        if vectors is ZERO_VECTOR:  # the last one of the direct vectors
-            direct_count = count
-    name = graph.join(values, "features", axis=1)
+        names.append(local_name if vectors is local_vectors else vectors.name)
+        if vectors is local_vectors:  # the last one of the direct vectors; its zero vector follows
+            direct_count = count = count + 1
+    name = graph.join(names, "features", axis=1)
     return Features(name, direct_count, VECTOR_SIZE * count, all_positions, table, pose_rows)
 
 
-ZERO_VECTOR = LocalVectors(
-    np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(1, np.int64), *2 * [np.array([[0, ZERO_COLUMN]])]
-)
-
-
-def _join(parts: list[LocalVectors]) -> LocalVectors:
-    """Join vectors: the added spaces of all parts come first, then the spaces of the joints."""
-    space_count, start, joined = sum(len(part.joints) for part in parts), 0, []
-    for part in parts:
-
-        def shift(spaces: np.ndarray, start: int = start, count: int = len(part.joints)) -> np.ndarray:
-            return np.where(spaces < count, start + spaces, space_count + spaces - count)
-
-        ends, origins = (
-            np.stack([np.where(columns == ZERO_COLUMN, 0, shift(spaces)), columns], axis=1)
-            for spaces, columns in (part.ends.T, part.origins.T)
-        )
-        # R of a zero vector may be any space.
-        spaces = part.spaces if part is ZERO_VECTOR else shift(part.spaces)
-        joined.append((part.joints, part.offsets, spaces, ends, origins))
-        start += len(part.joints)
-    return LocalVectors(*(np.concatenate(arrays) for arrays in zip(*joined, strict=True)))
-
-
 def _add_local_vectors(graph: GraphBuilder, trained_model: TrainedModel, vectors: LocalVectors) -> tuple[str, str]:
-    """Add the nodes of joined vectors; returns the names of the (N, ., 3) vectors and of the (N, ., 12) table."""
+    """Add the nodes of vectors and of a zero vector; returns the names of (N, ., 3) vectors and (N, ., 12) table."""
     space_count = len(vectors.joints) + len(trained_model.rig.joints)
     flat_matrices = graph.reshape(_add_spaces(graph, vectors), [0, space_count, 16], "flat_spaces")
     selection = graph.floats("table_picks", _table_selection())
     table = graph.reshape(graph.add("MatMul", [flat_matrices, selection], "table_rows"), [0, -1, 12], "table")
-    end_rows, origin_rows = (indices @ [ROWS_PER_SPACE, 1] for indices in (vectors.ends, vectors.origins))
-    inverses = [_add_inverses(graph, flat_matrices), graph.integers("vector_spaces", vectors.spaces)]
+    end_rows, origin_rows = (
+        np.append(indices @ [ROWS_PER_SPACE, 1], ZERO_COLUMN) for indices in (vectors.ends, vectors.origins)
+    )
+    inverses = [_add_inverses(graph, flat_matrices), graph.integers("vector_spaces", np.append(vectors.spaces, 0))]
     inverses = graph.add("Gather", inverses, "vector_inverses", axis=1)
     end_points = [graph.add("Gather", [table, graph.integers("vector_ends", end_rows)], "ends", axis=1)]
     end_points.append(graph.add("Gather", [table, graph.integers("vector_origins", origin_rows)], "origins", axis=1))

@@ -35,8 +35,8 @@ class Vectors:
 class LocalVectors:
     """B vectors R^-1 (d - t), where R and t are the axes and the translation of a space.
 
-    The graph computes the vectors of all blocks in the same few nodes. The spaces are S spaces that the block adds,
-    then the spaces of the J joints: index S + j is the pose matrix of joint j.
+    The spaces are S spaces that the block adds, then the spaces of the J joints: index S + j is the pose matrix of
+    joint j.
 
     Attributes:
         joints: (S,) int64, joint that carries an added space; -1 for a space that does not move.
@@ -119,8 +119,8 @@ class FeatureBlock(ABC):
             is_needed: (F,) bool, the features that a network, or another part of the graph, reads.
 
         Returns:
-            Vectors of the added nodes, or vectors that share nodes with other blocks. Then (F,) int64, the index of
-            each feature among their 3 B elements, -1 for a feature that is not computed.
+            Vectors of the added nodes, or, from one block alone, local vectors, whose nodes are added later. Then (F,)
+            int64, the index of each feature among their 3 B elements, -1 for a feature that is not computed.
         """
 
     @property
