@@ -44,7 +44,9 @@ def drop_components(
     """
     changes, gains, total_error = [], [], 0.0
     for partition, network in zip(prepared, networks, strict=True):
-        changes.append(_principal_directions(network.evaluate(partition.inputs[split.training], activation)))
+        predicted = network.evaluate(partition.inputs[split.training], activation).astype(np.float64)
+        # The columns are the principal directions of the predictions, largest first.
+        changes.append(np.linalg.eigh(predicted.T @ predicted)[1][:, ::-1])
         error, partition_gains = _component_gains(partition, network, changes[-1], split, activation)
         total_error += error
         gains.append(partition_gains)
@@ -58,12 +60,6 @@ def drop_components(
         )
     ]
     return [partition for partition, _ in remaining], [network for _, network in remaining]
-
-
-def _principal_directions(coefficients: np.ndarray) -> np.ndarray:
-    """Return (K, K) float64, orthonormal columns, the principal directions of (N, K) coefficients, largest first."""
-    coefficients = coefficients.astype(np.float64)
-    return np.linalg.eigh(coefficients.T @ coefficients)[1][:, ::-1]
 
 
 def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining: Sequence[PreparedPartition]) -> str:
@@ -93,9 +89,7 @@ def _component_gains(
     """Measure what each component of a changed basis gains on the validation poses, and on extreme poses.
 
     Args:
-        partition, network, activation: partition with its trained network.
         change: (K, K) orthonormal columns, the new components.
-        split: split of the poses.
 
     Returns:
         The mean over the poses of the sum of all vertices' errors, mesh units. Then (K,) by how much it would grow
@@ -141,9 +135,7 @@ def _change_basis(
     """Replace the K components of a partition by K' orthonormal combinations of them.
 
     Args:
-        partition, network: partition with its trained network.
         change: (K, K') float64, orthonormal columns.
-        split: split of the poses.
     """
     basis = partition.basis
     coefficients = partition.coefficients @ change

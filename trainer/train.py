@@ -80,7 +80,8 @@ def train_model(
         trained_model = make_trained_model(recording, inputs, split, prepared, networks, config.activation)
         exported = job.export(trained_model)
         report = job.measure(trained_model, exported, result.curves, model_path.name)
-        history = _history(recording, exported, checkpoint)
+        entry = {"poses": len(recording.pose_matrices), "p999": exported.info.held_out_mm["p999"]}
+        history = [*(checkpoint.history if checkpoint else ()), entry]
         goal_result = _evaluate_goal(config, history, report, recording_path, model_path)
         # The time is in the report only, so that equal recordings and settings give equal models.
         report["training"] = {**report["training"], "seconds": round(time.perf_counter() - start_time, 2)}
@@ -209,12 +210,6 @@ class _Job:
         surface = measure_surface(exported.session, recording, split.held_out)
         analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
         return make_report(recording, trained_model, exported, training_errors, surface, curves, model_name, analyses)
-
-
-def _history(recording: Recording, exported: ExportedModel, checkpoint: Checkpoint | None) -> list[dict]:
-    """Return the pose count and held-out error of this training and of its predecessors, as in `Checkpoint`."""
-    entry = {"poses": len(recording.pose_matrices), "p999": exported.info.held_out_mm["p999"]}
-    return [*(checkpoint.history if checkpoint else ()), entry]
 
 
 def _evaluate_goal(

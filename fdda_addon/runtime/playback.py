@@ -213,7 +213,8 @@ def update_mask(character: Character, mesh_object: bpy.types.Object, *, weights_
 
 def has_outdated_model(mesh_object: bpy.types.Object) -> bool:
     """Return whether an object plays a model whose file has been replaced since it was loaded."""
-    player = session.player_of(mesh_object)
+    character = session.characters.get(mesh_object.session_uid)
+    player = character and character.player
     return player is not None and player.network is not network_of(mesh_object)
 
 

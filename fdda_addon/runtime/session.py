@@ -131,11 +131,6 @@ class PlaybackSession:
             self.dispatch(Event.BIND, character)
         return character
 
-    def player_of(self, mesh_object: bpy.types.Object) -> Any:
-        """Return the player of an object; None if no model plays there."""
-        character = self.characters.get(mesh_object.session_uid)
-        return character and character.player
-
     def dispatch(self, event: Event, character: Character | None = None, error: FDDAError | None = None) -> None:
         """Change the state of a character, and apply the effects in their order.
 

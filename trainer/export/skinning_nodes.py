@@ -127,8 +127,6 @@ def _add_product(graph: GraphBuilder, rows: str, partition: _PartitionRows, colu
     """Add the product of the (N, 3, rows) rows of a partition with its matrix.
 
     Args:
-        rows: name of the rows.
-        partition: the partition.
         columns: the vertex of each column of its positions; -1 for a column of zeros.
 
     Returns:

@@ -164,7 +164,6 @@ def _most_extreme_joint(
     """Find the joint or control that is furthest from its mean in the analyzed poses.
 
     Args:
-        recording, partition: recording and partition of the values.
         held_out_values: (n, f) values of the held-out poses from `_influencing_values`.
         training_values: (m, f) values of training poses.
         poses: indices of the analyzed poses among the n.
@@ -200,7 +199,6 @@ def _truncation_fraction(
     """Return the part of the squared errors that fit and components do not represent.
 
     Args:
-        recording, partition, prepared: recording, and the partition with its data.
         held_out_poses: indices of the n held-out poses.
         poses, vertices: indices of the analyzed errors.
         errors: (n, Vp) distances, meters.

@@ -123,7 +123,6 @@ def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndar
 
     Args:
         poses: poses of J joints, the random ones first.
-        random_count: number of random poses.
         moments: as for `KeyJointSearch`.
 
     Returns:

@@ -131,17 +131,11 @@ class _Block:
         """Multiply the (4 J, B) moments by the rest positions; returns one (B, J) value for each joint."""
         return np.einsum("jkv,vk->vj", moments.reshape(-1, 4, len(self.rest)), self.rest)
 
-    @property
-    def _scores(self) -> np.ndarray:
-        """Return (B, J) rms errors of single joints, mesh units, plus a small preference that decides ties."""
-        return (
-            np.sqrt(self.single_errors / self._solver.pose_count)
-            + TIE_RATIO * self._solver.character_size * self.tie_preference
-        )
-
     def fit(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
         """Fit the block; returns (B, 4) int32 joints and (B, 4) float32 weights as in `fit_skin`."""
-        scores = self._scores
+        # A small preference decides ties between rms errors.
+        preferences = TIE_RATIO * self._solver.character_size * self.tie_preference
+        scores = np.sqrt(self.single_errors / self._solver.pose_count) + preferences
         if kind == "hard":
             return _pad_influences(scores.argmin(axis=1)[:, None], np.ones((len(scores), 1)))
         scores[self._rig_candidates()] = self.tie_preference[self._rig_candidates()] - 2
