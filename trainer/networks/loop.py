@@ -268,5 +268,5 @@ class _Loop:
 
 def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: torch.device) -> torch.Tensor:
     """Stack (n, width) arrays of the selected poses into one (P, n, max width) float32 tensor, padded with 0."""
-    columns = [torch.from_numpy(array[poses].T) for array in arrays]
+    columns = [torch.as_tensor(array[poses].T, dtype=torch.float32) for array in arrays]
     return pad_sequence(columns, batch_first=True).transpose(1, 2).contiguous().to(device)
