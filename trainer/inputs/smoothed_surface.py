@@ -2,7 +2,6 @@
 """The linearly skinned surface at increasing amounts of smoothing, and its surface frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
@@ -22,39 +21,19 @@ MIN_EPSILON = 1e-18
 """Minimum epsilon, mesh units. It applies to corners whose edges have no length."""
 
 
-@dataclass(frozen=True)
-class FaceCorners:
-    """The face corners of each vertex.
-
-    Attributes:
-        starts: (V + 1,) index of the first corner of each vertex.
-        predecessors, successors: (C,) preceding and following vertex of each corner in its face.
-    """
-
-    starts: np.ndarray
-    predecessors: np.ndarray
-    successors: np.ndarray
-
-
-def find_face_corners(rig: Rig) -> FaceCorners:
-    """Find the face corners of each vertex of a rig's mesh."""
-    corner_order = np.argsort(rig.face_vertices, kind="stable")
-    starts = np.searchsorted(rig.face_vertices[corner_order], np.arange(rig.vertex_count + 1))
-    adjacent_corner_indices = adjacent_corners(rig.face_starts, rig.face_vertices)
-    return FaceCorners(starts, *(rig.face_vertices[corners[corner_order]] for corners in adjacent_corner_indices))
-
-
 class SmoothedSurface:
     """The linearly skinned surface, smoothed as by Corrective Smooth in its simple mode."""
 
-    def __init__(self, rig: Rig, face_corners: FaceCorners):
-        """Compute one step of smoothing, and the skin weights as a matrix."""
-        self._face_corners, vertex_count = face_corners, rig.vertex_count
-        corner_vertices = np.repeat(np.arange(vertex_count), np.diff(face_corners.starts))
-        edges = (
-            np.concatenate([corner_vertices] * 2),
-            np.concatenate([face_corners.predecessors, face_corners.successors]),
+    def __init__(self, rig: Rig):
+        """Sort the face corners by vertex, and compute one step of smoothing and the skin weights as a matrix."""
+        vertex_count, corner_order = rig.vertex_count, np.argsort(rig.face_vertices, kind="stable")
+        corner_vertices = rig.face_vertices[corner_order]
+        self._starts = np.searchsorted(corner_vertices, np.arange(vertex_count + 1))
+        # The preceding and the following vertex of each corner in its face.
+        self._predecessors, self._successors = (
+            rig.face_vertices[corners[corner_order]] for corners in adjacent_corners(rig.face_starts, rig.face_vertices)
         )
+        edges = np.concatenate([corner_vertices] * 2), np.concatenate([self._predecessors, self._successors])
         adjacency = sparse.coo_array((np.ones(len(edges[0])), edges), (vertex_count, vertex_count)).tocsr()
         adjacency.data[:] = 1
         neighbor_counts = np.asarray(adjacency.sum(axis=1)).ravel()
@@ -82,7 +61,7 @@ class SmoothedSurface:
         Yields:
             The number of iterations, and the surface frames.
         """
-        starts, corner_counts = self._face_corners.starts[vertices], np.diff(self._face_corners.starts)[vertices]
+        starts, corner_counts = self._starts[vertices], np.diff(self._starts)[vertices]
         corner_slots = np.arange(corner_counts.max())
         is_corner, corners = (
             corner_slots < corner_counts[:, None],
@@ -91,7 +70,7 @@ class SmoothedSurface:
         # Both edges of a padded corner have length 0.
         edge_ends = np.where(
             is_corner,
-            (self._face_corners.predecessors[corners], self._face_corners.successors[corners]),
+            (self._predecessors[corners], self._successors[corners]),
             vertices[:, None],
         )
         nearby_vertices, row_indices = np.unique(np.append(edge_ends.ravel(), vertices), return_inverse=True)

@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
 
 from ..data.split import Split
 from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
 from ..fits.least_squares import solve_ridge
-from .smoothed_surface import FaceCorners, SmoothedSurface, find_face_corners
+from .smoothed_surface import SmoothedSurface
 from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
 MAX_POSES = 400
@@ -87,9 +88,9 @@ def select_surface_frames(recording: Recording, split: Split, tolerance_mm: floa
     if not len(rig.face_starts):
         return NO_SURFACE_FRAMES
     training = split.training[np.unique(np.linspace(0, len(split.training) - 1, MAX_POSES).astype(np.int64))]
-    matrices, face_corners = np.array(recording.pose_matrices[training]), find_face_corners(rig)
+    matrices = np.array(recording.pose_matrices[training])
     skin = skin_matrices(matrices, rig.rest_matrices)
-    is_usable = _may_be_candidate(face_corners)
+    is_usable = _may_be_candidate(rig)
     min_mean_square = (tolerance_mm / (1000 * rig.metres_per_unit)) ** 2
     candidates, column_spaces = [], {}
     for index, partition in enumerate(recording.partitions):
@@ -106,7 +107,7 @@ def select_surface_frames(recording: Recording, split: Split, tolerance_mm: floa
     candidates = candidates[:max_count]
     if not candidates:
         return NO_SURFACE_FRAMES
-    smoothed_surface = SmoothedSurface(rig, face_corners)
+    smoothed_surface = SmoothedSurface(rig)
     iteration_count = _best_iteration_count(smoothed_surface, candidates[:MAX_PROBED_CANDIDATES], poses)
     candidates.sort(key=lambda candidate: (candidate.partition, candidate.vertex))
     surface_frames = next(
@@ -124,9 +125,9 @@ def select_surface_frames(recording: Recording, split: Split, tolerance_mm: floa
     return replace(surface_frames, lengths=lengths).subset(explained_fractions >= MIN_EXPLAINED_VARIANCE)
 
 
-def _may_be_candidate(face_corners: FaceCorners) -> np.ndarray:
+def _may_be_candidate(rig: Rig) -> np.ndarray:
     """Return (V,) bool, the vertices in faces that do not have too many corners."""
-    counts = np.diff(face_corners.starts)
+    counts = np.bincount(rig.face_vertices, minlength=rig.vertex_count)
     max_count = min(np.quantile(counts[counts > 0], CORNER_COUNT_QUANTILE), MAX_CORNERS)
     return (counts > 0) & (counts <= max_count)
 
