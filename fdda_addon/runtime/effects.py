@@ -107,3 +107,6 @@ def remove_buffers() -> None:
         if modifier is not None:
             playback_modifier.set_buffer(modifier, None)
     remove_unused_objects()
+
+
+session.apply_effect = apply

@@ -149,5 +149,4 @@ def remove_unused_drivers() -> None:
 
 def _remove_batch(driver_uid: int) -> None:
     session.batches.pop(driver_uid).unbatch()
-    for batch_driver in [o for o in bpy.data.objects if o.session_uid == driver_uid]:
-        bpy.data.objects.remove(batch_driver)
+    remove_unused_drivers()

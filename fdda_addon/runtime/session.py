@@ -7,7 +7,7 @@ batches and models have the type `Any`, because their modules import this one.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from .transitions import SHOWS_MODEL, TABLE, Event, State, transition
+from .transitions import SHOWS_MODEL, TABLE, Effect, Event, State, transition
 
 CHECK_DELAY_S = 0.25
 """How long updates have to pause before changed rigs are checked. In the background they are checked at once."""
@@ -76,6 +76,7 @@ class PlaybackSession:
             before Blender writes the file itself.
         skips_models: whether players keep their last positions instead of running models.
         is_switching: whether an animated mode is being applied.
+        apply_effect: applies an effect to a character; `effects` sets it when it is imported.
         check_timer: the timer that checks changed rigs.
     """
 
@@ -91,6 +92,7 @@ class PlaybackSession:
         self.scanned_count = -1
         self.suspension_count = 0
         self.skips_models = self.is_switching = False
+        self.apply_effect: Callable[[Effect, Character, FDDAError | None], None]
         self._count_without_bound = -1
         self.read_bones: dict[tuple[int, bool], tuple] | None = None
         self._last_change = 0.0
@@ -139,8 +141,6 @@ class PlaybackSession:
             character: the character; None for all characters of the file.
             error: the reason of `Event.FAIL`.
         """
-        from . import effects
-
         for each in [character] if character else list(self.characters.values()):
             if event not in TABLE[each.state]:
                 continue  # Most frames dispatch to characters for which nothing changes.
@@ -148,7 +148,7 @@ class PlaybackSession:
             each.state = state
             with self.isolated_errors(each):
                 for effect in effect_list:
-                    effects.apply(effect, each, error)
+                    self.apply_effect(effect, each, error)
             if state == State.UNBOUND and event == Event.UNBIND:
                 self.characters.pop(each.object_uid, None)
 
