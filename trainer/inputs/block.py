@@ -33,7 +33,7 @@ class Vectors:
 
 @dataclass(frozen=True)
 class LocalVectors:
-    """B vectors R^-1 (d - t), where R and t are the axes and the translation of a space.
+    """B vectors R^-1 (d - t), where R is the 3 x 3 part of the matrix of a space, d and t columns of such matrices.
 
     The spaces are S spaces that the block adds, then the spaces of the J joints: index S + j is the pose matrix of
     joint j.
@@ -63,7 +63,7 @@ class FeatureBlock(ABC):
 
     Attributes:
         name: name of the block in checkpoints.
-        is_direct: whether the confidence depends on the features. Features of other blocks are functions of these.
+        is_direct: whether the confidence depends on the features. It depends on those of joints and controls only.
     """
 
     name: ClassVar[str]
@@ -76,7 +76,7 @@ class FeatureBlock(ABC):
 
     @classmethod
     def check_state(cls, state: State, rig: Rig) -> None:
-        """Check a state that was read from a file; its values are finite.
+        """Check a state that was read from a file: empty, or arrays of int64 or floats with finite values.
 
         Raises:
             ValueError: the block cannot be made from it.
@@ -116,7 +116,8 @@ class FeatureBlock(ABC):
 
         Args:
             graph: graph with the inputs `POSE_INPUT`, (N, J, 4, 4), and `CONTROLS_INPUT`, (N, C).
-            is_needed: (F,) bool, the features that a network, or another part of the graph, reads.
+            is_needed: (F,) bool, the features that a network, or another part of the graph, reads. The nodes may
+                compute more.
 
         Returns:
             Vectors of the added nodes, or, from one block alone, local vectors, whose nodes are added later. Then (F,)
@@ -130,6 +131,6 @@ class FeatureBlock(ABC):
 
 
 def add_scalar_vectors(graph: GraphBuilder, scalars: str, count: int) -> Vectors:
-    """Add vectors whose first `count` elements are (N, count) scalars."""
+    """Add `count` vectors for (N, count) scalars: element i of all their elements, in a row, is scalar i."""
     repeated = graph.add("Concat", [scalars] * VECTOR_SIZE, f"{scalars}_repeated", axis=1)
     return Vectors(graph.reshape(repeated, [0, count, VECTOR_SIZE], f"{scalars}_vectors"), count)
