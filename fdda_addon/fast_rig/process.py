@@ -24,6 +24,11 @@ KILL_AFTER_SECONDS = 5.0
 """Time after which a canceled process that still runs is killed."""
 _PROGRESS_LINE = re.compile(r"(?P<stage>[a-z ]+): (?P<done>\d+) of (?P<total>\d+), ")
 _ERROR_PREFIX = "Error: "
+_REGISTER = (
+    f"import bpy, importlib, sys; hasattr(bpy.types.Object, 'fdda') or (sys.path.insert(0, {str(ROOT)!r}), "
+    f"importlib.import_module({Path(__file__).parents[1].name!r}).register())"
+)
+"""Expression that registers this add-on in a Blender that does not load it, as when it runs from source."""
 
 
 class VerbProcess:
@@ -128,7 +133,7 @@ def _command() -> tuple[list[str], dict[str, str]]:
     """Return the start of the command line that runs a verb, and its environment variables."""
     environment = os.environ | UTF8_OUTPUT
     if bpy.app.binary_path:
-        return [bpy.app.binary_path, "--command", "fdda"], environment
+        return [bpy.app.binary_path, "--python-expr", _REGISTER, "--command", "fdda"], environment
     # The bpy module in a Python has no program.
     paths = [str(ROOT), *filter(None, [environment.get("PYTHONPATH")])]
     return [sys.executable, "-m", "fdda_addon"], environment | {"PYTHONPATH": os.pathsep.join(paths)}

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The button that makes a fast rig: another Blender works on the saved file."""
 
+import subprocess
+import sys
 import time
+from types import SimpleNamespace
 
 import bpy
 import pytest
 
 from fdda_addon.core.progress import Progress
+from fdda_addon.fast_rig import process as verb_process
 from fdda_addon.fast_rig.process import VerbProcess
 from fdda_addon.jobs import job
 from fdda_addon.operators.fast_rig import FDDA_OT_fast_rig, _write_models
@@ -92,6 +96,16 @@ def test_a_canceled_job_ends_the_other_blender_and_writes_nothing(saved, elbow_f
         assert process.is_running
     assert not process.is_running
     assert sorted(path.name for path in saved.iterdir()) == before
+
+
+def test_the_other_blender_registers_an_add_on_that_it_does_not_load(monkeypatch):
+    """Blender evaluates the expression before it runs the command."""
+    monkeypatch.setattr(verb_process, "bpy", SimpleNamespace(app=SimpleNamespace(binary_path="/blender")))
+    (program, option, expression, *command), _ = verb_process._command()
+    assert (program, option, command) == ("/blender", "--python-expr", ["--command", "fdda"])
+    script = f"{expression}\n{expression}\nassert sys.modules['fdda_addon'].is_registered()\nprint('done')"
+    result = subprocess.run([sys.executable, "-P", "-c", script], cwd="/", capture_output=True, text=True, check=False)
+    assert result.stdout.endswith("done\n"), result.stderr
 
 
 def test_unsaved_files_and_missing_choices_are_refused(saved):
