@@ -219,6 +219,10 @@ def main() -> None:
         sources = [path for path in sources if path.stem in options.only]
     if not sources:
         sys.exit(f"There are no characters in '{options.folder}': give a folder with .glb or .blend files.")
+    pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.DOTALL)
+    # Before hours of measurements.
+    if options.write and not pattern.search(PAGE.read_text(encoding="utf-8")):
+        sys.exit(f"'{PAGE}' lacks the lines '{START}' and '{END}', between which the table is written; add them.")
     lines = [
         f"{options.poses:,} random poses, {options.epochs} epochs, one seed, Blender {bpy.app.version_string}.",
         "",
@@ -234,7 +238,6 @@ def main() -> None:
     print(table)
     if options.write:
         text = PAGE.read_text(encoding="utf-8")
-        pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.DOTALL)
         PAGE.write_text(pattern.sub(lambda _: f"{START}\n\n{table}\n\n{END}", text), encoding="utf-8")
     sys.stdout.flush()
     # bpy 4.5 may hang at exit after an import.
