@@ -77,13 +77,23 @@ def check_full_rig(mesh_object: bpy.types.Object) -> None:
 
 
 def remaining_rig_note(mesh_object: bpy.types.Object) -> str:
-    """Say what deforms a mesh of a fast rig in which no model plays; empty if a model plays, or for a full rig."""
+    """Say when no model deforms a mesh of a fast rig; empty if a model always does, or for a full rig."""
+    from .temporary_state import animated_paths  # It imports numpy.
+
     binding = mesh_object.fdda
-    if not binding.is_fast_rig or (binding.is_bound and binding.mode != "RIG"):
+    if not binding.is_fast_rig:
+        return ""
+    if not binding.is_bound or binding.mode == "RIG":
+        condition, remedy = "without a model", "Bind a model"
+    elif "fdda.mode" in animated_paths(mesh_object):
+        condition, remedy = "where its keyed or driven mode is Rig", "Remove these keys or the driver"
+    elif not binding.use_in_render:
+        condition, remedy = "in renders, where the model is off", "Switch Use in Render on"
+    else:
         return ""
     return (
-        f"'{mesh_object.name}' belongs to a fast rig: without a model, only what is left of its bones and modifiers "
-        "deforms it. Bind a model, or open the file of the full rig."
+        f"'{mesh_object.name}' belongs to a fast rig: {condition}, only what is left of its bones and modifiers "
+        f"deforms it. {remedy}, or open the file of the full rig."
     )
 
 

@@ -105,7 +105,7 @@ def test_a_fast_rig_in_which_no_model_plays_says_so(bound_elbow: bpy.types.Objec
     def says_so() -> bool:
         return any(text.startswith(note) for text in texts_of(draw_section("playback")))
 
-    bound_elbow.fdda.is_fast_rig = True
+    bound_elbow.fdda.is_fast_rig = bound_elbow.fdda.use_in_render = True
     assert not says_so()
     # The user hides the modifier, which shows the rig in a full rig.
     bound_elbow.modifiers["FDDA"].show_viewport = False
@@ -115,6 +115,32 @@ def test_a_fast_rig_in_which_no_model_plays_says_so(bound_elbow: bpy.types.Objec
     assert says_so()
     bound_elbow.fdda.is_fast_rig = False
     assert not says_so()
+
+
+def test_a_fast_rig_says_where_no_model_plays(bound_elbow: bpy.types.Object):
+    """In some frames, or in renders, while the viewport shows the model."""
+    bpy.context.view_layer.objects.active = bound_elbow
+
+    def notes() -> list[str]:
+        return [text for text in texts_of(draw_section("playback")) if "belongs to a fast rig" in text]
+
+    bound_elbow.fdda.is_fast_rig, bound_elbow.fdda.use_in_render = True, False
+    left = "only what is left of its bones and modifiers deforms it."
+    assert notes() == [
+        f"'elbow' belongs to a fast rig: in renders, where the model is off, {left} Switch Use in Render on, or open "
+        "the file of the full rig."
+    ]
+    bound_elbow.fdda.use_in_render = True
+    assert notes() == []
+    keyed = f"'elbow' belongs to a fast rig: where its keyed or driven mode is Rig, {left} Remove these keys or the "
+    bound_elbow.keyframe_insert("fdda.mode", frame=1)
+    assert len(notes()) == 1 and notes()[0].startswith(keyed)
+    bound_elbow.animation_data_clear()
+    assert notes() == []
+    bound_elbow.driver_add("fdda.mode")
+    assert len(notes()) == 1 and notes()[0].startswith(keyed)
+    bound_elbow.fdda.is_fast_rig = False
+    assert notes() == []
 
 
 def test_a_removed_modifier_can_be_bound_again(bound_elbow: bpy.types.Object):
