@@ -10,6 +10,7 @@ from collections.abc import Generator
 
 import numpy as np
 
+from ..core.checks.warning import format_list, joint_name
 from ..core.features import FLOAT32_ROUNDING_RATIO
 from ..core.group_testing import GroupTesting
 from ..core.partition import Partition, make_partitions
@@ -25,6 +26,8 @@ from .influence_trials import JOINT, InfluenceSearch, Trials, prepared_trials
 
 MAX_BATCH_GROUPS, BATCH_BYTES = 50, 6 << 20
 """Limits of a batch whose residuals are computed together: groups of moved inputs, and bytes of their positions."""
+NOT_FINITE_CHANGE = 1e6
+"""Change of a vertex whose position is not finite any more, relative to the threshold."""
 
 
 def detect_influences(
@@ -49,6 +52,8 @@ def detect_influences(
                 nearby[number] = joints_near_patches[index]
         evaluation = _GroupEvaluation(rig, partitions, patches, evaluator, search, trials)
         influences = yield from _test_groups(nearby, trials.inputs, evaluation, search.poses)
+        if evaluation.infinite_groups:
+            yield Progress("influences", 1, 1, _describe_infinite(scene_rig, rig, trials, evaluation.infinite_groups))
     # The first control of a bone stands for all controls of its transform.
     controls_of_bones = {indices[0]: indices for indices in controls_by_bone(rig.controls).values()}
     by_kind: dict[str, dict[int, tuple[int, ...]]] = {JOINT: {}, CONTROL: {}}
@@ -61,6 +66,19 @@ def detect_influences(
             by_joint[partition.joint] = tuple(sorted(index for each, index in partition_inputs if each == kind))
     main_joints_of_merged = {joint: partition.joint for partition in partitions for joint in partition.merged}
     return make_partitions(rig, by_kind[JOINT], by_kind[CONTROL], main_joints_of_merged)
+
+
+def _describe_infinite(scene_rig: SceneRig, rig: Rig, trials: Trials, groups: list[tuple[int, list[int]]]) -> str:
+    """Say which inputs, moved together in pairs of trial and group, gave vertices positions that are not finite."""
+    trial, group = min(groups, key=lambda pair: len(pair[1]))
+    inputs = [trials.inputs[number] for number in group]
+    names = [joint_name(rig, index) if kind == JOINT else rig.controls[index].name for kind, index in inputs]
+    pose = "the rest pose" if trial == 0 else f"random pose {trial}"
+    return (
+        f"Some positions of '{scene_rig.mesh_object.name}' are not finite in {len(groups)} tests of its influences, as "
+        f"when {format_list(names)} move from {pose}; that counts as an influence. Look for a constraint, driver or "
+        "modifier that fails in extreme poses."
+    )
 
 
 def _test_groups(
@@ -78,7 +96,11 @@ def _test_groups(
 
 
 class _GroupEvaluation:
-    """Evaluates groups of moved inputs, and counts the evaluations."""
+    """Evaluates groups of moved inputs, and counts the evaluations.
+
+    Attributes:
+        infinite_groups: trial and moved inputs where finite positions became others.
+    """
 
     def __init__(
         self,
@@ -98,6 +120,7 @@ class _GroupEvaluation:
         self._batch_size = max(1, min(MAX_BATCH_GROUPS, BATCH_BYTES // (12 * rig.vertex_count)))
         self._base_residuals: dict[int, np.ndarray] = {}
         self._done, self._counts = 0, [0] * search.poses
+        self.infinite_groups: list[tuple[int, list[int]]] = []
 
     def evaluate(self, trial: int, groups: list[np.ndarray]) -> Generator[Progress, None, np.ndarray]:
         """Evaluate groups in a trial; return the change of each vertex relative to the threshold, sorted by patch.
@@ -115,11 +138,21 @@ class _GroupEvaluation:
             self._trials.show(trial, group.tolist())
             evaluated_poses.append(self._evaluator.evaluate()[:2])
             if len(evaluated_poses) == self._batch_size or number == len(groups):
-                batch = self._residuals(evaluated_poses) - self._base_residuals[trial]
-                changes.append(self.patches.sort(batch) / self._threshold)
+                batch = (self._residuals(evaluated_poses) - self._base_residuals[trial]) / self._threshold
+                if not np.isfinite(batch).all():
+                    self._replace_infinite(trial, groups[number - len(batch) : number], batch)
+                changes.append(self.patches.sort(batch))
                 evaluated_poses = []
             yield self._progress()
         return np.concatenate(changes)
+
+    def _replace_infinite(self, trial: int, groups: list[np.ndarray], changes: np.ndarray) -> None:
+        """Replace changes, (n, V, 3), that are not finite; where the base pose is not finite, nothing is known."""
+        is_known = np.isfinite(self._base_residuals[trial][0])
+        is_lost = is_known & ~np.isfinite(changes)
+        self.infinite_groups += [(trial, groups[index].tolist()) for index in np.flatnonzero(is_lost.any(axis=(1, 2)))]
+        changes[is_lost] = NOT_FINITE_CHANGE
+        changes[:, ~is_known] = 0
 
     def _progress(self) -> Progress:
         self._done += 1

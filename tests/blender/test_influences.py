@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import meshes
+from blend_fixtures.characters.base import tube
 from blend_fixtures.characters.bones import (
     NewBone,
     add_bone_collection,
@@ -17,9 +18,11 @@ from blend_fixtures.characters.bones import (
 )
 from fdda_addon.core import group_testing
 from fdda_addon.core.patches import largest_norms
+from fdda_addon.core.recording.index import read_index
 from fdda_addon.recording import influences
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
+from fdda_addon.rig.reading import PoseEvaluator
 from fdda_addon.scene.scene_rig import find_rig
 
 TRIALS = 4
@@ -165,3 +168,27 @@ def test_groups_find_what_single_joints_find(
     assert not (expected & ~found & (largest_changes > MAX_TOLERANCE_RATIO)).any()
     assert (found & ~expected & (largest_changes < 2 - MAX_TOLERANCE_RATIO)).sum() <= max_needless
     assert len(group_changes) < 0.9 * len(single_changes)
+
+
+@pytest.mark.parametrize("is_broken", [False, True])
+def test_a_joint_that_makes_positions_infinite_is_an_influence(is_broken, tmp_path, monkeypatch):
+    """Far from the bend, the surface of the upper bone does not depend on the lower bone."""
+    tube()
+    scene_rig, evaluate = find_rig(), PoseEvaluator.evaluate
+    bend = scene_rig.armature_object.pose.bones["lower"]
+
+    def evaluate_with_fault(evaluator: PoseEvaluator) -> tuple[np.ndarray, ...]:
+        pose_matrices, positions, controls = evaluate(evaluator)
+        if is_broken and bend.matrix_basis.to_quaternion().angle > 0.2:
+            positions[:5] = np.nan
+        return pose_matrices, positions, controls
+
+    monkeypatch.setattr(PoseEvaluator, "evaluate", evaluate_with_fault)
+    settings = RecordingSettings(poses=4, detect_influences=True)
+    notes = [step.note for step in record(scene_rig, tmp_path / "recording", settings) if step.note]
+    recording = read_index(tmp_path / "recording")
+    names = [joint["name"] for joint in recording["joints"]]
+    (upper,) = [p for p in recording["partitions"] if names[p["joint"]] == "upper"]
+    assert (names.index("lower") in upper["influencing"]) == is_broken
+    assert len(notes) == is_broken
+    assert all("are not finite in " in note and "'lower' move from the rest pose" in note for note in notes)
