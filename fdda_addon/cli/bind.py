@@ -59,7 +59,8 @@ def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
     from ..core.errors import ModelError
     from ..runtime.binding import bind
 
-    bind(scene_rig, model, use_in_render)
+    if note := bind(scene_rig, model, use_in_render):
+        print(note)
     # Evaluate now, so that a model that cannot play raises an error here.
     bpy.context.view_layer.update()
     if scene_rig.mesh_object.fdda.status:

@@ -86,24 +86,25 @@ def check_matches_rig(scene_rig: SceneRig, path: Path) -> None:
     read_matching_rig(scene_rig, path, read_model_info(path))
 
 
-def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
-    """Bind a model of the list in place of the bound one.
+def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> str:
+    """Bind a model of the list in place of the bound one, and return the sentence of `bind`.
 
     Raises:
         FDDAError: as `bind`, or because the model cannot play. The previous model is bound again.
     """
     mesh_object = scene_rig.mesh_object
-    _bind(scene_rig, entry_path(mesh_object, entry), entry.packed)
+    note = _bind(scene_rig, entry_path(mesh_object, entry), entry.packed)
     entry.path = mesh_object.fdda.model
     mesh_object.fdda.model_index = list(mesh_object.fdda.models).index(entry)
+    return note
 
 
-def _bind(scene_rig: SceneRig, path: Path, packed_text: bpy.types.Text | None = None) -> None:
+def _bind(scene_rig: SceneRig, path: Path, packed_text: bpy.types.Text | None = None) -> str:
     """Bind a model as `bind_entry` does, without changing the list."""
     mesh_object, binding = scene_rig.mesh_object, scene_rig.mesh_object.fdda
     use_in_render = binding.use_in_render
     previous_binding = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
-    bind(scene_rig, path, use_in_render, packed_text)
+    note = bind(scene_rig, path, use_in_render, packed_text)
     # Evaluate now, so that a model that cannot play raises the error here and not in the next frame.
     bpy.context.view_layer.update()
     if problem := binding.status:
@@ -114,6 +115,7 @@ def _bind(scene_rig: SceneRig, path: Path, packed_text: bpy.types.Text | None = 
             bind(scene_rig, absolute_path(mesh_object, previous_model), use_in_render, previous_text)
             binding.model, binding.mode = previous_model, previous_mode
         raise ModelError(problem)
+    return note
 
 
 def relink(scene_rig: SceneRig, path: Path) -> None:

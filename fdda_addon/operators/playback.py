@@ -148,8 +148,8 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
         entry = model_list.add_model(mesh_object, path)
     else:
         entry = model_list.require_active_entry(mesh_object)
-    model_list.bind_entry(scene_rig, entry)
-    return f"'{mesh_object.name}' plays {entry.name}.{pack_by_default(mesh_object, entry, pack_large)}"
+    note = model_list.bind_entry(scene_rig, entry)
+    return f"'{mesh_object.name}' plays {entry.name}.{pack_by_default(mesh_object, entry, pack_large)} {note}".rstrip()
 
 
 def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pack_large: bool = False) -> str:

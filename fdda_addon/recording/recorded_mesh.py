@@ -45,6 +45,7 @@ class RecordedMesh:
     Attributes:
         scene_rig: the rig as scene objects.
         rig: the rig as arrays; `fit_weights` replaces its skin weights, and may remove joints.
+        note: a sentence for the user about the rig; may be empty.
         original_rig: the rig with its own skin weights and all joints.
         path: folder of the recording.
         channels: channels of the random poses that belong to the mesh or its armature.
@@ -64,6 +65,7 @@ class RecordedMesh:
     limits: tuple[Channel, ...]
     previous_path: Path | None
     target: Target | None
+    note: str = ""
     fit: SkinFit | None = None
     needed_inputs: np.ndarray | None = None
     partitions: tuple[Partition, ...] = ()

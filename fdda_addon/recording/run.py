@@ -102,13 +102,14 @@ class RecordingSession:
         controls = [settings.controls] if len(rigs) == 1 else split_controls(scene_rigs, settings)
         if settings.target.name and len(rigs) > 1:
             raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
-        sampled_rigs = []
+        sampled_rigs, notes = [], []
         for (scene_rig, path), mesh_controls in zip(rigs, controls, strict=True):
             check_full_rig(scene_rig.mesh_object)
             stack = check_evaluable(scene_rig)
             sampled_rigs.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
+            notes.append("")
             if not settings.target.name:
-                check_time_inputs(scene_rig, sampled_rigs[-1][0].controls, stack, find_actions(settings))
+                notes[-1] = check_time_inputs(scene_rig, sampled_rigs[-1][0].controls, stack, find_actions(settings))
             check_recordable(path, settings.resume, settings.overwrite)
         target_controls = sampled_rigs[0][0].controls
         pose_setter = make_pose_setter(scene_rigs[0], settings.target, self.clips, settings.poses, target_controls)
@@ -124,7 +125,7 @@ class RecordingSession:
         self.meshes = [
             RecordedMesh(
                 *(scene_rig, rig, path, mesh_channels, self.poses.channels_of_mesh(index)),
-                *(self._previous_path(path, len(rigs) > 1), pose_setter.target),
+                *(self._previous_path(path, len(rigs) > 1), pose_setter.target, notes[index]),
             )
             for index, ((scene_rig, path), (rig, mesh_channels)) in enumerate(zip(rigs, sampled_rigs, strict=True))
         ]
@@ -193,8 +194,8 @@ class RecordingSession:
                 )
         if mesh.partitions:
             return
-        if seam_warning := check_seams(mesh, self.poses, player):
-            yield Progress("influences", 0, 1, seam_warning)
+        for note in filter(None, (mesh.note, check_seams(mesh, self.poses, player))):
+            yield Progress("influences", 0, 1, note)
         partitions = make_merged_partitions(mesh.rig, min_vertices)
         if mesh.target and mesh.target.follows != POSE:
             # A target that depends on time does not follow a moved joint immediately: influences cannot be detected.

@@ -20,7 +20,7 @@ _CHANNEL_PATHS = {
     **{f"SCALE_{axis}": f"scale[{index}]" for index, axis in enumerate("XYZ")},
 }
 """Path of a transform channel by its type in a driver variable."""
-_TRANSFORM_PREFIXES = ("location", "rotation_", "scale", "delta_", "constraints[")
+TRANSFORM_PREFIXES = ("location", "rotation_", "scale", "delta_", "constraints[")
 _GEOMETRY_CONSTRAINTS = {"SHRINKWRAP", "FOLLOW_PATH", "CLAMP_TO"}
 """Constraints that read the geometry of their target, not only its transform."""
 _TRANSFORM_MODIFIERS = {"HOOK", "CAST", "WARP", "SIMPLE_DEFORM", "MIRROR", "DISPLACE", "WAVE", "UV_WARP", "UV_PROJECT"}
@@ -44,6 +44,7 @@ class Sources:
         drivers: the drivers that set properties of any of these.
         numbers: datablock and RNA path of each number that the drivers read, except bones of the rig's armature.
         scene_reads: drivers that read a scene, each with the scene and the path.
+        carriers: the armature object of the rig, and the carriers of the rig.
     """
 
     def __init__(self, scene_rig: SceneRig, root: bpy.types.Object, modifiers: Iterable[str] | None = None):
@@ -57,7 +58,7 @@ class Sources:
         """
         self._rig, self._root = scene_rig, root
         self._only_active, self._modifiers = modifiers is not None, frozenset(modifiers or ())
-        self._carriers = _carriers(scene_rig)
+        self.carriers = _carriers(scene_rig)
         self.objects: dict[bpy.types.Object, bool] = {}
         self.datablocks: dict[bpy.types.ID, str] = {}
         self.bones: dict[bpy.types.Object, set[str]] = {}
@@ -90,7 +91,7 @@ class Sources:
         bone_name, subpath = split_bone_path(path)
         if bone_name:
             return bone_name in self.bones.get(datablock, ()) and not subpath.startswith('["')
-        return datablock != self._root and path.startswith(_TRANSFORM_PREFIXES)
+        return datablock != self._root and path.startswith(TRANSFORM_PREFIXES)
 
     def control_name(self, datablock: bpy.types.ID, path: str) -> str:
         """Return the name of the control at a path of a datablock; empty if the datablock cannot have controls."""
@@ -111,7 +112,7 @@ class Sources:
 
     def _add_object(self, scene_object: bpy.types.Object | None, uses_geometry: bool) -> None:
         is_rig_mesh = scene_object != self._root and scene_object == self._rig.mesh_object
-        if scene_object is None or scene_object in self._carriers or is_rig_mesh:
+        if scene_object is None or scene_object in self.carriers or is_rig_mesh:
             return
         if scene_object not in self.objects or (uses_geometry and not self.objects[scene_object]):
             self.objects[scene_object] = uses_geometry
@@ -119,7 +120,7 @@ class Sources:
 
     def _add_bones(self, armature_object: bpy.types.Object, names: Iterable[str], is_deforming: bool = False) -> None:
         is_rig_armature = armature_object == self._rig.armature_object
-        if armature_object in self._carriers and not is_rig_armature and not is_deforming:
+        if armature_object in self.carriers and not is_rig_armature and not is_deforming:
             return
         followed = self.bones.setdefault(armature_object, set())
         new_names = {name for name in names if name in armature_object.pose.bones} - followed
@@ -215,7 +216,7 @@ class Sources:
         for constraint in constraints:
             if constraint.mute:
                 continue
-            for target, subtarget in _constraint_targets(constraint):
+            for target, subtarget in constraint_targets(constraint):
                 if target.type == "ARMATURE" and subtarget:
                     self._add_bones(target, [subtarget])
                 else:
@@ -285,12 +286,12 @@ def _carriers(scene_rig: SceneRig) -> set[bpy.types.Object]:
     """Return the armature object of a rig, and the objects that move its mesh or armature object as a whole."""
     carriers = [scene_rig.mesh_object, scene_rig.armature_object]
     for scene_object in carriers:
-        targets = [target for c in scene_object.constraints if not c.mute for target, _ in _constraint_targets(c)]
+        targets = [target for c in scene_object.constraints if not c.mute for target, _ in constraint_targets(c)]
         carriers += [o for o in (scene_object.parent, *targets) if o is not None and o not in carriers]
     return set(carriers) - {scene_rig.mesh_object}
 
 
-def _constraint_targets(constraint: bpy.types.Constraint) -> Iterator[tuple[bpy.types.Object, str]]:
+def constraint_targets(constraint: bpy.types.Constraint) -> Iterator[tuple[bpy.types.Object, str]]:
     """Yield the objects that a constraint reads, each with the name of a bone or a vertex group."""
     owners = [(constraint, "target", "subtarget"), (constraint, "pole_target", "pole_subtarget")]
     owners += [(target, "target", "subtarget") for target in getattr(constraint, "targets", ())]

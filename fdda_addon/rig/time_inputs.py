@@ -12,6 +12,7 @@ from ..core.errors import RigError
 from ..scene.animation import changes_value, curves_with_actions, value_range
 from ..scene.controls import fcurve_target, owner_of
 from ..scene.scene_rig import SceneRig
+from .independent_objects import describe_independent_objects
 from .modifier_effects import time_dependence
 from .modifier_stack import ModifierStack, is_fdda_modifier
 from .other_armatures import check_other_armatures
@@ -44,7 +45,7 @@ def check_time_inputs(
     controls: Iterable[Control],
     stack: ModifierStack,
     actions: Iterable[bpy.types.Action] = (),
-) -> None:
+) -> str:
     """Check that the surface of a mesh depends only on the pose of its armature and on controls.
 
     Args:
@@ -52,6 +53,9 @@ def check_time_inputs(
         controls: the controls of the model or the recording.
         stack: the modifiers of the mesh object.
         actions: the actions whose frames are recorded.
+
+    Returns:
+        A sentence for the user about objects that do not move with the rig (`describe_independent_objects`), or "".
 
     Raises:
         RigError: the surface depends on time, or on a bone of another armature; the message names the cause.
@@ -68,6 +72,7 @@ def check_time_inputs(
             f"follow from the pose; {time_input.remedy}."
         )
     check_other_armatures(scene_rig, sources, keys)
+    return describe_independent_objects(scene_rig, sources, keys)
 
 
 def control_keys(scene_rig: SceneRig, controls: Iterable[Control]) -> set[PropertyKey]:

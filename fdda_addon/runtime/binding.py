@@ -20,7 +20,7 @@ from .transitions import SHOWS_MODEL, Event
 
 def bind(
     scene_rig: SceneRig, model_path: Path, use_in_render: bool = False, packed_text: bpy.types.Text | None = None
-) -> None:
+) -> str:
     """Bind a model to a rig and play it.
 
     Args:
@@ -29,6 +29,9 @@ def bind(
         use_in_render: whether final renders show the model instead of the rig.
         packed_text: the text datablock that holds a packed model (`packed_model`); `model_path` is then the path that
             the model was packed from.
+
+    Returns:
+        A sentence for the user (`rig.time_inputs.check_time_inputs`); may be empty.
 
     Raises:
         ModelError: the file is not a model, or the model was trained for another rig. The scene is unchanged.
@@ -43,7 +46,7 @@ def bind(
     with model_disabled(mesh_object):
         opened_model = open_model(scene_rig, network)
         stack = check_stack(mesh_object)
-        check_time_inputs(scene_rig, opened_model.rig.controls, stack)
+        note = check_time_inputs(scene_rig, opened_model.rig.controls, stack)
     if mesh_object.fdda.is_bound:
         unbind(mesh_object)
 
@@ -58,6 +61,7 @@ def bind(
     binding.use_in_render = use_in_render or binding.is_fast_rig
     binding.is_bound = True
     binding.mode = "FDDA"
+    return note
 
 
 def unbind(mesh_object: bpy.types.Object) -> None:
