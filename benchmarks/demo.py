@@ -132,7 +132,7 @@ def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
 if __name__ == "__main__":
     register()
     try:
-        status = main(Path(sys.argv[1]))
+        status = main(*map(Path, sys.argv[1:]))
     finally:
         unregister()
     sys.exit(status)
