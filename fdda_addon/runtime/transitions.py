@@ -73,7 +73,8 @@ _PLAYING_ROWS: dict[Event, Transition] = {
     Event.CHANGE: Transition(State.CHANGED, (Effect.SCHEDULE_CHECK,)),
     Event.EDIT: Transition(State.EDITED),
     Event.OUTDATE: _RESTART,
-    Event.FAIL: Transition(State.FAILED, (*_STOP, Effect.REPORT)),
+    # The reason is reported first: another effect may fail, too.
+    Event.FAIL: Transition(State.FAILED, (Effect.REPORT, *_STOP)),
 }
 """Transitions of a character whose model is shown; the states CHANGED and EDITED replace some of them."""
 
@@ -83,7 +84,7 @@ TABLE: dict[State, dict[Event, Transition]] = {
         Event.UNBIND: Transition(State.UNBOUND),
         Event.CHOOSE_MODEL: _START,
         Event.ANIMATE_MODEL: _START,
-        Event.FAIL: Transition(State.FAILED, (Effect.SHOW_RIG, Effect.REPORT)),
+        Event.FAIL: Transition(State.FAILED, (Effect.REPORT, Effect.SHOW_RIG)),
     },
     State.PLAYING: _PLAYING_ROWS,
     State.CHANGED: _PLAYING_ROWS | {Event.CHECK: Transition(State.PLAYING, (Effect.CHECK_RIG,))},
