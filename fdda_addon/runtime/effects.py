@@ -53,7 +53,7 @@ def _remove_player(character: Character) -> None:
     player_batch.unbatch(character.buffer_uid)
     session.players.pop(character.buffer_uid, None)
     character.player, character.buffer_uid = None, 0
-    session.scanned_count = -1
+    session.needs_scan = True
 
 
 def _check_rig(character: Character, mesh_object: bpy.types.Object) -> None:

@@ -93,7 +93,7 @@ def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object
     player = character.player
     if player is None:
         if character.state in SHOWS_MODEL or mesh_object.fdda.is_playing:
-            session.scanned_count = -1
+            session.needs_scan = True
     elif is_edited and not (player.fits_object(mesh_object) and _reads_buffer(mesh_object, character)):
         session.dispatch(Event.OUTDATE, character)
     elif is_edited:
@@ -145,7 +145,7 @@ def _update(depsgraph: bpy.types.Depsgraph) -> None:
 
 def scan() -> None:
     """Follow the bound objects of the file if objects were added or removed, or if a player was removed."""
-    if session.scanned_count == len(bpy.data.objects):
+    if not session.needs_scan and session.scanned_count == len(bpy.data.objects):
         return
     session.batches.clear()
     session.moved_buffers.clear()
@@ -157,7 +157,7 @@ def scan() -> None:
         with session.isolated_errors(character):
             _scan_object(character, mesh_object)
     effects.remove_unused_objects()
-    session.scanned_count = len(bpy.data.objects)
+    session.needs_scan, session.scanned_count = False, len(bpy.data.objects)
 
 
 def _scan_object(character: Character, mesh_object: bpy.types.Object) -> None:
@@ -239,7 +239,7 @@ def resume() -> None:
     if session.suspension_count:
         return
     session.dispatch(Event.RESUME)
-    session.scanned_count = -1
+    session.needs_scan = True
     scan()
 
 

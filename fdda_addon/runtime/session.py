@@ -71,7 +71,8 @@ class PlaybackSession:
         networks: the loaded models, by their paths or by the session ids of their text datablocks; with each, the time
             of modification and the size of its file.
         chosen_paths: paths of the models that the user chose since Blender started.
-        scanned_count: number of objects in the file at the last scan; -1 to scan after the next evaluation.
+        needs_scan: whether to scan after the next evaluation, even if the number of objects is the same.
+        scanned_count: number of objects in the file at the last scan.
         suspension_count: number of saves that have begun and not ended. A handler of another add-on may save a copy
             before Blender writes the file itself.
         skips_models: whether players keep their last positions instead of running models.
@@ -89,11 +90,11 @@ class PlaybackSession:
         self.modes: dict[int, list[str]] = {}
         self.networks: dict[Path | int, tuple[tuple, Any]] = {}
         self.chosen_paths: set[Path] = set()
-        self.scanned_count = -1
+        self.needs_scan, self.scanned_count = True, 0
         self.suspension_count = 0
         self.skips_models = self.is_switching = False
         self.apply_effect: Callable[[Effect, Character, FDDAError | None], None]
-        self._count_without_bound = -1
+        self._count_without_bound: int | None = None
         self.read_bones: dict[tuple[int, bool], tuple] | None = None
         self._last_change = 0.0
         # Blender compares timers by identity, and each access makes another bound method.
@@ -120,7 +121,7 @@ class PlaybackSession:
         self.suspension_count = 0
         for table in (self.characters, self.players, self.batches, self.moved_buffers):
             table.clear()
-        self.scanned_count = self._count_without_bound = -1
+        self.needs_scan, self._count_without_bound = True, None
         if not keep_checks:
             self.passed_checks.clear()
 

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import fdda_addon
-from fdda_addon.runtime import playback_modifier
+from fdda_addon.core.errors import ModelError
+from fdda_addon.runtime import modifier_switch, playback_modifier
+from fdda_addon.runtime.session import session
+from fdda_addon.runtime.transitions import Event, State
 from fdda_addon.scene.scene_rig import armature_modifier
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, predicted_positions, rig_positions
@@ -214,6 +217,17 @@ def test_the_others_play_on_when_one_character_raises_any_error(bound_elbow, elb
     for mesh_object in (crowd[0], crowd[2]):
         assert_plays(mesh_object, elbow_files.model)
     assert capsys.readouterr().out.count("switched off") == 1
+
+
+def test_a_failure_is_reported_even_if_switching_the_modifiers_fails_too(bound_elbow, monkeypatch, capsys):
+    def refuse(*_: object) -> None:
+        raise RuntimeError("read-only")
+
+    character = session.character_of(bound_elbow)
+    monkeypatch.setattr(modifier_switch, "switch_modifiers", refuse)
+    session.dispatch(Event.FAIL, character, ModelError("the reason"))
+    assert character.state == State.FAILED and bound_elbow.fdda.mode == "RIG"
+    assert bound_elbow.fdda.status == "the reason" and "the reason" in capsys.readouterr().out
 
 
 def test_a_topology_that_changes_shows_the_rig_in_the_same_frame(bound_elbow):
