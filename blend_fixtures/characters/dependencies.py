@@ -171,6 +171,26 @@ def _context_property(armature_object: bpy.types.Object, source: str) -> None:
     _drive(armature_object, "CONTEXT_PROP", data_path=path)
 
 
+def _view_layer_property(armature_object: bpy.types.Object, source: str) -> None:
+    """Drive `lower` by a custom property of the view layer that the source drives."""
+    scene, view_layer = bpy.context.scene, bpy.context.view_layer
+    view_layer["bend"] = 0.0
+    driver = scene.driver_add(f'{view_layer.path_from_id()}["bend"]').driver
+    driver.type = "SUM"
+    variable = driver.variables.new()
+    variable.type = "TRANSFORMS"
+    target = variable.targets[0]
+    target.id, target.bone_target, target.transform_type = armature_object, source, "LOC_Z"
+    _drive(armature_object, "CONTEXT_PROP", context_property="ACTIVE_VIEW_LAYER", data_path='["bend"]')
+
+
+def _pointer(armature_object: bpy.types.Object, source: str) -> None:
+    """Drive `lower` by a bone that a path names through the parent of an object."""
+    child = link(bpy.data.objects.new("child", None))
+    child.parent = armature_object
+    _drive(armature_object, "SINGLE_PROP", id=child, data_path=f'parent.pose.bones["{source}"].location[1]')
+
+
 def _driven_property(armature_object: bpy.types.Object, source: str) -> None:
     """Drive `lower` by a custom property of the object that the source drives."""
     add_property(armature_object, "bend")
@@ -232,7 +252,7 @@ DEPENDENCIES = {
     for function in (
         *(_target, _custom_space, _armature_constraint, _ik, _pole, _spline_ik, _action, _property, _transform_channel),
         *(_rotation_difference, _distance, _context_property, _driven_property, _driven_influence, _bone_parent),
-        *(_surface, _b_bone_handle),
+        *(_surface, _b_bone_handle, _view_layer_property, _pointer),
     )
 }
 """Functions that make `lower` depend on a bone, by the name of the way: (armature object, name of the bone) -> None."""

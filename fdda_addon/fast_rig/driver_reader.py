@@ -3,6 +3,7 @@
 
 import re
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import bpy
 
@@ -10,10 +11,17 @@ from .bone_reader import bone_node, datablock_node, is_armature
 from .dependency_graph import DependencyGraph, Node
 
 _BONE_PATH = re.compile(r'(?:^|\.)bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]')
-_OBJECT_PATH = re.compile(r'objects\["(?P<name>(?:[^"\\]|\\.)*)"\]')
 _QUOTED_TEXT = re.compile(r"""(["'])(?P<text>(?:(?!\1).)+)\1""")
 _SEGMENT_PATH = re.compile(r"bones\[.*\]\.bbone_\w+$")
+_PATH_PART = re.compile(r'\["(?:[^"\\]|\\.)*"\]|\[\d+\]|\w+')
 _ELEMENT_INDEX = re.compile(r"\[\d+\]$")
+
+
+class _Pointer(NamedTuple):
+    """A pointer in a path: the datablock to which it points, and the end of its part of the path."""
+
+    target: bpy.types.ID
+    end: int
 
 
 def drivers_of(datablock: bpy.types.ID) -> list[tuple[bpy.types.ID, bpy.types.FCurve]]:
@@ -82,7 +90,7 @@ def driver_needs(driver: bpy.types.Driver) -> Iterator[Node]:
     for variable in driver.variables:
         for target in variable.targets:
             if variable.type == "CONTEXT_PROP":
-                yield from _path_needs(bpy.context.scene, target.data_path)
+                yield from _context_needs(target)
             elif target.id is None:
                 continue
             elif variable.type == "SINGLE_PROP":
@@ -96,18 +104,39 @@ def driver_needs(driver: bpy.types.Driver) -> Iterator[Node]:
         yield from _expression_needs(driver.expression)
 
 
+def _context_needs(target: bpy.types.DriverTarget) -> Iterator[Node]:
+    """Yield what a driver needs that reads a property of the active scene or of the active view layer."""
+    scene, path = bpy.context.scene, target.data_path
+    if target.context_property == "ACTIVE_SCENE":
+        yield from _path_needs(scene, path)
+        return
+    separator = "" if path.startswith("[") else "."
+    for view_layer in scene.view_layers:
+        yield from _path_needs(scene, f"{view_layer.path_from_id()}{separator}{path}")
+
+
 def _path_needs(datablock: bpy.types.ID, path: str) -> Iterator[Node]:
-    """Yield the bone, the object and the driven property at a path of a datablock."""
+    """Yield the bones, the driven properties and the other datablocks through which a path of a datablock leads."""
     yield driven_node(datablock, path)
-    if match := _OBJECT_PATH.search(path):
-        scene_object = bpy.data.objects.get(bpy.utils.unescape_identifier(match["name"]))
-        if scene_object is None:
-            return
-        yield datablock_node(scene_object)
-        datablock, path = scene_object, path[match.end() :].removeprefix(".")
-        yield driven_node(datablock, path)
-    if bone_name := bone_of_path(path):
+    pointer = _pointer(datablock, path)
+    own_path = path if pointer is None else path[: pointer.end]
+    if bone_name := bone_of_path(own_path):
         yield from (bone_node(armature_object, bone_name) for armature_object in _armature_objects(datablock))
+    if pointer is not None:
+        yield datablock_node(pointer.target)
+        yield from _path_needs(pointer.target, path[pointer.end :].removeprefix("."))
+
+
+def _pointer(datablock: bpy.types.ID, path: str) -> _Pointer | None:
+    """Return the first pointer in a path to a datablock; None if there is none, or if the path is broken before it."""
+    for part in _PATH_PART.finditer(path):
+        try:
+            value = datablock.path_resolve(path[: part.end()])
+        except ValueError:
+            return None
+        if isinstance(value, bpy.types.ID):
+            return _Pointer(value, part.end())
+    return None
 
 
 def _expression_needs(expression: str) -> Iterator[Node]:
