@@ -26,6 +26,8 @@ from .driver_reader import add_drivers
 _INVISIBLE_TYPES = {"ARMATURE", "LATTICE", "SPEAKER", "LIGHT_PROBE"}
 """Types of objects that no render shows."""
 _CAGE_DISPLAY_TYPES = {"BOUNDS", "WIRE"}
+_COLLIDING_MODIFIERS = {"CLOTH", "SOFT_BODY", "PARTICLE_SYSTEM"}
+"""Modifiers that collide with all Collision objects, and that all force fields move."""
 _UNFOLLOWED_TYPES = (bpy.types.Scene, bpy.types.WindowManager, bpy.types.Screen, bpy.types.WorkSpace)
 """Datablocks that use all objects, and need none of them."""
 
@@ -80,19 +82,28 @@ def read_graph(
 def shown_objects(scene_rigs: list[SceneRig]) -> list[bpy.types.Object]:
     """Return the objects that a fast rig shows besides the meshes of its models.
 
-    These are the objects of the scene that renders show, except cages that only the replaced deformation reads, and
-    the objects of other scenes.
+    These are the objects of the scene that renders show in some frame, except cages that only the replaced deformation
+    reads, and the objects of other scenes.
     """
     cages = {
         scene_object
         for scene_rig in scene_rigs
         for scene_object in Sources(scene_rig, scene_rig.mesh_object).objects
-        if scene_object.type in {"LATTICE", "CURVE", "EMPTY"} or scene_object.display_type in _CAGE_DISPLAY_TYPES
+        if scene_object.type in {"LATTICE", "EMPTY"}
+        or (scene_object.type == "CURVE" and not _has_surface(scene_object.data))
+        or scene_object.display_type in _CAGE_DISPLAY_TYPES
     }
     scene = bpy.context.scene
     rendered = set(_rendered_objects(bpy.context.view_layer.layer_collection))
     candidates = [o for o in bpy.data.objects if o in rendered or (o.name not in scene.objects and o.users_scene)]
-    return [o for o in candidates if o not in cages and o.type not in _INVISIBLE_TYPES and not o.hide_render]
+    shown = [o for o in candidates if o not in cages and o.type not in _INVISIBLE_TYPES]
+    return [o for o in shown if not o.hide_render or "hide_render" in animated_paths(o)]
+
+
+def _has_surface(curve: bpy.types.Curve) -> bool:
+    """Return whether renders show a curve: it has a bevel or an extrusion, or it is filled."""
+    is_filled = curve.dimensions == "2D" and curve.fill_mode != "NONE" and any(s.use_cyclic_u for s in curve.splines)
+    return is_filled or bool(curve.bevel_depth or curve.extrude or curve.bevel_object)
 
 
 def _used_datablocks() -> dict[bpy.types.ID, set[bpy.types.ID]]:
@@ -126,6 +137,8 @@ def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier
     """Yield the datablocks and bones that a modifier reads, except through drivers."""
     yield from pointer_needs(modifier)
     yield from bones_of_modifier(scene_object, modifier)
+    if modifier.type in _COLLIDING_MODIFIERS:
+        yield from (datablock_node(o) for o in bpy.data.objects if _moves_simulations(o))
     if modifier.type == "NODES" and modifier.node_group is not None:
         for item in modifier.node_group.interface.items_tree:
             value = node_input(modifier, item.identifier) if item.item_type == "SOCKET" else None
@@ -134,6 +147,12 @@ def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier
         if bone_names := set(read_bone_names(modifier.node_group)):
             bones = ((o, bone.name) for o in bpy.data.objects if is_armature(o) for bone in o.data.bones)
             yield from (bone_node(o, name) for o, name in bones if "" in bone_names or name in bone_names)
+
+
+def _moves_simulations(scene_object: bpy.types.Object) -> bool:
+    """Return whether simulated objects collide with an object, or a force field of it moves them."""
+    has_field = scene_object.field is not None and scene_object.field.type != "NONE"
+    return has_field or any(modifier.type == "COLLISION" for modifier in scene_object.modifiers)
 
 
 def _rendered_objects(layer_collection: bpy.types.LayerCollection) -> Iterator[bpy.types.Object]:

@@ -29,7 +29,7 @@ def remove_unneeded(
 ) -> Removed:
     """Remove everything that joints, controls, shown objects and other nodes do not need, and the replaced modifiers.
 
-    The first Armature modifier stays, because it tells which armature a mesh has.
+    The first Armature modifier stays, because it tells which armature a mesh has. All actions stay.
 
     Args:
         scene_rigs: the rigs whose meshes models deform; they share one armature object.
@@ -42,6 +42,9 @@ def remove_unneeded(
     """
     armature_object = scene_rigs[0].armature_object
     check_armature(armature_object)
+    for action in (action for action in bpy.data.actions if action.library is None):
+        # Saving would drop the actions that only removed objects and constraints use.
+        action.use_fake_user = True
     shown = [*shown_objects(scene_rigs), armature_object, *(rig.mesh_object for rig in scene_rigs)]
     worlds = [scene.world for scene in bpy.data.scenes if scene.world is not None]
     roots = [*map(datablock_node, (*shown, *worlds)), *nodes]
