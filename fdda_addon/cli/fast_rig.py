@@ -86,9 +86,17 @@ def _summary(fast_rig: "FastRig") -> str:
         f"{fast_rig.joints:,}, and {len(fast_rig.controls):,} are controls",
         f"  removed {_count(fast_rig.removed_objects, 'object')}, {_count(fast_rig.removed_modifiers, 'modifier')} "
         f"and {fast_rig.removed_drivers:,} driver{'s' * (fast_rig.removed_drivers != 1)}",
-        f"  the joints move as in the full rig in {fast_rig.pose_count} poses (largest difference "
-        f"{fast_rig.largest_difference:.1e} of the size)",
     ]
+    if fast_rig.moving_joints:
+        lines.append(
+            f"  the joints move as in the full rig in {fast_rig.pose_count} poses (largest difference "
+            f"{fast_rig.largest_difference:.1e} of the size)"
+        )
+    else:
+        lines.append(
+            f"  no joint moves in {fast_rig.pose_count} poses of these controls, so nothing shows that the joints move "
+            "as in the full rig; choose the controls that move them with --controls"
+        )
     if counts := fast_rig.infinite_joints:
         lines.append(
             f"  in up to {max(counts.values())} of these, both rigs give no finite transform to "

@@ -92,6 +92,11 @@ def differing_joints(poses: JointPoses, before: np.ndarray, after: np.ndarray, t
     return {name: float(value) for name, value in zip(poses.joint_names, largest, strict=True) if value > tolerance}
 
 
+def moving_joints(poses: JointPoses, matrices: np.ndarray, tolerance: float) -> set[str]:
+    """Return the names of the joints that move between poses; arguments as for `differing_joints`."""
+    return set(differing_joints(poses, matrices, matrices[:1], tolerance))
+
+
 def infinite_joints(poses: JointPoses, matrices: np.ndarray) -> dict[str, int]:
     """Count the poses in which joints have an infinite or undefined place, rotation or scale.
 

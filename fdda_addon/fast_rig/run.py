@@ -22,7 +22,7 @@ from .bone_reader import bone_node, datablock_node
 from .controls import animating_actions, control_bones, keyed_bones
 from .dependency_graph import Node
 from .driver_reader import bone_of_path, driven_node
-from .joint_poses import JointPoses, differing_joints, evaluate_joints, infinite_joints, rig_size
+from .joint_poses import JointPoses, differing_joints, evaluate_joints, infinite_joints, moving_joints, rig_size
 from .removal import remove_unneeded
 
 TOLERANCE = 1e-5
@@ -46,6 +46,7 @@ class FastRig:
         lost_channels: number of keyed channels that have lost their bones, by action and bone.
         pose_count: number of poses in which the joints were compared.
         largest_difference: largest difference of a joint in these, as a ratio of the size of the rig.
+        moving_joints: number of joints that move in these.
         infinite_joints: number of these poses in which both rigs give a joint no finite transform, by its name.
     """
 
@@ -61,6 +62,7 @@ class FastRig:
     lost_channels: dict[str, dict[str, int]] = field(default_factory=dict)
     pose_count: int = 0
     largest_difference: float = 0.0
+    moving_joints: int = 0
     infinite_joints: dict[str, int] = field(default_factory=dict)
 
 
@@ -90,6 +92,11 @@ def make_fast_rig(
     networks = [network_of(rig.mesh_object) for rig in scene_rigs]
     joint_names = tuple(dict.fromkeys(n for network in networks for n in network.info.joint_names if n != STATIC_JOINT))
     controls = tuple(sorted(control_bones(armature_object, choices)))
+    if not controls:
+        raise RigError(
+            f"'{armature_object.name}' has no bones for --controls {' '.join(choices)}, so the fast rig would have "
+            "nothing to animate; choose other controls: visible, keyed or collection:NAME, a bone collection."
+        )
     actions = tuple(animating_actions(armature_object))
     poses = JointPoses(armature_object, joint_names, controls, actions, rig_size(armature_object))
     before = yield from _evaluate(poses, "full rig")
@@ -128,6 +135,7 @@ def make_fast_rig(
         _lost_channels(poses, removed.bones),
         len(before),
         max(differing_joints(poses, before, after, -1.0).values(), default=0.0),
+        len(moving_joints(poses, before, TOLERANCE)),
         infinite_joints(poses, before),
     )
 

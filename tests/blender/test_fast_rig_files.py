@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fast rigs of several meshes and of files with relative paths."""
+"""Fast rigs of several meshes, of files with relative paths, and with controls that move nothing."""
 
 import json
 from pathlib import Path
 
 import bpy
 
+from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.core.model import METADATA_KEY, OBJECT_KEY
 from fdda_addon.scene.blend_file import save_copy
 
+from .command_output import output_of
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, run, write_edited
+from .waves import wave
 
 OTHER = "a second: arm"
 
@@ -68,3 +71,30 @@ def test_relative_paths_lead_to_the_same_files_from_another_folder(elbow_files, 
     bpy.ops.wm.open_mainfile(filepath=str(fast))
     path = bpy.data.images["skin"].filepath
     assert path.startswith("//") and Path(bpy.path.abspath(path)).resolve() == texture.resolve()
+
+
+def test_controls_that_choose_no_bone_are_refused(elbow_files, tmp_path, capsys):
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
+    for action in list(bpy.data.actions):
+        bpy.data.actions.remove(action)
+    save_copy(tmp_path / "full.blend")
+    fast = tmp_path / "fast.blend"
+    assert run("fast-rig", tmp_path / "full.blend", elbow_files.model, fast, "--controls", "keyed") == 1
+    assert "'elbow_rig' has no bones for --controls keyed, so the fast rig would have" in capsys.readouterr().err
+    assert not fast.exists()
+
+
+def test_controls_that_move_no_joint_prove_nothing(elbow_files, tmp_path):
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
+    for action in list(bpy.data.actions):
+        bpy.data.actions.remove(action)
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    add_bones(armature_object, NewBone("aside", (0.0, 0.0, 0.3), (0.1, 0.0, 0.3), is_deforming=False))
+    wave(armature_object, "aside")
+    save_copy(tmp_path / "full.blend")
+    files = (tmp_path / "full.blend", elbow_files.model, tmp_path / "fast.blend")
+    lines = output_of("fast-rig", *files, "--controls", "keyed", "--frames", 0).out
+    assert lines[2].startswith(
+        "  no joint moves in 220 poses of these controls, so nothing shows that the joints move as "
+    )
+    assert len(lines) == 3
