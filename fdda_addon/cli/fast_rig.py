@@ -83,7 +83,7 @@ def _summary(fast_rig: "FastRig") -> str:
     """Return what was removed and compared, a line each."""
     lines = [
         f"'{fast_rig.armature_name}' has {fast_rig.bones_after:,} of {fast_rig.bones_before:,} bones; the model reads "
-        f"{fast_rig.joints:,}, and {len(fast_rig.controls):,} are controls",
+        f"{fast_rig.joints:,}, animators pose {len(fast_rig.controls):,}",
         f"  removed {_count(fast_rig.removed_objects, 'object')}, {_count(fast_rig.removed_modifiers, 'modifier')} "
         f"and {fast_rig.removed_drivers:,} driver{'s' * (fast_rig.removed_drivers != 1)}",
     ]

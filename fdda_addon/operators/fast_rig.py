@@ -55,9 +55,9 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         self.layout.label(text="Controls to Keep:")
         self.layout.prop(self, "visible")
         self.layout.prop(self, "keyed")
-        self.layout.prop_search(
-            self, "collection", self.bound_rig(context).armature_object.data, "collections_all", text="Bone Collection"
-        )
+        self.layout.label(text="Bone Collection:")
+        armature = self.bound_rig(context).armature_object.data
+        self.layout.prop_search(self, "collection", armature, "collections_all", text="")
 
     def subject(self, context: bpy.types.Context) -> int:
         return self.bound_rig(context).mesh_object.session_uid

@@ -52,7 +52,7 @@ class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
         measurements.store(self.verb, self.rig(context).mesh_object, result)
         largest_part = max(result.parts, key=lambda part: part.duration.median)
         share = largest_part.duration.median / max(result.total, 1e-9)
-        return f"{result.frame.median:.2f} ms per frame; {largest_part.title} takes {share:.0%}."
+        return f"A frame takes {result.total:.2f} ms; {largest_part.title} takes {share:.0%}."
 
 
 def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object]:

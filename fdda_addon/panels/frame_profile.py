@@ -24,7 +24,7 @@ def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     """Draw the profile of a rig, and the button that measures it or the progress of its job."""
     state, profile = job.state_of("profile_frame"), last_profile(rig.mesh_object)
     header, body = layout.panel("fdda_frame_profile", default_closed=True)
-    header.label(text=f"Frame Profile ({profile.frame.median:.1f} ms)" if profile else "Frame Profile")
+    header.label(text=f"Frame Profile ({profile.total:.1f} ms)" if profile else "Frame Profile")
     if body is None:
         return
     if state is not None and (state.is_running or state.outcome_level != "INFO"):

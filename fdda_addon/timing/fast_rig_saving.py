@@ -36,7 +36,7 @@ class FastRigSaving:
     def sentence(self) -> str:
         """Return a sentence that says what a fast rig would save."""
         return (
-            f"A fast rig with all {self.controls:,} visible controls and {self.joints:,} joints would keep "
+            f"A fast rig with all visible controls ({self.controls:,}) and joints ({self.joints:,}) would keep "
             f"{self.kept_bones:,} of {self.bones:,} bones, and take about {self.fast:.2f} ms in place of "
             f"{self.full.median:.2f} ms ({self.full.median / self.fast:.1f} times as fast)."
         )

@@ -81,7 +81,7 @@ def test_a_fast_rig_has_the_same_names_and_plays(folder):
     bpy.context.view_layer.update()
     assert_plays(mesh_object, folder / "moved.onnx")
 
-    assert f"has {full_count - 2} of {full_count} bones" in lines[0] and "1 are controls" in lines[0]
+    assert f"has {full_count - 2} of {full_count} bones" in lines[0] and "animators pose 1" in lines[0]
     assert "1 object ('cage'), 2 modifiers ('Mush', 'Lattice')" in lines[1]
     assert "in 240 poses (largest difference 0.0e+00 of the size)" in lines[2]
     assert lines[3].strip() == f"'{ACTION} {UNUSED}': 3 keyed channels have no bone any more: '{UNUSED}'"
@@ -257,8 +257,8 @@ def shown(armature_object: bpy.types.Object, path: Path) -> tuple[np.ndarray, np
     return np.array(evaluated.pose.bones["lower"].matrix), still(path)
 
 
-def relocate_in_window(fast: Path, full: Path) -> None:
-    """Relocate the library as in the Outliner, in the open shot."""
+def relocate_by_operator(fast: Path, full: Path) -> None:
+    """Relocate the library with the operator of the Outliner, in the open shot."""
     library = next(lib for lib in bpy.data.libraries if Path(bpy.path.abspath(lib.filepath)).samefile(fast))
     bpy.ops.wm.lib_relocate(library=library.name, directory=f"{full.parent}/", filename=full.name)
 
@@ -273,7 +273,7 @@ def relocate_by_script(fast: Path, full: Path) -> None:
     library.reload()
 
 
-@pytest.mark.parametrize("relocate", [relocate_in_window, relocate_by_script])
+@pytest.mark.parametrize("relocate", [relocate_by_operator, relocate_by_script])
 def test_a_shot_that_is_relocated_to_the_full_rig_renders_as_the_full_rig(folder, relocate):
     """Link the fast rig, override it, animate it, relocate the library to the full rig, save, reopen and render."""
     assert run(*fast_rig_arguments(folder, "--controls", "visible", "--frames", 0)) == 0
