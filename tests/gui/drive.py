@@ -21,6 +21,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 import cast_story
 import endure_story
+import fast_rig_story
 import film_story
 import flesh_story
 import leave_story
@@ -44,6 +45,7 @@ STEPS = {
     "session": session_story.STEPS,
     "update": update_story.STEPS,
     "film": film_story.STEPS,
+    "fast_rig": fast_rig_story.STEPS,
     "endure": endure_story.STEPS,
     "manual": manual_story.STEPS,
     "leave": leave_story.STEPS_BEFORE_CLOSING,

@@ -12,7 +12,15 @@ from pathlib import Path
 import bpy
 import numpy as np
 import sidebar
-from arm import arm_object, armature_object, check_model_plays, evaluated_positions, extension_module, open_copy_in
+from arm import (
+    arm_object,
+    armature_object,
+    check_model_plays,
+    evaluated_positions,
+    expected_positions,
+    extension_module,
+    open_copy_in,
+)
 from window import (
     click,
     move_mouse,
@@ -56,9 +64,8 @@ def play_pose_and_undo(_folder: Path) -> Iterator[float]:
         _action_counts[action.__name__[1:]] = _action_counts.get(action.__name__[1:], 0) + 1
         require(not arm_object().fdda.status, f"after {action.__name__[1:]} its status is '{arm_object().fdda.status}'")
         if arm_object().fdda.mode == "FDDA":
-            max_distance = max(
-                max_distance, float(np.abs(evaluated_positions(arm_object()) - _expected_positions()).max())
-            )
+            expected = expected_positions(arm_object(), armature_object())
+            max_distance = max(max_distance, float(np.abs(evaluated_positions(arm_object()) - expected).max()))
             require(
                 max_distance < MAX_DISTANCE, f"after {action.__name__[1:]} it is {max_distance:.2g} m from the model"
             )
@@ -121,17 +128,6 @@ def _change_frame(random: np.random.Generator) -> Iterator[float]:
 def _switch_mode(random: np.random.Generator) -> Iterator[float]:
     arm_object().fdda.mode = str(random.choice(["RIG", "LINEAR", "FDDA", "FDDA", "FDDA"]))
     yield 0.2
-
-
-def _expected_positions() -> np.ndarray:
-    """Return the output of the model for the evaluated pose: (V, 3) float32, meters."""
-    network = extension_module("runtime.model_files").network_of(arm_object())
-    depsgraph, info = bpy.context.evaluated_depsgraph_get(), network.info
-    scene_rig = extension_module("scene.scene_rig").SceneRig(arm_object(), armature_object())
-    reader = extension_module("rig.reading").PoseReader(scene_rig, info.joint_names, info.rest_matrices)
-    return network.positions(
-        reader.read(arm_object().evaluated_get(depsgraph), armature_object().evaluated_get(depsgraph))[None]
-    )[0]
 
 
 def _resident_memory_mb() -> float:

@@ -26,8 +26,8 @@ WIDTH, HEIGHT = 1600, 1200
 INSTALL_MAX_SECONDS, STORY_MAX_SECONDS, TERMINATE_MAX_SECONDS = 60, 600, 5
 MISSING_REQUIREMENT_STATUS = 3
 MAX_BLANK_IMAGE_VALUES = 32
-STORIES = ("path", "film", "work", "shot", "cast", "ranges", "flesh", "session", "leave", "back")
-"""Names of the stories, in order. Each runs in a new Blender, and uses the files that the story `path` has saved."""
+STORIES = ("path", "film", "work", "shot", "cast", "ranges", "flesh", "fast_rig", "session", "leave", "back")
+"""Names of the stories, in order. Each runs in a new Blender, and most use the files of the story `path`."""
 LONG_STORIES = ("endure", "manual")
 """Stories that run only by name, because they take minutes."""
 
@@ -152,7 +152,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="folder for screenshots; files of an earlier run in it are deleted")
     parser.add_argument("blender", nargs="?", default="blender", help="command that starts Blender")
-    story_help = "run only these stories; all need the files of the story 'path' in FOLDER"
+    story_help = "run only these stories; most need the files of the story 'path' in FOLDER"
     parser.add_argument("--story", nargs="+", choices=(*STORIES, *LONG_STORIES), help=story_help)
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # Exit by an exception, so that child processes are ended.

@@ -15,6 +15,8 @@ import bpy
 import numpy as np
 
 EVENT_WAIT_SECONDS = 0.03
+LEFT_BUTTON, RIGHT_BUTTON = 1, 3
+"""Buttons of the mouse, by their numbers in xdotool."""
 REDRAW_SECONDS = 0.25
 """Time until a region that was tagged for redrawing is on the screen."""
 MIN_CHANNEL_DIFFERENCE = 0.45
@@ -102,17 +104,17 @@ def move_mouse(x: float, y: float) -> None:
     run_xdotool("mousemove", "--window", x_window_id(), round(x), main_window().height - 1 - round(y))
 
 
-def click(x: float, y: float, times: int = 1) -> Iterator[float]:
-    """Move the mouse to a position and click its left button `times` times."""
+def click(x: float, y: float, times: int = 1, button: int = LEFT_BUTTON) -> Iterator[float]:
+    """Move the mouse to a position and click a button `times` times."""
     move_mouse(x, y)
     yield from wait_for_events()
-    run_xdotool("click", "--repeat", times, "--delay", 60, 1)
+    run_xdotool("click", "--repeat", times, "--delay", 60, button)
     yield from wait_for_events()
 
 
 def press_mouse_button(action: str) -> None:
     """Press ("mousedown") or release ("mouseup") the left mouse button."""
-    run_xdotool(action, 1)
+    run_xdotool(action, LEFT_BUTTON)
 
 
 def press_keys(*keys: str) -> Iterator[float]:
