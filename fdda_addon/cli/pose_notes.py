@@ -18,11 +18,12 @@ REMIX_HINT = (
 
 
 def print_control_bones(scene_rig: SceneRig, options: argparse.Namespace) -> None:
-    """Print how many inputs the control bones are, and which locations have no range."""
-    texts = [text for text in options.control if text.startswith(("collection:", "bone:"))]
-    if texts:
-        names, _ = split_control_bones(scene_rig, texts)
-        settings = RecordingSettings(controls=tuple(texts), sample=tuple(options.sample), actions=tuple(options.action))
+    """Print how many inputs the control bones are, and which locations and custom properties have no range."""
+    names, _ = split_control_bones(scene_rig, options.control)
+    if names:
+        settings = RecordingSettings(
+            controls=tuple(options.control), sample=tuple(options.sample), actions=tuple(options.action)
+        )
         print(describe_control_bones(scene_rig.armature_object, names, listed_controls(scene_rig, settings)))
 
 

@@ -10,6 +10,8 @@ from .joint_option import AUTO, parse_joints
 from .partition import Partition
 from .rig import KEY_JOINTS_PREFIX, Fingerprint, Joint, Rig
 
+MAX_NAMED_JOINTS = 3
+
 
 @dataclass(frozen=True)
 class KeyJointReport:
@@ -21,8 +23,8 @@ class KeyJointReport:
         unexplained_mm: largest motion of another joint that key joints and controls do not explain, mm: rms over poses
             and over the vertices of the joint, times skin weights.
         tolerance_mm: unexplained motion with which "auto" removes any joint.
-        independent: number of removed joints that "auto" would not remove.
-        still: number of removed joints that no pose moves relative to their parents.
+        independent: names of the removed joints that "auto" would not remove, the largest unexplained motion first.
+        still: names of the removed joints that no pose moves relative to their parents.
     """
 
     requested: str
@@ -30,8 +32,8 @@ class KeyJointReport:
     rig_joints: int
     unexplained_mm: float
     tolerance_mm: float
-    independent: int = 0
-    still: int = 0
+    independent: tuple[str, ...] = ()
+    still: tuple[str, ...] = ()
 
     def to_json(self) -> dict:
         """Return the JSON for `recording.json` and messages."""
@@ -44,14 +46,16 @@ class KeyJointReport:
         Raises:
             KeyError, TypeError, ValueError: the JSON is damaged.
         """
-        counts = [value[name] for name in ("joints", "rig_joints", "independent", "still")]
+        counts = [value[name] for name in ("joints", "rig_joints")]
         if any(type(count) is not int or count < 0 for count in counts):
             raise ValueError("the key joints are not counted by numbers")
-        joints, rig_joints, independent, still = counts
+        lost = [value[name] for name in ("independent", "still")]
+        if not all(isinstance(names, list | tuple) and all(isinstance(name, str) for name in names) for names in lost):
+            raise ValueError("the joints that are not read have no names")
         distances = [float(value[name]) for name in ("unexplained_mm", "tolerance_mm")]
         if not np.isfinite(distances).all() or not isinstance(value["requested"], str):
             raise ValueError("the errors of key joints are not numbers")
-        return KeyJointReport(parse_joints(value["requested"]), joints, rig_joints, *distances, independent, still)
+        return KeyJointReport(parse_joints(value["requested"]), *counts, *distances, *map(tuple, lost))
 
     def sentence(self) -> str:
         """Describe the choice, and what is lost."""
@@ -66,18 +70,23 @@ class KeyJointReport:
         text = f"Key joints: the model reads {self.joints} of {self.rig_joints} joints"
         if self.independent:
             text += (
-                f", but {self.independent} of the others move independently of these, by up to "
-                f"{self.unexplained_mm:.2f} mm (rms), and the model cannot learn that; read more joints, add their "
-                "controls as inputs, or leave the choice to auto."
+                f", but {len(self.independent)} of the others ({_first_names(self.independent)}) move independently of "
+                f"these, by up to {self.unexplained_mm:.2f} mm (rms), and the model cannot learn that; read more "
+                "joints, add their controls as inputs, or leave the choice to auto."
             )
         else:
             text += f"; in random poses the others follow from these within {self.unexplained_mm:.2f} mm (rms)."
         if self.still:
             text += (
-                f" No random pose moves {self.still} of the others relative to their parents, so the model does not "
-                "show their own motion."
+                f" No random pose moves {len(self.still)} of the others ({_first_names(self.still)}) relative to their "
+                "parents, so the model does not show their own motion."
             )
         return text
+
+
+def _first_names(names: tuple[str, ...]) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:MAX_NAMED_JOINTS])
+    return shown + (f" and {len(names) - MAX_NAMED_JOINTS} more" if len(names) > MAX_NAMED_JOINTS else "")
 
 
 def select_joints(rig: Rig, joints: tuple[Joint, ...]) -> Rig:

@@ -76,6 +76,7 @@ class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
+        from ..poses.control_bones import describe_control_bones
         from ..recording.plan import RecordingSettings, listed_controls
         from ..scene.compatibility import is_selected
 
@@ -92,8 +93,8 @@ class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
         for name in new_names:
             settings.controls.add().name = name
         settings.control_index = len(settings.controls) - 1
-        bone_text = "1 bone" if len(new_names) == 1 else f"{len(new_names)} bones"
-        return f"Added {bone_text} with {len(controls)} inputs."
+        bone_names = [name.removeprefix("bone:") for name in new_names]
+        return f"Added {describe_control_bones(rig.armature_object, bone_names, controls)}"
 
 
 class FDDA_OT_remove_control(PoseOperator, bpy.types.Operator):

@@ -74,7 +74,7 @@ def bone_controls(scene_rig: SceneRig, names: frozenset[str], channels: Iterable
             try:
                 controls.append(make_control(scene_rig, ARMATURE_OBJECT, property_path))
             except RigError:
-                # A property without a range, such as a setting of an add-on, is not made for animation.
+                # A property without a range, such as a setting of an add-on, is seldom made for animation.
                 continue
     if names and not controls:
         raise RigError(
@@ -133,19 +133,50 @@ def bones_without_location_range(
     ]
 
 
+def properties_without_range(
+    armature_object: bpy.types.Object, names: Iterable[str], controls: Iterable[Control]
+) -> list[tuple[str, str]]:
+    """Return the custom properties of control bones that are no controls, because they have no range.
+
+    Returns:
+        The names of bone and property of each, sorted.
+    """
+    paths = {control.path for control in controls}
+    bone_paths = [(name, armature_object.pose.bones[name].path_from_id()) for name in sorted(names)]
+    return [
+        (name, bpy.utils.unescape_identifier(property_path.removeprefix(path)[2:-2]))
+        for name, path in bone_paths
+        for property_path in sorted(custom_properties(armature_object, path))
+        if property_path not in paths
+    ]
+
+
 def describe_control_bones(
     armature_object: bpy.types.Object, names: Iterable[str], controls: tuple[Control, ...]
 ) -> str:
-    """Return a sentence with the number of inputs of control bones, and one that names locations without a range."""
+    """Return a sentence with the number of inputs of control bones, and sentences about what has no range.
+
+    Args:
+        armature_object: the armature object.
+        names: names of the control bones.
+        controls: the controls of these, and any others.
+    """
     names = frozenset(names)
     bone_paths = [armature_object.pose.bones[name].path_from_id() for name in names]
-    moving_count = sum(any(control.path.startswith(path) for control in controls) for path in bone_paths)
-    sentence = f"{moving_count} control bones with {len(controls)} inputs."
-    unlimited = bones_without_location_range(armature_object, names, controls)
-    if not unlimited:
-        return sentence
-    others = f" and of {len(unlimited) - 1} more" if len(unlimited) > 1 else ""
-    return (
-        f"{sentence} The location of '{unlimited[0]}'{others} has no range and is no input; lock it, give it a Limit "
-        "Location, or record an action that moves it."
-    )
+    counts = [sum(control.path.startswith(path) for control in controls) for path in bone_paths]
+    moving_count = sum(count > 0 for count in counts)
+    sentence = f"{moving_count} control bone{'s' * (moving_count != 1)} with {sum(counts)} inputs."
+    if unlimited := bones_without_location_range(armature_object, names, controls):
+        others = f" and of {len(unlimited) - 1} more" if len(unlimited) > 1 else ""
+        sentence += (
+            f" The location of '{unlimited[0]}'{others} has no range and is no input; lock it, give it a Limit "
+            "Location, or record an action that moves it."
+        )
+    if properties := properties_without_range(armature_object, names, controls):
+        bone_name, property_name = properties[0]
+        others = f" and {len(properties) - 1} more" if len(properties) > 1 else ""
+        sentence += (
+            f" The custom property '{property_name}' of '{bone_name}'{others} has no range and is no input; set "
+            "Soft Min and Soft Max in the settings of the property."
+        )
+    return sentence

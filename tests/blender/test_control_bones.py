@@ -237,6 +237,30 @@ def test_a_collection_takes_no_range(face):
         listed_controls(face, RecordingSettings(controls=(f"{FACE}=0:1",)))
 
 
+def test_custom_properties_without_a_range_are_named(face, capfd):
+    """They are no inputs; the verb and the sidebar say which, unless the user gives a range."""
+    armature_object = face.armature_object
+    mouth = armature_object.pose.bones["mouth"]
+    mouth['pu"ff'], mouth["strap"] = 0.5, 0.5
+    expected = (
+        """The custom property 'pu"ff' of 'mouth' and 1 more has no range and is no input; set Soft Min and Soft Max """
+        "in the settings of the property."
+    )
+    controls = listed_controls(face, RecordingSettings(controls=("bone:mouth",)))
+    sentence = describe_control_bones(armature_object, ["mouth"], controls)
+    assert sentence == f"1 control bone with 2 inputs. {expected}"
+
+    for bone in armature_object.pose.bones:
+        owner = bone if hasattr(bone, "select") else bone.bone
+        owner.select = bone == mouth
+    assert bpy.ops.fdda.add_control_bones(object="elbow") == {"FINISHED"}
+    assert f"Info: Added {sentence}" in capfd.readouterr().out
+    mouth.id_properties_ui("strap").update(soft_min=0.0, soft_max=1.0)
+    listed = ("bone:mouth", """armature_object/pose.bones["mouth"]["pu\\"ff"]=0:1""")
+    controls = listed_controls(face, RecordingSettings(controls=listed))
+    assert describe_control_bones(armature_object, ["mouth"], controls) == "1 control bone with 4 inputs."
+
+
 def test_control_bones_with_brackets_in_their_names_are_counted_one_by_one(face):
     bones = face.armature_object.pose.bones
     bones["eye"].name, bones["lid"].name = "upper]eye", "upper]lid"

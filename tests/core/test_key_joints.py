@@ -12,7 +12,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.rig import Fingerprint, Joint, Rig, rig_differences
 from fdda_addon.core.skin_fit import FitReport, SkinFit, weights_match
 
-REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=12)
+REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
 ERRORS = FitReport({"rig": 2.0, "fitted": 1.0}, {"rig": 20.0, "fitted": 10.0})
 
 
@@ -89,21 +89,30 @@ def test_the_report_is_read_back_and_says_what_is_lost():
     assert KeyJointReport.from_json(REPORT.to_json()) == REPORT
     assert REPORT.sentence() == (
         "Key joints: the model reads 60 of 500 joints; in random poses the others follow from these within 0.40 mm "
-        "(rms). No random pose moves 12 of the others relative to their parents, so the model does not show their own "
-        "motion."
+        "(rms). No random pose moves 5 of the others ('a', 'b', 'c' and 2 more) relative to their parents, so the "
+        "model does not show their own motion."
     )
     assert replace(REPORT, requested="600", joints=500).sentence() == (
         "Key joints: all 500 joints are read, because 600 were asked for."
     )
-    assert replace(REPORT, independent=7, still=0).sentence() == (
-        "Key joints: the model reads 60 of 500 joints, but 7 of the others move independently of these, by up to 0.40 "
-        "mm (rms), and the model cannot learn that; read more joints, add their controls as inputs, or leave the "
-        "choice to auto."
+    assert replace(REPORT, independent=("x", "y"), still=()).sentence() == (
+        "Key joints: the model reads 60 of 500 joints, but 2 of the others ('x', 'y') move independently of these, by "
+        "up to 0.40 mm (rms), and the model cannot learn that; read more joints, add their controls as inputs, or "
+        "leave the choice to auto."
     )
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("joints", "60"), ("still", -1), ("unexplained_mm", float("nan")), ("requested", "none")]
+    ("key", "value"),
+    [
+        ("joints", "60"),
+        ("still", -1),
+        ("still", "ab"),
+        ("independent", [1]),
+        ("rig_joints", -1),
+        ("unexplained_mm", float("nan")),
+        ("requested", "none"),
+    ],
 )
 def test_damaged_reports_are_refused(key, value):
     with pytest.raises((TypeError, ValueError)):

@@ -121,7 +121,7 @@ def test_joints_that_nearly_follow_are_kept_where_the_rest_of_their_motion_shows
 def test_independent_joints_are_all_kept():
     poses = chain_poses(followers=("free",))
     choice = choose(poses)
-    assert len(choice.joints) == len(poses.rig.joints) and choice.report.independent == 0
+    assert len(choice.joints) == len(poses.rig.joints) and choice.report.independent == ()
     assert choice.report.sentence() == (
         f"Key joints: all {2 * BONES} joints are read, because each moves by more than "
         f"{choice.report.tolerance_mm:.2f} mm in ways that the others do not explain."
@@ -137,12 +137,14 @@ def test_joints_that_follow_a_control_need_it_as_an_input():
     assert len(choose(replace(poses, controls=np.zeros((len(poses.controls), 1)))).joints) == BONES + 1
 
 
-def test_still_joints_are_counted():
-    choice = choose(chain_poses(followers=("still",)))
-    assert choice.joints.tolist() == list(range(BONES)) and choice.report.still == BONES
+def test_still_joints_are_named():
+    poses = chain_poses(followers=("still",))
+    choice = choose(poses)
+    names = tuple(joint.name for joint in poses.rig.joints[BONES:])
+    assert choice.joints.tolist() == list(range(BONES)) and choice.report.still == names
     assert choice.report.sentence().endswith(
-        f"No random pose moves {BONES} of the others relative to their parents, so the model does not show their own "
-        "motion."
+        f"No random pose moves {BONES} of the others ('{names[0]}', '{names[1]}', '{names[2]}' and {BONES - 3} more) "
+        "relative to their parents, so the model does not show their own motion."
     )
 
 
@@ -236,9 +238,10 @@ def test_a_number_of_joints_is_met_and_what_is_lost_is_told(count):
     choice = choose(poses, str(count))
     assert len(choice.joints) == min(count, 2 * BONES)
     removed = 2 * BONES - len(choice.joints)
-    assert choice.report.independent == removed
+    others = {joint.name for index, joint in enumerate(poses.rig.joints) if index not in choice.joints}
+    assert set(choice.report.independent) == others and len(others) == removed
     if removed:
-        assert f"but {removed} of the others move independently of these, by up to " in choice.report.sentence()
+        assert f"but {removed} of the others ('" in choice.report.sentence()
         assert choice.report.unexplained_mm > 10
 
 

@@ -93,6 +93,7 @@ def choose_key_joints(
     )
     columns = np.concatenate([result.joints, np.arange(joint_count, blocks.count)])
     needed_inputs = (acts.astype(np.float32) @ result.inputs[:, columns].astype(np.float32)) > 0
+    names = rig.joint_names
     is_removed = ~np.isin(np.arange(joint_count), result.joints)
     report = KeyJointReport(
         requested,
@@ -100,8 +101,8 @@ def choose_key_joints(
         joint_count,
         1000 * metres_per_unit * float(result.unexplained.max()),
         1000 * metres_per_unit * tolerance,
-        int(result.is_independent.sum()),
-        int((is_removed & is_still).sum()),
+        tuple(names[joint] for joint in np.argsort(-result.unexplained) if result.is_independent[joint]),
+        tuple(names[joint] for joint in np.flatnonzero(is_removed & is_still)),
     )
     return Choice(result.joints, result.weighted_joints, needed_inputs, report)
 
