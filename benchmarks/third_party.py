@@ -37,7 +37,7 @@ MERGE_DISTANCE_RATIO = 1e-5
 MIN_LINEAR_MM = 0.01
 """With a smaller mean error of linear skinning, errors have no meaningful ratio."""
 PAGE = ROOT / "docs" / "characters.md"
-START, END = "<!-- make third-party writes this table -->", "<!-- end of the table of make third-party -->"
+START, END = "<!-- third_party.py --write writes this table -->", "<!-- end of the table of third_party.py -->"
 AUTHORS = {
     "Knight": "KayKit (Kay Lousberg), CC0",
     "Fox": "PixelMannen, rigged by tomkranis, CC0 and CC-BY 4.0",

@@ -37,7 +37,7 @@ class KeyJointReport:
 
     def to_json(self) -> dict:
         """Return the JSON for `recording.json` and messages."""
-        return asdict(self)
+        return asdict(self) | {"independent": list(self.independent), "still": list(self.still)}
 
     @staticmethod
     def from_json(value: dict) -> "KeyJointReport":

@@ -213,14 +213,22 @@ def _run_fit(folder: Path, rig: Rig, request: FitRequest) -> Generator[Progress,
                 if message.values.get("stage") == KEY_JOINTS_STAGE:
                     progress = Progress(KEY_JOINTS_STAGE, done, int(message.values["total"]))
             elif message.type is MessageType.FINISHED:
-                values = message.values
-                return SkinFit.from_json(values["fit"]) if values["fit"] else _read_report(values)
+                return _read_result(message.values, rig)
             yield progress
     raise TrainingError("The fit of the skin weights was ended from outside; record again.")
 
 
-def _read_report(values: dict) -> KeyJointReport:
-    return KeyJointReport.from_json(values["key_joints"])
+def _read_result(values: dict, rig: Rig) -> SkinFit | KeyJointReport:
+    """Read the result of the process, which names joints by their indices."""
+    fit = SkinFit.from_json(values["fit"]) if values["fit"] else None
+    report = fit.key_joints if fit else KeyJointReport.from_json(values["key_joints"])
+    if report is not None:
+        lost = {
+            key: tuple(rig.joint_names[int(index)] for index in getattr(report, key))
+            for key in ("independent", "still")
+        }
+        report = replace(report, **lost)
+    return replace(fit, key_joints=report) if fit else report
 
 
 def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:

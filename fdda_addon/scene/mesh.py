@@ -6,6 +6,7 @@ import numpy as np
 
 from ..core.errors import RigError
 from .arrays import COORDINATE_ELEMENT, LOOP_START_ELEMENT, VECTOR_ELEMENT, VERTEX_INDEX_ELEMENT, read, write
+from .temporary_state import animated_paths
 
 
 def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -39,10 +40,13 @@ def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Deps
     """
     mesh, vertex_count = mesh_object.evaluated_get(depsgraph).data, len(mesh_object.data.vertices)
     if len(mesh.vertices) != vertex_count:
+        paths = animated_paths(mesh_object)
+        names = [m.name for m in mesh_object.modifiers if any(path.startswith(m.path_from_id()) for path in paths)]
+        animated = " (animated: {})".format(", ".join(f"'{name}'" for name in names)) if names else ""
         raise RigError(
             f"In some pose the modifiers of '{mesh_object.name}' turn {vertex_count} vertices into "
-            f"{len(mesh.vertices)}; look for Geometry Nodes that make or remove vertices depending on the pose, and "
-            "switch them off."
+            f"{len(mesh.vertices)}; look for a modifier that makes or removes vertices depending on the pose{animated};"
+            " switch it off, or remove its animation."
         )
     return mesh_positions(mesh)
 

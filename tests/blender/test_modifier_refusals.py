@@ -117,10 +117,27 @@ def test_nodes_that_remove_vertices_in_some_poses_are_refused(tmp_path):
     group.links.new(above.outputs[0], group.nodes["Delete Geometry"].inputs["Selection"])
     before = scene_state(rig)
     with pytest.raises(
-        RigError, match=r"In some pose the modifiers of 'elbow' turn 300 vertices into \d+; look for Geo"
+        RigError,
+        match=r"In some pose the modifiers of 'elbow' turn 300 vertices into \d+; look for a modifier that makes or "
+        r"removes vertices depending on the pose; switch it off",
     ):
         drain(record(rig, tmp_path / "recording", RecordingSettings(poses=20)))
     assert_same_state(before, scene_state(rig))
+
+
+def test_an_animated_modifier_that_removes_vertices_is_named(tmp_path):
+    rig = build_rig()
+    modifiers = rig.mesh_object.modifiers
+    modifiers.new("Hide", "MASK").vertex_group = "lower"
+    modifiers["Hide"].show_viewport = False
+    curve = modifiers["Hide"].driver_add("show_viewport")
+    variable = curve.driver.variables.new()
+    variable.name, variable.type, variable.targets[0].id = "turn", "TRANSFORMS", rig.armature_object
+    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
+    variable.targets[0].transform_space = "LOCAL_SPACE"
+    curve.driver.expression = "abs(turn) > 0.1"
+    with pytest.raises(RigError, match=r"depending on the pose \(animated: 'Hide'\); switch it off"):
+        drain(record(rig, tmp_path / "recording", RecordingSettings(poses=20)))
 
 
 PARENTED = {

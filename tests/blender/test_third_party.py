@@ -29,7 +29,9 @@ def test_a_page_without_the_place_of_the_table_is_refused(tmp_path, monkeypatch,
     with pytest.raises(SystemExit) as ended:
         third_party.main()
     # A text as the code is printed, and the status is 1.
-    assert str(ended.value.code).startswith(f"'{page}' lacks the lines '<!-- make third-party writes this table -->'")
+    assert str(ended.value.code).startswith(
+        f"'{page}' lacks the lines '<!-- third_party.py --write writes this table -->'"
+    )
     assert page.read_bytes() == content
 
 
