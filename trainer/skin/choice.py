@@ -50,9 +50,6 @@ def choose_key_joints(
 
     Joints that only frames of actions move are kept, because random poses do not show what they would follow from.
 
-    The weights of a rig may be those of a cage, or none. So the vertices that a joint moves are those where either the
-    rig has a weight, or a fit with all joints has one. The fit takes one vertex of each small patch of the mesh.
-
     Args:
         all_poses: poses with J joints; random ones, and then frames of actions.
         random_count: number of random poses; every other of these measures errors.
@@ -70,30 +67,16 @@ def choose_key_joints(
             "A bone has a scale of zero in some pose, so key joints cannot be chosen; look for the key, constraint or "
             "driver that sets it."
         )
-    rig, joint_count = poses.rig, len(poses.rig.joints)
-    patches = divide_into_patches(rig, make_partitions(rig))
-    representatives = patches.vertices[patches.starts]
-    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives)
-    moments = joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count)
-    fitted_moments = joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count)
-    # The last element is the mean square weight.
-    moments = np.where((moments[:, 3, 3] >= fitted_moments[:, 3, 3])[:, None, None], moments, fitted_moments)
-    without_vertices = poses.is_dependency & (np.trace(moments, axis1=1, axis2=2) == 0)
-    moments[without_vertices] = _moments_at_heads(rig)[without_vertices]
+    joint_count, names = len(poses.rig.joints), poses.rig.joint_names
+    moments, acts = _measure_vertices(poses)
     blocks = InputBlocks(poses)
     is_still = blocks.widths[:joint_count] == 0
     tolerance = TOLERANCE_RATIO * poses.rig.size
     is_unseen = is_still & (_measure_unseen_motions(all_poses, random_count, moments) > tolerance)
     search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
     result = search.search(None if requested == AUTO else int(requested), on_progress)
-    acts = joints_with_weight(rig.skin_joints, rig.skin_weights, joint_count)
-    patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))
-    acts[patches.vertices] |= np.repeat(
-        joints_with_weight(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0
-    )
     columns = np.concatenate([result.joints, np.arange(joint_count, blocks.count)])
     needed_inputs = (acts.astype(np.float32) @ result.inputs[:, columns].astype(np.float32)) > 0
-    names = rig.joint_names
     is_removed = ~np.isin(np.arange(joint_count), result.joints)
     report = KeyJointReport(
         requested,
@@ -105,6 +88,34 @@ def choose_key_joints(
         tuple(names[joint] for joint in np.flatnonzero(is_removed & is_still)),
     )
     return Choice(result.joints, result.weighted_joints, needed_inputs, report)
+
+
+def _measure_vertices(poses: FitPoses) -> tuple[np.ndarray, np.ndarray]:
+    """Find the vertices that each joint moves.
+
+    The weights of a rig may be those of a cage, or none. So these are the vertices where either the rig has a weight,
+    or a fit with all joints has one. The fit takes one vertex of each small patch of the mesh.
+
+    Returns:
+        (J, 4, 4) moments of the vertices of each joint, as of `joint_moments`, and (V, J) bool, whether a joint acts on
+        a vertex.
+    """
+    rig, joint_count = poses.rig, len(poses.rig.joints)
+    patches = divide_into_patches(rig, make_partitions(rig))
+    representatives = patches.vertices[patches.starts]
+    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives)
+    moments = joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count)
+    fitted_moments = joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count)
+    # The last element is the mean square weight.
+    moments = np.where((moments[:, 3, 3] >= fitted_moments[:, 3, 3])[:, None, None], moments, fitted_moments)
+    without_vertices = poses.is_dependency & (np.trace(moments, axis1=1, axis2=2) == 0)
+    moments[without_vertices] = _moments_at_heads(rig)[without_vertices]
+    acts = joints_with_weight(rig.skin_joints, rig.skin_weights, joint_count)
+    patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))
+    acts[patches.vertices] |= np.repeat(
+        joints_with_weight(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0
+    )
+    return moments, acts
 
 
 def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
