@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Applies the effects of transitions to the data of Blender and to the session."""
 
+from contextlib import suppress
+
 import bpy
 
 from ..core.errors import FDDAError, ModelError
@@ -66,7 +68,9 @@ def _check_rig(character: Character, mesh_object: bpy.types.Object) -> None:
 def _report(mesh_object: bpy.types.Object, error: FDDAError | None) -> None:
     mesh_object.fdda.mode = "RIG"
     mesh_object.fdda.status = str(error)
-    print(f"FDDA is switched off for '{mesh_object.name}': {error}")
+    # The terminal may be closed; the effects that follow show the rig all the same.
+    with suppress(OSError, ValueError):
+        print(f"FDDA is switched off for '{mesh_object.name}': {error}")
 
 
 def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.types.Object:

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Frames stay correct after users, scripts or other add-ons change a character during playback."""
 
+import os
+import sys
+
 import bpy
 import numpy as np
 import pytest
@@ -228,6 +231,15 @@ def test_a_failure_is_reported_even_if_switching_the_modifiers_fails_too(bound_e
     session.dispatch(Event.FAIL, character, ModelError("the reason"))
     assert character.state == State.FAILED and bound_elbow.fdda.mode == "RIG"
     assert bound_elbow.fdda.status == "the reason" and "the reason" in capsys.readouterr().out
+
+
+def test_the_rig_is_shown_even_if_the_terminal_is_closed(bound_elbow, monkeypatch):
+    with open(os.devnull) as unwritable:
+        monkeypatch.setattr(sys, "stdout", unwritable)
+        session.dispatch(Event.FAIL, session.character_of(bound_elbow), ModelError("the reason"))
+        monkeypatch.undo()
+    assert bound_elbow.fdda.status == "the reason" and not session.players
+    assert armature_modifier(bound_elbow).show_viewport
 
 
 def test_a_topology_that_changes_shows_the_rig_in_the_same_frame(bound_elbow):
