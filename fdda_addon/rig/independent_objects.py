@@ -30,8 +30,9 @@ def describe_independent_objects(
         return ""
     return (
         f"The surface of '{scene_rig.mesh_object.name}' depends on the place of {format_with_noun(names, 'object')}, "
-        f"which '{scene_rig.armature_object.name}' does not move: the model keeps it as it is in the recording. Parent "
-        "each to the armature or a bone, or name what moves it as a control (--control)."
+        f"which no parent or constraint attaches to '{scene_rig.armature_object.name}': the model keeps the place in "
+        "the recording. If one has to move with the character, parent it to the armature or a bone; if something else "
+        "moves it, make that an extra input (--control)."
     )
 
 

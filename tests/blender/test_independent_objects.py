@@ -15,8 +15,9 @@ from .modifiers import build_rig
 
 APART = 1e-3
 SENTENCE = (
-    "The surface of 'elbow' depends on the place of {}, which 'elbow_rig' does not move: the model keeps it as it is "
-    "in the recording. Parent each to the armature or a bone, or name what moves it as a control (--control)."
+    "The surface of 'elbow' depends on the place of {}, which no parent or constraint attaches to 'elbow_rig': the "
+    "model keeps the place in the recording. If one has to move with the character, parent it to the armature or a "
+    "bone; if something else moves it, make that an extra input (--control)."
 )
 
 
