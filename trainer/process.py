@@ -48,7 +48,7 @@ class StopRequest:
 
     @contextmanager
     def exit_immediately(self) -> Iterator[None]:
-        """Let a stop request, an earlier one too, end the process at once. The block must not write files."""
+        """Let a stop request, an earlier one too, end the process at once. The block must not write files that stay."""
         is_done = threading.Event()
 
         def watch() -> None:

@@ -15,7 +15,7 @@ LINE_FORMATS = {
     MessageType.WARNING: WARNING_LINE,
     MessageType.MODEL_FINISHED: FINISHED_LINE,
     MessageType.FINISHED: FINISHED_LINE,
-    MessageType.CANCELLED: "Cancelled; nothing was written.",
+    MessageType.CANCELLED: "Cancelled before the model was written.",
 }
 LINE_EPOCH_INTERVAL = 0.1
 """Part of the epochs between two lines of progress, if stdout is not a terminal."""
