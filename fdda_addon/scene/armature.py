@@ -25,9 +25,7 @@ def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.nd
 
 _REST_CHANNEL_VALUES = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
 """The values of `POSE_CHANNELS` in the rest pose."""
-_STORED_CHANNELS = dict(
-    zip((LOCATION, ROTATION, SCALE), (POSE_CHANNELS[0], POSE_CHANNELS[1], POSE_CHANNELS[4]), strict=True)
-)
+_STORED_CHANNELS = {LOCATION: POSE_CHANNELS[0], ROTATION: POSE_CHANNELS[1], SCALE: POSE_CHANNELS[4]}
 """The property in which Blender stores the channels of a kind; rotations of bones whose mode is one of Euler angles."""
 
 
