@@ -29,11 +29,14 @@ def state_diagram() -> str:
     for event in Event:
         common_states = {TABLE[state][event].state if event in TABLE[state] else None for state in SHOWS_MODEL}
         is_common = len(common_states) == 1 and not common_states & {None, *SHOWS_MODEL}
+        keeps_states = all(event in TABLE[state] and TABLE[state][event].state == state for state in SHOWS_MODEL)
         for state, row in TABLE.items():
             if event not in row or (row[event].state == state and not row[event].effects):
                 continue
-            start = GROUP if is_common and state in SHOWS_MODEL else state.name
-            events = arrows.setdefault((start, row[event].state.name), [])
+            is_in_group = state in SHOWS_MODEL and (is_common or keeps_states)
+            start = GROUP if is_in_group else state.name
+            end = GROUP if is_in_group and keeps_states else row[event].state.name
+            events = arrows.setdefault((start, end), [])
             if event.name not in events:
                 events.append(event.name)
     lines = ["```mermaid", "stateDiagram-v2", "    [*] --> UNBOUND", f"    state {GROUP} {{"]

@@ -12,10 +12,10 @@ from ..rig.modifier_stack import check_stack
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import stored_path_for
-from . import model_files, modifier_switch, playback, playback_modifier, position_buffer
+from . import effects, model_files, playback, playback_modifier
 from .opened_model import open_model
 from .session import session
-from .transitions import SHOWS_MODEL, Event
+from .transitions import Event
 
 
 def bind(
@@ -78,13 +78,9 @@ def unbind(mesh_object: bpy.types.Object) -> None:
     binding.mode = "RIG"
     session.dispatch(Event.UNBIND, character)
     modifier = playback_modifier.find_modifier(mesh_object)
-    if modifier is not None:
-        buffer = playback_modifier.buffer_of(modifier)
-        playback_modifier.set_buffer(modifier, None)
-        if not playback_modifier.is_from_library(modifier):
-            mesh_object.modifiers.remove(modifier)
-        if buffer is not None and buffer not in playback_modifier.used_buffers():
-            position_buffer.remove_buffer(buffer)
+    if modifier is not None and not playback_modifier.is_from_library(modifier):
+        mesh_object.modifiers.remove(modifier)
+    effects.remove_unused_objects()
     for property_name in ("is_bound", "model", "packed", "use_in_render", "status"):
         binding.property_unset(property_name)
 
@@ -104,9 +100,6 @@ def on_property_update(mesh_object: bpy.types.Object) -> None:
         return
     character = session.character_of(mesh_object)
     session.dispatch(Event.CHOOSE_MODEL if session.uses_model(mesh_object) else Event.SHOW_RIG, character)
-    with session.isolated_errors(character):
-        # Use in Render may have changed.
-        modifier_switch.switch_modifiers(mesh_object, character.state in SHOWS_MODEL)
     # Scan now: a handler that sets the mode may run after ours, and a render does not evaluate a third time.
     playback.scan()
     mesh_object.update_tag()
@@ -127,10 +120,6 @@ def temporary_mode(mesh_object: bpy.types.Object, mode: str) -> Iterator[None]:
         with session.override_mode(mesh_object, mode):
             if binding.is_bound:
                 binding.mode = mode
-                modifier = playback_modifier.find_modifier(mesh_object)
-                if not binding.is_playing and modifier is not None:
-                    # The user may make the modifier visible meanwhile.
-                    modifier_switch.disconnect(modifier)
             yield
     finally:
         if binding.is_bound:

@@ -34,10 +34,20 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
     elif mesh_object := character.find_object():
         if effect in (Effect.SHOW_MODEL, Effect.SHOW_RIG):
             modifier_switch.switch_modifiers(mesh_object, effect == Effect.SHOW_MODEL)
+        elif effect == Effect.DISCONNECT:
+            playback_modifier.disconnect(mesh_object)
         elif effect == Effect.CREATE_PLAYER:
             _create_player(character, mesh_object)
         elif effect == Effect.CHECK_RIG:
             _check_rig(character, mesh_object)
+        elif effect == Effect.READ_VISIBILITY:
+            modifier_switch.apply_visibility(mesh_object, character.animated)
+        elif effect == Effect.TAG_BUFFER:
+            _tag_buffer(character, mesh_object)
+        elif effect == Effect.SHOW_WARNING:
+            mesh_object.fdda.status = character.player.reported_warning = character.player.warning
+        elif effect == Effect.CLEAR_STATUS:
+            mesh_object.fdda.status = ""
         elif effect == Effect.REPORT:
             _report(mesh_object, error)
 
@@ -54,7 +64,7 @@ def _create_player(character: Character, mesh_object: bpy.types.Object) -> None:
 def _remove_player(character: Character) -> None:
     player_batch.unbatch(character.buffer_uid)
     session.players.pop(character.buffer_uid, None)
-    character.player, character.buffer_uid = None, 0
+    character.player = None
     session.needs_scan = True
 
 
@@ -63,6 +73,12 @@ def _check_rig(character: Character, mesh_object: bpy.types.Object) -> None:
     character.reported.clear()
     if not character.player.check_rig(mesh_object, reported):
         session.dispatch(Event.OUTDATE, character)
+
+
+def _tag_buffer(character: Character, mesh_object: bpy.types.Object) -> None:
+    buffer = playback_modifier.buffer_of_object(mesh_object)
+    if buffer is not None and buffer.session_uid == character.buffer_uid:
+        buffer.data.update_tag()
 
 
 def _report(mesh_object: bpy.types.Object, error: FDDAError | None) -> None:
@@ -78,23 +94,19 @@ def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.t
     modifier = playback_modifier.find_modifier(mesh_object)
     if modifier is None:
         raise ModelError(f"The FDDA modifier of '{mesh_object.name}' was removed; bind the model again.")
-    buffer = playback_modifier.buffer_of(modifier)
-    if (
-        buffer is None
-        or not position_buffer.is_buffer(buffer)
-        or len(buffer.data.vertices) != len(mesh_object.data.vertices)
-        # A duplicate still points to the buffer of its original, and an override to the buffer of the linked object.
-        or any(c.buffer_uid == buffer.session_uid for c in session.characters.values() if c is not character)
-    ):
+    # A duplicate still points to the buffer of its original, and an override to the buffer of the linked object.
+    buffer = next((o for o in bpy.data.objects if o.session_uid == character.buffer_uid), None)
+    if buffer is None or len(buffer.data.vertices) != len(mesh_object.data.vertices):
         buffer = position_buffer.create_buffer(mesh_object)
+    if playback_modifier.buffer_of(modifier) != buffer:
         playback_modifier.set_buffer(modifier, buffer)
     return buffer
 
 
 def remove_unused_objects() -> None:
-    """Remove the position buffers that no modifier reads, and the batch drivers that play no batch."""
-    used_buffers = playback_modifier.used_buffers()
-    for buffer in [o for o in bpy.data.objects if position_buffer.is_buffer(o) and o not in used_buffers]:
+    """Remove the position buffers that no character has, and the batch drivers that play no batch."""
+    used_uids = {character.buffer_uid for character in session.characters.values()}
+    for buffer in [o for o in bpy.data.objects if position_buffer.is_buffer(o) and o.session_uid not in used_uids]:
         session.players.pop(buffer.session_uid, None)
         position_buffer.remove_buffer(buffer)
     player_batch.remove_unused_drivers()
@@ -107,9 +119,9 @@ def remove_buffers() -> None:
     was created outside of an undo step, it points to freed memory after the undo.
     """
     for mesh_object in [o for o in bpy.data.objects if o.type == "MESH"]:
-        modifier = playback_modifier.find_modifier(mesh_object)
-        if modifier is not None:
-            playback_modifier.set_buffer(modifier, None)
+        playback_modifier.disconnect(mesh_object)
+    for character in session.characters.values():
+        character.buffer_uid = 0
     remove_unused_objects()
 
 

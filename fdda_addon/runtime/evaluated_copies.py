@@ -1,26 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Follows the evaluated copies of characters in the dependency graphs of windows and renders."""
+"""Changes the evaluated copies of characters in the dependency graphs of windows."""
 
 import bpy
 import numpy as np
 
 from ..scene.arrays import MUTE_ELEMENT, write
 from .depsgraph_changes import seen_mode
-from .session import session
-
-
-def tag_new_depsgraph(depsgraph: bpy.types.Depsgraph) -> None:
-    """Tag the position buffers of new players, so that a dependency graph evaluates them once more.
-
-    The first evaluation of a graph leaves out the objects that it did not need while the modifier was off.
-    """
-    # A graph has no id, and Blender reuses the address of a graph for another one.
-    depsgraph_key = depsgraph.mode, depsgraph.scene.session_uid, depsgraph.view_layer.name
-    new_uids = {uid for uid, player in session.players.items() if depsgraph_key not in player.depsgraph_keys}
-    if new_uids:
-        for buffer in [o for o in bpy.data.objects if o.session_uid in new_uids]:
-            session.players[buffer.session_uid].depsgraph_keys.add(depsgraph_key)
-            buffer.data.update_tag()
 
 
 def mute_shape_keys(mesh_object: bpy.types.Object) -> None:

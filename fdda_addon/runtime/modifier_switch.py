@@ -65,26 +65,6 @@ def apply_visibility(mesh_object: bpy.types.Object, animated: frozenset[str]) ->
         binding.use_in_render = modifier.show_render
 
 
-def disconnect_visible(mesh_object: bpy.types.Object, animated: frozenset[str]) -> None:
-    """Disconnect an FDDA modifier that is or may become visible while no model plays, so that it changes nothing.
-
-    Args:
-        mesh_object: the bound object.
-        animated: the result of `animated_settings`.
-    """
-    if mesh_object.fdda.is_playing:
-        return
-    modifier = playback_modifier.find_modifier(mesh_object)
-    if modifier is not None and (modifier.show_viewport or modifier.show_render or animated - {"mode"}):
-        disconnect(modifier)
-
-
-def disconnect(modifier: bpy.types.NodesModifier) -> None:
-    """Remove the position buffer from an FDDA modifier; the next scan connects it again if the model plays."""
-    if playback_modifier.buffer_of(modifier) is not None:
-        playback_modifier.set_buffer(modifier, None)
-
-
 def switch_modifiers(mesh_object: bpy.types.Object, show_model: bool) -> None:
     """Switch a bound object between the modifiers of its rig and the FDDA modifier.
 

@@ -10,9 +10,10 @@ from contextlib import contextmanager
 
 import bpy
 
-from . import effects, evaluated_copies, modifier_switch, playback_modifier, player_batch
+from . import effects, playback_modifier, player_batch
 from .depsgraph_changes import DepsgraphChanges, changed_meshes, has_copied_armature
 from .model_files import network_of
+from .modifier_switch import animated_settings, evaluated_uses_model
 from .rig_signature import BONES, MESH, OBJECT, PARENTS, STABLE_MODES
 from .session import Character, session
 from .transitions import SHOWS_MODEL, Event, State
@@ -86,10 +87,9 @@ def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
 def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object, is_edited: bool) -> None:
     """Dispatch the changes of a bound object that an evaluation has reported (`DepsgraphChanges.mesh_objects`)."""
     update_mask(character, mesh_object)
-    character.animated = modifier_switch.animated_settings(mesh_object)
+    character.animated = animated_settings(mesh_object)
     if is_edited:
-        modifier_switch.apply_visibility(mesh_object, character.animated)
-        modifier_switch.disconnect_visible(mesh_object, character.animated)
+        session.dispatch(Event.EDIT_OBJECT, character)
     player = character.player
     if player is None:
         if character.state in SHOWS_MODEL or mesh_object.fdda.is_playing:
@@ -122,20 +122,23 @@ def _reads_buffer(mesh_object: bpy.types.Object, character: Character) -> bool:
 
 
 def _update(depsgraph: bpy.types.Depsgraph) -> None:
-    """Follow added and removed objects, restart outdated players, report warnings, and apply animated modes."""
+    """Follow added and removed objects, dispatch what players have noted, and apply animated modes."""
     for character in list(session.characters.values()):
         if character.player is not None and character.player.needs_recreation:
             session.dispatch(Event.OUTDATE, character)
     scan()
-    evaluated_copies.tag_new_depsgraph(depsgraph)
-    for character in list(session.characters.values()):
+    # A graph has no id, and Blender reuses the address of a graph for another one.
+    depsgraph_key = depsgraph.mode, depsgraph.scene.session_uid, depsgraph.view_layer.name
+    for character in [c for c in session.characters.values() if c.player is not None]:
         player = character.player
-        if player is None or not (player.error or player.warning != player.reported_warning):
-            continue
+        if depsgraph_key not in player.depsgraph_keys:
+            # Its first evaluation leaves out the objects that it did not need while the modifier was off.
+            player.depsgraph_keys.add(depsgraph_key)
+            session.dispatch(Event.REPLAY, character)
         if player.error:
             session.dispatch(Event.FAIL, character, player.error)
-        elif mesh_object := character.find_object():
-            mesh_object.fdda.status = player.reported_warning = player.warning
+        elif player.warning != player.reported_warning:
+            session.dispatch(Event.WARN, character)
     if not session.is_switching:
         for character in [c for c in session.characters.values() if c.animated]:
             if mesh_object := character.find_object():
@@ -162,14 +165,13 @@ def scan() -> None:
 
 def _scan_object(character: Character, mesh_object: bpy.types.Object) -> None:
     """Dispatch whether a bound object shows its model."""
-    character.animated = modifier_switch.animated_settings(mesh_object)
-    modifier_switch.apply_visibility(mesh_object, character.animated)
+    character.animated = animated_settings(mesh_object)
+    session.dispatch(Event.EDIT_OBJECT, character)
     # Saved files show the rig, so linked, appended and reloaded objects do not play yet.
     shows_model = mesh_object.fdda.is_playing if character.animated else session.uses_model(mesh_object)
     if not shows_model:
-        if character.state in SHOWS_MODEL:
+        if character.state in SHOWS_MODEL or playback_modifier.buffer_of_object(mesh_object) is not None:
             session.dispatch(Event.SHOW_RIG, character)
-        modifier_switch.disconnect_visible(mesh_object, character.animated)
     elif character.player is None:
         session.dispatch(Event.CHOOSE_MODEL, character)
     elif not (mesh_object.fdda.is_playing and _reads_buffer(mesh_object, character)):
@@ -181,18 +183,16 @@ def _scan_object(character: Character, mesh_object: bpy.types.Object) -> None:
 
 def _apply_animated_mode(character: Character, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
     """Dispatch the animated or driven mode of an object if it differs from what the object shows."""
-    evaluated, binding = mesh_object.evaluated_get(depsgraph), mesh_object.fdda
-    modifier_switch.disconnect_visible(mesh_object, character.animated)
-    if not evaluated.is_evaluated or (depsgraph.mode == "RENDER" and not binding.use_in_render):
+    evaluated = mesh_object.evaluated_get(depsgraph)
+    if not evaluated.is_evaluated or (depsgraph.mode == "RENDER" and not mesh_object.fdda.use_in_render):
         return
     if session.overriding_mode(mesh_object.session_uid):
         return
-    uses_model = modifier_switch.evaluated_uses_model(evaluated, depsgraph, character.animated)
+    uses_model = evaluated_uses_model(evaluated, depsgraph, character.animated)
     if uses_model == (character.state in SHOWS_MODEL):
         return
     session.dispatch(Event.ANIMATE_MODEL if uses_model else Event.SHOW_RIG, character)
     if uses_model == (character.state in SHOWS_MODEL):
-        binding.status = ""
         # The first evaluation only finds that the position buffer is needed; the next one evaluates it.
         session.is_switching = True
         try:
@@ -204,11 +204,10 @@ def _apply_animated_mode(character: Character, mesh_object: bpy.types.Object, de
 
 
 def update_mask(character: Character, mesh_object: bpy.types.Object, *, weights_changed: bool = False) -> None:
-    """Play the pose of a bound object again if its mask has changed."""
+    """Dispatch whether the mask of a bound object has changed."""
     player = character.player
     if player is not None and player.update_mask(mesh_object, weights_changed):
-        for buffer in [o for o in bpy.data.objects if o.session_uid == character.buffer_uid]:
-            buffer.data.update_tag()
+        session.dispatch(Event.REPLAY, character)
 
 
 def has_outdated_model(mesh_object: bpy.types.Object) -> bool:

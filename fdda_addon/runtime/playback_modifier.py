@@ -67,17 +67,18 @@ def buffer_of_object(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     return modifier and buffer_of(modifier)
 
 
+def disconnect(mesh_object: bpy.types.Object) -> None:
+    """Remove the position buffer from the FDDA modifier of a mesh object, if it has one."""
+    modifier = find_modifier(mesh_object)
+    if modifier is not None and buffer_of(modifier) is not None:
+        set_buffer(modifier, None)
+
+
 def set_buffer(modifier: bpy.types.NodesModifier, buffer: bpy.types.Object | None) -> None:
-    """Set the position buffer of an FDDA modifier; None to disconnect it."""
+    """Set the position buffer of an FDDA modifier; None for none."""
     set_node_input(modifier, _buffer_socket(modifier.node_group), buffer)
     # Setting the input alone does not update the relations of the dependency graph.
     modifier.node_group = modifier.node_group
-
-
-def used_buffers() -> set[bpy.types.Object]:
-    """Return the position buffers that FDDA modifiers read."""
-    modifiers = (m for o in bpy.data.objects if o.type == "MESH" for m in o.modifiers if has_playback_group(m))
-    return {buffer for modifier in modifiers if (buffer := buffer_of(modifier)) is not None}
 
 
 def _buffer_socket(node_group: bpy.types.NodeTree) -> str:

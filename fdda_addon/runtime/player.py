@@ -55,7 +55,7 @@ class Player:
         new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
         has_moved: whether there were new inputs since the last update of the batches, which resets it.
         pose_input_count: number of driver variables whose datablocks `play` reads (`driver_inputs`).
-        depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer (`evaluated_copies`).
+        depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer.
         has_new_copy: whether Blender has copied the object with its shape keys since changes were read.
         lock: the lock that is held from `read_pose` to `write_positions`.
     """

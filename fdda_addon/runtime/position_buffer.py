@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The position buffer of a bound mesh object: an object whose evaluated mesh holds the vertex positions of the model.
 
-Object and mesh are local runtime data and in no scene. Blender never saves them. `playback.scan` creates missing
-buffers.
+Object and mesh are local runtime data and in no scene. Blender never saves them. A character keeps its buffer while its
+rig is shown (`effects`): removing an object in a handler of a render crashes Blender.
 """
 
 import bpy

@@ -31,7 +31,7 @@ class Character:
         object_uid: session id of the object.
         state: its state (`transitions`).
         player: the `player.Player` that runs the model; None unless the model is shown.
-        buffer_uid: session id of the position buffer that the player writes to.
+        buffer_uid: session id of its position buffer, which it keeps while its rig is shown; 0 for none.
         animated: keyed and driven settings (`modifier_switch.animated_settings`).
         reported: parts of the rig that may have changed since the last check (`rig_signature`).
     """

@@ -33,6 +33,9 @@ class Event(Enum):
     RESUME = "the file was written"
     CHANGE = "Blender reported an update that may have changed the rig"
     CHECK = "the updates have paused, or a frame is evaluated"
+    EDIT_OBJECT = "Blender reported an edit of the object, or a scan has found it"
+    REPLAY = "the same pose has to be played again: with another mask, or in another dependency graph"
+    WARN = "the player has another warning"
     EDIT = "the mesh is in a mode that changes it"
     LEAVE_EDIT = "the mesh has left that mode"
     OUTDATE = "the player no longer fits its object, rig or model"
@@ -44,11 +47,16 @@ class Effect(Enum):
 
     SHOW_MODEL = "switch the modifiers of the rig off and the FDDA modifier on"
     SHOW_RIG = "switch the modifiers of the rig on and the FDDA modifier off"
+    DISCONNECT = "disconnect the position buffer, so that the FDDA modifier changes nothing even if it gets visible"
     CREATE_PLAYER = "connect a position buffer and create the player, which checks the rig"
     REMOVE_PLAYER = "remove the player"
     FORGET_CHECK = "read the whole rig in the next check"
     SCHEDULE_CHECK = "check the rig after a pause"
     CHECK_RIG = "compare the signature of the rig; an outdated player is created again"
+    READ_VISIBILITY = "set the mode from the visibility of the FDDA modifier, in case the user has changed it"
+    TAG_BUFFER = "make Blender evaluate the position buffer again"
+    SHOW_WARNING = "set the status to the warning of the player"
+    CLEAR_STATUS = "clear the status"
     REPORT = "set the mode RIG, and report the reason"
 
 
@@ -64,45 +72,62 @@ SHOWS_MODEL = frozenset({State.PLAYING, State.CHANGED, State.EDITED})
 
 _START = Transition(State.PLAYING, (Effect.SHOW_MODEL, Effect.CREATE_PLAYER))
 _RESTART = Transition(State.PLAYING, (Effect.REMOVE_PLAYER, Effect.CREATE_PLAYER))
-_STOP = (Effect.REMOVE_PLAYER, Effect.SHOW_RIG)
+_PAUSE = (Effect.REMOVE_PLAYER, Effect.SHOW_RIG)
+_STOP = (*_PAUSE, Effect.DISCONNECT)
 
-_PLAYING_ROWS: dict[Event, Transition] = {
-    Event.UNBIND: Transition(State.UNBOUND, _STOP),
-    Event.SHOW_RIG: Transition(State.BOUND, _STOP),
-    Event.SUSPEND: Transition(State.SUSPENDED, _STOP),
-    Event.CHANGE: Transition(State.CHANGED, (Effect.SCHEDULE_CHECK,)),
-    Event.EDIT: Transition(State.EDITED),
-    Event.OUTDATE: _RESTART,
-    # The reason is reported first: another effect may fail, too.
-    Event.FAIL: Transition(State.FAILED, (Effect.REPORT, *_STOP)),
-}
-"""Transitions of a character whose model is shown; the states CHANGED and EDITED replace some of them."""
+
+def _bound_row(state: State) -> dict[Event, Transition]:
+    """Return what all states of a bound character have in common."""
+    return {
+        Event.UNBIND: Transition(State.UNBOUND),
+        Event.EDIT_OBJECT: Transition(state, (Effect.READ_VISIBILITY,)),
+    }
+
+
+def _playing_row(state: State) -> dict[Event, Transition]:
+    """Return what the states have in common in which the model is shown."""
+    return _bound_row(state) | {
+        Event.UNBIND: Transition(State.UNBOUND, _STOP),
+        # Whether renders show the model may have changed.
+        Event.CHOOSE_MODEL: Transition(state, (Effect.SHOW_MODEL,)),
+        Event.SHOW_RIG: Transition(State.BOUND, (*_STOP, Effect.CLEAR_STATUS)),
+        # Connected: else Blender may drop an override that has no other change when it opens the written file.
+        Event.SUSPEND: Transition(State.SUSPENDED, _PAUSE),
+        Event.CHANGE: Transition(State.CHANGED, (Effect.SCHEDULE_CHECK,)),
+        Event.REPLAY: Transition(state, (Effect.TAG_BUFFER,)),
+        Event.WARN: Transition(state, (Effect.SHOW_WARNING,)),
+        Event.EDIT: Transition(State.EDITED),
+        Event.OUTDATE: _RESTART,
+        # The reason is reported first: another effect may fail, too.
+        Event.FAIL: Transition(State.FAILED, (Effect.REPORT, *_STOP)),
+    }
+
 
 TABLE: dict[State, dict[Event, Transition]] = {
     State.UNBOUND: {Event.BIND: Transition(State.BOUND)},
-    State.BOUND: {
-        Event.UNBIND: Transition(State.UNBOUND),
+    State.BOUND: _bound_row(State.BOUND)
+    | {
         Event.CHOOSE_MODEL: _START,
         Event.ANIMATE_MODEL: _START,
-        Event.FAIL: Transition(State.FAILED, (Effect.REPORT, Effect.SHOW_RIG)),
+        # A duplicate of a playing object has its modifiers and its position buffer.
+        Event.SHOW_RIG: Transition(State.BOUND, (Effect.SHOW_RIG, Effect.DISCONNECT)),
+        Event.FAIL: Transition(State.FAILED, (Effect.REPORT, Effect.SHOW_RIG, Effect.DISCONNECT)),
     },
-    State.PLAYING: _PLAYING_ROWS,
-    State.CHANGED: _PLAYING_ROWS | {Event.CHECK: Transition(State.PLAYING, (Effect.CHECK_RIG,))},
-    State.EDITED: _PLAYING_ROWS
+    State.PLAYING: _playing_row(State.PLAYING),
+    State.CHANGED: _playing_row(State.CHANGED) | {Event.CHECK: Transition(State.PLAYING, (Effect.CHECK_RIG,))},
+    State.EDITED: _playing_row(State.EDITED)
     | {
         Event.CHANGE: Transition(State.EDITED),
         Event.LEAVE_EDIT: Transition(State.PLAYING, (Effect.FORGET_CHECK, *_RESTART.effects)),
     },
-    State.SUSPENDED: {
-        Event.UNBIND: Transition(State.UNBOUND),
-        Event.SHOW_RIG: Transition(State.BOUND),
+    State.SUSPENDED: _bound_row(State.SUSPENDED)
+    | {
+        Event.UNBIND: Transition(State.UNBOUND, (Effect.DISCONNECT,)),
+        Event.SHOW_RIG: Transition(State.BOUND, (Effect.DISCONNECT,)),
         Event.RESUME: _START,
-        Event.FAIL: Transition(State.FAILED, (Effect.REPORT,)),
+        Event.FAIL: Transition(State.FAILED, (Effect.REPORT, Effect.DISCONNECT)),
     },
-    State.FAILED: {
-        Event.UNBIND: Transition(State.UNBOUND),
-        Event.CHOOSE_MODEL: _START,
-    },
+    State.FAILED: _bound_row(State.FAILED) | {Event.CHOOSE_MODEL: _START},
 }
 
 

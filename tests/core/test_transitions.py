@@ -21,6 +21,7 @@ class Scene:
     Attributes:
         shows_model: whether the modifiers of the rig are off.
         has_player: whether a player exists.
+        is_connected: whether the FDDA modifier reads a position buffer.
         is_unchecked: whether the rig may have changed since the check.
         check_is_scheduled: whether a check will come.
         reports: number of reports to the user.
@@ -28,6 +29,7 @@ class Scene:
 
     shows_model: bool = False
     has_player: bool = False
+    is_connected: bool = False
     is_unchecked: bool = False
     check_is_scheduled: bool = False
     reports: int = 0
@@ -42,9 +44,14 @@ class Scene:
             assert self.shows_model, "a player reads modifiers that show the model"
             assert not self.has_player, "the former player is still there"
             # A new player checks its rig.
-            self.has_player, self.is_unchecked = True, False
+            self.has_player, self.is_unchecked, self.is_connected = True, False, True
+        elif effect == Effect.DISCONNECT:
+            assert not self.has_player, "a player writes to a buffer that the modifier reads"
+            self.is_connected = False
         elif effect == Effect.REMOVE_PLAYER:
             self.has_player = self.is_unchecked = self.check_is_scheduled = False
+        elif effect in (Effect.TAG_BUFFER, Effect.SHOW_WARNING):
+            assert self.has_player
         elif effect == Effect.SCHEDULE_CHECK:
             self.check_is_scheduled = True
         elif effect == Effect.CHECK_RIG:
@@ -77,6 +84,7 @@ class Walk:
         scene, state = self.scene, self.state
         assert scene.shows_model == (state in SHOWS_MODEL), step
         assert scene.has_player == (state in SHOWS_MODEL), step
+        assert scene.is_connected == (state in SHOWS_MODEL | {State.SUSPENDED}), step
         if scene.is_unchecked:
             assert state == State.EDITED or (state == State.CHANGED and scene.check_is_scheduled), step
 
@@ -161,20 +169,28 @@ By event: the next states, each with the former states that the event changes to
 @pytest.mark.parametrize("event", Event, ids=lambda event: event.name.lower())
 def test_what_users_expect(event: Event):
     expected = {state: state for state in State}
-    for following, former_states in NEXT_STATES[event].items():
+    for following, former_states in NEXT_STATES.get(event, {}).items():
         expected |= dict.fromkeys(former_states, following)
     assert {state: transition(state, event).state for state in State} == expected
 
 
-STOP = (Effect.REMOVE_PLAYER, Effect.SHOW_RIG)
+PAUSE = (Effect.REMOVE_PLAYER, Effect.SHOW_RIG)
+STOP = (*PAUSE, Effect.DISCONNECT)
 START = (Effect.SHOW_MODEL, Effect.CREATE_PLAYER)
 RESTART = (Effect.REMOVE_PLAYER, Effect.CREATE_PLAYER)
 EFFECTS = {
-    Event.UNBIND: {STOP: SHOWS_MODEL},
-    Event.CHOOSE_MODEL: {START: {State.BOUND, State.FAILED}},
+    Event.UNBIND: {STOP: SHOWS_MODEL, (Effect.DISCONNECT,): {State.SUSPENDED}},
+    Event.CHOOSE_MODEL: {START: {State.BOUND, State.FAILED}, (Effect.SHOW_MODEL,): SHOWS_MODEL},
     Event.ANIMATE_MODEL: {START: {State.BOUND}},
-    Event.SHOW_RIG: {STOP: SHOWS_MODEL},
-    Event.SUSPEND: {STOP: SHOWS_MODEL},
+    Event.SHOW_RIG: {
+        (*STOP, Effect.CLEAR_STATUS): SHOWS_MODEL,
+        (Effect.SHOW_RIG, Effect.DISCONNECT): {State.BOUND},
+        (Effect.DISCONNECT,): {State.SUSPENDED},
+    },
+    Event.EDIT_OBJECT: {(Effect.READ_VISIBILITY,): BOUND_STATES},
+    Event.REPLAY: {(Effect.TAG_BUFFER,): SHOWS_MODEL},
+    Event.WARN: {(Effect.SHOW_WARNING,): SHOWS_MODEL},
+    Event.SUSPEND: {PAUSE: SHOWS_MODEL},
     Event.RESUME: {START: {State.SUSPENDED}},
     Event.CHANGE: {(Effect.SCHEDULE_CHECK,): {State.PLAYING, State.CHANGED}},
     Event.CHECK: {(Effect.CHECK_RIG,): {State.CHANGED}},
@@ -183,9 +199,9 @@ EFFECTS = {
     Event.FAIL: {
         (Effect.REPORT, *STOP): SHOWS_MODEL,
         # The modifiers of a bound character may be half switched.
-        (Effect.REPORT, Effect.SHOW_RIG): {State.BOUND},
+        (Effect.REPORT, Effect.SHOW_RIG, Effect.DISCONNECT): {State.BOUND},
         # A suspended character shows its rig already.
-        (Effect.REPORT,): {State.SUSPENDED},
+        (Effect.REPORT, Effect.DISCONNECT): {State.SUSPENDED},
     },
 }
 """By event: the effects, each with the states in which the event has them. In all other states it has none.
