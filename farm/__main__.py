@@ -18,6 +18,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from fdda_addon.core.counts import format_count
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_fault_sentence
 from fdda_addon.core.stop_signals import INTERRUPTED
 
@@ -204,7 +205,7 @@ def _run_all_tasks(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "
                     _print_outcome(outcome, len(outcomes), len(names) + len(unreadable))
     finally:
         write_report(plan, tasks, outcomes, page)
-    print(f"{page}: {len(plan.characters)} characters")
+    print(f"{page}: {format_count(len(plan.characters), 'character')}")
     states = {outcome.state for outcome in outcomes.values()}
     if states <= set(SUCCESS_STATES):
         return 0

@@ -5,6 +5,7 @@ import argparse
 from pathlib import Path
 
 from ..core.assessment import farther_than_skinning_sentence
+from ..core.counts import format_count
 from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED, FILM_TIMED_FRAMES
 from ..core.errors import WrongUsageError
 from ..core.file_kind import EVALUATION, PICTURE, VIDEO
@@ -166,7 +167,7 @@ def table(evaluation: Evaluation) -> str:
     random_errors = [] if any(errors is evaluation.held_out for errors in evaluation.actions) else [evaluation.held_out]
     for errors in (*random_errors, *evaluation.scaled_ranges, *evaluation.named, *evaluation.actions):
         values = errors.to_json()
-        lines.append(f"{errors.name}, {values['poses']} poses")
+        lines.append(f"{errors.name}, {format_count(values['poses'], 'pose')}")
         for key, label in (("linear", "  linear skinning"), ("fdda", "  FDDA")):
             row = values[key]
             cells = "".join(f"{row[name]:>10.4f}" for name in ("mean", "rms", "p99", "p999", "max"))

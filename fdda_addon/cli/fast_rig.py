@@ -5,6 +5,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.counts import format_count
+
 if TYPE_CHECKING:
     from ..fast_rig.run import FastRig
 
@@ -89,13 +91,13 @@ def _summary(fast_rig: "FastRig") -> str:
     ]
     if fast_rig.moving_joints:
         lines.append(
-            f"  the joints move as in the full rig in {fast_rig.pose_count} poses (largest difference "
+            f"  the joints move as in the full rig in {format_count(fast_rig.pose_count, 'pose')} (largest difference "
             f"{fast_rig.largest_difference:.1e} of the size)"
         )
     else:
         lines.append(
-            f"  no joint moves in {fast_rig.pose_count} poses of these controls, so nothing shows that the joints move "
-            "as in the full rig; choose the controls that move them with --controls"
+            f"  no joint moves in {format_count(fast_rig.pose_count, 'pose')} of these controls, so nothing shows that "
+            "the joints move as in the full rig; choose the controls that move them with --controls"
         )
     if counts := fast_rig.infinite_joints:
         lines.append(

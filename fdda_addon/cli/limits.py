@@ -5,6 +5,8 @@ import argparse
 import math
 from pathlib import Path
 
+from ..core.counts import format_count
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     from ..poses.measured_limits import DEFAULT_MARGIN
@@ -47,4 +49,4 @@ def run(options: argparse.Namespace) -> None:
     for line in describe_limits(scene_rig.armature_object, limits):
         print(line)
     bone_count = len({limit.bone for limit in limits if not limit.reason_unset})
-    print(f"{options.out}: set the limits of {bone_count} bones of '{scene_rig.armature_object.name}'")
+    print(f"{options.out}: set the limits of {format_count(bone_count, 'bone')} of '{scene_rig.armature_object.name}'")

@@ -5,6 +5,8 @@ import argparse
 import time
 from pathlib import Path
 
+from ..core.counts import format_count
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -22,4 +24,5 @@ def run(options: argparse.Namespace) -> None:
         for step in merge_recordings(options.shards, options.recording):
             progress.show(step.stage, step.done, step.total)
     seconds = time.monotonic() - start
-    print(f"{options.recording}: {step.total} poses of {len(options.shards)} shards in {seconds:.1f} s")
+    counts = f"{format_count(step.total, 'pose')} of {format_count(len(options.shards), 'shard')}"
+    print(f"{options.recording}: {counts} in {seconds:.1f} s")

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.counts import format_count
 from ..core.defaults import MARGIN, MIN_PARTITION_VERTICES, POSES, REFINEMENT_POSES, SPREAD
 from ..core.joint_option import ALL, parse_joints
 
@@ -235,7 +236,7 @@ def run(options: argparse.Namespace) -> None:
                     print(line)
             if repeatability := read_info(index).repeatability:
                 print(repeatability.sentence())
-        poses_text = f"{step.total} poses{' added' if options.refine else ''}"
+        poses_text = f"{format_count(step.total, 'pose')}{' added' if options.refine else ''}"
         print(f"{recording}: {'influences' if options.detect_influences else poses_text} in {seconds:.1f} s")
 
 

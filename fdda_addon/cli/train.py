@@ -10,6 +10,7 @@ import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.counts import format_count
 from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import WrongUsageError
 from ..core.messages import WARNING_LINE, MessageType
@@ -80,7 +81,7 @@ def _train(arguments: list[str]) -> tuple[int, dict]:
             elif message.type is MessageType.CANCELLED:
                 return INTERRUPTED, values
     if models := values.get("models"):
-        print(f"{values['model']}: {models} models in {values['seconds']:.1f} s")
+        print(f"{values['model']}: {format_count(models, 'model')} in {values['seconds']:.1f} s")
     else:
         print(_finished_line(values))
     return 0, values
@@ -137,4 +138,4 @@ def _refine(recording: Path, model: Path, options: argparse.Namespace, round_ind
     with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
         for step in refine(scene_rig, recording, model, RefinementSettings(seed=round_index, **pose_options)):
             progress.show(step.stage, step.done, step.total)
-    print(f"{recording}: added {step.total} poses at the worst errors of the model")
+    print(f"{recording}: added {format_count(step.total, 'pose')} at the worst errors of the model")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
+from ..core.counts import format_count
 from ..core.defaults import MIN_PARTITION_VERTICES
 from ..core.errors import ModelError
 from ..core.metrics import viewport_colors
@@ -207,7 +208,9 @@ _colors = _MeshColors()
 def _describe_errors(evaluation: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:
     if statistic != "pose":
         poses = (
-            f"{evaluation.poses} frames of {evaluation.name}" if evaluation.name else f"{evaluation.poses} random poses"
+            f"{format_count(evaluation.poses, 'frame')} of {evaluation.name}"
+            if evaluation.name
+            else format_count(evaluation.poses, "random pose")
         )
         return f"{'mean' if statistic == 'mean' else 'max'} error over {poses}"
     if not evaluation.name:

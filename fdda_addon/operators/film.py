@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.defaults import FILM_TIMED_FRAMES
 from ..core.errors import RigError
 from ..core.progress import Progress
@@ -90,7 +91,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
 
     def finish(self, _context: bpy.types.Context, result: object) -> str:
         path, film = result
-        return f"Rendered {film.frames} frames to {path.name}."
+        return f"Rendered {format_count(film.frames, 'frame')} to {path.name}."
 
     def _action_name(self, armature_object: bpy.types.Object) -> str:
         animation = armature_object.animation_data

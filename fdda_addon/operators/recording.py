@@ -97,7 +97,7 @@ class FDDA_OT_record(RigOperator, JobOperator, bpy.types.Operator):
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
         names = " and ".join(f"'{path.name}'" for path in self._paths)
-        return f"Recorded {self.state.total:,} poses into {names}."
+        return f"Recorded {format_count(self.state.total, 'pose')} into {names}."
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
         if self.state.stage != "poses" or not self.state.done:
@@ -133,11 +133,11 @@ class FDDA_OT_refine(RigOperator, JobOperator, bpy.types.Operator):
             yield from refine(rig, self._path, model, settings)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
-        return f"Added {self.state.total:,} poses to '{self._path.name}'; press Continue Training."
+        return f"Added {format_count(self.state.total, 'pose')} to '{self._path.name}'; press Continue Training."
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
         added = self.state.done if self.state.stage == "poses" else 0
-        return f"Refinement canceled; {added:,} poses were added."
+        return f"Refinement canceled after {format_count(added, 'added pose')}."
 
 
 class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):

@@ -4,6 +4,7 @@
 import bpy
 
 from ..core.assessment import assess_evaluation
+from ..core.counts import format_count
 from ..evaluation import last_evaluation, markers, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..jobs import job
@@ -116,7 +117,8 @@ def _draw_statistics(
     rig: SceneRig,
 ) -> None:
     bound = bound_model_name(rig.mesh_object)
-    poses_text = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
+    frames_text = f"{format_count(last.poses, 'frame')} of {last.name}"
+    poses_text = frames_text if last.name else format_count(last.poses, "random pose")
     header, body = layout.panel("fdda_figures", default_closed=False)
     header.label(text="Error (mm)")
     if body is None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.errors import FDDAError
 from ..jobs import job
 from ..properties.character import default_recording, recording_folder
@@ -112,7 +113,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         row = layout.row()
         row.scale_y = 1.3
         draw_button(row, context, "fdda.train", "Train", "PLAY")
-        draw_wrapped(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
+        draw_wrapped(layout, context, f"{format_count(content.poses, 'pose')} recorded. Next: Train", "CHECKMARK")
     elif content.state is FolderState.INCOMPLETE:
         _draw_record(layout, context, "Resume", can_record, resume=True)
         text = f"{content.complete:,} of {content.poses:,} poses recorded. Press Resume to continue."
@@ -167,9 +168,9 @@ def _describe_poses(rig: SceneRig) -> str:
 
     settings = rig.mesh_object.fdda.settings
     frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig.armature_object)]
-    parts = [f"{settings.poses:,} random poses"] if settings.poses or not frames else []
+    parts = [format_count(settings.poses, "random pose")] if settings.poses or not frames else []
     if frames:
-        parts.append(f"{sum(frames):,} frames of {len(frames)} {'action' if len(frames) == 1 else 'actions'}")
+        parts.append(f"{format_count(sum(frames), 'frame')} of {format_count(len(frames), 'action')}")
         if settings.mirror:
             parts.append("their mirrored copies")
     return " and ".join(parts)

@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from ..counts import format_count
 from ..defaults import MIN_PARTITION_VERTICES
 from ..features import float32_rounding, joint_features_in_metres
 from ..recording.reader import Recording
@@ -73,10 +74,10 @@ def merges_sentence(index: dict, min_vertices: int) -> str:
     merges = [f"'{names[j]}' into '{names[p['joint']]}'" for p in index["partitions"] for j in p.get("merged", ())]
     if not merges:
         return ""
-    count_text = "1 partition" if len(merges) == 1 else f"{len(merges)} partitions"
     verb = "is" if len(merges) == 1 else "are"
     omitted_text = f" and {len(merges) - MAX_LISTED_MERGES} more" if len(merges) > MAX_LISTED_MERGES else ""
     shown_merges = ", ".join(merges[:MAX_LISTED_MERGES])
+    count_text = format_count(len(merges), "partition")
     return f"{count_text} of fewer than {min_vertices} vertices {verb} merged: {shown_merges}{omitted_text}."
 
 

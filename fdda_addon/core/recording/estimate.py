@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..counts import format_count
 from ..errors import DiskFullError
 from ..output import nearest_existing_folder
 from ..rig import STATIC_JOINT_LABEL, Rig
@@ -38,10 +39,9 @@ class Estimate:
 
     def sentence(self) -> str:
         """Format the estimate: "2,000 poses of 200,612 vertices: about 4.8 GB on the disk, about 12 minutes"."""
-        poses_text = "1 pose" if self.poses == 1 else f"{self.poses:,} poses"
         time_text = "" if self.seconds is None else f", {format_duration(self.seconds)}"
         size_text = f"{'about ' if self.size_bytes >= MIN_SHOWN_BYTES else ''}{format_size(self.size_bytes)}"
-        return f"{poses_text} of {self.vertices:,} vertices: {size_text} on the disk{time_text}"
+        return f"{format_count(self.poses, 'pose')} of {self.vertices:,} vertices: {size_text} on the disk{time_text}"
 
 
 def recording_bytes(rig: Rig, poses: int) -> int:

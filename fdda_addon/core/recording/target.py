@@ -4,6 +4,7 @@
 import math
 from dataclasses import dataclass
 
+from ..counts import format_count
 from ..rig import read_name
 
 STATISTIC_NAMES = ("mean", "rms", "p99", "p999", "max")
@@ -98,7 +99,7 @@ class Repeatability:
 
     def sentence(self) -> str:
         """Return a text about how closely a repeated pose gives the same surface."""
-        count = "1 pose" if len(self.poses) == 1 else f"{len(self.poses)} poses"
+        count = format_count(len(self.poses), "pose")
         return (
             f"The same pose from two directions: {self.distance_mm['mean']:.3g} mm apart on average, "
             f"{self.distance_mm['max']:.3g} mm at most ({count}); linear skinning is {self.linear_mm:.3g} mm off. No "
