@@ -64,8 +64,11 @@ def test_names_in_the_documentation_are_defined_in_their_files(page: Path):
     assert undefined_names == []
 
 
-def test_the_path_of_a_pose_names_functions():
-    assert len(re.findall(rf"`{PATH_PATTERN}\.py`\s+\(`", chapter_text("The path of a pose"))) > 25
+@pytest.mark.parametrize(("chapter", "steps"), [("A frame", 6), ("A recorded pose", 8), ("A training", 6)])
+def test_a_pose_takes_at_most_eight_steps_which_name_functions(chapter: str, steps: int):
+    text = chapter_text(chapter)
+    assert len(re.findall(r"^\d\. ", text, re.MULTILINE)) == steps <= 8
+    assert len(re.findall(rf"`{PATH_PATTERN}\.py`\s+\(`", text)) >= steps
 
 
 def test_every_package_is_in_the_text_and_in_the_map():
