@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from .model import ModelInfo
+from .model_info import ModelInfo
 
 
 def repair_pose(pose_matrices: np.ndarray, info: ModelInfo) -> tuple[np.ndarray, str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import bpy
 
-from ..core.model import ModelInfo
+from ..core.model_info import ModelInfo
 from ..core.poses import ROTATION_VECTOR, Channel, bones_with_changed_range
 from ..core.rig import Rig, rig_differences
 from ..poses.sampling import sampled_channels

@@ -9,7 +9,7 @@ import bpy
 from ..core.counts import format_count
 from ..core.errors import OutputError
 from .confirm import ChooseFileFirst
-from .playback import ModelOperator
+from .model_operator import ModelOperator
 
 
 class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):

@@ -19,8 +19,7 @@ from ..properties.view import show_graph
 from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import check_full_rig
 from .job import JobOperator
-from .playback import ModelOperator
-from .rig_operator import RigOperator
+from .model_operator import ModelOperator
 
 
 class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
@@ -279,43 +278,9 @@ class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
         return f"{names} {results[self.placement]}."
 
 
-class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
-    bl_idname = "fdda.show_bone"
-    bl_label = "Select Bone"
-    bl_description = "Select this bone in Pose Mode"
-    bl_options = {"REGISTER", "UNDO"}
-
-    bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_rig(context)
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.compatibility import select_bone
-
-        armature_object = self.rig(context).armature_object
-        bone = armature_object.pose.bones.get(self.bone)
-        if bone is None:
-            self.report({"ERROR"}, f"'{armature_object.name}' has no bone '{self.bone}'.")
-            return {"CANCELLED"}
-        mesh_object = self.rig(context).mesh_object
-        if context.mode != "POSE":
-            if context.mode != "OBJECT":
-                bpy.ops.object.mode_set(mode="OBJECT")
-            context.view_layer.objects.active = armature_object
-            bpy.ops.object.mode_set(mode="POSE")
-            context.window_manager.fdda.mesh = mesh_object.name
-        for other_bone in armature_object.pose.bones:
-            select_bone(other_bone, other_bone == bone)
-        armature_object.data.bones.active = bone.bone
-        return {"FINISHED"}
-
-
 CLASSES = (
     FDDA_OT_evaluate,
     FDDA_OT_show_rig,
-    FDDA_OT_show_bone,
     FDDA_OT_color_mesh,
     FDDA_OT_fit_color_range,
     FDDA_OT_open_report,

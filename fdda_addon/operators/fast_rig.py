@@ -11,7 +11,7 @@ import bpy
 from ..core.errors import OutputError, RigError, os_error_text
 from ..scene.scene_rig import SceneRig
 from .confirm import ChooseFileFirst
-from .playback import ModelOperator
+from .model_operator import ModelOperator
 
 
 class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):

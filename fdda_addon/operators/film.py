@@ -11,7 +11,7 @@ from ..core.defaults import FILM_TIMED_FRAMES
 from ..core.errors import RigError
 from ..core.progress import Progress
 from .confirm import ChooseFileFirst
-from .playback import ModelOperator
+from .model_operator import ModelOperator
 
 
 class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operator):

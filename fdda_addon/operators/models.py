@@ -7,7 +7,7 @@ from ..core.errors import ModelError
 from ..models.entries import format_file_size
 from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import remaining_rig_note
-from .playback import ModelFileOperator, ModelOperator
+from .model_operator import ModelFileOperator, ModelOperator
 
 
 def _has_models(mesh_object: bpy.types.Object) -> bool:

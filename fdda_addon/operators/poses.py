@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators on poses and limits: preview random poses, reset the pose, set the limits of a bone."""
+"""Operators on poses and limits: preview random poses, reset the pose, set the limits of a bone, select a bone."""
 
 import math
 
@@ -9,6 +9,7 @@ from ..core.counts import format_count
 from ..core.errors import RigError
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
 from .pose_operator import LimitsOperator, PoseOperator
+from .rig_operator import RigOperator
 
 
 class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
@@ -150,10 +151,44 @@ class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
         return f"Set the limits of {format_count(len(limited_bones), 'bone')} from {', '.join(names)}{remarks}."
 
 
+class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
+    bl_idname = "fdda.show_bone"
+    bl_label = "Select Bone"
+    bl_description = "Select this bone in Pose Mode"
+    bl_options = {"REGISTER", "UNDO"}
+
+    bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_rig(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        from ..scene.compatibility import select_bone
+
+        armature_object = self.rig(context).armature_object
+        bone = armature_object.pose.bones.get(self.bone)
+        if bone is None:
+            self.report({"ERROR"}, f"'{armature_object.name}' has no bone '{self.bone}'.")
+            return {"CANCELLED"}
+        mesh_object = self.rig(context).mesh_object
+        if context.mode != "POSE":
+            if context.mode != "OBJECT":
+                bpy.ops.object.mode_set(mode="OBJECT")
+            context.view_layer.objects.active = armature_object
+            bpy.ops.object.mode_set(mode="POSE")
+            context.window_manager.fdda.mesh = mesh_object.name
+        for other_bone in armature_object.pose.bones:
+            select_bone(other_bone, other_bone == bone)
+        armature_object.data.bones.active = bone.bone
+        return {"FINISHED"}
+
+
 CLASSES = (
     FDDA_OT_preview_pose,
     FDDA_OT_rest_pose,
     FDDA_OT_set_limit,
     FDDA_OT_clear_limit,
     FDDA_OT_limits_from_actions,
+    FDDA_OT_show_bone,
 )

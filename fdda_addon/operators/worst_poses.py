@@ -8,7 +8,7 @@ from ..core.defaults import MARKERS
 from ..core.errors import ModelError
 from ..evaluation import markers
 from .evaluation import EvaluationOperator
-from .playback import ModelOperator
+from .model_operator import ModelOperator
 
 
 class WorstPosesOperator(EvaluationOperator):

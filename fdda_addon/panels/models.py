@@ -14,7 +14,7 @@ from .section import Section, draw_wrapped, panel_rig
 from .timed_value import timed_values
 
 if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..core.model import ModelInfo
+    from ..core.model_info import ModelInfo
     from ..core.poses import Channel
 
 

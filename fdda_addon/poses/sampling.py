@@ -8,7 +8,7 @@ import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
-from ..core.model import ModelInfo
+from ..core.model_info import ModelInfo
 from ..core.poses import CHANNEL_KINDS, CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.remix import replace_bone_channels
 from ..core.rig import Rig

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from ..core.errors import RecordingError
 from ..core.partition import Partition, make_merged_partitions
-from ..core.recording.index import RecordingInfo, read_index, read_info
+from ..core.recording.index import RecordingInfo, find_different_keys, read_index, read_info
 from ..core.recording.reader import read_partitions, read_recorded_skin
-from ..core.recording.writer import find_different_keys
 from ..core.rig import Fingerprint, Rig, read_joints, rig_differences
 from ..core.skin_fit import DEFAULT_KIND, SkinFit, weights_match
 from ..rig.reading import read_key_joints_rig

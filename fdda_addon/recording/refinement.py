@@ -12,7 +12,7 @@ from ..core.defaults import REFINEMENT_POSES, SPREAD
 from ..core.errors import RecordingError
 from ..core.features import joint_features
 from ..core.metrics import distances
-from ..core.model import ModelInfo
+from ..core.model_info import ModelInfo
 from ..core.poses import Channel, sample_pose
 from ..core.progress import Progress
 from ..core.recording.extension import RecordingExtension

@@ -11,7 +11,7 @@ from mathutils import Matrix
 from ..core.errors import RigError
 from ..core.features import FLOAT32_ROUNDING_RATIO
 from ..core.key_joints import select_joints
-from ..core.model import ModelInfo
+from ..core.model_info import ModelInfo
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig
 from ..poses.sampling import model_channels, sampled_channels
 from ..scene import armature as armature_io

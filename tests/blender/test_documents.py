@@ -141,7 +141,7 @@ def test_model_chapter_names_every_key(folder):
 
 
 def test_metadata_table_names_every_key_of_a_partition():
-    from fdda_addon.core.model import ModelPartition
+    from fdda_addon.core.model_info import ModelPartition
 
     section = chapter("Model").partition("#### Partitions of a model\n")[2].partition("\n#")[0]
     keys = [field.name for field in fields(ModelPartition)]

@@ -8,7 +8,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.model import CHECKSUM_KEY, ModelPartition, check_model
+from fdda_addon.core.model import CHECKSUM_KEY, check_model
+from fdda_addon.core.model_info import ModelPartition
 from fdda_addon.core.onnx_cost import OPERATORS, compute_graph_cost
 from fdda_addon.core.onnx_file import read_onnx
 

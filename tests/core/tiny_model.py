@@ -8,7 +8,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, ModelInfo, ModelPartition
+from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY
+from fdda_addon.core.model_info import ModelInfo, ModelPartition
 from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.rig import Fingerprint, Joint
 

@@ -14,8 +14,8 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.messages import STOP_FILE_VARIABLE, Message, MessageType
+from fdda_addon.core.recording.arrays import array_header
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted_weights
-from fdda_addon.core.recording.writer import array_header
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skin_fit import SkinFit
 from fdda_addon.core.skinning import LinearSkinning

@@ -14,16 +14,13 @@ from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import (
     CHECKSUM_KEY,
     CONTROLS_INPUT,
-    LIMITS_KEY,
     METADATA_KEY,
-    OBJECT_KEY,
     POSE_INPUT,
     POSITIONS_OUTPUT,
     SKIN_KEY,
-    ModelInfo,
-    ModelPartition,
     read_model_info,
 )
+from fdda_addon.core.model_info import LIMITS_KEY, OBJECT_KEY, ModelInfo, ModelPartition
 from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.skin_fit import skin_to_text

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Arrays of a recording: untrusted `.npy` files, which are checked before they are memory-mapped."""
 
+import io
 import math
 import os
 import tokenize
@@ -139,3 +140,29 @@ def find_invalid_pose(name: str, array: np.ndarray) -> tuple[int, str] | None:
                 if not is_valid.all():
                     return start + int(np.flatnonzero(~is_valid.reshape(len(chunk), -1).all(axis=1))[0]), description
     return None
+
+
+def check_pose_values(arrays: dict[str, np.ndarray], first_pose: int) -> None:
+    """Check arrays of poses with `find_invalid_pose`.
+
+    Args:
+        arrays: the arrays by name.
+        first_pose: index of the first pose of the arrays.
+
+    Raises:
+        RecordingError: a pose has invalid values.
+    """
+    for name, array in arrays.items():
+        if (invalid := find_invalid_pose(name, array)) is not None:
+            pose, description = invalid
+            raise RecordingError(
+                f"Pose {first_pose + pose} of the rig evaluates to {description} ({name}); look for a scale of zero "
+                "or a broken driver."
+            )
+
+
+def array_header(shape: tuple, dtype: type) -> bytes:
+    """Return the header of a `.npy` file of version 1.0; its length is the same for any number of rows."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape})
+    return header.getvalue()

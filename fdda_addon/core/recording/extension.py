@@ -9,11 +9,10 @@ import numpy as np
 
 from ..errors import BusyError, OutputError, RecordingError, os_error_text
 from ..input_file import open_input
-from .arrays import STREAMED_ARRAY_NAMES, array_shapes, streamed_arrays
-from .index import REFINED, Source, read_index
+from .arrays import STREAMED_ARRAY_NAMES, array_header, array_shapes, check_pose_values, streamed_arrays
+from .index import REFINED, Source, read_index, write_index
 from .lock import RecordingLock
 from .reader import Recording
-from .writer import array_header, check_pose_values, write_index
 
 
 class RecordingExtension:

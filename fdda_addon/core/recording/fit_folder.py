@@ -18,8 +18,7 @@ from ..input_file import open_input
 from ..rig import Fingerprint, Joint, Rig
 from ..skin_fit import INFLUENCES, are_skin_weights
 from ..skinning import are_invertible
-from .arrays import NPY_HEADER_ERRORS, read_array_header
-from .writer import array_header, check_pose_values
+from .arrays import NPY_HEADER_ERRORS, array_header, check_pose_values, read_array_header
 
 MIN_POSES = 10
 """Smallest number of poses of a fit, half of which are held out."""

@@ -12,9 +12,8 @@ from ..key_joints import select_joints
 from ..rig import Fingerprint, Rig, read_joints, rig_differences
 from ..skin_fit import weights_match
 from .folder_check import is_available, is_recording, remove_recording_files
-from .index import INDEX_NAME, REFINED, read_index, read_info
+from .index import INDEX_NAME, REFINED, find_different_keys, read_index, read_info
 from .lock import RecordingLock
-from .writer import find_different_keys
 
 SETTING_LABELS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "base skinning"}
 """Labels of sampling keys in messages."""

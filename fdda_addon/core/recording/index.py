@@ -7,8 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..controls import read_controls
-from ..errors import RecordingError, os_error_text
+from ..errors import OutputError, RecordingError, os_error_text
 from ..input_file import read_input
+from ..output import atomic_write, to_json_text
 from ..poses import Channel, Margin
 from ..rig import Fingerprint, read_joints, read_name
 from ..skin_fit import SkinFit
@@ -230,3 +231,28 @@ def read_info(index: dict) -> RecordingInfo:
         tuple(index.get("unsettled", ())),
         Repeatability.from_json(index["repeatability"], index["complete"]) if "repeatability" in index else None,
     )
+
+
+def write_index(path: Path, index: dict) -> None:
+    """Replace the index of a recording.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    try:
+        with atomic_write(path / INDEX_NAME, keep_on_failure=False) as temporary:
+            temporary.write_text(to_json_text(index), encoding="utf-8")
+    except OutputError as error:
+        raise error.__cause__ from None
+
+
+def find_different_keys(first: dict, second: dict, prefix: str = "") -> list[str]:
+    """List the keys whose values differ between two dictionaries; nested keys are joined by dots."""
+    different_keys = []
+    for key in sorted(first.keys() | second.keys()):
+        values = first.get(key), second.get(key)
+        if all(isinstance(value, dict) for value in values):
+            different_keys += find_different_keys(*values, f"{prefix}{key}.")
+        elif key not in first or key not in second or values[0] != values[1]:
+            different_keys.append(f"{prefix}{key}")
+    return different_keys

@@ -15,9 +15,9 @@ from .arrays import STREAMED_ARRAY_NAMES, array_shapes, open_array
 from .estimate import check_disk_space, recording_bytes
 from .folder import recordings_in
 from .folder_check import RECORDING_FILES
-from .index import INDEX_NAME, read_index
+from .index import INDEX_NAME, find_different_keys, read_index
 from .reader import Recording, open_recording
-from .writer import RecordingWriter, find_different_keys
+from .writer import RecordingWriter
 
 COPY_CHUNK_BYTES = 16 << 20
 """Size of the chunks in which poses are copied."""

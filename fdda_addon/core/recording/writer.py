@@ -15,13 +15,20 @@ import numpy as np
 from ..errors import OutputError, RecordingError, os_error_text
 from ..input_file import open_input
 from ..open_files import remove_file
-from ..output import atomic_write, to_json_text
 from ..partition import Partition
 from ..rig import Rig, rest_matrices_match
 from ..unit import read_unit, unit_to_json
-from .arrays import ARRAY_NAMES, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array, streamed_arrays
+from .arrays import (
+    ARRAY_NAMES,
+    STREAMED_ARRAY_NAMES,
+    array_header,
+    array_shapes,
+    check_pose_values,
+    open_array,
+    streamed_arrays,
+)
 from .folder_check import check_folder, remove_recording_files, remove_temporary_files
-from .index import FORMAT, INDEX_NAME, VERSION, RecordingInfo, read_index
+from .index import FORMAT, INDEX_NAME, VERSION, RecordingInfo, find_different_keys, read_index, write_index
 from .lock import RecordingLock
 from .reader import check_poses, partitions_to_json
 from .target import Repeatability
@@ -279,54 +286,3 @@ class RecordingWriter:
         for folder in self._new_folders:
             with contextlib.suppress(OSError):
                 folder.rmdir()
-
-
-def write_index(path: Path, index: dict) -> None:
-    """Replace the index of a recording.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    try:
-        with atomic_write(path / INDEX_NAME, keep_on_failure=False) as temporary:
-            temporary.write_text(to_json_text(index), encoding="utf-8")
-    except OutputError as error:
-        raise error.__cause__ from None
-
-
-def check_pose_values(arrays: dict[str, np.ndarray], first_pose: int) -> None:
-    """Check arrays of poses with `find_invalid_pose`.
-
-    Args:
-        arrays: the arrays by name.
-        first_pose: index of the first pose of the arrays.
-
-    Raises:
-        RecordingError: a pose has invalid values.
-    """
-    for name, array in arrays.items():
-        if (invalid := find_invalid_pose(name, array)) is not None:
-            pose, description = invalid
-            raise RecordingError(
-                f"Pose {first_pose + pose} of the rig evaluates to {description} ({name}); look for a scale of zero "
-                "or a broken driver."
-            )
-
-
-def array_header(shape: tuple, dtype: type) -> bytes:
-    """Return the header of a `.npy` file of version 1.0; its length is the same for any number of rows."""
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape})
-    return header.getvalue()
-
-
-def find_different_keys(first: dict, second: dict, prefix: str = "") -> list[str]:
-    """List the keys whose values differ between two dictionaries; nested keys are joined by dots."""
-    different_keys = []
-    for key in sorted(first.keys() | second.keys()):
-        values = first.get(key), second.get(key)
-        if all(isinstance(value, dict) for value in values):
-            different_keys += find_different_keys(*values, f"{prefix}{key}.")
-        elif key not in first or key not in second or values[0] != values[1]:
-            different_keys.append(f"{prefix}{key}")
-    return different_keys

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The metadata of a model: what it was trained for, on what, and how accurate it is."""
+
+import json
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from .controls import Control, read_controls
+from .model_graph import Budget, compute_budget
+from .partition import Partition, make_partitions
+from .poses import Channel
+from .rig import Fingerprint, Joint, Rig, read_joints
+from .unit import read_unit, unit_to_json
+
+VERSION = 1
+MAX_METADATA_LENGTH = 16 << 20
+"""Largest number of characters of the metadata."""
+LIMITS_KEY = "limits"
+"""Key in `ModelInfo.training` for the range of motion."""
+OBJECT_KEY = "object"
+"""Key in `ModelInfo.training` for the name of the recorded mesh object."""
+
+
+@dataclass(frozen=True)
+class ModelPartition:
+    """One partition in the metadata of a model.
+
+    Attributes:
+        joint, influencing, controls, merged: as in `Partition`.
+        vertices: number of vertices.
+        basis: number of components.
+    """
+
+    joint: int
+    influencing: tuple[int, ...]
+    vertices: int
+    basis: int
+    controls: tuple[int, ...] = ()
+    merged: tuple[int, ...] = ()
+
+    def to_json(self) -> dict:
+        value = asdict(self)
+        return {key: value[key] for key in value if value[key] or key not in ("controls", "merged")}
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """The metadata property `fdda` of a model.
+
+    Attributes:
+        joints: joints of the input `pose_matrices`, every parent before its children.
+        rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
+        vertex_count: number of vertices of the mesh.
+        fingerprint: fingerprint of the recorded rig.
+        partitions: partitions in ascending order of their main joints; the output `confidence` has the same order.
+        feature_low, feature_high: (J, 12) float32, range of the joint features (core.features) in training.
+        controls: controls with their ranges in training.
+        held_out_mm: errors over the held-out poses, mm, by the names of `metrics.ErrorStatistics`.
+        parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
+        constant_bytes: size of the constants of the graph; 0 where unknown.
+        training: settings and seed of the training.
+        metres_per_unit: length of one unit of mesh-object space, as in `Rig`.
+    """
+
+    joints: tuple[Joint, ...]
+    rest_matrices: np.ndarray
+    vertex_count: int
+    fingerprint: Fingerprint
+    partitions: tuple[ModelPartition, ...]
+    feature_low: np.ndarray
+    feature_high: np.ndarray
+    controls: tuple[Control, ...] = ()
+    held_out_mm: dict[str, float] = field(default_factory=dict)
+    parity_mm: float = 0.0
+    training: dict = field(default_factory=dict)
+    metres_per_unit: float = 1.0
+    constant_bytes: int = 0
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.joints)
+
+    def partitions_of(self, rig: Rig) -> tuple[Partition, ...]:
+        """Make the partitions of the model for a rig that has the skin weights of the model."""
+        return make_partitions(
+            rig,
+            {p.joint: p.influencing for p in self.partitions},
+            {p.joint: p.controls for p in self.partitions},
+            {joint: p.joint for p in self.partitions for joint in p.merged},
+        )
+
+    def budget(self) -> Budget:
+        """Compute the budget of the model's graph from the metadata."""
+        partitions = [(p.vertices, p.basis, len(p.influencing) + len(p.controls)) for p in self.partitions]
+        return compute_budget(len(self.joints), len(self.controls), partitions, self.training)
+
+    @property
+    def limits(self) -> tuple[Channel, ...]:
+        """Channels of the random poses with their range of motion; empty where there were none or they are unknown."""
+        return tuple(Channel.from_json(channel) for channel in self.training.get(LIMITS_KEY, ()))
+
+    @property
+    def trained_poses(self) -> int:
+        """Number of poses of the recording, including held-out poses; 0 where unknown."""
+        counts = [self.training.get(f"{subset}_poses") for subset in ("training", "validation", "held_out")]
+        return sum(counts) if all(type(count) is int for count in counts) else 0
+
+    @property
+    def object_name(self) -> str:
+        """Name of the recorded mesh object; empty where unknown."""
+        name = self.training.get(OBJECT_KEY, "")
+        return name if isinstance(name, str) else ""
+
+    def to_json(self) -> str:
+        """Return the text of the metadata property."""
+        value = {
+            "version": VERSION,
+            "joints": [asdict(joint) for joint in self.joints],
+            "rest_matrices": self.rest_matrices.reshape(-1, 16).tolist(),
+            "vertices": self.vertex_count,
+            "fingerprint": asdict(self.fingerprint),
+            "partitions": [partition.to_json() for partition in self.partitions],
+            **({"controls": [control.to_json() for control in self.controls]} if self.controls else {}),
+            "training_ranges": {"low": self.feature_low.tolist(), "high": self.feature_high.tolist()},
+            "held_out_mm": self.held_out_mm,
+            "parity_mm": self.parity_mm,
+            "training": self.training,
+            **unit_to_json(self.metres_per_unit),
+            **({"constant_bytes": self.constant_bytes} if self.constant_bytes else {}),
+        }
+        return json.dumps(value, allow_nan=False)
+
+    @staticmethod
+    def from_json(text: str) -> "ModelInfo":
+        """Read the metadata property.
+
+        Raises:
+            ValueError: the metadata is damaged or of another version; the message is a clause about the model.
+        """
+        try:
+            if len(text) > MAX_METADATA_LENGTH:
+                raise ValueError(f"its metadata has {len(text)} characters")
+            return _read_info(json.loads(text))
+        except json.JSONDecodeError as error:
+            raise ValueError(f"its metadata is not JSON ({error})") from error
+        except KeyError as error:
+            raise ValueError(f"its metadata lacks {error}") from error
+        except (TypeError, AttributeError, OverflowError, RecursionError) as error:
+            raise ValueError(f"its metadata cannot be read ({error})") from error
+
+
+def _read_info(value: dict) -> ModelInfo:
+    if value["version"] != VERSION:
+        raise ValueError(f"it is of version {value['version']!r} and this add-on reads version {VERSION}")
+    joints = read_joints(value["joints"])
+    partitions = tuple(
+        ModelPartition(
+            *(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"])),
+            *(tuple(map(int, p.get(key, ()))) for key in ("controls", "merged")),
+        )
+        for p in value["partitions"]
+    )
+    controls = read_controls(value.get("controls", []))
+    joint_count = len(joints)
+    if not all(0 <= joint < joint_count for p in partitions for joint in (p.joint, *p.influencing, *p.merged)):
+        raise ValueError("a partition names a joint that is none of its joints")
+    if not all(0 <= control < len(controls) for p in partitions for control in p.controls):
+        raise ValueError("a partition names a control that is none of its controls")
+    if not partitions or not all(p.vertices > 0 and p.basis >= 0 for p in partitions):
+        raise ValueError("it has no partitions, or one without vertices")
+    if sum(p.vertices for p in partitions) != int(value["vertices"]):
+        raise ValueError("the partitions do not add up to the vertices")
+    rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(joint_count, 4, 4)
+    if not np.isfinite(rest_matrices).all():
+        raise ValueError("its rest pose holds values that are not numbers")
+    info = ModelInfo(
+        joints,
+        rest_matrices,
+        int(value["vertices"]),
+        Fingerprint.from_json(value["fingerprint"]),
+        partitions,
+        np.array(value["training_ranges"]["low"], np.float32).reshape(joint_count, 12),
+        np.array(value["training_ranges"]["high"], np.float32).reshape(joint_count, 12),
+        controls,
+        {str(name): float(error) for name, error in value["held_out_mm"].items()},
+        float(value["parity_mm"]),
+        dict(value["training"]),
+        read_unit(value),
+        int(value.get("constant_bytes", 0)),
+    )
+    if info.constant_bytes < 0:
+        raise ValueError(f"its constants are said to take {info.constant_bytes} bytes")
+    if not isinstance(info.training.get(LIMITS_KEY, []), list) or not all(info.limits):
+        raise ValueError("its range of motion cannot be read")
+    if not np.isfinite([*info.held_out_mm.values()]).all():
+        raise ValueError("its errors are not numbers")
+    return info
