@@ -95,6 +95,6 @@ def make_trained_model(
         inputs,
         tuple(prepared),
         tuple(networks),
-        measure_training_range(features, recording.rig, recording.partitions),
+        measure_training_range(features, inputs.length_mask(), recording.rig, recording.partitions),
         activation,
     )

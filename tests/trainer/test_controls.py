@@ -161,7 +161,8 @@ def test_a_constant_control_with_a_range_counts_where_it_influences():
     partitions = make_partitions(rig, INFLUENCING, {1: (0,)})
     inputs = make_inputs(rig, partitions)
     poses, constant_values = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
-    training_range = measure_training_range(inputs.compute_features(poses, constant_values), rig, partitions)
+    features = inputs.compute_features(poses, constant_values)
+    training_range = measure_training_range(features, inputs.length_mask(), rig, partitions)
     assert training_range.controls == (replace(BULGE, low=0.25, high=0.25),)
     confidence = training_range.compute_confidence(inputs.compute_features(poses[:3], np.array([[0.25], [1], [16]])))
     assert (

@@ -7,15 +7,16 @@ import numpy as np
 import onnx
 import pytest
 
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from trainer.__main__ import main
 from trainer.inputs import network_inputs
 from trainer.inputs.controls import ControlFeatures
 from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs, make_inputs
+from trainer.networks.confidence import MARGIN_RATIO, MIN_MARGINS, measure_training_range
 
-from .chain import chain_angles, pose_chain
+from .chain import chain_angles, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS, REPOSITORY
 
 PARENTS = np.array([-1, 0, 1, 1, 3])
@@ -58,3 +59,21 @@ def test_a_block_is_added_as_the_documentation_says(recording, tmp_path, monkeyp
     poses = pose_chain(rig, chain_angles(5, 3, 0))
     lengths = make_inputs(rig, partitions).compute_features(poses, np.zeros((5, 0)))[:, -1]
     np.testing.assert_allclose(lengths, np.linalg.norm(poses[:, 2, :3, 3] - poses[:, 0, :3, 3], axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("is_length", [True, False])
+def test_the_margin_of_a_feature_has_its_unit(is_length):
+    """Only a length has a margin that depends on the size of the character."""
+    rig = chain_rig()
+    partitions, poses = make_partitions(rig), pose_chain(rig, chain_angles(20, 3, 0))
+    inputs = make_inputs(rig, partitions)
+    features = np.append(inputs.compute_features(poses, np.zeros((20, 0))), np.full((20, 1), 0.5, np.float32), axis=1)
+    mask = np.append(inputs.length_mask(), is_length)
+    training_range = measure_training_range(features, mask, rig, partitions)
+    margin = MIN_MARGINS[1] * rig.size if is_length else MIN_MARGINS[0]
+    assert training_range.high[-1] - 0.5 == pytest.approx(margin, rel=1e-3)
+    spread = np.ptp(features[:, :-1], axis=0)
+    widest = int(spread.argmax())
+    assert training_range.high[widest] - features[:, widest].max() == pytest.approx(
+        MARGIN_RATIO * spread[widest], rel=1e-3
+    )

@@ -24,8 +24,8 @@ FADE_RATIO = 18.0
 outside the range. The linear fit has no bound without a fade: docs/experiments.md, Fade of the confidence."""
 MIN_MARGINS = (0.01, 0.001)
 MIN_FADE_WIDTHS = (12.0, 0.6)
-"""Minimum margin and minimum fade width. The first value is for rotation elements, without unit, and for controls, as a
-part of their recorded range. The second is for translations, as a part of the character's size. These minimums apply
+"""Minimum margin and minimum fade width. The first value is for features without unit, and for controls, as a
+part of their recorded range. The second is for lengths, as a part of the character's size. These minimums apply
 to a locked axis, which has no range."""
 MIN_LOCKED_SPREAD = 1e-4
 """A joint was locked in the recording if its features spread less than this: rotations no unit, translations meters."""
@@ -59,19 +59,21 @@ class TrainingRange:
         return (np.maximum(0, 1 - excess**2 @ self.counts.T) ** 2).astype(np.float32)
 
 
-def measure_training_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> TrainingRange:
+def measure_training_range(
+    features: np.ndarray, is_length: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]
+) -> TrainingRange:
     """Measure the range of the training poses.
 
     Args:
         features: (n, F) float32, features of the training poses from `NetworkInputs.compute_features`.
+        is_length: (F,) bool, which features are lengths in mesh units.
         rig, partitions: rig and partitions of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)
     spread, joint_columns = high - low, len(rig.joints) * FEATURES_PER_JOINT
     direct_columns = joint_columns + len(rig.controls)
-    is_translation = (np.arange(len(low)) % 4 == 3) | (np.arange(len(low)) >= direct_columns)
     min_margin, min_fade_width = (
-        np.where(is_translation, minimum[1] * rig.size, minimum[0]) for minimum in (MIN_MARGINS, MIN_FADE_WIDTHS)
+        np.where(is_length, minimum[1] * rig.size, minimum[0]) for minimum in (MIN_MARGINS, MIN_FADE_WIDTHS)
     )
     for minimum, ratio in ((min_margin, MIN_MARGINS[0]), (min_fade_width, MIN_FADE_WIDTHS[0])):
         minimum[joint_columns:direct_columns] = [ratio * _control_range(control) for control in rig.controls]
