@@ -5,7 +5,7 @@ The graph computes features of joints as vectors R^-1 (d - t) of three elements,
 translation of a space. A vector is a column of a joint's matrix, in the space of the joint as its parent carries it
 along. All vectors together take one gather of spaces, two gathers of points, and one product.
 
-The features of surface frames come after the vectors. Half-rotation matrices are computed from the same vectors.
+Half-rotation matrices and the features of rotations are computed from the same vectors.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSE_INPUT
 
 from ..fits.half_rotations import add_half_rotations
 from ..graph_builder import GraphBuilder
-from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, LocalVectors
+from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, JointVectors, LocalVectors
 from ..inputs.joints import needed_joints
 from ..model import TrainedModel
 
@@ -34,7 +34,7 @@ class Features:
     """The features in the graph.
 
     Attributes:
-        name: name of the (N, B, 3) vectors, in this order: controls, joints, a zero vector, surface frames.
+        name: name of the (N, B, 3) vectors, in this order: controls, joints, a zero vector, other blocks.
         direct_count: B', the number of vectors of controls and joints, including the zero vector. The other vectors
             are functions of these.
         element_count: 3 B.
@@ -69,24 +69,23 @@ class Features:
 def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
     """Add the nodes that compute the features of the networks and of the confidence."""
     inputs, is_needed = trained_model.inputs, _needed_features(trained_model)
+    joints_block, joints = inputs.blocks[0], needed_joints(is_needed[inputs.block_slices[0]])
+    name, table = _add_local_vectors(graph, trained_model, joints_block.local_vectors(joints))
+    joint_vectors = JointVectors(name, joints)
+    table, pose_rows = _add_half_rotations(graph, trained_model, joint_vectors, table)
     parts = [
-        (columns, block.is_direct, *block.add_nodes(graph, is_needed[columns]))
+        (block, columns, *block.add_nodes(graph, is_needed[columns], joint_vectors))
         for block, columns in zip(inputs.blocks, inputs.block_slices, strict=True)
         if columns.stop > columns.start
     ]
-    parts.sort(key=lambda part: (not part[1], isinstance(part[2], LocalVectors)))
-    (local_vectors,) = (vectors for *_, vectors, _ in parts if isinstance(vectors, LocalVectors))
-    local_name, table = _add_local_vectors(graph, trained_model, local_vectors)
-    added_space_count = len(local_vectors.joints)
-    table, pose_rows = _add_half_rotations(graph, trained_model, added_space_count, is_needed, local_name, table)
-    names, count, direct_count, all_positions = [], 0, 0, np.full(len(is_needed), -1, np.int64)
-    for columns, _, vectors, position in parts:
+    # The zero vector of the joints is the last one of the direct vectors.
+    parts.sort(key=lambda part: (not part[0].is_direct, part[0] is joints_block))
+    count, direct_count, all_positions = 0, 0, np.full(len(is_needed), -1, np.int64)
+    for block, columns, vectors, position in parts:
         all_positions[columns] = np.where(position < 0, -1, position + VECTOR_SIZE * count)
         count += vectors.count
-        names.append(local_name if vectors is local_vectors else vectors.name)
-        if vectors is local_vectors:  # the last one of the direct vectors; its zero vector follows
-            direct_count = count = count + 1
-    name = graph.join(names, "features", axis=1)
+        direct_count += vectors.count * block.is_direct
+    name = graph.join([vectors.name for _, _, vectors, _ in parts], "features", axis=1)
     return Features(name, direct_count, VECTOR_SIZE * count, all_positions, table, pose_rows)
 
 
@@ -143,29 +142,21 @@ def _table_selection() -> np.ndarray:
 
 
 def _add_half_rotations(
-    graph: GraphBuilder,
-    trained_model: TrainedModel,
-    added_space_count: int,
-    is_needed: np.ndarray,
-    vectors: str,
-    table: str,
+    graph: GraphBuilder, trained_model: TrainedModel, joint_vectors: JointVectors, table: str
 ) -> tuple[str, np.ndarray]:
-    """Append the needed half-rotation matrices to the table; returns the name of the table and `Features.pose_rows`.
-
-    The first of the added spaces are those of `JointFeatures`, and so are the first vectors.
-    """
+    """Append the needed half-rotation matrices to the table; returns the name of the table and `Features.pose_rows`."""
     joint_count, half_rotation_joints = len(trained_model.rig.joints), trained_model.half_rotation_joints()
+    added_space_count = len(joint_vectors.joints)
     matrix_rows = ROWS_PER_SPACE * (added_space_count + np.arange(joint_count)) + MATRIX_ROW
     pose_rows = np.append(matrix_rows, np.full(joint_count, -1))
     if len(half_rotation_joints):
         appended_rows = ROWS_PER_SPACE * (added_space_count + joint_count) + np.arange(len(half_rotation_joints))
         pose_rows[joint_count + half_rotation_joints] = appended_rows
-        joints = needed_joints(is_needed[: FEATURES_PER_JOINT * joint_count])
-        carried_spaces = np.searchsorted(joints, half_rotation_joints)[:, None]
-        zero_vector = np.full_like(carried_spaces, MATRIX_COLUMNS * len(joints))
-        rotation_columns = np.append(MATRIX_COLUMNS * carried_spaces + np.arange(3), zero_vector, axis=1)
+        rotation_columns = joint_vectors.columns(half_rotation_joints)
+        carried_spaces = rotation_columns[:, :1] // MATRIX_COLUMNS
         carried_columns = MATRIX_COLUMNS * (ROWS_PER_SPACE * carried_spaces + MATRIX_ROW) + np.arange(3)
-        table = add_half_rotations(graph, vectors, rotation_columns, table, carried_columns)
+        rotation_columns[:, -1] = MATRIX_COLUMNS * added_space_count  # the zero vector
+        table = add_half_rotations(graph, joint_vectors.name, rotation_columns, table, carried_columns)
     return table, pose_rows
 
 

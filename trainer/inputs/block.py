@@ -32,6 +32,23 @@ class Vectors:
 
 
 @dataclass(frozen=True)
+class JointVectors:
+    """The features of joints in the graph: the four columns of the matrix F_j of each joint (`core.features`).
+
+    Attributes:
+        name: name of the (N, 4 B + 1, 3) vectors: the columns of B joints, and a zero vector.
+        joints: (B,) int64, ascending.
+    """
+
+    name: str
+    joints: np.ndarray
+
+    def columns(self, joints: np.ndarray) -> np.ndarray:
+        """Return the (n, 4) indices of the columns of n of the B joints."""
+        return MATRIX_COLUMNS * np.searchsorted(self.joints, joints)[:, None] + np.arange(MATRIX_COLUMNS)
+
+
+@dataclass(frozen=True)
 class LocalVectors:
     """B vectors R^-1 (d - t), where R is the 3 x 3 part of the matrix of a space, d and t columns of such matrices.
 
@@ -98,6 +115,11 @@ class FeatureBlock(ABC):
     def offered(self, partition: Partition) -> np.ndarray:
         """Return indices of the features that are offered to the network of a partition."""
 
+    @property
+    def replaced(self) -> np.ndarray:
+        """Indices of the features of joints that this block replaces: no network takes them."""
+        return np.zeros(0, np.int64)
+
     @abstractmethod
     def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray) -> np.ndarray:
         """Compute the features: the reference, with which the nodes of the graph are compared.
@@ -111,17 +133,20 @@ class FeatureBlock(ABC):
         """
 
     @abstractmethod
-    def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[Vectors | LocalVectors, np.ndarray]:
+    def add_nodes(
+        self, graph: GraphBuilder, is_needed: np.ndarray, joint_vectors: JointVectors
+    ) -> tuple[Vectors, np.ndarray]:
         """Add the nodes that compute the features; not called for a block without features.
 
         Args:
             graph: graph with the inputs `POSE_INPUT`, (N, J, 4, 4), and `CONTROLS_INPUT`, (N, C).
             is_needed: (F,) bool, the features that a network, or another part of the graph, reads. The nodes may
                 compute more.
+            joint_vectors: the features of all joints that a network, or another part of the graph, depends on.
 
         Returns:
-            Vectors of the added nodes, or, from one block alone, local vectors, whose nodes are added later. Then (F,)
-            int64, the index of each feature among their 3 B elements, -1 for a feature that is not computed.
+            The vectors, and (F,) int64, the index of each feature among their 3 B elements, -1 for a feature that is
+            not computed.
         """
 
     @property

@@ -12,7 +12,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
 from ..graph_builder import GraphBuilder
-from .block import FeatureBlock, State, Vectors, add_scalar_vectors
+from .block import FeatureBlock, JointVectors, State, Vectors, add_scalar_vectors
 
 
 @dataclass(frozen=True)
@@ -38,5 +38,7 @@ class ControlFeatures(FeatureBlock):
             raise ValueError(f"values of controls are {controls.shape} and should be {expected_shape}")
         return controls.astype(np.float32)
 
-    def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[Vectors, np.ndarray]:
+    def add_nodes(
+        self, graph: GraphBuilder, is_needed: np.ndarray, joint_vectors: JointVectors
+    ) -> tuple[Vectors, np.ndarray]:
         return add_scalar_vectors(graph, CONTROLS_INPUT, self.count), np.arange(self.count)

@@ -12,7 +12,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
 from ..graph_builder import GraphBuilder
-from .block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, FeatureBlock, LocalVectors, State
+from .block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, FeatureBlock, JointVectors, LocalVectors, State, Vectors
 
 
 @dataclass(frozen=True)
@@ -43,30 +43,34 @@ class JointFeatures(FeatureBlock):
     def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray) -> np.ndarray:
         return joint_features(pose_matrices, self.rest_matrices, self.parents).reshape(len(pose_matrices), -1)
 
-    def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[LocalVectors, np.ndarray]:
-        """Request the columns of each needed joint in the space Q_j of the joint as its parent carries it along.
+    def local_vectors(self, joints: np.ndarray) -> LocalVectors:
+        """Return the columns of (B,) joints in the space Q_j of the joint as its parent carries it along.
 
         Q_j = P_p B_p^-1 B_j with the parent p. The axes of a joint have no origin. Its translation is relative to Q_j.
         """
-        joints = needed_joints(is_needed)
         parents, rest_matrices = self.parents[joints], self.rest_matrices.astype(np.float64)
         to_child = np.linalg.inv(rest_matrices[np.maximum(parents, 0)]) @ rest_matrices[joints]
         offsets = np.where((parents < 0)[:, None, None], rest_matrices[joints], to_child)
         carried, columns = np.indices((len(joints), MATRIX_COLUMNS))
         is_translation = columns == MATRIX_COLUMNS - 1
-        vectors = LocalVectors(
+        return LocalVectors(
             parents.astype(np.int64),
             offsets,
             carried.ravel(),
             np.stack([len(joints) + joints[carried], columns], axis=2).reshape(-1, 2),
             np.stack([carried * is_translation, np.where(is_translation, columns, ZERO_COLUMN)], axis=2).reshape(-1, 2),
         )
-        position = np.full(len(is_needed), -1, np.int64)
+
+    def add_nodes(
+        self, graph: GraphBuilder, is_needed: np.ndarray, joint_vectors: JointVectors
+    ) -> tuple[Vectors, np.ndarray]:
+        joints, position = joint_vectors.joints, np.full(len(is_needed), -1, np.int64)
         by_column = np.arange(FEATURES_PER_JOINT).reshape(VECTOR_SIZE, MATRIX_COLUMNS).T.ravel()
         position[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(
             FEATURES_PER_JOINT * len(joints)
         )
-        return vectors, position
+        # The zero vector belongs to them.
+        return Vectors(joint_vectors.name, MATRIX_COLUMNS * len(joints) + 1), position
 
 
 def needed_joints(is_needed: np.ndarray) -> np.ndarray:

@@ -17,10 +17,11 @@ from ..data.split import Split
 from .block import FeatureBlock, State
 from .controls import ControlFeatures
 from .joints import JointFeatures
+from .rotations import RotationFeatures
 from .surface_frames import SurfaceFrameFeatures
 
-BLOCKS: tuple[type[FeatureBlock], ...] = (JointFeatures, ControlFeatures, SurfaceFrameFeatures)
-"""All blocks, in the order of their features. The direct blocks come first."""
+BLOCKS: tuple[type[FeatureBlock], ...] = (JointFeatures, ControlFeatures, SurfaceFrameFeatures, RotationFeatures)
+"""All blocks, in the order of their features. The features of joints come first, and direct blocks before others."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,12 @@ class NetworkInputs:
         cls, blocks: Sequence[FeatureBlock], partitions: Sequence[Partition], states: dict[str, State] | None = None
     ) -> Self:
         """Offer the features of blocks to the networks of partitions."""
-        starts = _starts(blocks)[:-1]
+        starts, replaced = _starts(blocks)[:-1], np.concatenate([block.replaced for block in blocks])
         columns = (
             np.concatenate([start + block.offered(partition) for start, block in zip(starts, blocks, strict=True)])
             for partition in partitions
         )
-        return cls(tuple(blocks), tuple(columns), states or {})
+        return cls(tuple(blocks), tuple(c[~np.isin(c, replaced)] for c in columns), states or {})
 
     @property
     def block_slices(self) -> list[slice]:

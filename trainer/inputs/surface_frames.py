@@ -24,7 +24,7 @@ from ..blocks import block_slices
 from ..config import TrainingConfig
 from ..data.split import Split
 from ..graph_builder import GraphBuilder
-from .block import VECTOR_SIZE, FeatureBlock, State, Vectors
+from .block import VECTOR_SIZE, FeatureBlock, JointVectors, State, Vectors
 from .surface_frame_fit import select_surface_frames
 from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
@@ -92,7 +92,9 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
             features[block] = np.einsum("ndab,nda->ndb", axes, frame_sums).reshape(len(poses), -1)
         return features
 
-    def add_nodes(self, graph: GraphBuilder, is_needed: np.ndarray) -> tuple[Vectors, np.ndarray]:
+    def add_nodes(
+        self, graph: GraphBuilder, is_needed: np.ndarray, joint_vectors: JointVectors
+    ) -> tuple[Vectors, np.ndarray]:
         (frame_count, corner_count), column_count = self.lengths.shape[1:], self.tangents.shape[3]
         # The corners come before the frames, so that a sum over the corners adds contiguous rows.
         tangent_weights, epsilons, lengths = (
