@@ -77,7 +77,7 @@ def controlled_recording(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def model(controlled_recording) -> Path:
     path = controlled_recording.parent / "model.onnx"
-    assert main([str(controlled_recording), str(path), *QUICK_OPTIONS]) == 0
+    assert main([str(controlled_recording), str(path), *QUICK_OPTIONS, "--epochs", "100"]) == 0
     return path
 
 

@@ -40,8 +40,8 @@ def test_too_few_components_are_the_cause(tmp_path):
 
 
 def test_too_few_poses_are_the_cause(tmp_path):
-    """With thirty poses and many epochs, the training poses are accurate and the other poses are not."""
-    partitions = train_chain(tmp_path, 30, "--epochs", "300", "--tolerance-mm", "0.001", "--held-out-fraction", "0.4")
+    """With forty poses and many epochs, the training poses are accurate and the other poses are not."""
+    partitions = train_chain(tmp_path, 40, "--epochs", "300", "--tolerance-mm", "0.001", "--held-out-fraction", "0.4")
     analysis = max(partitions, key=lambda p: p["held_out"]["max"])["largest_errors"]
     assert analysis["generalization"] > 1.5 and analysis["cause"] in (TOO_FEW_POSES, EXTREME_POSES)
 

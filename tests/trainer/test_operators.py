@@ -30,7 +30,7 @@ def models(recording, tmp_path_factory) -> list[bytes]:
     contents = []
     for index, (path, *options) in enumerate(trainings):
         model = folder / f"{index}.onnx"
-        assert main([str(path), str(model), "--epochs", "2", *options]) == 0
+        assert main([str(path), str(model), "--epochs", "5", *options]) == 0
         contents.append(model.read_bytes())
     return contents
 

@@ -196,7 +196,7 @@ def test_the_model_has_surface_frames(model_path):
     """The training checks that the graph agrees with PyTorch."""
     names = {node.name for node in onnx.load(model_path).graph.node}
     assert "surface_frame_features" in names
-    assert len(names) <= 60 + 23 + JOINTS
+    assert len(names) <= 69 + 23 + JOINTS
 
 
 @pytest.mark.parametrize(
