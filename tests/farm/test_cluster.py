@@ -82,7 +82,7 @@ def test_a_farm_that_is_up_to_date_runs_no_task(write_plan, capsys, monkeypatch)
     monkeypatch.setattr("farm.fingerprints.is_up_to_date", lambda task, key: True)
     assert main([str(plan.path)]) == 0
     out = capsys.readouterr().out
-    assert "to do" not in out and out.endswith("report.html: 1 characters\n")
+    assert "to do" not in out and out.endswith("report.html: 1 character\n")
 
 
 @pytest.mark.parametrize(
