@@ -21,12 +21,14 @@ sys.path.insert(0, str(ROOT))
 import bpy  # noqa: E402
 
 import fdda_addon  # noqa: E402
+from benchmarks.page_table import PageTable  # noqa: E402
 from blend_fixtures.characters.comparison import compare_row, record_row  # noqa: E402
 from blend_fixtures.characters.rows import ROWS, Row  # noqa: E402
 from blend_fixtures.characters.training import SMALL, Trainings  # noqa: E402
 
-PAGE = ROOT / "docs" / "characters.md"
-START_MARKER, END_MARKER = "<!-- make characters writes what follows -->", "<!-- until here -->"
+TABLE = PageTable(
+    ROOT / "docs" / "characters.md", "<!-- make characters writes what follows -->", "<!-- until here -->"
+)
 BLENDER_VERSIONS = ("4.5", "5.2")
 
 
@@ -48,12 +50,14 @@ def compare(rows: tuple[Row, ...], folder: Path) -> list[dict]:
 
 
 def write_tables(folder: Path) -> None:
-    """Write the results of all Blender versions in a folder to the tables of the page."""
+    """Write the results of all Blender versions in a folder to the tables of the page.
+
+    Raises:
+        SystemExit: the page has no place for them.
+    """
     files = [folder / f"{version}.json" for version in BLENDER_VERSIONS]
     runs = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()}
-    text = PAGE.read_text(encoding="utf-8")
-    before, after = text.partition(START_MARKER)[0], text.partition(END_MARKER)[2]
-    PAGE.write_text(f"{before}{START_MARKER}\n\n{format_tables(runs)}\n\n{END_MARKER}{after}", encoding="utf-8")
+    TABLE.write(format_tables(runs))
 
 
 def format_tables(runs: dict[str, dict]) -> str:
@@ -87,18 +91,24 @@ def main() -> None:
     parser.add_argument(
         "names",
         nargs="*",
+        metavar="NAME",
         help="rows to compare and print without writing the table; by default all rows, with the table",
     )
     options = parser.parse_args()
+    if unknown := sorted(set(options.names) - {row.name for row in ROWS}):
+        parser.error(f"there is no row '{unknown[0]}'; the rows are {', '.join(row.name for row in ROWS)}")
+    rows = tuple(row for row in ROWS if row.name in options.names or not options.names)
+    writes_table = not options.names
+    if writes_table:
+        TABLE.check()
     options.out.mkdir(parents=True, exist_ok=True)
-    rows = tuple(row for row in ROWS if row.name in options.names) or ROWS
     fdda_addon.register()
     try:
         with tempfile.TemporaryDirectory() as folder:
             results = compare(rows, Path(folder))
     finally:
         fdda_addon.unregister()
-    if rows is ROWS:
+    if writes_table:
         version = ".".join(map(str, bpy.app.version[:2]))
         content = {"blender": bpy.app.version_string, "date": date.today().isoformat(), "results": results}
         (options.out / f"{version}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")

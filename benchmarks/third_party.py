@@ -11,7 +11,6 @@ trained and bound, and the action left out is compared. Prints the table of docs
 import argparse
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ sys.path.insert(0, str(ROOT))
 import bpy  # noqa: E402
 
 import fdda_addon  # noqa: E402
+from benchmarks.page_table import PageTable  # noqa: E402
 from fdda_addon.core.errors import FDDAError  # noqa: E402
 from fdda_addon.fast_rig.controls import animating_actions  # noqa: E402
 from fdda_addon.scene.blend_file import save_copy, silenced_stdout  # noqa: E402
@@ -36,8 +36,11 @@ MERGE_DISTANCE_RATIO = 1e-5
 """Largest distance of vertices that are merged, as a part of the size of the mesh."""
 MIN_LINEAR_MM = 0.01
 """With a smaller mean error of linear skinning, errors have no meaningful ratio."""
-PAGE = ROOT / "docs" / "characters.md"
-START, END = "<!-- third_party.py --write writes this table -->", "<!-- end of the table of third_party.py -->"
+TABLE = PageTable(
+    ROOT / "docs" / "characters.md",
+    "<!-- third_party.py --write writes this table -->",
+    "<!-- end of the table of third_party.py -->",
+)
 AUTHORS = {
     "Knight": "KayKit (Kay Lousberg), CC0",
     "Fox": "PixelMannen, rigged by tomkranis, CC0 and CC-BY 4.0",
@@ -216,13 +219,13 @@ def main() -> None:
     out, folder = options.out.resolve(), options.folder.resolve()
     sources = sorted(path for path in folder.glob("*") if path.suffix in {".glb", ".gltf", ".blend"})
     if options.only:
+        if unknown := sorted(set(options.only) - {source.stem for source in sources}):
+            sys.exit(f"There is no character '{unknown[0]}' in '{options.folder}'.")
         sources = [path for path in sources if path.stem in options.only]
     if not sources:
         sys.exit(f"There are no characters in '{options.folder}': give a folder with .glb or .blend files.")
-    pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.DOTALL)
-    # Before hours of measurements.
-    if options.write and not pattern.search(PAGE.read_text(encoding="utf-8")):
-        sys.exit(f"'{PAGE}' lacks the lines '{START}' and '{END}', between which the table is written; add them.")
+    if options.write:
+        TABLE.check()
     lines = [
         f"{options.poses:,} random poses, {options.epochs} epochs, one seed, Blender {bpy.app.version_string}.",
         "",
@@ -237,8 +240,7 @@ def main() -> None:
     table = "\n".join(lines)
     print(table)
     if options.write:
-        text = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(pattern.sub(lambda _: f"{START}\n\n{table}\n\n{END}", text), encoding="utf-8")
+        TABLE.write(table)
     sys.stdout.flush()
     # bpy 4.5 may hang at exit after an import.
     os._exit(0)

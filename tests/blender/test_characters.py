@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.characters import END_MARKER, START_MARKER, format_tables
+from benchmarks.characters import TABLE, format_tables
 from blend_fixtures.characters import controls, skinning, stacks, targets, transforms
 from blend_fixtures.characters.comparison import compare_row, record_row
 from blend_fixtures.characters.rows import ROWS, Row
@@ -70,7 +70,7 @@ def test_every_built_character_has_a_row():
 
 def results_by_row(page: str) -> dict[str, list[str]]:
     """Return the other cells of each row of the generated table, by the first cell of the row."""
-    table_text = page.partition(START_MARKER)[2].partition(END_MARKER)[0]
+    table_text = page.partition(TABLE.start)[2].partition(TABLE.end)[0]
     rows = [line.strip("| ").split(" | ") for line in table_text.splitlines() if line.startswith("| ")]
     return {cells[0]: cells[1:] for cells in rows}
 
@@ -92,7 +92,7 @@ def test_the_table_has_cells_for_every_blender_version():
     result = {"linear_mm": 2.0, "fdda_mm": 0.5, "moved_mm": 100.0, "difference": 2e-8}
     results = [{"row": row.name, "mesh": mesh, **result} for row in ROWS for mesh in row.meshes]
     line = {"blender": "5.2.3", "date": "2026-01-01", "results": results}
-    rows = results_by_row(f"{START_MARKER}\n{format_tables({'4.5': line, '5.2': line})}\n{END_MARKER}")
+    rows = results_by_row(f"{TABLE.start}\n{format_tables({'4.5': line, '5.2': line})}\n{TABLE.end}")
     assert rows["Preserve Volume"] == ["2.000 / 0.500", "25.0 %", "2.000 / 0.500", "25.0 %", "2e-08"]
 
 
