@@ -28,6 +28,8 @@ _INVISIBLE_TYPES = {"ARMATURE", "LATTICE", "SPEAKER", "LIGHT_PROBE"}
 _CAGE_DISPLAY_TYPES = {"BOUNDS", "WIRE"}
 _COLLIDING_MODIFIERS = {"CLOTH", "SOFT_BODY", "PARTICLE_SYSTEM"}
 """Modifiers that collide with all Collision objects, and that all force fields move."""
+_SURFACE_MODIFIERS = {"NODES", "SCREW", "MESH_SEQUENCE_CACHE"}
+"""Modifiers that can give a curve a surface."""
 _UNFOLLOWED_TYPES = (bpy.types.Scene, bpy.types.WindowManager, bpy.types.Screen, bpy.types.WorkSpace)
 """Datablocks that use all objects, and need none of them."""
 
@@ -90,7 +92,7 @@ def shown_objects(scene_rigs: list[SceneRig]) -> list[bpy.types.Object]:
         for scene_rig in scene_rigs
         for scene_object in Sources(scene_rig, scene_rig.mesh_object).objects
         if scene_object.type in {"LATTICE", "EMPTY"}
-        or (scene_object.type == "CURVE" and not _has_surface(scene_object.data))
+        or (scene_object.type == "CURVE" and not _has_surface(scene_object))
         or scene_object.display_type in _CAGE_DISPLAY_TYPES
     }
     scene = bpy.context.scene
@@ -100,10 +102,12 @@ def shown_objects(scene_rigs: list[SceneRig]) -> list[bpy.types.Object]:
     return [o for o in shown if not o.hide_render or "hide_render" in animated_paths(o)]
 
 
-def _has_surface(curve: bpy.types.Curve) -> bool:
-    """Return whether renders show a curve: it has a bevel or an extrusion, or it is filled."""
+def _has_surface(curve_object: bpy.types.Object) -> bool:
+    """Return whether renders may show a curve: it is filled, or bevel, extrusion or a modifier gives it a surface."""
+    curve = curve_object.data
     is_filled = curve.dimensions == "2D" and curve.fill_mode != "NONE" and any(s.use_cyclic_u for s in curve.splines)
-    return is_filled or bool(curve.bevel_depth or curve.extrude or curve.bevel_object)
+    is_modified = any(modifier.type in _SURFACE_MODIFIERS for modifier in curve_object.modifiers)
+    return is_filled or is_modified or bool(curve.bevel_depth or curve.extrude or curve.bevel_object)
 
 
 def _used_datablocks() -> dict[bpy.types.ID, set[bpy.types.ID]]:
@@ -129,6 +133,9 @@ def _object_needs(scene_object: bpy.types.Object, modifiers: Iterable[bpy.types.
             yield from deforming_bones(scene_object, parent)
     for constraint in scene_object.constraints:
         yield from constraint_needs(constraint)
+    if scene_object.rigid_body is not None:
+        # All rigid bodies may collide, and constraints connect them.
+        yield from (datablock_node(o) for o in bpy.data.objects if o.rigid_body or o.rigid_body_constraint)
     for modifier in modifiers:
         yield from _modifier_needs(scene_object, modifier)
 

@@ -37,7 +37,7 @@ def test_objects_that_renders_show_in_some_frames_stay(is_driven):
     assert remove(scene_rig) == ("cage", "never shown")
 
 
-@pytest.mark.parametrize("surface", ["none", "bevel", "extrusion", "fill"])
+@pytest.mark.parametrize("surface", ["none", "bevel", "extrusion", "fill", "NODES", "SCREW"])
 def test_a_curve_that_deforms_the_mesh_stays_if_renders_show_it(surface):
     scene_rig = SceneRig(*studio_arm())
     data = bpy.data.curves.new("path", "CURVE")
@@ -47,6 +47,8 @@ def test_a_curve_that_deforms_the_mesh_stays_if_renders_show_it(surface):
     spline.use_cyclic_u = surface == "fill"
     data.bevel_depth, data.extrude = 0.01 * (surface == "bevel"), 0.01 * (surface == "extrusion")
     curve = link(bpy.data.objects.new("path", data))
+    if surface.isupper():
+        curve.modifiers.new("Surface", surface)
     scene_rig.mesh_object.modifiers.new("Curve", "CURVE").object = curve
     assert remove(scene_rig) == (("cage", "path") if surface == "none" else ("cage",))
 
@@ -65,6 +67,24 @@ def test_what_simulations_collide_with_stays(modifier):
     # Without the simulation, nothing needs them.
     simulated.modifiers.clear()
     assert set(remove(scene_rig)) == {"collider", "wind"}
+
+
+def test_rigid_bodies_and_their_constraints_stay_with_a_shown_one():
+    scene_rig = SceneRig(*studio_arm())
+    bpy.ops.rigidbody.world_add()
+    bodies = {name: add_mesh_object(name, is_rendered=name == "falling") for name in ("falling", "floor", "weight")}
+    for body in bodies.values():
+        bpy.context.view_layer.objects.active = body
+        bpy.ops.rigidbody.object_add(type="PASSIVE" if body.name == "floor" else "ACTIVE")
+    rope = link(bpy.data.objects.new("rope", None))
+    rope.hide_render = True
+    bpy.context.view_layer.objects.active = rope
+    bpy.ops.rigidbody.constraint_add()
+    rope.rigid_body_constraint.object1, rope.rigid_body_constraint.object2 = bodies["falling"], bodies["weight"]
+    assert remove(scene_rig) == ("cage",)
+    # Without a shown rigid body, nothing needs them.
+    bodies["falling"].hide_render = True
+    assert set(remove(scene_rig)) == {"falling", "floor", "weight", "rope"}
 
 
 def test_actions_that_only_removed_objects_use_are_saved(tmp_path):
