@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from fdda_addon.core.counts import format_count
 from fdda_addon.core.recording.estimate import format_duration
 
 from .characters import Farm
@@ -132,8 +133,8 @@ def print_estimate(farm: Farm, tasks: dict[str, Task], counts: Sequence[int]) ->
     runs = [simulate(tasks, seconds, count) for count in sorted(set(counts))]
     character_count = len({task.character for task in tasks.values()})
     print(
-        f"{len(tasks)} tasks of {character_count} characters, {measured_count} of them measured: "
-        f"{format_duration(total_seconds)} on one worker."
+        f"{format_count(len(tasks), 'task')} of {format_count(character_count, 'character')}, "
+        f"{measured_count} of them measured: {format_duration(total_seconds)} on one worker."
     )
     print(f"{'workers':>8} {'seconds':>10} {'speed-up':>14} {'utilization':>13}")
     for run in runs:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.errors import ModelError, RigError
 from ..core.model import read_model
 from ..core.progress import Progress
@@ -103,8 +104,8 @@ def make_fast_rig(
     again = yield from _evaluate(replace(poses, actions=(), pose_count=REPEATED_POSES), "repeated poses")
     if differences := differing_joints(poses, before[:REPEATED_POSES], again, TOLERANCE):
         raise RigError(
-            f"{_named_bones(differences)} of '{armature_object.name}' move differently when the same pose is evaluated "
-            "again, so a fast rig cannot be compared; look for dependency cycles among their constraints and drivers."
+            f"Evaluating the same pose again moves {_named_bones(differences)} of '{armature_object.name}' differently, "
+            "so a fast rig cannot be compared; look for dependency cycles among constraints and drivers."
         )
     bones_before = len(armature_object.data.bones)
     for scene_rig in scene_rigs:
@@ -118,8 +119,8 @@ def make_fast_rig(
 
     if differences := differing_joints(poses, before, after, TOLERANCE):
         raise RigError(
-            f"{_named_bones(differences)} of '{armature_object.name}', which the model reads, move differently without "
-            "the removed bones; keep more bones with --controls collection:NAME."
+            f"Without the removed bones, {_named_bones(differences)} of '{armature_object.name}', which the model "
+            "reads, would move differently; keep more bones with --controls collection:NAME."
         )
     save_copy(out)
     yield FastRig(
@@ -200,7 +201,7 @@ def _named_bones(differences: dict[str, float]) -> str:
     names = sorted(differences, key=differences.__getitem__, reverse=True)
     shown = ", ".join(f"'{name}' by {differences[name]:.1e} of the size" for name in names[:MAX_NAMED_BONES])
     more = f" and {len(names) - MAX_NAMED_BONES} more" if len(names) > MAX_NAMED_BONES else ""
-    return f"{len(names)} bones ({shown}{more})"
+    return f"{format_count(len(names), 'bone')} ({shown}{more})"
 
 
 def _lost_channels(poses: JointPoses, removed_bones: set[str]) -> dict[str, dict[str, int]]:

@@ -3,6 +3,7 @@
 
 import bpy
 
+from ..core.counts import format_count
 from ..core.errors import ModelError
 from ..models.entries import format_file_size
 from ..scene.active_rig import any_mesh_object
@@ -48,7 +49,9 @@ class ModelListOperator(ModelOperator):
         model_list.add_bound_model(mesh_object)
         count = len(mesh_object.fdda.models)
         if self.index >= count:
-            raise ModelError(f"'{mesh_object.name}' has {count} models and none with index {self.index}.")
+            raise ModelError(
+                f"'{mesh_object.name}' has {format_count(count, 'model')} and none with index {self.index}."
+            )
         if self.index < 0:
             return scene_rig, model_list.require_active_entry(mesh_object)
         return scene_rig, mesh_object.fdda.models[self.index]

@@ -3,6 +3,7 @@
 
 import bpy
 
+from ..core.counts import format_count
 from ..jobs import job
 from ..operators.rig import measured_cost
 from ..properties.character import file_problem
@@ -83,10 +84,15 @@ def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     check = checks.last_check(rig)
     column = layout.column(align=True)
-    column.label(text=f"{rig.mesh_object.name}: {len(rig.mesh_object.data.vertices):,} vertices", icon="MESH_DATA")
+    column.label(
+        text=f"{rig.mesh_object.name}: {format_count(len(rig.mesh_object.data.vertices), 'vertex', 'vertices')}",
+        icon="MESH_DATA",
+    )
     bone_count = len(rig.armature_object.data.bones)
     deforming_count = len(check.rig.joints) if check and check.rig else bone_count
-    count_text = f"{bone_count} bones" if deforming_count == bone_count else f"{deforming_count} of {bone_count} bones"
+    count_text = format_count(bone_count, "bone")
+    if deforming_count != bone_count:
+        count_text = f"{deforming_count:,} of {count_text}"
     column.label(text=f"{rig.armature_object.name}: {count_text}", icon="ARMATURE_DATA")
 
 

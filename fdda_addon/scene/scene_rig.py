@@ -48,7 +48,7 @@ def find_rig(name: str = "") -> SceneRig:
     if not rigged_objects:
         if messages := [message for o in meshes if (message := parenting_message(o))]:
             raise RigError(messages[0])
-        subject = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
+        subject = f"'{name}' has no" if name else "No mesh of the scene has an"
         raise RigError(f"{subject} Armature modifier with an armature; add one, or choose another object.")
     if len(rigged_objects) > 1:
         names = ", ".join(f"'{o.name}'" for o in rigged_objects)

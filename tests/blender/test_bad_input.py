@@ -72,7 +72,7 @@ def test_a_mesh_without_an_armature_modifier_is_refused(refusal, verb, tmp_path)
         rig.mesh_object.modifiers.remove(rig.mesh_object.modifiers["Armature"])
 
     path = save_elbow(tmp_path / "rig.blend", remove_armature)
-    assert "None of the 1 meshes of the scene has an Armature modifier with an armature" in refusal(*verb(path))
+    assert "No mesh of the scene has an Armature modifier with an armature" in refusal(*verb(path))
     assert "'elbow' has no Armature modifier with an armature" in refusal(*verb(path, "--object", "elbow"))
 
 

@@ -133,9 +133,8 @@ def test_bones_that_differ_are_named_and_nothing_is_written(folder, monkeypatch,
     monkeypatch.setattr(fast_rig_removal, "read_graph", read_incomplete_graph)
     assert run(*fast_rig_arguments(folder)) == 1
     error = capsys.readouterr().err.splitlines()[-1]
-    assert (
-        "bones ('lower' by " in error and "which the model reads, move differently without the removed bones" in error
-    )
+    assert "Without the removed bones, 1 bone ('lower' by " in error
+    assert "which the model reads, would move differently" in error
     assert not (folder / "fast.blend").exists()
 
 
@@ -152,9 +151,7 @@ def test_a_rig_that_does_not_repeat_itself_is_refused(folder, capsys):
         target.id, target.data_path = armature_object, f"{source.path_from_id(name)}[0]"
     bpy.ops.wm.save_mainfile()
     assert run(*fast_rig_arguments(folder)) == 1
-    assert (
-        "of the size) of 'elbow_rig' move differently when the same pose is evaluated again" in capsys.readouterr().err
-    )
+    assert "of the size) of 'elbow_rig' differently, so a fast rig cannot be compared" in capsys.readouterr().err
     assert not (folder / "fast.blend").exists()
 
 

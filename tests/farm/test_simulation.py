@@ -84,7 +84,7 @@ def test_the_printed_estimate_names_its_limit_and_a_remedy(write_plan, capsys):
     tasks = make_tasks(write_plan(ONE_CHARACTER + "poses = 100000\nshards = 1\ntrain = { epochs = 1 }"))
     assert print_estimate(Farm(Path("work")), tasks, [8, 1]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("6 tasks of 1 characters, 0 of them measured: about ")
+    assert lines[0].startswith("6 tasks of 1 character, 0 of them measured: about ")
     assert [line.split()[0] for line in lines[2:4]] == ["1", "8"]
     assert "More than 1 workers are idle for more than half of the time." in lines
     assert lines[-1].startswith("Most of it, ") and "train: a training is one task; a GPU (gpu = true)" in lines[-1]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fdda_addon.core.counts import format_count
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording.index import RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording
@@ -82,7 +83,9 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
             "--include-unsettled."
         )
     if (count := int((~always_trains).sum())) < MIN_POSES:
-        raise TrainingError(f"The recording has {count} poses and training takes at least {MIN_POSES}; record more.")
+        raise TrainingError(
+            f"The recording has {format_count(count, 'pose')} and training takes at least {MIN_POSES}; record more."
+        )
     is_random, margin_poses = is_random & is_usable, margin_poses[is_usable[margin_poses]]
     fractions = config.validation_fraction, config.seed, config.held_out_fraction
     splits = [split_poses(np.flatnonzero(is_random), *fractions)] if is_random.any() else []

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
+from fdda_addon.core.counts import format_count
 from fdda_addon.core.input_file import read_input
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
@@ -18,7 +19,8 @@ MAX_PICTURE_BYTES = 256 << 20
 STATISTIC_LABELS = {"mean": "mean", "rms": "rms", "p99": "99 %", "p999": "99.9 %", "max": "max"}
 """Heading of each error statistic in tables, by the key of the statistic in reports and evaluations."""
 NUMBER_FILTERS = {
-    "count": lambda number: f"{number:,}",
+    "number": "{:,}".format,
+    "count": format_count,
     "fixed": lambda number, digits: f"{number:.{digits}f}",
     "mm": lambda length: f"{length:.3g} mm" if length < 100 else f"{length:.0f} mm",
     "share_of": lambda part, whole: f"{100 * part / whole:.1f} %" if whole > 0 else "-",

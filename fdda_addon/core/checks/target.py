@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ..counts import format_count
 from ..recording.index import ACTION, STRIP, Source
 from ..recording.reader import Recording
 from ..skinning import LinearSkinning
@@ -84,16 +85,16 @@ def _check_frames(recording: Recording, skinning: LinearSkinning) -> list[Record
     warnings = []
     if frozen:
         text = (
-            f"The target stands still in {len(frozen)} frames in which the rig moves: {format_list(frozen)}: its cache "
-            "ends before, or begins after; record frames that it has."
+            f"The target stands still in {format_count(len(frozen), 'frame')} in which the rig moves: "
+            f"{format_list(frozen)}: its cache ends before, or begins after; record frames that it has."
         )
         warnings.append(RecordingWarning("frozen-frames", text))
     if jumps:
         jumps.sort(key=lambda jump: -jump[1])
         text = (
-            f"The target jumps in {len(jumps)} frames, by up to {format_length(recording.rig, jumps[0][1])} from one "
-            f"frame to the next: {format_list([label for label, _ in jumps])}: look at the simulation there, or leave "
-            "these frames out."
+            f"The target jumps in {format_count(len(jumps), 'frame')}, by up to "
+            f"{format_length(recording.rig, jumps[0][1])} from one frame to the next: "
+            f"{format_list([label for label, _ in jumps])}: look at the simulation there, or leave these frames out."
         )
         warnings.append(RecordingWarning("frame-jumps", text))
     return warnings

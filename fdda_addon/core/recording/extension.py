@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from ..counts import format_count
 from ..errors import BusyError, OutputError, RecordingError, os_error_text
 from ..input_file import open_input
 from .arrays import STREAMED_ARRAY_NAMES, array_header, array_shapes, check_pose_values, streamed_arrays
@@ -60,8 +61,8 @@ class RecordingExtension:
         index = read_index(self.path)
         if index["poses"] != self.complete:
             raise BusyError(
-                f"The recording '{self.path}' had {self.complete} poses when it was read and has {index['poses']} now: "
-                "another process added to it; try again."
+                f"The recording '{self.path}' had {format_count(self.complete, 'pose')} when it was read and has "
+                f"{index['poses']} now: another process added to it; try again."
             )
         return index
 
