@@ -104,8 +104,8 @@ def make_fast_rig(
     again = yield from _evaluate(replace(poses, actions=(), pose_count=REPEATED_POSES), "repeated poses")
     if differences := differing_joints(poses, before[:REPEATED_POSES], again, TOLERANCE):
         raise RigError(
-            f"Evaluating the same pose again moves {_named_bones(differences)} of '{armature_object.name}' differently, "
-            "so a fast rig cannot be compared; look for dependency cycles among constraints and drivers."
+            f"Evaluating the same pose again moves {_named_bones(differences)} of '{armature_object.name}' differently"
+            ", so a fast rig cannot be compared; look for dependency cycles among constraints and drivers."
         )
     bones_before = len(armature_object.data.bones)
     for scene_rig in scene_rigs:
