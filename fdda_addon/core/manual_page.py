@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Conversion of the manual to an HTML page, for the subset of Markdown that it uses."""
+"""Conversion of the manual to an HTML page, for the subset of Markdown that it uses.
+
+Blender brings no Markdown library. A wheel for this one page would be larger than this module, and part of each update.
+"""
 
 import html
 import re
