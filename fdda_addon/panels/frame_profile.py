@@ -30,15 +30,15 @@ def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     if state is not None and (state.is_running or state.outcome_level != "INFO"):
         draw_job(body, context, "profile_frame")
     if profile is not None:
-        _draw_parts(body, profile)
-        _draw_groups(body, profile)
+        _draw_parts(body, context, profile)
+        _draw_groups(body, context, profile)
         for sentence in profile.savings_sentences():
             draw_wrapped(body, context, sentence, "INFO")
     if state is None or not state.is_running:
         body.operator("fdda.profile_frame", icon="TIME").object = rig.mesh_object.name
 
 
-def _draw_parts(layout: bpy.types.UILayout, profile: "FrameProfile") -> None:
+def _draw_parts(layout: bpy.types.UILayout, context: bpy.types.Context, profile: "FrameProfile") -> None:
     smallest_ms = MIN_SHOWN_SHARE * profile.frame.median
     shown = [
         (part, part.duration.median / max(profile.total, 1e-9))
@@ -49,9 +49,8 @@ def _draw_parts(layout: bpy.types.UILayout, profile: "FrameProfile") -> None:
     column = layout.column(align=True)
     _draw_bar(column, [(letter, share) for letter, (_, share) in zip(letters, shown, strict=False)])
     for index, (part, share) in enumerate(shown):
-        row = column.split(factor=0.55)
-        row.label(text=f"{letters[index : index + 1]}  {f'{share:.0%}' if share >= 0.01 else '<1%'}  {part.title}")
-        row.label(text=f"{part.duration} ms")
+        letter, percentage = letters[index : index + 1], f"{share:.0%}" if share >= 0.01 else "<1%"
+        draw_wrapped(column, context, f"{letter}  {percentage}  {part.duration} ms  {part.title}")
 
 
 def _draw_bar(layout: bpy.types.UILayout, segments: list[tuple[str, float]]) -> None:
@@ -66,12 +65,10 @@ def _draw_bar(layout: bpy.types.UILayout, segments: list[tuple[str, float]]) -> 
         remaining -= share
 
 
-def _draw_groups(layout: bpy.types.UILayout, profile: "FrameProfile") -> None:
+def _draw_groups(layout: bpy.types.UILayout, context: bpy.types.Context, profile: "FrameProfile") -> None:
     if not profile.groups:
         return
     column = layout.column(align=True)
     column.label(text="Slowest Constraints and Drivers")
     for group in profile.groups:
-        row = column.split(factor=0.7)
-        row.label(text=group.title, icon="BONE_DATA")
-        row.label(text=f"{group.duration.median:.2f} ms")
+        draw_wrapped(column, context, f"{group.duration.median:.2f} ms  {group.title}", "BONE_DATA")
