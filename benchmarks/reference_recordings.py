@@ -30,7 +30,6 @@ from trainer.fits.joint_fit import make_joint_regression
 from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs
 from trainer.networks.loop import train
-from trainer.networks.networks import Network
 from trainer.preparation import PartitionData, PreparedPartition, prepare_partition
 
 DATA_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
@@ -133,11 +132,11 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
 
 
 def measure(
-    partition: ReferencePartition, prepared: PreparedPartition, network: Network, activation: str, measured: np.ndarray
+    partition: ReferencePartition, prepared: PreparedPartition, measured: np.ndarray
 ) -> tuple[float, float, float]:
     """Return the mean and largest error over the measured poses and the mean length of their residuals, cm."""
     true_residuals, poses = partition.data.read_residuals()[measured], partition.poses[measured]
-    coefficients = network.evaluate(prepared.inputs[measured], activation)
+    coefficients = prepared.network.evaluate(prepared.inputs[measured])
     fitted = prepared.fit.compute_offsets(poses) @ np.linalg.inv(poses[:, partition.joint, :3, :3]).transpose(0, 2, 1)
     learned = prepared.basis.reconstruct(coefficients).reshape(true_residuals.shape)
     errors_cm = np.linalg.norm(fitted + learned - true_residuals, axis=2) / METERS_PER_CM
@@ -165,15 +164,14 @@ def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bo
         measured, trained_on = np.arange(TRAINING_POSES, pose_count), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
     prepared = [prepare_partition(partition.data, split, config.tolerance_mm, config.seed) for partition in partitions]
-    result = train(prepared, split, config)
     rows = []
-    for partition, prepared_partition, network in zip(partitions, prepared, result.networks, strict=True):
-        mean, largest, linear = measure(partition, prepared_partition, network, config.activation, measured)
+    for partition, trained in zip(partitions, train(prepared, split, config), strict=True):
+        mean, largest, linear = measure(partition, trained, measured)
         published = PUBLISHED_ERRORS_CM[partition.name]
         rows.append(
             {
                 "partition": partition.name,
-                "components": len(prepared_partition.basis.components),
+                "components": len(trained.basis.components),
                 "linear_mean": linear,
                 "mean": mean,
                 "max": largest,

@@ -25,7 +25,6 @@ from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs, fit_inputs
 from trainer.inputs.surface_frames import SurfaceFrameFeatures
 from trainer.model import TrainedModel, make_trained_model
-from trainer.networks.curves import Curves
 from trainer.networks.loop import train
 from trainer.preparation import partition_data, prepare_partition
 
@@ -121,7 +120,7 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
     prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor_start, "wall": time.perf_counter() - wall_start}
-    trained_model = make_trained_model(recording, inputs, split, prepared, trained.networks, config.activation)
+    trained_model = make_trained_model(recording, inputs, split, trained)
     exported = build_model(recording, trained_model, split.validation, config.to_json())
     held_out = measure(exported.session, study_data.held_out, np.arange(len(study_data.held_out.pose_matrices)))
     with atomic_write(model_path) as temporary:
@@ -129,24 +128,24 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
     return {
         "seconds": {key: round(value, 2) for key, value in seconds.items()},
         "model_bytes": len(exported.content),
-        "parameters": sum(a.size for network in trained.networks for a in (*network.weights, *network.biases)),
+        "parameters": sum(a.size for p in trained for a in (*p.network.weights, *p.network.biases)),
         "partitions": {
             recording.rig.joint_names[trained_model.partitions[index].joint]: {
                 "basis_left": {
-                    "validation": float(prepared[index].validation_truncation.mean()) * 1000,
+                    "validation": float(partition.validation_truncation.mean()) * 1000,
                     "held_out": _truncation_error_mm(trained_model, index, study_data.held_out),
                 },
-                **_partition_entry(trained_model, index, exported.held_out, held_out, curves),
+                **_partition_entry(trained_model, index, exported.held_out, held_out),
             }
-            for index, curves in enumerate(trained.curves)
+            for index, partition in enumerate(trained)
         },
     }
 
 
 def _partition_entry(
-    trained_model: TrainedModel, index: int, validation: PositionErrors, held_out: PositionErrors, curves: Curves
+    trained_model: TrainedModel, index: int, validation: PositionErrors, held_out: PositionErrors
 ) -> dict:
-    vertices = trained_model.partitions[index].vertices
+    vertices, curves = trained_model.partitions[index].vertices, trained_model.prepared[index].curves
 
     def errors(distances: np.ndarray) -> dict:
         return error_statistics(distances[:, vertices]).to_json()

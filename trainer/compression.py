@@ -19,12 +19,7 @@ MIN_DROPPED_PART = 0.1
 """If the dropped components have at least this part of the squared residuals, a remedy is suggested."""
 
 
-def drop_components(
-    prepared: Sequence[PreparedPartition],
-    networks: Sequence[Network],
-    split: Split,
-    activation: str,
-) -> tuple[list[PreparedPartition], list[Network]]:
+def drop_components(prepared: Sequence[PreparedPartition], split: Split) -> list[PreparedPartition]:
     """Drop the components that lower the mean error too little, or raise it.
 
     The error is measured on the validation poses. Margin poses and refined poses also count, with a lower weight,
@@ -34,32 +29,24 @@ def drop_components(
     The components are first replaced by the principal components of the predictions, which are fewer than those of
     the residuals (reduced-rank regression: Izenman, 1975).
 
-    Args:
-        prepared, networks: partitions with their trained networks.
-        split: split of the poses.
-        activation: as in `TrainingConfig`.
-
     Returns:
-        The partitions and networks with the remaining components; a partition may lose all.
+        The partitions with the remaining components; a partition may lose all.
     """
     changes, gains, total_error = [], [], 0.0
-    for partition, network in zip(prepared, networks, strict=True):
-        predicted = network.evaluate(partition.inputs[split.training], activation).astype(np.float64)
+    for partition in prepared:
+        predicted = partition.network.evaluate(partition.inputs[split.training]).astype(np.float64)
         # The columns are the principal directions of the predictions, largest first.
         changes.append(np.linalg.eigh(predicted.T @ predicted)[1][:, ::-1])
-        error, partition_gains = _component_gains(partition, network, changes[-1], split, activation)
+        error, partition_gains = _component_gains(partition, changes[-1], split)
         total_error += error
         gains.append(partition_gains)
-    costs = [3 * p.vertex_count + len(network.weights[-1]) + 1 for p, network in zip(prepared, networks, strict=True)]
+    costs = [3 * p.vertex_count + len(p.network.weights[-1]) + 1 for p in prepared]
     total_cost = sum(cost * len(partition_gains) for cost, partition_gains in zip(costs, gains, strict=True))
     min_gain_per_parameter = MIN_GAIN_RATIO * total_error / max(total_cost, 1)
-    remaining = [
-        _change_basis(partition, network, change[:, partition_gains > min_gain_per_parameter * cost], split)
-        for partition, network, change, partition_gains, cost in zip(
-            prepared, networks, changes, gains, costs, strict=True
-        )
+    return [
+        _change_basis(partition, change[:, partition_gains > min_gain_per_parameter * cost], split)
+        for partition, change, partition_gains, cost in zip(prepared, changes, gains, costs, strict=True)
     ]
-    return [partition for partition, _ in remaining], [network for _, network in remaining]
 
 
 def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining: Sequence[PreparedPartition]) -> str:
@@ -83,9 +70,7 @@ def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining
     )
 
 
-def _component_gains(
-    partition: PreparedPartition, network: Network, change: np.ndarray, split: Split, activation: str
-) -> tuple[float, np.ndarray]:
+def _component_gains(partition: PreparedPartition, change: np.ndarray, split: Split) -> tuple[float, np.ndarray]:
     """Measure what each component of a changed basis gains on the validation poses, and on extreme poses.
 
     Args:
@@ -95,13 +80,13 @@ def _component_gains(
         The mean over the poses of the sum of all vertices' errors, mesh units. Then (K,) by how much it would grow
         without each of the components.
     """
-    coefficients = network.evaluate(partition.inputs[partition.validation], activation)
+    coefficients = partition.network.evaluate(partition.inputs[partition.validation])
     errors = partition.validation_residuals - partition.basis.reconstruct(coefficients)
     error, gains = _gains_in_poses(partition, coefficients, errors, change)
     extremes = np.union1d(split.margin, split.refined)
     if len(extremes):
         poses = extremes[:: -(-len(extremes) // len(partition.validation))]
-        coefficients = network.evaluate(partition.inputs[poses], activation)
+        coefficients = partition.network.evaluate(partition.inputs[poses])
         # What the components do not represent is small in these poses, and left out.
         errors = (partition.coefficients[poses] - coefficients) @ partition.basis.components
         extreme_error, extreme_gains = _gains_in_poses(partition, coefficients, errors, change)
@@ -129,9 +114,7 @@ def _gains_in_poses(
     return error, np.array(without) - error
 
 
-def _change_basis(
-    partition: PreparedPartition, network: Network, change: np.ndarray, split: Split
-) -> tuple[PreparedPartition, Network]:
+def _change_basis(partition: PreparedPartition, change: np.ndarray, split: Split) -> PreparedPartition:
     """Replace the K components of a partition by K' orthonormal combinations of them.
 
     Args:
@@ -147,7 +130,7 @@ def _change_basis(
     dropped_square = max(0.0, float(former_squares.sum() - squares.sum())) / partition.vertex_count
     left_square = basis.truncation_rms**2 + dropped_square
     squares_by_count = np.append(np.cumsum(squares[::-1])[::-1], 0) / partition.vertex_count
-    changed = replace(
+    return replace(
         partition,
         basis=Basis(
             basis.mean, (change.T @ basis.components).astype(np.float32), np.sqrt(squares_by_count + left_square)
@@ -155,59 +138,41 @@ def _change_basis(
         coefficients=coefficients.astype(np.float32),
         dropped_count=len(change) - change.shape[1],
         dropped_rms=float(np.sqrt(dropped_square)),
+        network=_change_outputs(partition.network, change),
     )
-    return changed, _change_outputs(network, change)
 
 
 def _change_outputs(network: Network, change: np.ndarray) -> Network:
     """Return a network with other outputs, (K, K') combinations; without outputs it has one layer."""
     weights, biases = network.weights, network.biases
     if not change.shape[1]:
-        return Network((np.zeros((len(weights[0]), 0), np.float32),), (np.zeros(0, np.float32),))
+        return Network.without_outputs(len(weights[0]), network.activation)
     change = change.astype(np.float32)
-    return Network((*weights[:-1], weights[-1] @ change), (*biases[:-1], biases[-1] @ change))
+    return Network((*weights[:-1], weights[-1] @ change), (*biases[:-1], biases[-1] @ change), network.activation)
 
 
-def factorize_partitions(
-    prepared: Sequence[PreparedPartition],
-    networks: Sequence[Network],
-    partitions: Sequence[PartitionData],
-    split: Split,
-    tolerance: float,
-) -> tuple[list[PreparedPartition], list[Network]]:
-    """Factorize the partitions where that saves parameters (`low_rank`).
+def factorize_partition(
+    prepared: PreparedPartition, partition: PartitionData, split: Split, tolerance: float
+) -> PreparedPartition:
+    """Factorize a trained partition if that saves parameters (`low_rank`).
 
     Args:
-        prepared, networks: partitions with their trained networks.
-        partitions: data of the partitions.
+        prepared, partition: the partition, and its data.
         split: split of the poses.
         tolerance: rms error that the components may leave, mesh units.
-
-    Returns:
-        The partitions, and the networks with outputs for the changed bases.
     """
-    factorized = [
-        _factorize_partition(*arguments, split, tolerance)
-        for arguments in zip(prepared, networks, partitions, strict=True)
-    ]
-    return [partition for partition, _ in factorized], [network for _, network in factorized]
-
-
-def _factorize_partition(
-    prepared: PreparedPartition, network: Network, partition: PartitionData, split: Split, tolerance: float
-) -> tuple[PreparedPartition, Network]:
-    if not may_factorize(prepared.fit, prepared.basis):
-        return prepared, network
     fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
+    if not may_factorize(fit, basis):
+        return prepared
     weights, regression = split.weights(), partition.read_regression()
     factors = factorize(fit, basis, coefficients, regression, split.training, weights, tolerance)
     if factors is None:
-        return prepared, network
-    factorized = replace(
+        return prepared
+    return replace(
         prepared,
         fit=factors.fit,
         basis=factors.basis,
         coefficients=(coefficients @ factors.change_of_basis.T).astype(np.float32),
         vertex_factors=factors.vertex_factors,
+        network=_change_outputs(prepared.network, factors.change_of_basis.T),
     )
-    return factorized, _change_outputs(network, factors.change_of_basis.T)

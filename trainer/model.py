@@ -10,11 +10,11 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 
+from .config import TrainingConfig
 from .data.split import Split
 from .inputs.network_inputs import NetworkInputs
 from .networks.checkpoint import Checkpoint, PartitionCheckpoint
 from .networks.confidence import TrainingRange, measure_training_range
-from .networks.networks import Network
 from .preparation import PreparedPartition
 
 
@@ -26,48 +26,40 @@ class TrainedModel:
         rig: rig with J joints and V vertices.
         partitions: P partitions.
         inputs: input features of the networks.
-        prepared: data of each partition.
-        networks: network of each partition.
+        prepared: fit, components and network of each partition.
         training_range: range of the training poses.
-        activation: activation of the networks.
     """
 
     rig: Rig
     partitions: tuple[Partition, ...]
     inputs: NetworkInputs
     prepared: tuple[PreparedPartition, ...]
-    networks: tuple[Network, ...]
     training_range: TrainingRange
-    activation: str
-
-    def feature_columns(self, partition: int) -> np.ndarray:
-        """Return (F',) indices of the features that a partition's network takes, in its order."""
-        return self.inputs.columns[partition][self.prepared[partition].columns]
 
     def half_rotation_joints(self) -> np.ndarray:
         """Return (H,) int64, ascending, the joints whose half-rotation matrices some partition is fitted to."""
         fitted = np.unique(np.concatenate([prepared.fit.joints for prepared in self.prepared]))
         return fitted[fitted >= len(self.rig.parents)] - len(self.rig.parents)
 
-    def checkpoint(self, holdout: str, hidden: tuple[int, ...], history: list[dict]) -> Checkpoint:
-        """Return the state from which the training can be continued; arguments as in `Checkpoint`."""
+    def checkpoint(self, holdout: str, config: TrainingConfig, history: list[dict]) -> Checkpoint:
+        """Return the state from which the training can be continued; other arguments as in `Checkpoint`."""
         partitions = [
             PartitionCheckpoint(
-                self.feature_columns(index),
+                prepared.columns,
                 prepared.feature_mean,
                 prepared.feature_scale,
                 prepared.basis.mean,
                 prepared.basis.components,
-                network,
+                prepared.network,
             )
-            for index, (prepared, network) in enumerate(zip(self.prepared, self.networks, strict=True))
+            for prepared in self.prepared
         ]
         return Checkpoint(
             self.rig.fingerprint,
             tuple(control.name for control in self.rig.controls),
             holdout,
-            hidden,
-            self.activation,
+            config.hidden,
+            config.activation,
             tuple(history),
             tuple(partitions),
             self.inputs.states,
@@ -79,12 +71,7 @@ class TrainedModel:
 
 
 def make_trained_model(
-    recording: Recording,
-    inputs: NetworkInputs,
-    split: Split,
-    prepared: Sequence[PreparedPartition],
-    networks: Sequence[Network],
-    activation: str,
+    recording: Recording, inputs: NetworkInputs, split: Split, prepared: Sequence[PreparedPartition]
 ) -> TrainedModel:
     """Put together the result of a training, and measure the range of its training poses."""
     matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
@@ -94,7 +81,5 @@ def make_trained_model(
         recording.partitions,
         inputs,
         tuple(prepared),
-        tuple(networks),
         measure_training_range(features, inputs.length_mask(), recording.rig, recording.partitions),
-        activation,
     )

@@ -2,8 +2,9 @@
 """Training data of the networks: features and coefficients of each partition."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,10 @@ from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_
 from .fits.half_rotations import regression_matrices
 from .fits.joint_fit import JointFit, JointRegression, joint_regression
 from .inputs.network_inputs import NetworkInputs
+from .networks.curves import Curves
+
+if TYPE_CHECKING:  # The page of a report needs no torch.
+    from .networks.networks import Network
 
 
 @dataclass(frozen=True)
@@ -29,21 +34,24 @@ class PartitionData:
             partition's residuals are in memory at a time.
         read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
         min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
+        columns: (F,) int64, indices of the features among all features of `NetworkInputs`; None for 0 to F - 1.
     """
 
     features: np.ndarray
     read_residuals: Callable[[], np.ndarray]
     read_regression: Callable[[], JointRegression] | None = None
     min_spread: np.ndarray | float = MIN_FEATURE_SPREAD
+    columns: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class PreparedPartition:
-    """A partition that is ready to train.
+    """A partition that is ready to train, or trained.
 
     Attributes:
         vertex_count: Vp.
-        columns: (F',) int32, the offered features that vary over the training poses: the inputs of the network.
+        columns: (F',) int64, the offered features that vary over the training poses, the inputs of the network: indices
+            among all features of `NetworkInputs`.
         feature_mean, feature_scale: (F',) float32, mean and standard deviation over the training poses.
         inputs: (N, F') float32, standardized features of all poses.
         fit: linear part of the residuals.
@@ -56,6 +64,7 @@ class PreparedPartition:
         vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
         dropped_count: number of components that were dropped after the training (`compression`).
         dropped_rms: rms distance over training poses and vertices that they represent, mesh units.
+        network, curves: the network and its learning curves; None and empty before the training.
     """
 
     vertex_count: int
@@ -73,6 +82,8 @@ class PreparedPartition:
     vertex_factors: np.ndarray | None = None
     dropped_count: int = 0
     dropped_rms: float = 0.0
+    network: "Network | None" = None
+    curves: Curves = field(default_factory=Curves)
 
     @cached_property
     def validation_truncation(self) -> np.ndarray:
@@ -107,6 +118,7 @@ def partition_data(
             lambda partition=partition: recording.residuals[:, partition.vertices],
             lambda partition=partition: joint_regression(rig, partition, matrices),
             min_spread[columns],
+            columns,
         )
         for partition, columns in zip(recording.partitions, inputs.columns, strict=True)
     ]
@@ -130,9 +142,9 @@ def prepare_partition(
     features = partition.features
     training = features[split.training].astype(np.float64)
     scale = training.std(axis=0)
-    columns = np.flatnonzero(scale > partition.min_spread).astype(np.int32)
-    mean = training[:, columns].mean(axis=0).astype(np.float32)
-    scale = scale[columns].astype(np.float32)
+    is_varying = scale > partition.min_spread
+    columns = np.flatnonzero(is_varying) if partition.columns is None else partition.columns[is_varying]
+    mean, scale = training[:, is_varying].mean(axis=0).astype(np.float32), scale[is_varying].astype(np.float32)
     residuals = np.asarray(partition.read_residuals(), np.float32)
     vertex_count = residuals.shape[1]
     fit = JointFit(np.zeros(0, np.int64), np.zeros((0, vertex_count), np.float32))
@@ -150,7 +162,7 @@ def prepare_partition(
         columns,
         mean,
         scale,
-        (features[:, columns] - mean) / scale,
+        (features[:, is_varying] - mean) / scale,
         fit,
         basis,
         basis.project(residuals),

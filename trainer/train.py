@@ -2,7 +2,7 @@
 """Runs a training: all steps from the recording to the written files."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import report_text
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
-from .compression import drop_components, dropped_components_sentence, factorize_partitions
+from .compression import drop_components, dropped_components_sentence, factorize_partition
 from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
 from .export.export import ExportedModel, build_model, measure, measure_surface, write_model
@@ -29,9 +29,7 @@ from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
 from .inputs.surface_frames import SurfaceFrameFeatures
 from .model import TrainedModel, make_trained_model
 from .networks.checkpoint import Checkpoint, write_checkpoint
-from .networks.curves import Curves
-from .networks.loop import TrainingResult, choose_device, train
-from .networks.networks import Network
+from .networks.loop import choose_device, train
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import training_outputs
 from .preparation import PartitionData, PreparedPartition, partition_data, prepare_partitions
@@ -75,11 +73,10 @@ def train_model(
         inputs = job.fit_inputs()
         partitions = job.collect_partition_data(inputs)
         prepared = job.prepare(partitions)
-        result = job.train_networks(prepared, inputs)
-        prepared, networks = job.compress(prepared, result.networks, partitions)
-        trained_model = make_trained_model(recording, inputs, split, prepared, networks, config.activation)
+        prepared = job.compress(job.train_networks(prepared), partitions)
+        trained_model = make_trained_model(recording, inputs, split, prepared)
         exported = job.export(trained_model)
-        report = job.measure(trained_model, exported, result.curves, model_path.name)
+        report = job.measure(trained_model, exported, model_path.name)
         entry = {"poses": len(recording.pose_matrices), "p999": exported.info.held_out_mm["p999"]}
         history = [*(checkpoint.history if checkpoint else ()), entry]
         goal_result = _evaluate_goal(config, history, report, recording_path, model_path)
@@ -90,7 +87,7 @@ def train_model(
     model_path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
-        write_checkpoint(checkpoint_file, trained_model.checkpoint(holdout, config.hidden, history))
+        write_checkpoint(checkpoint_file, trained_model.checkpoint(holdout, config, history))
         report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
     _send_final_messages(sink, model_path, report, goal_result, time.perf_counter() - start_time)
@@ -162,12 +159,11 @@ class _Job:
             lambda done: self.sink.send(MessageType.PREPARING, done=done, total=len(partitions)),
         )
 
-    def train_networks(self, prepared: list[PreparedPartition], inputs: NetworkInputs) -> TrainingResult:
+    def train_networks(self, prepared: list[PreparedPartition]) -> list[PreparedPartition]:
         """Train the networks from random weights, or from a checkpoint."""
         config, initial = self.config, None
         if self.checkpoint:
-            columns = [offered[partition.columns] for offered, partition in zip(inputs.columns, prepared, strict=True)]
-            config, initial = warm_start_config(config), initial_networks(self.checkpoint, prepared, columns)
+            config, initial = warm_start_config(config), initial_networks(self.checkpoint, prepared)
 
         def send_progress(epoch: int, training_mm: float, validation_mm: float) -> None:
             errors = {"training_mm": round(training_mm, 6), "validation_mm": round(validation_mm, 6)}
@@ -175,15 +171,13 @@ class _Job:
 
         return train(prepared, self.split, config, on_epoch=send_progress, initial=initial)
 
-    def compress(
-        self, prepared: list[PreparedPartition], networks: Sequence[Network], partitions: list[PartitionData]
-    ) -> tuple[list[PreparedPartition], list[Network]]:
+    def compress(self, prepared: list[PreparedPartition], partitions: list[PartitionData]) -> list[PreparedPartition]:
         """Drop components that the networks do not predict, and factorize large partitions."""
-        remaining, networks = drop_components(prepared, networks, self.split, self.config.activation)
+        remaining = drop_components(prepared, self.split)
         if text := dropped_components_sentence(prepared, remaining):
             self.log(text)
         tolerance = self.config.tolerance_mm / (1000 * self.recording.rig.metres_per_unit)
-        return factorize_partitions(remaining, networks, partitions, self.split, tolerance)
+        return [factorize_partition(*p, self.split, tolerance) for p in zip(remaining, partitions, strict=True)]
 
     def export(self, trained_model: TrainedModel) -> ExportedModel:
         """Build the model, and compare it with PyTorch on the held-out poses."""
@@ -200,16 +194,14 @@ class _Job:
         self.log(f"Exporting the model, and measuring it on {len(self.split.held_out)} poses.")
         return build_model(self.recording, trained_model, self.split.held_out, training_info)
 
-    def measure(
-        self, trained_model: TrainedModel, exported: ExportedModel, curves: Sequence[Curves], model_name: str
-    ) -> dict:
+    def measure(self, trained_model: TrainedModel, exported: ExportedModel, model_name: str) -> dict:
         """Measure the model on training and held-out poses; returns the content of the report."""
         recording, split = self.recording, self.split
         training_sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
         training_errors = measure(exported.session, recording, training_sample)
         surface = measure_surface(exported.session, recording, split.held_out)
         analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
-        return make_report(recording, trained_model, exported, training_errors, surface, curves, model_name, analyses)
+        return make_report(recording, trained_model, exported, training_errors, surface, model_name, analyses)
 
 
 def _evaluate_goal(

@@ -52,7 +52,8 @@ def test_padding_does_not_change_outputs(activation):
 
 def test_training_learns_every_partition():
     prepared, trained = train_partitions([make_partition_data(2, 12, 0), make_partition_data(5, 7, 1)])
-    for data, network, curve in zip(prepared, trained.networks, trained.curves, strict=True):
+    for data, partition in zip(prepared, trained, strict=True):
+        network, curve = partition.network, partition.curves
         assert min(curve.validation_mm) < 0.15 * data.residual_rms * 1000
         assert curve.validation_mm[curve.best_epoch - 1] == min(curve.validation_mm)
         assert [w.shape[0] for w in network.weights] == [data.inputs.shape[1], 16, 16]
@@ -67,18 +68,18 @@ def test_the_training_returns_the_weights_of_the_best_epoch():
     prepared, trained = train_partitions(
         [replace(smooth_partition, read_residuals=lambda: smooth_partition.read_residuals() + noise)]
     )
-    assert trained.curves[0].best_epoch < CONFIG.epochs
+    assert trained[0].curves.best_epoch < CONFIG.epochs
     split = split_poses(np.arange(40), CONFIG.validation_fraction, CONFIG.seed)
-    coefficients = trained.networks[0].evaluate(prepared[0].inputs[split.validation], CONFIG.activation)
+    coefficients = trained[0].network.evaluate(prepared[0].inputs[split.validation])
     squared = ((coefficients - prepared[0].coefficients[split.validation]) ** 2).sum(axis=1) / 10
     error = np.sqrt(squared + prepared[0].validation_truncation ** 2).mean() * 1000
-    assert error == pytest.approx(min(trained.curves[0].validation_mm), rel=1e-3)
+    assert error == pytest.approx(min(trained[0].curves.validation_mm), rel=1e-3)
 
 
 def test_one_seed_gives_the_same_weights_and_another_does_not():
     partitions = [make_partition_data(3, 10, 2), make_partition_data(2, 5, 3)]
     config = TrainingConfig(epochs=3, hidden=(8,), batch_size=16)
-    first, second = (train_partitions(partitions, config)[1].networks for _ in range(2))
+    first, second = ([p.network for p in train_partitions(partitions, config)[1]] for _ in range(2))
     for first_network, second_network in zip(first, second, strict=True):
         for first_array, second_array in zip(
             (*first_network.weights, *first_network.biases),
@@ -88,7 +89,7 @@ def test_one_seed_gives_the_same_weights_and_another_does_not():
             np.testing.assert_array_equal(first_array, second_array)
     reseeded_config = TrainingConfig(seed=1, epochs=3, hidden=(8,), batch_size=16)
     assert not np.array_equal(
-        train_partitions(partitions, reseeded_config)[1].networks[0].weights[0], first[0].weights[0]
+        train_partitions(partitions, reseeded_config)[1][0].network.weights[0], first[0].weights[0]
     )
 
 
@@ -99,8 +100,8 @@ def test_a_partition_without_inputs_keeps_its_mean():
     )
     prepared, trained = train_partitions([without_features, make_partition_data(2, 6, 5), constant])
     assert [len(p.basis.components) > 0 for p in prepared] == [False, True, False]
-    assert trained.curves[0].validation_mm == []
-    assert trained.networks[2].biases[-1].shape == (0,)
+    assert trained[0].curves.validation_mm == []
+    assert trained[2].network.biases[-1].shape == (0,)
 
 
 def test_the_progress_shows_what_a_constant_partition_misses_in_unseen_poses_alone():
@@ -110,7 +111,7 @@ def test_the_progress_shows_what_a_constant_partition_misses_in_unseen_poses_alo
     constant = PartitionData(np.ones((150, 0), np.float32), lambda: residuals)
     progress = []
     _, trained = train_partitions([learned, constant], on_epoch=lambda *errors: progress.append(errors))
-    (epoch, training_mm, validation_mm), curve = progress[-1], trained.curves[0]
+    (epoch, training_mm, validation_mm), curve = progress[-1], trained[0].curves
     assert epoch == CONFIG.epochs and training_mm == pytest.approx(curve.training_mm[-1] / 2)
     # Each coordinate of half of the vertices is off by 10 mm.
     assert validation_mm == pytest.approx(curve.validation_mm[-1] / 2 + 10 * 3**0.5 / 2)
@@ -123,7 +124,7 @@ def test_irrelevant_inputs_are_suppressed(monkeypatch):
     config = replace(CONFIG, validation_fraction=0.3, weight_decay=0.2)
 
     def validation_error() -> float:
-        return min(train_partitions([with_noise], config)[1].curves[0].validation_mm)
+        return min(train_partitions([with_noise], config)[1][0].curves.validation_mm)
 
     rescaled_error = validation_error()
     monkeypatch.setattr("trainer.networks.loop.RELEVANCE_EPOCH_FRACTIONS", ())
@@ -142,8 +143,8 @@ def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
 
     monkeypatch.setattr(_Loop, "run", run_and_rescale)
     prepared, after = train_partitions(partitions, config)
-    for data, first_network, second_network in zip(prepared, before.networks, after.networks, strict=True):
-        expected, actual = (network.evaluate(data.inputs, "silu") for network in (first_network, second_network))
+    for data, *partitions in zip(prepared, before, after, strict=True):
+        expected, actual = (partition.network.evaluate(data.inputs) for partition in partitions)
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
@@ -151,9 +152,9 @@ def test_a_warm_start_keeps_the_outputs():
     partitions = [make_partition_data(3, 10, 2), make_partition_data(5, 7, 1)]
     prepared, first = train_partitions(partitions)
     paused_config = replace(CONFIG, epochs=10, learning_rate=1e-12)
-    restarted = train_partitions(partitions, paused_config, initial=first.networks)[1]
-    for curve, first_curve in zip(restarted.curves, first.curves, strict=True):
-        np.testing.assert_allclose(curve.validation_mm, min(first_curve.validation_mm), rtol=1e-3)
-    for data, first_network, second_network in zip(prepared, first.networks, restarted.networks, strict=True):
-        expected, actual = (network.evaluate(data.inputs, "silu") for network in (first_network, second_network))
+    restarted = train_partitions(partitions, paused_config, initial=[p.network for p in first])[1]
+    for partition, former in zip(restarted, first, strict=True):
+        np.testing.assert_allclose(partition.curves.validation_mm, min(former.curves.validation_mm), rtol=1e-3)
+    for data, *partitions in zip(prepared, first, restarted, strict=True):
+        expected, actual = (partition.network.evaluate(data.inputs) for partition in partitions)
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())

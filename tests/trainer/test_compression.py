@@ -18,7 +18,7 @@ from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network as ModelNetwork
 from trainer import compression
 from trainer.__main__ import main
-from trainer.compression import _change_basis, drop_components, dropped_components_sentence, factorize_partitions
+from trainer.compression import _change_basis, drop_components, dropped_components_sentence, factorize_partition
 from trainer.config import TrainingConfig
 from trainer.data.split import Split, split_poses, split_recording
 from trainer.inputs.network_inputs import make_inputs
@@ -45,25 +45,25 @@ def make_data(noise: float, signal: float = 0.01, poses: int = 200) -> Partition
     return PartitionData(features, lambda: residuals)
 
 
-def train_partitions(*data: PartitionData) -> tuple[list[PreparedPartition], list[Network], Split]:
+def train_partitions(*data: PartitionData) -> tuple[list[PreparedPartition], Split]:
     split = split_poses(np.arange(len(data[0].features)), 0.2, 0, 0.2)
     prepared = [prepare_partition(partition, split, 0.01, 0) for partition in data]
-    return prepared, list(train(prepared, split, CONFIG, torch.device("cpu")).networks), split
+    return train(prepared, split, CONFIG, torch.device("cpu")), split
 
 
-def mean_error(data: PartitionData, partition: PreparedPartition, network: Network, poses: np.ndarray) -> float:
-    predicted = partition.basis.reconstruct(network.evaluate(partition.inputs[poses], CONFIG.activation))
+def mean_error(data: PartitionData, partition: PreparedPartition, poses: np.ndarray) -> float:
+    predicted = partition.basis.reconstruct(partition.network.evaluate(partition.inputs[poses]))
     return float(np.linalg.norm(data.read_residuals()[poses] - predicted.reshape(-1, VERTEX_COUNT, 3), axis=2).mean())
 
 
 def test_random_components_are_dropped_and_predictable_ones_stay():
     data = make_data(noise=0.003)
-    prepared, networks, split = train_partitions(data)
-    (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
+    prepared, split = train_partitions(data)
+    (partition,) = drop_components(prepared, split)
     assert len(prepared[0].basis.components) == 2 and len(partition.basis.components) == 1
     assert partition.dropped_count == 1 and partition.coefficients.shape == (200, 1)
-    assert network.weights[-1].shape == (16, 1) and network.biases[-1].shape == (1,)
-    errors = [mean_error(data, p, n, split.held_out) for p, n in ((prepared[0], networks[0]), (partition, network))]
+    assert partition.network.weights[-1].shape == (16, 1) and partition.network.biases[-1].shape == (1,)
+    errors = [mean_error(data, p, split.held_out) for p in (prepared[0], partition)]
     assert errors[1] < 1.05 * errors[0]
     residuals = data.read_residuals().reshape(200, -1)
     truncated = residuals - partition.basis.reconstruct(partition.coefficients)
@@ -74,35 +74,32 @@ def test_random_components_are_dropped_and_predictable_ones_stay():
 
 
 def test_nothing_is_dropped_where_all_is_predictable():
-    prepared, networks, split = train_partitions(make_data(noise=0))
-    (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
+    prepared, split = train_partitions(make_data(noise=0))
+    (partition,) = drop_components(prepared, split)
     for poses in (split.training, split.held_out):
-        before, after = (
-            p.basis.reconstruct(n.evaluate(p.inputs[poses], CONFIG.activation))
-            for p, n in ((prepared[0], networks[0]), (partition, network))
-        )
+        before, after = (p.basis.reconstruct(p.network.evaluate(p.inputs[poses])) for p in (prepared[0], partition))
         np.testing.assert_allclose(after, before, atol=1e-6)
     assert not partition.dropped_count and dropped_components_sentence(prepared, [partition]) == ""
 
 
 def test_a_partition_of_noise_loses_its_network():
-    prepared, networks, split = train_partitions(make_data(noise=0.01, signal=0), make_data(noise=0))
-    remaining, remaining_networks = drop_components(prepared, networks, split, CONFIG.activation)
+    prepared, split = train_partitions(make_data(noise=0.01, signal=0), make_data(noise=0))
+    remaining = drop_components(prepared, split)
     assert [len(partition.basis.components) for partition in remaining] == [0, 1]
-    assert [weight.shape for weight in remaining_networks[0].weights] == [(1, 0)]
-    assert remaining_networks[0].evaluate(remaining[0].inputs, CONFIG.activation).shape == (200, 0)
+    assert [weight.shape for weight in remaining[0].network.weights] == [(1, 0)]
+    assert remaining[0].network.evaluate(remaining[0].inputs).shape == (200, 0)
     sentence = dropped_components_sentence(prepared, remaining)
     assert sentence.startswith("The networks do not predict 1 of 2 components") and "record more poses" in sentence
 
 
 def test_components_without_truncation_error_have_a_finite_error():
     """Rounding makes the squared error that remains without dropped components negative."""
-    prepared, networks, split = train_partitions(make_data(noise=0.003))
+    prepared, split = train_partitions(make_data(noise=0.003))
     basis = replace(prepared[0].basis, error_by_count=prepared[0].basis.error_by_count * [1, 1, 0])
     exact = replace(prepared[0], basis=basis)
     for angle in np.linspace(0, 3, 50):
         change = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        changed, _ = _change_basis(exact, networks[0], change, split)
+        changed = _change_basis(exact, change, split)
         assert np.isfinite(changed.basis.error_by_count).all()
 
 
@@ -119,15 +116,15 @@ def test_a_component_for_extreme_poses_stays(kind):
     inner, extremes = split_poses(np.arange(200), 0.2, 0, 0.2), np.arange(200, 300)
     split = Split(np.append(inner.training, extremes), inner.validation, inner.held_out, **{kind: extremes})
     prepared = [prepare_partition(data, split, 0.01, 0)]
-    networks = train(prepared, split, CONFIG, torch.device("cpu")).networks
-    (partition,), (network,) = drop_components(prepared, networks, split, CONFIG.activation)
-    error = mean_error(data, partition, network, extremes)
-    assert error < 1.1 * mean_error(data, prepared[0], networks[0], extremes) < 0.2 * np.abs(residuals[extremes]).mean()
+    prepared = train(prepared, split, CONFIG, torch.device("cpu"))
+    (partition,) = drop_components(prepared, split)
+    error = mean_error(data, partition, extremes)
+    assert error < 1.1 * mean_error(data, prepared[0], extremes) < 0.2 * np.abs(residuals[extremes]).mean()
 
 
 def test_a_dropped_component_that_is_small_needs_no_remedy():
-    prepared, networks, split = train_partitions(make_data(noise=0.001))
-    remaining, _ = drop_components(prepared, networks, split, CONFIG.activation)
+    prepared, split = train_partitions(make_data(noise=0.001))
+    remaining = drop_components(prepared, split)
     assert remaining[0].dropped_count == 1
     sentence = dropped_components_sentence(prepared, remaining)
     assert "record" not in sentence and sentence.endswith("of what the linear fit leaves.")
@@ -189,18 +186,17 @@ def test_factorized_networks_predict_the_projected_residuals(tmp_path):
     split = split_recording(recording, CONFIG)
     data = partition_data(recording, make_inputs(recording.rig, recording.partitions))
     prepared, rng = prepare_partitions(data, split, TrainingConfig()), np.random.default_rng(0)
-    networks = []
-    for partition in prepared:
+    for index, partition in enumerate(prepared):
         sizes = (len(partition.columns), 8, len(partition.basis.components))
         weights = [rng.normal(size=shape).astype(np.float32) for shape in pairwise(sizes)]
         biases = [rng.normal(size=size).astype(np.float32) for size in sizes[1:]]
-        networks.append(Network(tuple(weights), tuple(biases)))
-    factorized, changed_networks = factorize_partitions(prepared, networks, data, split, 4e-5)
-    for before, after, network, changed in zip(prepared, factorized, networks, changed_networks, strict=True):
+        prepared[index] = replace(partition, network=Network(tuple(weights), tuple(biases), "silu"))
+    factorized = [factorize_partition(*partitions, split, 4e-5) for partitions in zip(prepared, data, strict=True)]
+    for before, after in zip(prepared, factorized, strict=True):
         assert after.vertex_factors is not None and before.vertex_factors is None
         predicted, expected = (
-            (n.evaluate(p.inputs, "silu").astype(np.float64) @ p.basis.components).reshape(POSES, -1, 3)
-            for p, n in ((after, changed), (before, network))
+            (p.network.evaluate(p.inputs).astype(np.float64) @ p.basis.components).reshape(POSES, -1, 3)
+            for p in (after, before)
         )
         vertex_factors = after.vertex_factors.astype(np.float64)
         expected = np.einsum("nvc,rv,rw->nwc", expected, vertex_factors, vertex_factors, optimize=True)

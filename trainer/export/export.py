@@ -74,12 +74,9 @@ def reference_positions(
     clamped = np.clip(features, training_range.low, training_range.high).astype(np.float64)
     matrices = regression_matrices(pose_matrices, rig, len(trained_model.half_rotation_joints()) > 0)
     local, offsets = (np.zeros((len(features), rig.vertex_count, 3), np.float32) for _ in range(2))
-    for index, (partition, prepared, network) in enumerate(
-        zip(trained_model.partitions, trained_model.prepared, trained_model.networks, strict=True)
-    ):
-        inputs = clamped[:, trained_model.feature_columns(index)] - prepared.feature_mean
-        inputs = (inputs / prepared.feature_scale).astype(np.float32)
-        coefficients = network.evaluate(inputs, trained_model.activation)
+    for index, (partition, prepared) in enumerate(zip(trained_model.partitions, trained_model.prepared, strict=True)):
+        inputs = (clamped[:, prepared.columns] - prepared.feature_mean) / prepared.feature_scale
+        coefficients = prepared.network.evaluate(inputs.astype(np.float32))
         residuals = prepared.basis.reconstruct(coefficients) * confidence[:, index, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
         offsets[:, partition.vertices] = prepared.fit.compute_offsets(matrices) * confidence[:, index, None, None]

@@ -17,6 +17,7 @@ from fdda_addon.core.model import CONFIDENCE_OUTPUT
 from ..graph_builder import GraphBuilder
 from ..inputs.block import VECTOR_SIZE
 from ..model import TrainedModel
+from ..preparation import PreparedPartition
 from .pose_nodes import Features
 
 CHUNK_COST, SPLIT_COST = 800, 15_000
@@ -49,21 +50,21 @@ def add_networks(
     Returns:
         The coefficients; None if no partition has components.
     """
-    learned_partitions = [index for index, count in enumerate(trained_model.component_counts()) if count]
-    if not learned_partitions:
+    learned = {index: p for index, p in enumerate(trained_model.prepared) if len(p.basis.components)}
+    if not learned:
         return None
-    networks = [trained_model.networks[index] for index in learned_partitions]
-    first_layers = [_first_layer(features, trained_model, index) for index in learned_partitions]
+    networks = [prepared.network for prepared in learned.values()]
+    activation = networks[0].activation
+    first_layers = [_first_layer(features, prepared) for prepared in learned.values()]
     values = _add_first_layer(graph, clamped, first_layers)
-    values = _add_activation(graph, values, trained_model.activation, "hidden_0")
+    values = _add_activation(graph, values, activation, "hidden_0")
     for layer in range(1, len(networks[0].weights) - 1):
         weights = graph.floats(f"weights_{layer}", np.stack([network.weights[layer] for network in networks]))
         values = graph.add("MatMul", [values, weights], f"product_{layer}")
         biases = graph.floats(f"biases_{layer}", np.stack([network.biases[layer][None] for network in networks]))
         values = graph.add("Add", [values, biases], f"layer_{layer}")
-        values = _add_activation(graph, values, trained_model.activation, f"hidden_{layer}")
-    last_weights = [network.weights[-1] for network in networks]
-    return _add_last_layer(graph, values, dict(zip(learned_partitions, last_weights, strict=True)))
+        values = _add_activation(graph, values, activation, f"hidden_{layer}")
+    return _add_last_layer(graph, values, {index: p.network.weights[-1] for index, p in learned.items()})
 
 
 def _chunk_size(layer_sizes: Sequence[int], width: int, combine_cost: int) -> int:
@@ -141,15 +142,14 @@ def _add_last_layer(graph: GraphBuilder, values: str, layers: dict[int, np.ndarr
     return Coefficients(name, {partition: chunk_size * chunk_networks.index(n) for n, partition in enumerate(layers)})
 
 
-def _first_layer(features: Features, trained_model: TrainedModel, index: int) -> tuple[np.ndarray, np.ndarray]:
+def _first_layer(features: Features, prepared: PreparedPartition) -> tuple[np.ndarray, np.ndarray]:
     """Fold the standardization of the features into the first layer of a network.
 
     Returns:
         (Bn,) int64 indices of the vectors that are its inputs, and their (Bn, 3, H) float64 weights. The last vector is
         `Features.ones_vector`, and the weight of its last element is the bias.
     """
-    prepared, network = trained_model.prepared[index], trained_model.networks[index]
-    position = features.position[trained_model.feature_columns(index)]
+    network, position = prepared.network, features.position[prepared.columns]
     vectors, vector_slots = np.unique(position // VECTOR_SIZE, return_inverse=True)
     unscaled_weights = network.weights[0].astype(np.float64) / prepared.feature_scale[:, None]
     weights = np.zeros((len(vectors) + 1, VECTOR_SIZE, unscaled_weights.shape[1]))

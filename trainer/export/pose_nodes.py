@@ -112,8 +112,8 @@ def _needed_features(trained_model: TrainedModel) -> np.ndarray:
     is_needed = np.zeros(len(trained_model.training_range.low), bool)
     counts = trained_model.training_range.counts
     is_needed[: counts.shape[1]] = counts.any(axis=0)
-    for index in range(len(trained_model.partitions)):
-        is_needed[trained_model.feature_columns(index)] = True
+    for prepared in trained_model.prepared:
+        is_needed[prepared.columns] = True
     by_joint = is_needed[: FEATURES_PER_JOINT * len(trained_model.rig.joints)].reshape(-1, FEATURES_PER_JOINT)
     by_joint[trained_model.half_rotation_joints()] = True
     return is_needed

@@ -36,7 +36,7 @@ class _PartitionRows:
     def __init__(self, trained_model: TrainedModel, index: int):
         """Lay out the rows of the partition with this index."""
         self.index, self._rig = index, trained_model.rig
-        self.prepared, self._last_bias = trained_model.prepared[index], trained_model.networks[index].biases[-1]
+        self.prepared = trained_model.prepared[index]
         self.joint, self.vertices = trained_model.partitions[index].joint, trained_model.partitions[index].vertices
         self.skin = SkinBlock(self._rig, trained_model.partitions[index])
         is_half_rotation = self.prepared.fit.joints >= len(self._rig.joints)
@@ -56,7 +56,7 @@ class _PartitionRows:
         mean = basis.mean.astype(np.float64)
         if self.component_count:
             # The last bias of the network is a constant residual.
-            mean = mean + self._last_bias.astype(np.float64) @ basis.components
+            mean = mean + self.prepared.network.biases[-1].astype(np.float64) @ basis.components
         fit_factors[np.flatnonzero(fit.joints == self.joint), :3] += mean.reshape(vertex_count, 3).T
         fit_rows = inverse_rest[fit.joints % len(inverse_rest)] @ fit_factors
         has_translation = fit.joints < len(inverse_rest)

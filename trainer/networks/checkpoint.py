@@ -132,14 +132,14 @@ def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
     metadata = json.loads(arrays["about"].tobytes())
     if metadata["version"] != VERSION:
         raise ValueError(f"version {metadata['version']!r}")
-    hidden = tuple(int(units) for units in metadata["hidden"])
+    hidden, activation = tuple(int(units) for units in metadata["hidden"]), str(metadata["activation"])
     partitions = []
     for index in range(int(metadata["partitions"])):
         names = ("columns", "feature_mean", "feature_scale", "basis_mean", "basis_components")
         values = {name: arrays[f"{index}/{name}"] for name in names}
         layers = range(1 if not len(values["basis_components"]) else len(hidden) + 1)
         weights, biases = (tuple(arrays[f"{index}/{kind}_{layer}"] for layer in layers) for kind in ("weight", "bias"))
-        partition = PartitionCheckpoint(**values, network=Network(weights, biases))
+        partition = PartitionCheckpoint(**values, network=Network(weights, biases, activation))
         _check_partition(partition, hidden)
         partitions.append(partition)
     return Checkpoint(
@@ -147,7 +147,7 @@ def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
         tuple(str(name) for name in metadata["controls"]),
         str(metadata["holdout"]),
         hidden,
-        str(metadata["activation"]),
+        activation,
         tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in metadata["history"]),
         tuple(partitions),
         _read_input_states(arrays),

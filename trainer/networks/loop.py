@@ -2,7 +2,7 @@
 """The training loop, which trains the networks of all partitions together."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -29,14 +29,6 @@ LOSS_EPSILON = 1e-6
 """Added to squared relative errors, so that the loss, a distance, is smooth at zero."""
 
 
-@dataclass(frozen=True)
-class TrainingResult:
-    """Network and learning curves of each partition. The network of a constant partition has no outputs."""
-
-    networks: tuple[Network, ...]
-    curves: tuple[Curves, ...]
-
-
 def choose_device() -> torch.device:
     """Return the GPU where torch finds one, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -49,7 +41,7 @@ def train(
     device: torch.device | None = None,
     on_epoch: Callable[[int, float, float], None] = lambda *_: None,
     initial: Sequence[Network | None] | None = None,
-) -> TrainingResult:
+) -> list[PreparedPartition]:
     """Train the networks of all partitions together.
 
     Args:
@@ -61,24 +53,26 @@ def train(
             partitions, weighted by their vertices, mm. Epoch 1 is the first.
         initial: for each partition the network to start from, or None for random weights.
 
+    Returns:
+        The partitions with their networks and learning curves. The network of a constant partition has no outputs.
+
     Raises:
         TrainingError: the training diverged.
     """
     device = device or choose_device()
     # Inactive units lead to denormal numbers in the optimizer, which take twice the time.
     torch.set_flush_denormal(True)
+    trained = [replace(p, network=Network.without_outputs(len(p.columns), config.activation)) for p in partitions]
     learning_indices = [index for index, partition in enumerate(partitions) if len(partition.basis.components)]
-    curves = tuple(Curves() for _ in partitions)
-    networks = [Network((np.zeros((len(p.columns), 0), np.float32),), (np.zeros(0, np.float32),)) for p in partitions]
     if learning_indices:
         loop = _Loop([partitions[index] for index in learning_indices], split, config, device)
         if initial is not None:
             loop.start_from([initial[index] for index in learning_indices])
         constant = [partition for partition in partitions if not len(partition.basis.components)]
-        loop.run([curves[index] for index in learning_indices], on_epoch, constant)
-        for index, network in zip(learning_indices, loop.best_networks(), strict=True):
-            networks[index] = network
-    return TrainingResult(tuple(networks), curves)
+        loop.run(on_epoch, constant)
+        for index, network, curves in zip(learning_indices, loop.best_networks(), loop.curves, strict=True):
+            trained[index] = replace(partitions[index], network=network, curves=curves)
+    return trained
 
 
 class _Loop:
@@ -110,6 +104,7 @@ class _Loop:
             torch.Generator().manual_seed(config.seed),
         ).to(device)
         self.best_parameters = [parameter.detach().clone() for parameter in self.model.parameters()]
+        self.curves = [Curves() for _ in partitions]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
         # (P, F) product of all factors by which the standardized features were rescaled.
         self.input_scales = torch.ones_like(self.inputs[:, 0])
@@ -160,19 +155,8 @@ class _Loop:
                 self.model.biases[layer][index, 0, :columns] = torch.from_numpy(bias * factor)
         self.model.weights[0] /= self.rescale_inputs_by_relevance().transpose(1, 2)
 
-    def run(
-        self,
-        curves: list[Curves],
-        on_epoch: Callable[[int, float, float], None],
-        constant: list[PreparedPartition],
-    ) -> None:
-        """Train for all epochs.
-
-        Args:
-            curves: learning curves of the P partitions; each epoch adds its errors.
-            on_epoch: as in `train`.
-            constant: the partitions without components, whose only error is that of their bases.
-        """
+    def run(self, on_epoch: Callable[[int, float, float], None], constant: list[PreparedPartition]) -> None:
+        """Train for all epochs; `on_epoch` as in `train`, `constant` are the partitions without components."""
         config, step_count = self.config, -(-self.inputs.shape[1] // self.config.batch_size)
         optimizer = OneCycleAdamW(
             self.model.parameters(),
@@ -193,14 +177,14 @@ class _Loop:
                 self.rescale_inputs_by_relevance()
             training_mm = self._train_epoch(optimizer, order_generator)
             validation_mm, worst_mm = self._validate()
-            self._update_best(validation_mm, epoch, curves)
+            self._update_best(validation_mm, epoch)
             if not torch.isfinite(validation_mm).all():
                 raise TrainingError(
                     f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
                     f"{config.learning_rate:g}."
                 )
             errors_mm = (training_mm.tolist(), validation_mm.tolist(), worst_mm.tolist())
-            for curve, training_error, validation_error, worst_error in zip(curves, *errors_mm, strict=True):
+            for curve, training_error, validation_error, worst_error in zip(self.curves, *errors_mm, strict=True):
                 curve.training_mm.append(training_error)
                 curve.validation_mm.append(validation_error)
                 curve.worst_mm.append(worst_error)
@@ -239,13 +223,13 @@ class _Loop:
         errors = (squared + self.validation_truncation_mm.square()).sqrt()
         return errors.mean(dim=1), errors.max(dim=1).values
 
-    def _update_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
+    def _update_best(self, validation_mm: torch.Tensor, epoch: int) -> None:
         is_better = validation_mm < self.best_mm
         self.best_mm = torch.where(is_better, validation_mm, self.best_mm)
         for best_parameter, parameter in zip(self.best_parameters, self.model.parameters(), strict=True):
             best_parameter[is_better] = parameter.detach()[is_better]
         for index in torch.nonzero(is_better).flatten().tolist():
-            curves[index].best_epoch = epoch
+            self.curves[index].best_epoch = epoch
 
     def best_networks(self) -> list[Network]:
         """Return the best weights of each partition without padding, for coefficients in mesh units."""
@@ -262,7 +246,7 @@ class _Loop:
             weights[0] = weights[0][:input_count] * input_scales[index, :input_count, None]
             weights[-1] = weights[-1][:, :output_count] * np.float32(scale)
             biases[-1] = biases[-1][:, :output_count] * np.float32(scale)
-            networks.append(Network(tuple(weights), tuple(bias[0] for bias in biases)))
+            networks.append(Network(tuple(weights), tuple(bias[0] for bias in biases), self.config.activation))
         return networks
 
 

@@ -4,6 +4,7 @@
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 import torch
@@ -24,26 +25,25 @@ class Network:
     Attributes:
         weights: one (in, out) float32 array per layer, from standardized features to coefficients in mesh units.
         biases: one (out,) float32 array per layer.
+        activation: as in `TrainingConfig`.
     """
 
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
+    activation: str
 
-    def evaluate(self, inputs: np.ndarray, activation: str) -> np.ndarray:
-        """Evaluate the network in PyTorch.
+    @classmethod
+    def without_outputs(cls, input_count: int, activation: str) -> Self:
+        """Return the network of a partition without components. It has one layer."""
+        return cls((np.zeros((input_count, 0), np.float32),), (np.zeros(0, np.float32),), activation)
 
-        Args:
-            inputs: (N, F) float32 standardized features.
-            activation: as in `TrainingConfig`.
-
-        Returns:
-            (N, K) float32 coefficients, mesh units.
-        """
+    def evaluate(self, inputs: np.ndarray) -> np.ndarray:
+        """Compute (N, K) float32 coefficients, mesh units, of (N, F) float32 standardized features, in PyTorch."""
         values = torch.from_numpy(inputs)
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = torch.addmm(torch.from_numpy(bias), values, torch.from_numpy(weight))
             if layer < len(self.weights) - 1:
-                values = ACTIVATION_FUNCTIONS[activation](values)
+                values = ACTIVATION_FUNCTIONS[self.activation](values)
         return values.numpy()
 
 

@@ -68,15 +68,12 @@ def warm_start_config(config: TrainingConfig) -> TrainingConfig:
     )
 
 
-def initial_networks(
-    checkpoint: Checkpoint, prepared: list[PreparedPartition], columns: list[np.ndarray]
-) -> list[Network | None]:
+def initial_networks(checkpoint: Checkpoint, prepared: list[PreparedPartition]) -> list[Network | None]:
     """Convert the networks of a checkpoint to the features and bases of the current training.
 
     Args:
         checkpoint: checkpoint of the same rig, controls, hidden layers and activation.
         prepared: the partitions of the current training.
-        columns: for each partition, (F',) indices of its features among all features of `NetworkInputs`.
 
     Returns:
         For each partition a network with nearly the former outputs; None where the partition has no network now or had
@@ -88,19 +85,18 @@ def initial_networks(
     sizes = [3 * partition.vertex_count for partition in prepared]
     if sizes != [len(partition.basis_mean) for partition in checkpoint.partitions]:
         raise TrainingError("The checkpoint is of other partitions; train without --warm-start.")
-    return [_convert_network(*arguments) for arguments in zip(checkpoint.partitions, prepared, columns, strict=True)]
+    return [_convert_network(*partitions) for partitions in zip(checkpoint.partitions, prepared, strict=True)]
 
 
-def _convert_network(former: PartitionCheckpoint, prepared: PreparedPartition, columns: np.ndarray) -> Network | None:
-    """Convert the network of one partition; arguments and result as in `initial_networks`."""
+def _convert_network(former: PartitionCheckpoint, prepared: PreparedPartition) -> Network | None:
     if not len(former.basis_components) or not len(prepared.basis.components):
         return None
     weights, biases = (
         [array.astype(np.float64) for array in arrays] for arrays in (former.network.weights, former.network.biases)
     )
     # A feature that was constant before gets weight 0. A feature that is constant now stays at its mean.
-    first_weights = np.zeros((len(columns), weights[0].shape[1]))
-    _, new_rows, former_rows = np.intersect1d(columns, former.columns, return_indices=True)
+    first_weights = np.zeros((len(prepared.columns), weights[0].shape[1]))
+    _, new_rows, former_rows = np.intersect1d(prepared.columns, former.columns, return_indices=True)
     unscaled = weights[0][former_rows] / former.feature_scale[former_rows, None]
     first_weights[new_rows] = unscaled * prepared.feature_scale[new_rows, None]
     biases[0] = biases[0] + (prepared.feature_mean[new_rows] - former.feature_mean[former_rows]) @ unscaled
@@ -109,4 +105,5 @@ def _convert_network(former: PartitionCheckpoint, prepared: PreparedPartition, c
     change_of_basis = former.basis_components @ components
     weights[-1] = weights[-1] @ change_of_basis
     biases[-1] = biases[-1] @ change_of_basis + (former.basis_mean - prepared.basis.mean) @ components
-    return Network(*(tuple(array.astype(np.float32) for array in arrays) for arrays in (weights, biases)))
+    layers = (tuple(array.astype(np.float32) for array in arrays) for arrays in (weights, biases))
+    return Network(*layers, former.network.activation)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from ..export.export import ExportedModel, PositionErrors
     from ..model import TrainedModel
-    from ..networks.curves import Curves
     from ..preparation import PreparedPartition
     from .error_analysis import ErrorAnalysis
 
@@ -31,14 +30,13 @@ def make_report(
     exported: ExportedModel,
     training_errors: PositionErrors,
     surface: dict,
-    curves: Sequence[Curves],
     model_name: str,
     analyses: Sequence[ErrorAnalysis],
 ) -> dict:
     """Create the content of `report.json`; docs/formats.md describes the keys. Errors are in mm.
 
     Args:
-        recording, trained_model, exported, curves: input and results of the training.
+        recording, trained_model, exported: input and results of the training.
         training_errors: errors on a sample of the training poses.
         surface: `normals` and `edges` of held-out poses.
         model_name: file name of the model.
@@ -46,9 +44,9 @@ def make_report(
     """
     controls, held_out = [control.name for control in recording.rig.controls], exported.held_out
     partitions = [
-        _partition_entry(recording.rig, partition, prepared, curve, analysis, held_out, training_errors)
-        for partition, prepared, curve, analysis in zip(
-            trained_model.partitions, trained_model.prepared, curves, analyses, strict=True
+        _partition_entry(recording.rig, partition, prepared, analysis, held_out, training_errors)
+        for partition, prepared, analysis in zip(
+            trained_model.partitions, trained_model.prepared, analyses, strict=True
         )
     ]
     return {
@@ -84,12 +82,12 @@ def _partition_entry(
     rig: Rig,
     partition: Partition,
     prepared: PreparedPartition,
-    curve: Curves,
     analysis: ErrorAnalysis,
     held_out: PositionErrors,
     training_errors: PositionErrors,
 ) -> dict:
     names, controls, vertices = rig.joint_names, [control.name for control in rig.controls], partition.vertices
+    curves = prepared.curves
     return {
         "joint": names[partition.joint],
         "vertices": len(vertices),
@@ -106,10 +104,10 @@ def _partition_entry(
         "histogram": _histogram(held_out.fdda[:, vertices]),
         "largest_errors": analysis.to_json(),
         "curve": {
-            "training": [round(value, 6) for value in curve.training_mm],
-            "validation": [round(value, 6) for value in curve.validation_mm],
-            "worst": [round(value, 6) for value in curve.worst_mm],
-            "best_epoch": curve.best_epoch,
+            "training": [round(value, 6) for value in curves.training_mm],
+            "validation": [round(value, 6) for value in curves.validation_mm],
+            "worst": [round(value, 6) for value in curves.worst_mm],
+            "best_epoch": curves.best_epoch,
         },
     }
 
