@@ -14,17 +14,18 @@ import numpy as np
 
 from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSE_INPUT
+from fdda_addon.core.rig import Rig
 
 from ..fits.half_rotations import add_half_rotations
 from ..graph_builder import GraphBuilder
-from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, JointVectors, LocalVectors
+from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, JointVectors
 from ..inputs.joints import needed_joints
 from ..model import TrainedModel
 
-MATRIX_ROW, ROWS_PER_SPACE = 5, 6
-"""Row of the table with the matrix of a space, column by column, and the number of rows of a space.
+ZERO_ROW, MATRIX_ROW, ROWS_PER_SPACE = 4, 5, 6
+"""Rows of the table that are zero and that have the matrix of a space, column by column; number of rows of a space.
 
-Each of the first four rows has one column of the matrix, three times in succession. Row `ZERO_COLUMN` is zero."""
+Each of the first four rows has one column of the matrix, three times in succession."""
 MIN_DETERMINANT = 1e-18
 """Added to determinants before a division, so that a joint that is scaled to zero gives finite values."""
 
@@ -70,7 +71,7 @@ def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
     """Add the nodes that compute the features of the networks and of the confidence."""
     inputs, is_needed = trained_model.inputs, _needed_features(trained_model)
     joints_block, joints = inputs.blocks[0], needed_joints(is_needed[inputs.block_slices[0]])
-    name, table = _add_local_vectors(graph, trained_model, joints_block.local_vectors(joints))
+    name, table = _add_joint_vectors(graph, trained_model.rig, joints)
     joint_vectors = JointVectors(name, joints)
     table, pose_rows = _add_half_rotations(graph, trained_model, joint_vectors, table)
     parts = [
@@ -89,16 +90,23 @@ def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
     return Features(name, direct_count, VECTOR_SIZE * count, all_positions, table, pose_rows)
 
 
-def _add_local_vectors(graph: GraphBuilder, trained_model: TrainedModel, vectors: LocalVectors) -> tuple[str, str]:
-    """Add the nodes of vectors and of a zero vector; returns the names of (N, ., 3) vectors and (N, ., 12) table."""
-    space_count = len(vectors.joints) + len(trained_model.rig.joints)
-    flat_matrices = graph.reshape(_add_spaces(graph, vectors), [0, space_count, 16], "flat_spaces")
+def _add_joint_vectors(graph: GraphBuilder, rig: Rig, joints: np.ndarray) -> tuple[str, str]:
+    """Add the columns of (B,) joints in the space Q_j of the joint as its parent carries it along, and a zero vector.
+
+    Q_j = P_p B_p^-1 B_j with the parent p. The axes of a joint have no origin. Its translation is relative to Q_j.
+
+    Returns:
+        Names of the (N, 4 B + 1, 3) vectors, and of the (N, ., 12) table: B spaces Q_j, then the J joints.
+    """
+    count, columns = len(joints), np.arange(MATRIX_COLUMNS)
+    flat_matrices = graph.reshape(_add_spaces(graph, rig, joints), [0, count + len(rig.joints), 16], "flat_spaces")
     selection = graph.floats("table_picks", _table_selection())
     table = graph.reshape(graph.add("MatMul", [flat_matrices, selection], "table_rows"), [0, -1, 12], "table")
-    end_rows, origin_rows = (
-        np.append(indices @ [ROWS_PER_SPACE, 1], ZERO_COLUMN) for indices in (vectors.ends, vectors.origins)
-    )
-    inverses = [_add_inverses(graph, flat_matrices), graph.integers("vector_spaces", np.append(vectors.spaces, 0))]
+    end_rows = np.append(ROWS_PER_SPACE * (count + joints)[:, None] + columns, ZERO_ROW)
+    origin_rows = np.full(end_rows.shape, ZERO_ROW)
+    origin_rows[MATRIX_COLUMNS - 1 :: MATRIX_COLUMNS] = ROWS_PER_SPACE * np.arange(count) + MATRIX_COLUMNS - 1
+    spaces = np.append(np.repeat(np.arange(count), MATRIX_COLUMNS), 0)
+    inverses = [_add_inverses(graph, flat_matrices), graph.integers("vector_spaces", spaces)]
     inverses = graph.add("Gather", inverses, "vector_inverses", axis=1)
     end_points = [graph.add("Gather", [table, graph.integers("vector_ends", end_rows)], "ends", axis=1)]
     end_points.append(graph.add("Gather", [table, graph.integers("vector_origins", origin_rows)], "origins", axis=1))
@@ -119,15 +127,16 @@ def _needed_features(trained_model: TrainedModel) -> np.ndarray:
     return is_needed
 
 
-def _add_spaces(graph: GraphBuilder, vectors: LocalVectors) -> str:
-    """Add the (N, S + J, 4, 4) matrices of all spaces."""
-    is_fixed = (vectors.joints < 0)[:, None, None]
-    source_joints = graph.integers("space_joints", np.maximum(vectors.joints, 0))
-    space_matrices = graph.add("Gather", [POSE_INPUT, source_joints], "space_poses", axis=1)
-    offsets = graph.floats("space_offsets", np.where(is_fixed, 0, vectors.offsets))
+def _add_spaces(graph: GraphBuilder, rig: Rig, joints: np.ndarray) -> str:
+    """Add the (N, B + J, 4, 4) matrices of all spaces."""
+    parents, rest_matrices = rig.parents[joints], rig.rest_matrices.astype(np.float64)
+    is_fixed, parents = (parents < 0)[:, None, None], np.maximum(parents, 0)
+    to_child = np.linalg.inv(rest_matrices[parents]) @ rest_matrices[joints]
+    space_matrices = graph.add("Gather", [POSE_INPUT, graph.integers("space_joints", parents)], "space_poses", axis=1)
+    offsets = graph.floats("space_offsets", np.where(is_fixed, 0, to_child))
     space_matrices = graph.add("MatMul", [space_matrices, offsets], "moved")
     if is_fixed.any():
-        fixed_matrices = graph.floats("root_spaces", np.where(is_fixed, vectors.offsets, 0))
+        fixed_matrices = graph.floats("root_spaces", np.where(is_fixed, rest_matrices[joints], 0))
         space_matrices = graph.add("Add", [space_matrices, fixed_matrices], "carried")
     return graph.add("Concat", [space_matrices, POSE_INPUT], "spaces", axis=1)
 

@@ -19,8 +19,8 @@ from ..graph_builder import GraphBuilder
 State = dict[str, np.ndarray]
 VECTOR_SIZE = 3
 """Number of elements of a vector. The graph gathers three features at a time, as one vector."""
-MATRIX_COLUMNS, ZERO_COLUMN = 4, 4
-"""Number of columns of an affine matrix, and the index that stands for a zero vector in `LocalVectors`."""
+MATRIX_COLUMNS = 4
+"""Number of columns of an affine matrix."""
 
 
 @dataclass(frozen=True)
@@ -46,33 +46,6 @@ class JointVectors:
     def columns(self, joints: np.ndarray) -> np.ndarray:
         """Return the (n, 4) indices of the columns of n of the B joints."""
         return MATRIX_COLUMNS * np.searchsorted(self.joints, joints)[:, None] + np.arange(MATRIX_COLUMNS)
-
-
-@dataclass(frozen=True)
-class LocalVectors:
-    """B vectors R^-1 (d - t), where R is the 3 x 3 part of the matrix of a space, d and t columns of such matrices.
-
-    The spaces are S spaces that the block adds, then the spaces of the J joints: index S + j is the pose matrix of
-    joint j.
-
-    Attributes:
-        joints: (S,) int64, joint that carries an added space; -1 for a space that does not move.
-        offsets: (S, 4, 4) float64, the matrix of the space is the pose matrix of its joint times this offset.
-        spaces: (B,) int64, index of the space of R.
-        ends, origins: (B, 2) int64, d and t: index of a space, and column of its matrix. Column 3 is the translation,
-            `ZERO_COLUMN` a zero vector.
-    """
-
-    joints: np.ndarray
-    offsets: np.ndarray
-    spaces: np.ndarray
-    ends: np.ndarray
-    origins: np.ndarray
-
-    @property
-    def count(self) -> int:
-        """B, the number of vectors."""
-        return len(self.spaces)
 
 
 class FeatureBlock(ABC):

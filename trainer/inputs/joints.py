@@ -12,7 +12,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
 from ..graph_builder import GraphBuilder
-from .block import MATRIX_COLUMNS, VECTOR_SIZE, ZERO_COLUMN, FeatureBlock, JointVectors, LocalVectors, State, Vectors
+from .block import MATRIX_COLUMNS, VECTOR_SIZE, FeatureBlock, JointVectors, State, Vectors
 
 
 @dataclass(frozen=True)
@@ -42,24 +42,6 @@ class JointFeatures(FeatureBlock):
 
     def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray) -> np.ndarray:
         return joint_features(pose_matrices, self.rest_matrices, self.parents).reshape(len(pose_matrices), -1)
-
-    def local_vectors(self, joints: np.ndarray) -> LocalVectors:
-        """Return the columns of (B,) joints in the space Q_j of the joint as its parent carries it along.
-
-        Q_j = P_p B_p^-1 B_j with the parent p. The axes of a joint have no origin. Its translation is relative to Q_j.
-        """
-        parents, rest_matrices = self.parents[joints], self.rest_matrices.astype(np.float64)
-        to_child = np.linalg.inv(rest_matrices[np.maximum(parents, 0)]) @ rest_matrices[joints]
-        offsets = np.where((parents < 0)[:, None, None], rest_matrices[joints], to_child)
-        carried, columns = np.indices((len(joints), MATRIX_COLUMNS))
-        is_translation = columns == MATRIX_COLUMNS - 1
-        return LocalVectors(
-            parents.astype(np.int64),
-            offsets,
-            carried.ravel(),
-            np.stack([len(joints) + joints[carried], columns], axis=2).reshape(-1, 2),
-            np.stack([carried * is_translation, np.where(is_translation, columns, ZERO_COLUMN)], axis=2).reshape(-1, 2),
-        )
 
     def add_nodes(
         self, graph: GraphBuilder, is_needed: np.ndarray, joint_vectors: JointVectors
