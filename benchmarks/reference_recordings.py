@@ -30,7 +30,8 @@ from trainer.fits.joint_fit import make_joint_regression
 from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs
 from trainer.networks.loop import train
-from trainer.preparation import PartitionData, PreparedPartition, prepare_partition
+from trainer.networks.networks import TrainedPartition
+from trainer.preparation import PartitionData, prepare_partition
 
 DATA_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
 TRAINING_POSES = 700
@@ -132,7 +133,7 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
 
 
 def measure(
-    partition: ReferencePartition, prepared: PreparedPartition, measured: np.ndarray
+    partition: ReferencePartition, prepared: TrainedPartition, measured: np.ndarray
 ) -> tuple[float, float, float]:
     """Return the mean and largest error over the measured poses and the mean length of their residuals, cm."""
     true_residuals, poses = partition.data.read_residuals()[measured], partition.poses[measured]

@@ -9,8 +9,8 @@ import numpy as np
 from .data.split import MARGIN_POSE_WEIGHT, Split
 from .fits.basis import Basis
 from .fits.low_rank import factorize, may_factorize
-from .networks.networks import Network
-from .preparation import PartitionData, PreparedPartition
+from .networks.networks import Network, TrainedPartition
+from .preparation import PartitionData
 
 MIN_GAIN_RATIO = 0.1
 """A component stays if it lowers the mean error by more than this part of the error, times its part of the parameters
@@ -19,7 +19,7 @@ MIN_DROPPED_PART = 0.1
 """If the dropped components have at least this part of the squared residuals, a remedy is suggested."""
 
 
-def drop_components(prepared: Sequence[PreparedPartition], split: Split) -> list[PreparedPartition]:
+def drop_components(prepared: Sequence[TrainedPartition], split: Split) -> list[TrainedPartition]:
     """Drop the components that lower the mean error too little, or raise it.
 
     The error is measured on the validation poses. Margin poses and refined poses also count, with a lower weight,
@@ -49,7 +49,7 @@ def drop_components(prepared: Sequence[PreparedPartition], split: Split) -> list
     ]
 
 
-def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining: Sequence[PreparedPartition]) -> str:
+def dropped_components_sentence(prepared: Sequence[TrainedPartition], remaining: Sequence[TrainedPartition]) -> str:
     """Describe which components were dropped, and what may help; empty if none was dropped.
 
     Args:
@@ -70,7 +70,7 @@ def dropped_components_sentence(prepared: Sequence[PreparedPartition], remaining
     )
 
 
-def _component_gains(partition: PreparedPartition, change: np.ndarray, split: Split) -> tuple[float, np.ndarray]:
+def _component_gains(partition: TrainedPartition, change: np.ndarray, split: Split) -> tuple[float, np.ndarray]:
     """Measure what each component of a changed basis gains on the validation poses, and on extreme poses.
 
     Args:
@@ -96,7 +96,7 @@ def _component_gains(partition: PreparedPartition, change: np.ndarray, split: Sp
 
 
 def _gains_in_poses(
-    partition: PreparedPartition, coefficients: np.ndarray, errors: np.ndarray, change: np.ndarray
+    partition: TrainedPartition, coefficients: np.ndarray, errors: np.ndarray, change: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Measure what components gain in n poses; other arguments and result as in `_component_gains`.
 
@@ -114,7 +114,7 @@ def _gains_in_poses(
     return error, np.array(without) - error
 
 
-def _change_basis(partition: PreparedPartition, change: np.ndarray, split: Split) -> PreparedPartition:
+def _change_basis(partition: TrainedPartition, change: np.ndarray, split: Split) -> TrainedPartition:
     """Replace the K components of a partition by K' orthonormal combinations of them.
 
     Args:
@@ -152,8 +152,8 @@ def _change_outputs(network: Network, change: np.ndarray) -> Network:
 
 
 def factorize_partition(
-    prepared: PreparedPartition, partition: PartitionData, split: Split, tolerance: float
-) -> PreparedPartition:
+    prepared: TrainedPartition, partition: PartitionData, split: Split, tolerance: float
+) -> TrainedPartition:
     """Factorize a trained partition if that saves parameters (`low_rank`).
 
     Args:

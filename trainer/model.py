@@ -15,7 +15,7 @@ from .data.split import Split
 from .inputs.network_inputs import NetworkInputs
 from .networks.checkpoint import Checkpoint, PartitionCheckpoint
 from .networks.confidence import TrainingRange, measure_training_range
-from .preparation import PreparedPartition
+from .networks.networks import TrainedPartition
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class TrainedModel:
     rig: Rig
     partitions: tuple[Partition, ...]
     inputs: NetworkInputs
-    prepared: tuple[PreparedPartition, ...]
+    prepared: tuple[TrainedPartition, ...]
     training_range: TrainingRange
 
     def half_rotation_joints(self) -> np.ndarray:
@@ -71,7 +71,7 @@ class TrainedModel:
 
 
 def make_trained_model(
-    recording: Recording, inputs: NetworkInputs, split: Split, prepared: Sequence[PreparedPartition]
+    recording: Recording, inputs: NetworkInputs, split: Split, prepared: Sequence[TrainedPartition]
 ) -> TrainedModel:
     """Put together the result of a training, and measure the range of its training poses."""
     matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))

@@ -2,9 +2,7 @@
 """Training data of the networks: features and coefficients of each partition."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,10 +16,6 @@ from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_
 from .fits.half_rotations import regression_matrices
 from .fits.joint_fit import JointFit, JointRegression, joint_regression
 from .inputs.network_inputs import NetworkInputs
-from .networks.curves import Curves
-
-if TYPE_CHECKING:  # The page of a report needs no torch.
-    from .networks.networks import Network
 
 
 @dataclass(frozen=True)
@@ -46,7 +40,7 @@ class PartitionData:
 
 @dataclass(frozen=True)
 class PreparedPartition:
-    """A partition that is ready to train, or trained.
+    """A partition that is ready to train.
 
     Attributes:
         vertex_count: Vp.
@@ -64,7 +58,6 @@ class PreparedPartition:
         vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
         dropped_count: number of components that were dropped after the training (`compression`).
         dropped_rms: rms distance over training poses and vertices that they represent, mesh units.
-        network, curves: the network and its learning curves; None and empty before the training.
     """
 
     vertex_count: int
@@ -82,10 +75,8 @@ class PreparedPartition:
     vertex_factors: np.ndarray | None = None
     dropped_count: int = 0
     dropped_rms: float = 0.0
-    network: "Network | None" = None
-    curves: Curves = field(default_factory=Curves)
 
-    @cached_property
+    @property
     def validation_truncation(self) -> np.ndarray:
         """(n,) rms distance over the vertices between validation residuals and their approximation, mesh units."""
         truncated = self.validation_residuals - self.basis.reconstruct(self.coefficients[self.validation])

@@ -30,6 +30,7 @@ from .inputs.surface_frames import SurfaceFrameFeatures
 from .model import TrainedModel, make_trained_model
 from .networks.checkpoint import Checkpoint, write_checkpoint
 from .networks.loop import choose_device, train
+from .networks.networks import TrainedPartition
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import training_outputs
 from .preparation import PartitionData, PreparedPartition, partition_data, prepare_partitions
@@ -159,7 +160,7 @@ class _Job:
             lambda done: self.sink.send(MessageType.PREPARING, done=done, total=len(partitions)),
         )
 
-    def train_networks(self, prepared: list[PreparedPartition]) -> list[PreparedPartition]:
+    def train_networks(self, prepared: list[PreparedPartition]) -> list[TrainedPartition]:
         """Train the networks from random weights, or from a checkpoint."""
         config, initial = self.config, None
         if self.checkpoint:
@@ -171,7 +172,7 @@ class _Job:
 
         return train(prepared, self.split, config, on_epoch=send_progress, initial=initial)
 
-    def compress(self, prepared: list[PreparedPartition], partitions: list[PartitionData]) -> list[PreparedPartition]:
+    def compress(self, prepared: list[TrainedPartition], partitions: list[PartitionData]) -> list[TrainedPartition]:
         """Drop components that the networks do not predict, and factorize large partitions."""
         remaining = drop_components(prepared, self.split)
         if text := dropped_components_sentence(prepared, remaining):

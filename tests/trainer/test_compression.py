@@ -24,8 +24,8 @@ from trainer.data.split import Split, split_poses, split_recording
 from trainer.inputs.network_inputs import make_inputs
 from trainer.networks.checkpoint import read_checkpoint
 from trainer.networks.loop import train
-from trainer.networks.networks import Network
-from trainer.preparation import PartitionData, PreparedPartition, partition_data, prepare_partition, prepare_partitions
+from trainer.networks.networks import Curves, Network, TrainedPartition
+from trainer.preparation import PartitionData, partition_data, prepare_partition, prepare_partitions
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
@@ -45,13 +45,13 @@ def make_data(noise: float, signal: float = 0.01, poses: int = 200) -> Partition
     return PartitionData(features, lambda: residuals)
 
 
-def train_partitions(*data: PartitionData) -> tuple[list[PreparedPartition], Split]:
+def train_partitions(*data: PartitionData) -> tuple[list[TrainedPartition], Split]:
     split = split_poses(np.arange(len(data[0].features)), 0.2, 0, 0.2)
     prepared = [prepare_partition(partition, split, 0.01, 0) for partition in data]
     return train(prepared, split, CONFIG, torch.device("cpu")), split
 
 
-def mean_error(data: PartitionData, partition: PreparedPartition, poses: np.ndarray) -> float:
+def mean_error(data: PartitionData, partition: TrainedPartition, poses: np.ndarray) -> float:
     predicted = partition.basis.reconstruct(partition.network.evaluate(partition.inputs[poses]))
     return float(np.linalg.norm(data.read_residuals()[poses] - predicted.reshape(-1, VERTEX_COUNT, 3), axis=2).mean())
 
@@ -190,7 +190,8 @@ def test_factorized_networks_predict_the_projected_residuals(tmp_path):
         sizes = (len(partition.columns), 8, len(partition.basis.components))
         weights = [rng.normal(size=shape).astype(np.float32) for shape in pairwise(sizes)]
         biases = [rng.normal(size=size).astype(np.float32) for size in sizes[1:]]
-        prepared[index] = replace(partition, network=Network(tuple(weights), tuple(biases), "silu"))
+        network = Network(tuple(weights), tuple(biases), "silu")
+        prepared[index] = TrainedPartition(**vars(partition), network=network, curves=Curves())
     factorized = [factorize_partition(*partitions, split, 4e-5) for partitions in zip(prepared, data, strict=True)]
     for before, after in zip(prepared, factorized, strict=True):
         assert after.vertex_factors is not None and before.vertex_factors is None

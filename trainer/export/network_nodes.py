@@ -17,7 +17,7 @@ from fdda_addon.core.model import CONFIDENCE_OUTPUT
 from ..graph_builder import GraphBuilder
 from ..inputs.block import VECTOR_SIZE
 from ..model import TrainedModel
-from ..preparation import PreparedPartition
+from ..networks.networks import TrainedPartition
 from .pose_nodes import Features
 
 CHUNK_COST, SPLIT_COST = 800, 15_000
@@ -142,7 +142,7 @@ def _add_last_layer(graph: GraphBuilder, values: str, layers: dict[int, np.ndarr
     return Coefficients(name, {partition: chunk_size * chunk_networks.index(n) for n, partition in enumerate(layers)})
 
 
-def _first_layer(features: Features, prepared: PreparedPartition) -> tuple[np.ndarray, np.ndarray]:
+def _first_layer(features: Features, prepared: TrainedPartition) -> tuple[np.ndarray, np.ndarray]:
     """Fold the standardization of the features into the first layer of a network.
 
     Returns:

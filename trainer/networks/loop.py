@@ -2,7 +2,6 @@
 """The training loop, which trains the networks of all partitions together."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,8 +12,7 @@ from fdda_addon.core.errors import TrainingError
 from ..config import TrainingConfig
 from ..data.split import Split
 from ..preparation import PreparedPartition
-from .curves import Curves
-from .networks import Network, PartitionNetworks
+from .networks import Curves, Network, PartitionNetworks, TrainedPartition
 from .optimizer import OneCycleAdamW
 
 WARM_UP_FRACTION = 0.15
@@ -41,7 +39,7 @@ def train(
     device: torch.device | None = None,
     on_epoch: Callable[[int, float, float], None] = lambda *_: None,
     initial: Sequence[Network | None] | None = None,
-) -> list[PreparedPartition]:
+) -> list[TrainedPartition]:
     """Train the networks of all partitions together.
 
     Args:
@@ -62,17 +60,21 @@ def train(
     device = device or choose_device()
     # Inactive units lead to denormal numbers in the optimizer, which take twice the time.
     torch.set_flush_denormal(True)
-    trained = [replace(p, network=Network.without_outputs(len(p.columns), config.activation)) for p in partitions]
+    networks = [Network.without_outputs(len(partition.columns), config.activation) for partition in partitions]
+    curves = [Curves() for _ in partitions]
     learning_indices = [index for index, partition in enumerate(partitions) if len(partition.basis.components)]
     if learning_indices:
         loop = _Loop([partitions[index] for index in learning_indices], split, config, device)
         if initial is not None:
             loop.start_from([initial[index] for index in learning_indices])
         constant = [partition for partition in partitions if not len(partition.basis.components)]
-        loop.run(on_epoch, constant)
-        for index, network, curves in zip(learning_indices, loop.best_networks(), loop.curves, strict=True):
-            trained[index] = replace(partitions[index], network=network, curves=curves)
-    return trained
+        loop.run([curves[index] for index in learning_indices], on_epoch, constant)
+        for index, network in zip(learning_indices, loop.best_networks(), strict=True):
+            networks[index] = network
+    return [
+        TrainedPartition(**vars(partition), network=network, curves=curve)
+        for partition, network, curve in zip(partitions, networks, curves, strict=True)
+    ]
 
 
 class _Loop:
@@ -104,7 +106,6 @@ class _Loop:
             torch.Generator().manual_seed(config.seed),
         ).to(device)
         self.best_parameters = [parameter.detach().clone() for parameter in self.model.parameters()]
-        self.curves = [Curves() for _ in partitions]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
         # (P, F) product of all factors by which the standardized features were rescaled.
         self.input_scales = torch.ones_like(self.inputs[:, 0])
@@ -155,8 +156,19 @@ class _Loop:
                 self.model.biases[layer][index, 0, :columns] = torch.from_numpy(bias * factor)
         self.model.weights[0] /= self.rescale_inputs_by_relevance().transpose(1, 2)
 
-    def run(self, on_epoch: Callable[[int, float, float], None], constant: list[PreparedPartition]) -> None:
-        """Train for all epochs; `on_epoch` as in `train`, `constant` are the partitions without components."""
+    def run(
+        self,
+        curves: list[Curves],
+        on_epoch: Callable[[int, float, float], None],
+        constant: list[PreparedPartition],
+    ) -> None:
+        """Train for all epochs.
+
+        Args:
+            curves: learning curves of the P partitions; each epoch adds its errors.
+            on_epoch: as in `train`.
+            constant: the partitions without components, whose only error is that of their bases.
+        """
         config, step_count = self.config, -(-self.inputs.shape[1] // self.config.batch_size)
         optimizer = OneCycleAdamW(
             self.model.parameters(),
@@ -177,14 +189,14 @@ class _Loop:
                 self.rescale_inputs_by_relevance()
             training_mm = self._train_epoch(optimizer, order_generator)
             validation_mm, worst_mm = self._validate()
-            self._update_best(validation_mm, epoch)
+            self._update_best(validation_mm, epoch, curves)
             if not torch.isfinite(validation_mm).all():
                 raise TrainingError(
                     f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
                     f"{config.learning_rate:g}."
                 )
             errors_mm = (training_mm.tolist(), validation_mm.tolist(), worst_mm.tolist())
-            for curve, training_error, validation_error, worst_error in zip(self.curves, *errors_mm, strict=True):
+            for curve, training_error, validation_error, worst_error in zip(curves, *errors_mm, strict=True):
                 curve.training_mm.append(training_error)
                 curve.validation_mm.append(validation_error)
                 curve.worst_mm.append(worst_error)
@@ -223,13 +235,13 @@ class _Loop:
         errors = (squared + self.validation_truncation_mm.square()).sqrt()
         return errors.mean(dim=1), errors.max(dim=1).values
 
-    def _update_best(self, validation_mm: torch.Tensor, epoch: int) -> None:
+    def _update_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
         is_better = validation_mm < self.best_mm
         self.best_mm = torch.where(is_better, validation_mm, self.best_mm)
         for best_parameter, parameter in zip(self.best_parameters, self.model.parameters(), strict=True):
             best_parameter[is_better] = parameter.detach()[is_better]
         for index in torch.nonzero(is_better).flatten().tolist():
-            self.curves[index].best_epoch = epoch
+            curves[index].best_epoch = epoch
 
     def best_networks(self) -> list[Network]:
         """Return the best weights of each partition without padding, for coefficients in mesh units."""

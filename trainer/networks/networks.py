@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The networks of all partitions as one batched network."""
+"""The networks of partitions, alone and as one batched network."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Self
 
 import numpy as np
 import torch
 from torch.nn import functional
+
+from ..preparation import PreparedPartition
 
 ACTIVATION_FUNCTIONS = {
     "silu": functional.silu,
@@ -45,6 +47,31 @@ class Network:
             if layer < len(self.weights) - 1:
                 values = ACTIVATION_FUNCTIONS[self.activation](values)
         return values.numpy()
+
+
+@dataclass
+class Curves:
+    """Errors of one partition after each epoch: rms distances over the vertices, mm.
+
+    Attributes:
+        training_mm: mean over the training poses.
+        validation_mm: mean over the validation poses.
+        worst_mm: maximum over the validation poses.
+        best_epoch: epoch with the lowest `validation_mm`; epoch 1 is the first.
+    """
+
+    training_mm: list[float] = field(default_factory=list)
+    validation_mm: list[float] = field(default_factory=list)
+    worst_mm: list[float] = field(default_factory=list)
+    best_epoch: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedPartition(PreparedPartition):
+    """A partition with its network and the curves of its training."""
+
+    network: Network
+    curves: Curves
 
 
 class PartitionNetworks(torch.nn.Module):

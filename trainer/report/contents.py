@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from ..export.export import ExportedModel, PositionErrors
     from ..model import TrainedModel
-    from ..preparation import PreparedPartition
+    from ..networks.networks import TrainedPartition
     from .error_analysis import ErrorAnalysis
 
 HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
@@ -81,7 +81,7 @@ def make_report(
 def _partition_entry(
     rig: Rig,
     partition: Partition,
-    prepared: PreparedPartition,
+    prepared: TrainedPartition,
     analysis: ErrorAnalysis,
     held_out: PositionErrors,
     training_errors: PositionErrors,
