@@ -18,7 +18,7 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
 from trainer.config import TrainingConfig
 from trainer.data.split import split_poses
-from trainer.export.export import PositionErrors, build_model, measure, write_model
+from trainer.export.export import Measurement, build_model, measure, write_model
 from trainer.inputs.block import State
 from trainer.inputs.controls import ControlFeatures
 from trainer.inputs.joints import JointFeatures
@@ -142,9 +142,7 @@ def train_once(study_data: StudyData, config: TrainingConfig, model_path: Path) 
     }
 
 
-def _partition_entry(
-    trained_model: TrainedModel, index: int, validation: PositionErrors, held_out: PositionErrors
-) -> dict:
+def _partition_entry(trained_model: TrainedModel, index: int, validation: Measurement, held_out: Measurement) -> dict:
     vertices, curves = trained_model.partitions[index].vertices, trained_model.prepared[index].curves
 
     def errors(distances: np.ndarray) -> dict:

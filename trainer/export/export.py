@@ -13,6 +13,7 @@ from fdda_addon.core.features import FEATURES_PER_JOINT, FLOAT32_ROUNDING_RATIO
 from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import (
     CHECKSUM_KEY,
+    CONFIDENCE_OUTPUT,
     CONTROLS_INPUT,
     METADATA_KEY,
     POSE_INPUT,
@@ -44,15 +45,18 @@ MAX_SURFACE_POSES = 50
 
 
 @dataclass(frozen=True)
-class PositionErrors:
-    """Distances to the recorded positions, meters, with the vertices in mesh order.
+class Measurement:
+    """Errors of an exported model in n poses, meters.
 
     Attributes:
-        fdda, linear: (n, V) float32, errors of the model and of linear skinning alone.
+        fdda, linear: (n, V) float32, distances to the recorded positions, of the model and of linear skinning alone;
+            with the vertices in mesh order.
+        difference: largest distance from `reference_positions`; 0 if it was not measured.
     """
 
     fdda: np.ndarray
     linear: np.ndarray
+    difference: float = 0.0
 
 
 def reference_positions(
@@ -97,35 +101,56 @@ def open_session(model: bytes) -> onnxruntime.InferenceSession:
         raise TrainingError(f"ONNX Runtime {onnxruntime.__version__} refuses the exported model: {error}") from error
 
 
-def _inputs(recording: Recording, poses: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the inputs of a session for poses of a recording."""
+def _evaluate(
+    session: onnxruntime.InferenceSession, recording: Recording, skinning: LinearSkinning, poses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Evaluate n poses of a recording.
+
+    Returns:
+        (n, V, 3) positions of the model, (n, P) confidence, and the positions of linear skinning alone and of the rig.
+    """
     inputs = {POSE_INPUT: np.array(recording.pose_matrices[poses])}
     if recording.rig.controls:
         inputs[CONTROLS_INPUT] = np.array(recording.controls[poses])
-    return inputs
-
-
-def _evaluate(
-    session: onnxruntime.InferenceSession, recording: Recording, skinning: LinearSkinning, poses: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (n, V, 3) positions in poses of a recording: of the model, of linear skinning alone, and of the rig."""
-    inputs = _inputs(recording, poses)
     matrices = inputs[POSE_INPUT]
-    (positions,) = session.run([POSITIONS_OUTPUT], inputs)
     truth = skinning.complex_positions(matrices, np.array(recording.residuals[poses]))
-    return positions, skinning.positions(matrices), truth
+    return *session.run([POSITIONS_OUTPUT, CONFIDENCE_OUTPUT], inputs), skinning.positions(matrices), truth
 
 
-def measure(session: onnxruntime.InferenceSession, recording: Recording, poses: np.ndarray) -> PositionErrors:
-    """Measure the errors of the exported model and of linear skinning on poses of the recording."""
-    rig = recording.rig
+def measure(
+    session: onnxruntime.InferenceSession,
+    recording: Recording,
+    poses: np.ndarray,
+    trained_model: TrainedModel | None = None,
+) -> Measurement:
+    """Measure the exported model and linear skinning on poses of the recording.
+
+    Args:
+        session, recording: the exported model, and what it was made from.
+        poses: indices of poses.
+        trained_model: model whose `reference_positions` are compared with those of the exported model.
+
+    Raises:
+        TrainingError: the outputs are not finite, or their confidence differs from that of `trained_model`.
+    """
+    rig, difference = recording.rig, 0.0
     fdda, linear = (np.empty((len(poses), rig.vertex_count), np.float32) for _ in range(2))
     skinning = LinearSkinning(rig, recording.partitions)
     for block in block_slices(len(poses), 3 * rig.vertex_count):
-        positions, skinned, truth = _evaluate(session, recording, skinning, poses[block])
+        positions, confidence, skinned, truth = _evaluate(session, recording, skinning, poses[block])
         fdda[block] = distances(positions, truth, rig.metres_per_unit)
         linear[block] = distances(skinned, truth, rig.metres_per_unit)
-    return PositionErrors(fdda, linear)
+        if trained_model:
+            arrays = (np.array(array[poses[block]]) for array in (recording.pose_matrices, recording.controls))
+            expected, expected_confidence = reference_positions(trained_model, *arrays)
+            if not np.isfinite(positions).all() or not np.isfinite(confidence).all():
+                raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
+            if np.abs(confidence - expected_confidence).max(initial=0) > MAX_CONFIDENCE_DIFFERENCE:
+                raise TrainingError(
+                    "The confidence of the exported model differs from PyTorch; this is a defect, report it."
+                )
+            difference = max(difference, float(distances(positions, expected, rig.metres_per_unit).max()))
+    return Measurement(fdda, linear, difference)
 
 
 def measure_surface(session: onnxruntime.InferenceSession, recording: Recording, poses: np.ndarray) -> dict:
@@ -138,66 +163,34 @@ def measure_surface(session: onnxruntime.InferenceSession, recording: Recording,
         Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, recording.partitions
     )
     for pose in poses[:: -(-len(poses) // MAX_SURFACE_POSES)]:
-        (positions,), (skinned,), (truth,) = _evaluate(session, recording, skinning, np.array([pose]))
+        (positions,), _, (skinned,), (truth,) = _evaluate(session, recording, skinning, np.array([pose]))
         rows.append(comparison.compare(truth, (positions, skinned)))
     return surface_json(*(surface_errors(method_rows) for method_rows in zip(*rows, strict=True)))
 
 
-def check_parity(
-    session: onnxruntime.InferenceSession,
-    recording: Recording,
-    trained_model: TrainedModel,
-    poses: np.ndarray,
-    held_out_rms: float,
-) -> float:
-    """Compare the exported model with `reference_positions`.
-
-    Args:
-        session, recording, trained_model: the exported model, and what it was made from.
-        poses: indices of poses.
-        held_out_rms: rms error of the model in held-out poses, meters.
-
-    Returns:
-        The largest difference of a position, meters.
+def check_parity(recording: Recording, held_out: Measurement) -> None:
+    """Check how far the exported model is from `reference_positions` on the held-out poses.
 
     Raises:
-        TrainingError: the difference is too large, or the outputs are not finite.
+        TrainingError: the difference is too large.
     """
-    max_difference, rig = 0.0, recording.rig
-    for block in block_slices(len(poses), 3 * rig.vertex_count):
-        inputs = _inputs(recording, poses[block])
-        positions, confidence = session.run(None, inputs)
-        controls = np.array(recording.controls[poses[block]])
-        expected, expected_confidence = reference_positions(trained_model, inputs[POSE_INPUT], controls)
-        if not np.isfinite(positions).all() or not np.isfinite(confidence).all():
-            raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
-        if np.abs(confidence - expected_confidence).max(initial=0) > MAX_CONFIDENCE_DIFFERENCE:
-            raise TrainingError(
-                "The confidence of the exported model differs from PyTorch; this is a defect, report it."
-            )
-        max_difference = max(max_difference, float(distances(positions, expected, rig.metres_per_unit).max()))
+    rig = recording.rig
     max_coordinate = float(np.abs(rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max())
     rounding = 2 * FLOAT32_ROUNDING_RATIO * max_coordinate * rig.metres_per_unit
     allowed = MAX_DIFFERENCE_METRES * max(1.0, rig.size * rig.metres_per_unit) + rounding
-    allowed = max(allowed, MAX_DIFFERENCE_RATIO * held_out_rms)
-    if max_difference > allowed:
+    allowed = max(allowed, MAX_DIFFERENCE_RATIO * float(np.sqrt(np.square(held_out.fdda).mean())))
+    if held_out.difference > allowed:
         raise TrainingError(
-            f"The exported model differs from PyTorch by {max_difference * 1000:.3g} mm, more than the allowed "
+            f"The exported model differs from PyTorch by {held_out.difference * 1000:.3g} mm, more than the allowed "
             f"{allowed * 1000:.3g} mm; look whether the rig bursts in recorded poses (Corrective Smooth may do that), "
             "or train with a larger weight decay."
         )
-    return max_difference
 
 
 def _model_info(
-    recording: Recording,
-    trained_model: TrainedModel,
-    held_out_errors: np.ndarray,
-    parity: float,
-    training_info: dict,
-    constant_bytes: int,
+    recording: Recording, trained_model: TrainedModel, held_out: Measurement, training_info: dict, constant_bytes: int
 ) -> ModelInfo:
-    """Create the metadata of a model; `parity` is the result of `check_parity`, others are as in `build_model`."""
+    """Create the metadata of a model; arguments as in `build_model`."""
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
     partitions = zip(trained_model.partitions, trained_model.component_counts(), strict=True)
     return ModelInfo(
@@ -211,8 +204,8 @@ def _model_info(
         ),
         *(bound[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         trained_model.training_range.controls,
-        error_statistics(held_out_errors).to_json(),
-        1000 * parity,
+        error_statistics(held_out.fdda).to_json(),
+        1000 * held_out.difference,
         {
             **training_info,
             OBJECT_KEY: recording.info.object_name,
@@ -236,7 +229,7 @@ class ExportedModel:
 
     content: bytes
     info: ModelInfo
-    held_out: PositionErrors
+    held_out: Measurement
     session: onnxruntime.InferenceSession
 
 
@@ -257,18 +250,17 @@ def build_model(
     model = build_graph(trained_model)
     onnx.checker.check_model(model)
     session = open_session(model.SerializeToString())
-    held_out_errors = measure(session, recording, held_out_poses)
-    rms = float(np.sqrt(np.square(held_out_errors.fdda).mean()))
-    parity = check_parity(session, recording, trained_model, held_out_poses, rms)
+    held_out = measure(session, recording, held_out_poses, trained_model)
+    check_parity(recording, held_out)
     constant_bytes = sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer)
-    info = _model_info(recording, trained_model, held_out_errors.fdda, parity, training_info, constant_bytes)
+    info = _model_info(recording, trained_model, held_out, training_info, constant_bytes)
     # The checksum comes first, so that a truncated file still has it.
     model.metadata_props.add(key=CHECKSUM_KEY, value=read_onnx(model.SerializeToString()).checksum)
     model.metadata_props.add(key=METADATA_KEY, value=info.to_json())
     if recording.info.fit:
         skin = skin_to_text(recording.rig.skin_joints, recording.rig.skin_weights)
         model.metadata_props.add(key=SKIN_KEY, value=skin)
-    return ExportedModel(model.SerializeToString(), info, held_out_errors, session)
+    return ExportedModel(model.SerializeToString(), info, held_out, session)
 
 
 def write_model(path: Path, content: bytes) -> None:

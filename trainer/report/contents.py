@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from fdda_addon.core.recording.reader import Recording
     from fdda_addon.core.rig import Rig
 
-    from ..export.export import ExportedModel, PositionErrors
+    from ..export.export import ExportedModel, Measurement
     from ..model import TrainedModel
     from ..networks.networks import TrainedPartition
     from .error_analysis import ErrorAnalysis
@@ -28,7 +28,7 @@ def make_report(
     recording: Recording,
     trained_model: TrainedModel,
     exported: ExportedModel,
-    training_errors: PositionErrors,
+    training_errors: Measurement,
     surface: dict,
     model_name: str,
     analyses: Sequence[ErrorAnalysis],
@@ -83,8 +83,8 @@ def _partition_entry(
     partition: Partition,
     prepared: TrainedPartition,
     analysis: ErrorAnalysis,
-    held_out: PositionErrors,
-    training_errors: PositionErrors,
+    held_out: Measurement,
+    training_errors: Measurement,
 ) -> dict:
     names, controls, vertices = rig.joint_names, [control.name for control in rig.controls], partition.vertices
     curves = prepared.curves
