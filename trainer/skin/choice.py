@@ -2,13 +2,12 @@
 """Chooses the key joints of a folder of poses, and finds what the motion of each vertex follows from."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
-from fdda_addon.core.key_joints import KeyJointReport
 from fdda_addon.core.partition import joints_with_weight, make_partitions
 from fdda_addon.core.patches import divide_into_patches
 from fdda_addon.core.recording.fit_folder import FitPoses
@@ -16,26 +15,8 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import are_invertible, skin_matrices
 
 from .input_blocks import LENGTH_RATIO, InputBlocks
-from .key_joints import TOLERANCE_RATIO, KeyJointSearch, joint_moments
+from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments
 from .solver import fit_skin
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Key joints of a rig with J joints and C controls.
-
-    Attributes:
-        joints: (K,) indices of the key joints, ascending.
-        weighted_joints: indices of the key joints to which weights are fitted, ascending.
-        needed_inputs: (V, K + C) bool, the key joints and controls from which the motion of a vertex follows that
-            other joints cause.
-        report: numbers of joints and errors.
-    """
-
-    joints: np.ndarray
-    weighted_joints: np.ndarray
-    needed_inputs: np.ndarray
-    report: KeyJointReport
 
 
 def choose_key_joints(
@@ -45,7 +26,7 @@ def choose_key_joints(
     static_joints: np.ndarray,
     metres_per_unit: float,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Choice:
+) -> KeyJoints:
     """Choose key joints by random poses.
 
     Joints that only frames of actions move are kept, because random poses do not show what they would follow from.
@@ -67,27 +48,16 @@ def choose_key_joints(
             "A bone has a scale of zero in some pose, so key joints cannot be chosen; look for the key, constraint or "
             "driver that sets it."
         )
-    joint_count, names = len(poses.rig.joints), poses.rig.joint_names
     moments, acts = _measure_vertices(poses)
     blocks = InputBlocks(poses)
-    is_still = blocks.widths[:joint_count] == 0
-    tolerance = TOLERANCE_RATIO * poses.rig.size
-    is_unseen = is_still & (_measure_unseen_motions(all_poses, random_count, moments) > tolerance)
-    search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
-    result = search.search(None if requested == AUTO else int(requested), on_progress)
-    columns = np.concatenate([result.joints, np.arange(joint_count, blocks.count)])
-    needed_inputs = (acts.astype(np.float32) @ result.inputs[:, columns].astype(np.float32)) > 0
-    is_removed = ~np.isin(np.arange(joint_count), result.joints)
-    report = KeyJointReport(
-        requested,
-        len(result.joints),
-        joint_count,
-        1000 * metres_per_unit * float(result.unexplained.max()),
-        1000 * metres_per_unit * tolerance,
-        tuple(names[joint] for joint in np.argsort(-result.unexplained) if result.is_independent[joint]),
-        tuple(names[joint] for joint in np.flatnonzero(is_removed & is_still)),
+    is_still, unseen_motions = (
+        blocks.widths[: len(moments)] == 0,
+        _measure_unseen_motions(all_poses, random_count, moments),
     )
-    return Choice(result.joints, result.weighted_joints, needed_inputs, report)
+    is_unseen = is_still & (unseen_motions > TOLERANCE_RATIO * poses.rig.size)
+    search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
+    search.search(None if requested == AUTO else int(requested), on_progress)
+    return search.result(requested, acts, metres_per_unit)
 
 
 def _measure_vertices(poses: FitPoses) -> tuple[np.ndarray, np.ndarray]:

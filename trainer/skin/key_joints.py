@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdda_addon.core.key_joints import KeyJointReport
 from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.skinning import skin_matrices
 
@@ -38,21 +39,20 @@ ANCHOR_POSES = 24
 
 @dataclass(frozen=True)
 class KeyJoints:
-    """The result of a search among J joints and C controls.
+    """Key joints of a rig with V vertices, J joints and C controls.
 
     Attributes:
         joints: (K,) indices of the key joints, ascending.
-        weighted_joints: key joints that may have skin weights; the others are kept for their children alone.
-        inputs: (J, J + C) bool, the key joints and controls that explain each removed joint.
-        unexplained: (J,) motion that the inputs do not explain, rms, mesh units; 0 for key joints.
-        is_independent: (J,) bool, removed joints that would not be removed automatically.
+        weighted_joints: ascending, key joints that may have skin weights; the others are kept for their children alone.
+        needed_inputs: (V, K + C) bool, the key joints and controls from which the motion of a vertex follows that other
+            joints cause.
+        report: numbers of joints and errors.
     """
 
     joints: np.ndarray
     weighted_joints: np.ndarray
-    inputs: np.ndarray
-    unexplained: np.ndarray
-    is_independent: np.ndarray
+    needed_inputs: np.ndarray
+    report: KeyJointReport
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class KeyJointSearch:
             is_static: (J,) bool, joints that never move.
             is_unseen: (J,) bool, joints that only actions move. Neither are removed.
         """
-        self._size = max(poses.rig.size, 1e-9)
+        self._size, self._names = max(poses.rig.size, 1e-9), poses.rig.joint_names
         self._tolerance = TOLERANCE_RATIO * self._size
         self._blocks, self._is_kept = blocks, np.ones(len(moments), bool)
         self._is_required = is_static | is_unseen
@@ -149,9 +149,7 @@ class KeyJointSearch:
             motions[joint, joint] = np.inf
         return motions
 
-    def search(
-        self, count: int | None = None, on_step: Callable[[int, int], None] = lambda done, total: None
-    ) -> KeyJoints:
+    def search(self, count: int | None, on_step: Callable[[int, int], None]) -> None:
         """Remove joints whose unexplained motion is within the tolerance, or until `count` joints are left.
 
         At least one joint is left besides those that are never removed. `on_step` is called often, with the number of
@@ -185,7 +183,6 @@ class KeyJointSearch:
             self._blocks.restore(joint, children)
             if is_removable:
                 heapq.heappush(queue, entry)
-        return self._result()
 
     @property
     def _may_have_weights(self) -> np.ndarray:
@@ -266,7 +263,8 @@ class KeyJointSearch:
                 break
         return best
 
-    def _result(self) -> KeyJoints:
+    def result(self, requested: str, acts: np.ndarray, metres_per_unit: float) -> KeyJoints:
+        """Return the joints that are left; `acts` is (V, J) bool, the vertices on which each joint acts."""
         joint_count = len(self._is_kept)
         inputs, unexplained = np.zeros((joint_count, self._blocks.count), bool), np.zeros(joint_count)
         is_independent = np.zeros(joint_count, bool)
@@ -279,9 +277,18 @@ class KeyJointSearch:
             unexplained[joint], is_independent[joint] = explanation.unexplained, explanation.cost > 1
         joints = np.flatnonzero(self._is_kept)
         weighted_joints = joints[self._may_have_weights[joints]]
-        return KeyJoints(
-            joints, weighted_joints if len(weighted_joints) else joints, inputs, unexplained, is_independent
+        columns = np.append(joints, np.arange(joint_count, self._blocks.count))
+        needed_inputs = (acts.astype(np.float32) @ inputs[:, columns].astype(np.float32)) > 0
+        report = KeyJointReport(
+            requested,
+            len(joints),
+            joint_count,
+            1000 * metres_per_unit * float(unexplained.max()),
+            1000 * metres_per_unit * self._tolerance,
+            tuple(self._names[joint] for joint in np.argsort(-unexplained) if is_independent[joint]),
+            tuple(self._names[joint] for joint in np.flatnonzero(~self._is_kept & self._is_still)),
         )
+        return KeyJoints(joints, weighted_joints if len(weighted_joints) else joints, needed_inputs, report)
 
 
 def _rms(motion: np.ndarray) -> float:
