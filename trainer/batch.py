@@ -16,20 +16,6 @@ from .outputs import check_training_outputs, training_outputs
 from .progress import MessageSink
 
 
-class _BatchItemSink:
-    """Forwards the messages of each training, sends `FINISHED` as `MODEL_FINISHED`, and stores its values."""
-
-    def __init__(self, sink: MessageSink):
-        self._sink = sink
-        self.finished_values: list[dict] = []
-
-    def send(self, message_type: MessageType, **values) -> None:
-        if message_type is MessageType.FINISHED:
-            message_type = MessageType.MODEL_FINISHED
-            self.finished_values.append(values)
-        self._sink.send(message_type, **values)
-
-
 def check_batch(recordings: list[Path], folder: Path, overwrite: bool = False) -> None:
     """Check recordings and outputs before the first training, without importing torch.
 
@@ -82,16 +68,12 @@ def train_models(
     from .train import train_model
 
     started = time.perf_counter()
-    item_sink = _BatchItemSink(sink)
-    for recording in recordings:
-        model = _model_path(recording, folder)
-        train_model(recording, model, config, item_sink, stoppable, warm_start, strict)
+    settings = (config, sink, stoppable, warm_start, strict, MessageType.MODEL_FINISHED)
+    results = [train_model(recording, _model_path(recording, folder), *settings) for recording in recordings]
     sink.send(
         MessageType.FINISHED,
         model=str(folder),
         models=len(recordings),
         seconds=round(time.perf_counter() - started, 2),
-        **{
-            key: max(values[key] for values in item_sink.finished_values) for key in ("held_out_mm", "held_out_p999_mm")
-        },
+        **{key: max(values[key] for values in results) for key in ("held_out_mm", "held_out_p999_mm")},
     )

@@ -33,7 +33,7 @@ from .networks.loop import choose_device, train
 from .networks.networks import TrainedPartition
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import training_outputs
-from .preparation import PartitionData, PreparedPartition, partition_data, prepare_partitions
+from .preparation import PartitionData, partition_data, prepare_partitions
 from .progress import MessageSink
 from .report.contents import make_report
 from .report.error_analysis import analyze_errors
@@ -48,17 +48,22 @@ def train_model(
     stoppable: Callable[[], AbstractContextManager] = nullcontext,
     warm_start: bool = False,
     strict: bool = False,
-) -> None:
+    last_message: MessageType = MessageType.FINISHED,
+) -> dict:
     """Train a model, and write it with its checkpoint and its report beside it.
 
     Args:
         recording_path: folder of a complete recording.
         model_path: the .onnx file; `check_training_outputs` has checked it. All files are written at the end.
         config: settings of the training.
-        sink: receives the messages from `STARTED` to `FINISHED`. Errors are raised, not sent.
+        sink: receives the messages from `STARTED` to `last_message`. Errors are raised, not sent.
         stoppable: makes the context in which the process may be ended, because it writes nothing there.
         warm_start: start from the checkpoint of the model, on a recording that may have grown since.
         strict: treat warnings about the recording as errors.
+        last_message: `FINISHED`, or `MODEL_FINISHED` in a batch.
+
+    Returns:
+        The values of the last message.
 
     Raises:
         FDDAError: the recording or the settings cannot be used, or a file cannot be written.
@@ -73,14 +78,17 @@ def train_model(
         warnings = job.start(strict)
         inputs = job.fit_inputs()
         partitions = job.collect_partition_data(inputs)
-        prepared = job.prepare(partitions)
-        prepared = job.compress(job.train_networks(prepared), partitions)
+        prepared = job.compress(job.train_networks(partitions), partitions)
         trained_model = make_trained_model(recording, inputs, split, prepared)
         exported = job.export(trained_model)
         report = job.measure(trained_model, exported, model_path.name)
         entry = {"poses": len(recording.pose_matrices), "p999": exported.info.held_out_mm["p999"]}
         history = [*(checkpoint.history if checkpoint else ()), entry]
-        goal_result = _evaluate_goal(config, history, report, recording_path, model_path)
+        goal_result = None
+        if config.goal_mm:
+            training_p999_mm = report["fdda"]["training"]["p999"]
+            goal_result = evaluate_goal(config.goal_mm, history, training_p999_mm, recording_path, model_path)
+            report["goal"] = goal_result.to_json()
         # The time is in the report only, so that equal recordings and settings give equal models.
         report["training"] = {**report["training"], "seconds": round(time.perf_counter() - start_time, 2)}
         report["warnings"] = [warning.to_json() for warning in warnings]
@@ -91,7 +99,7 @@ def train_model(
         write_checkpoint(checkpoint_file, trained_model.checkpoint(holdout, config, history))
         report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
-    _send_final_messages(sink, model_path, report, goal_result, time.perf_counter() - start_time)
+    return _send_final_messages(sink, model_path, report, goal_result, start_time, last_message)
 
 
 @dataclass(frozen=True)
@@ -150,19 +158,16 @@ class _Job:
             self.log("The rig blends rotations: residuals are fitted to half-rotation features, too.")
         return partition_data(self.recording, inputs, use_half_rotations)
 
-    def prepare(self, partitions: list[PartitionData]) -> list[PreparedPartition]:
-        """Fit the linear part of each partition, and compute its components."""
-        return prepare_partitions(
+    def train_networks(self, partitions: list[PartitionData]) -> list[TrainedPartition]:
+        """Prepare the partitions, and train their networks from random weights, or from a checkpoint."""
+        config, initial = self.config, None
+        prepared = prepare_partitions(
             partitions,
             self.split,
-            self.config,
+            config,
             self.recording.rig.metres_per_unit,
             lambda done: self.sink.send(MessageType.PREPARING, done=done, total=len(partitions)),
         )
-
-    def train_networks(self, prepared: list[PreparedPartition]) -> list[TrainedPartition]:
-        """Train the networks from random weights, or from a checkpoint."""
-        config, initial = self.config, None
         if self.checkpoint:
             config, initial = warm_start_config(config), initial_networks(self.checkpoint, prepared)
 
@@ -205,21 +210,15 @@ class _Job:
         return make_report(recording, trained_model, exported, training_errors, surface, model_name, analyses)
 
 
-def _evaluate_goal(
-    config: TrainingConfig, history: list[dict], report: dict, recording_path: Path, model_path: Path
-) -> GoalResult | None:
-    """Compare the model with the accuracy goal, and add the result to the report; returns None without a goal."""
-    if not config.goal_mm:
-        return None
-    training_p999_mm = report["fdda"]["training"]["p999"]
-    goal_result = evaluate_goal(config.goal_mm, history, training_p999_mm, recording_path, model_path)
-    report["goal"] = goal_result.to_json()
-    return goal_result
-
-
 def _send_final_messages(
-    sink: MessageSink, model_path: Path, report: dict, goal_result: GoalResult | None, seconds: float
-) -> None:
+    sink: MessageSink,
+    model_path: Path,
+    report: dict,
+    goal_result: GoalResult | None,
+    start_time: float,
+    last_message: MessageType,
+) -> dict:
+    """Send the messages after the files are written; arguments and result as in `train_model`."""
     for partition in report["partitions"]:
         sink.send(
             MessageType.PARTITION_FINISHED,
@@ -229,12 +228,12 @@ def _send_final_messages(
         )
     if goal_result:
         sink.send(MessageType.LOG, text=goal_result.text)
-    held_out = report["fdda"]["held_out"]
-    sink.send(
-        MessageType.FINISHED,
-        model=str(model_path),
-        seconds=round(seconds, 2),
-        held_out_mm=held_out["mean"],
-        held_out_p999_mm=held_out["p999"],
+    values = {
+        "model": str(model_path),
+        "seconds": round(time.perf_counter() - start_time, 2),
+        "held_out_mm": report["fdda"]["held_out"]["mean"],
+        "held_out_p999_mm": report["fdda"]["held_out"]["p999"],
         **({"verdict": goal_result.verdict.value} if goal_result else {}),
-    )
+    }
+    sink.send(last_message, **values)
+    return values
