@@ -24,9 +24,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fdda_addon.core.partition import Partition
+from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import split_poses
-from trainer.fits.joint_fit import make_joint_regression
+from trainer.fits.joint_fit import joint_regression
 from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs
 from trainer.networks.loop import train
@@ -115,19 +116,20 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
         index = names.index(joint)
         poses[:, index, :3] = local
         poses[:, index, :3, 3] *= METERS_PER_CM
-    parents = np.array([names.index(parent_of(joint)) if parent_of(joint) else -1 for joint in names])
+    hierarchy = tuple(Joint(joint, names.index(parent_of(joint)) if parent_of(joint) else -1) for joint in names)
     for index in range(1, len(names)):
-        poses[:, index] = poses[:, parents[index]] @ poses[:, index]
-    partition = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
-    joints = JointFeatures(parents, np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
-    inputs = NetworkInputs.of([joints], [partition])
+        poses[:, index] = poses[:, hierarchy[index].parent] @ poses[:, index]
+    # The rest pose is not known: the identity replaces it, and one vertex at the origin the mesh.
+    rest_matrices, skin = np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)), np.zeros((1, 1), np.int32)
+    rig = Rig(hierarchy, np.zeros((1, 3), np.float32), rest_matrices, skin, 1.0 + skin, Fingerprint("", "", ""))
+    partition = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(1, np.int32))
+    inputs = NetworkInputs.of([JointFeatures.make(rig, [], {})], [partition])
     features = inputs.compute_features(poses.astype(np.float32), np.zeros((len(poses), 0)))
     residuals = residuals * np.float32(METERS_PER_CM)
     data = PartitionData(
         features[:, inputs.columns[0]],
         lambda: residuals,
-        # The rest pose is not known: the identity replaces it.
-        lambda: make_joint_regression(parents, partition, poses, np.zeros(3)),
+        lambda: joint_regression(rig, partition, poses),
     )
     return ReferencePartition(name, data, partition.joint, poses)
 

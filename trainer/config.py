@@ -3,7 +3,7 @@
 
 import argparse
 import math
-from collections.abc import Callable
+import sys
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -11,31 +11,13 @@ from fdda_addon.core.defaults import EPOCHS, TOLERANCE_MM
 from fdda_addon.core.errors import TrainingError
 
 ACTIVATIONS = ("silu", "gelu", "tanh", "relu")
+MAX_SEED = (1 << 63) - 1
+"""torch takes no larger seeds."""
+ABOVE_ZERO, LARGEST = math.ulp(0.0), sys.float_info.max
 
 
-def _is_at_least(minimum: float) -> Callable[[float], bool]:
-    return lambda value: minimum <= value < math.inf
-
-
-def _is_positive(value: float) -> bool:
-    return 0 < value < math.inf
-
-
-def _is_seed(value: int) -> bool:
-    # torch takes no larger seeds.
-    return 0 <= value < 1 << 63
-
-
-def _is_part(value: float) -> bool:
-    return 0 < value <= 0.4
-
-
-def _are_layers(hidden: tuple[int, ...]) -> bool:
-    return len(hidden) > 0 and all(1 <= units <= 4096 for units in hidden)
-
-
-def _setting(default: Any, help_text: str, is_valid: Callable[[Any], bool]) -> Any:
-    return field(default=default, metadata={"help": help_text, "is_valid": is_valid})
+def _setting(default: Any, help_text: str, low: float = 0, high: float = LARGEST) -> Any:
+    return field(default=default, metadata={"help": help_text, "low": low, "high": high})
 
 
 @dataclass(frozen=True)
@@ -46,33 +28,36 @@ class TrainingConfig:
         TrainingError: a value is impossible.
     """
 
-    seed: int = _setting(0, "of the split, the initial weights and the order of the poses", _is_seed)
+    seed: int = _setting(0, "of the split, the initial weights and the order of the poses", high=MAX_SEED)
     tolerance_mm: float = _setting(
-        TOLERANCE_MM, "rms error that the components may leave over the whole mesh, in mm", _is_positive
+        TOLERANCE_MM, "rms error that the components may leave over the whole mesh, in mm", ABOVE_ZERO
     )
-    hidden: tuple[int, ...] = _setting((64, 64), "units of each hidden layer", _are_layers)
-    activation: str = _setting("silu", "of the hidden layers", ACTIVATIONS.__contains__)
-    epochs: int = _setting(EPOCHS, "passes over the training poses", _is_at_least(1))
-    batch_size: int = _setting(64, "poses per step", _is_at_least(1))
-    learning_rate: float = _setting(1e-2, "maximum of the one-cycle schedule", _is_positive)
-    weight_decay: float = _setting(0.2, "of AdamW", _is_at_least(0))
+    hidden: tuple[int, ...] = _setting((64, 64), "units of each hidden layer", 1, 4096)
+    activation: str = _setting("silu", "of the hidden layers")
+    epochs: int = _setting(EPOCHS, "passes over the training poses", 1)
+    batch_size: int = _setting(64, "poses per step", 1)
+    learning_rate: float = _setting(1e-2, "maximum of the one-cycle schedule", ABOVE_ZERO)
+    weight_decay: float = _setting(0.2, "of AdamW", 0)
     validation_fraction: float = _setting(
-        0.05, "part of the poses that selects the best weights and does not train", _is_part
+        0.05, "part of the poses that selects the best weights and does not train", ABOVE_ZERO, 0.4
     )
     held_out_fraction: float = _setting(
-        0.1, "part of the poses that measures the error, and neither trains nor selects weights", _is_part
+        0.1, "part of the poses that measures the error, and neither trains nor selects weights", ABOVE_ZERO, 0.4
     )
     goal_mm: float = _setting(
-        0.0, "distance that 99.9 %% of the held-out vertices should not exceed, in mm; 0 for no goal", _is_at_least(0)
+        0.0, "distance that 99.9 %% of the held-out vertices should not exceed, in mm; 0 for no goal", 0
     )
-    include_unsettled: bool = _setting(
-        False, "also use poses in which the target did not come to rest", (False, True).__contains__
-    )
+    include_unsettled: bool = _setting(False, "also use poses in which the target did not come to rest")
 
     def __post_init__(self):
         for setting in fields(self):
-            value = getattr(self, setting.name)
-            if not setting.metadata["is_valid"](value):
+            value, limits = getattr(self, setting.name), setting.metadata
+            if isinstance(setting.default, str | bool):
+                is_valid = value in (ACTIVATIONS if setting.name == "activation" else (False, True))
+            else:
+                values = value if isinstance(value, tuple) else (value,)
+                is_valid = values and all(limits["low"] <= number <= limits["high"] for number in values)
+            if not is_valid:
                 raise TrainingError(
                     f"The training setting {setting.name} cannot be {value!r}; see python -m trainer --help."
                 )

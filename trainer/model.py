@@ -44,15 +44,8 @@ class TrainedModel:
     def checkpoint(self, holdout: str, config: TrainingConfig, history: list[dict]) -> Checkpoint:
         """Return the state from which the training can be continued; other arguments as in `Checkpoint`."""
         partitions = [
-            PartitionCheckpoint(
-                prepared.columns,
-                prepared.feature_mean,
-                prepared.feature_scale,
-                prepared.basis.mean,
-                prepared.basis.components,
-                prepared.network,
-            )
-            for prepared in self.prepared
+            PartitionCheckpoint(p.columns, p.feature_mean, p.feature_scale, p.basis.mean, p.basis.components, p.network)
+            for p in self.prepared
         ]
         return Checkpoint(
             self.rig.fingerprint,

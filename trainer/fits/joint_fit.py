@@ -7,7 +7,6 @@ Lewis, Direct Delta Mush Skinning and Variants, 2019, show how much of delta mus
 that preserves volume, half-rotation features are also regressors (`half_rotations`).
 """
 
-from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +47,7 @@ class JointFit:
         """Compute the offsets of the vertices from linear skinning.
 
         Args:
-            matrices: (N, J, 3, 4) or (N, 2 J, 3, 4), as in `make_joint_regression`.
+            matrices: (N, J, 3, 4) or (N, 2 J, 3, 4), as in `joint_regression`.
 
         Returns:
             (N, Vp, 3) float64, mesh-object space, mesh units.
@@ -72,7 +71,7 @@ class JointRegression:
     joints: np.ndarray
     center: np.ndarray
     design: np.ndarray
-    metres_per_unit: float = 1.0
+    metres_per_unit: float
 
     def main_joint_only(self) -> "JointRegression":
         """Return the regression on the main joint alone, which is constant in its own space."""
@@ -169,31 +168,16 @@ def _select_joints(gram: np.ndarray, moments: np.ndarray, total: float) -> np.nd
 
 
 def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> JointRegression:
-    """Create the regression of a rig's partition; `matrices` as in `make_joint_regression`."""
-    center = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
-    static = {index for index, name in enumerate(rig.joint_names) if name == STATIC_JOINT}
-    return make_joint_regression(rig.parents, partition, matrices, center, static, rig.metres_per_unit)
-
-
-def make_joint_regression(
-    parents: np.ndarray,
-    partition: Partition,
-    matrices: np.ndarray,
-    center: np.ndarray,
-    static: Set[int] = frozenset(),
-    metres_per_unit: float = 1.0,
-) -> JointRegression:
     """Create the regression on all joints whose motion relative to the main joint depends on influencing joints alone.
 
     Args:
-        parents: (J,) parent index of each joint, -1 for a root.
-        partition: partition with its main joint and influencing joints.
+        rig, partition: the rig, and a partition of it.
         matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) followed by half-rotation
             matrices (`half_rotations.regression_matrices`). The rest pose may be any fixed pose.
-        center: (3,) center of the partition where all skin matrices are the identity, mesh units.
-        static: joints that never move; they influence nothing.
-        metres_per_unit: as in `Rig`.
     """
+    parents, center = rig.parents, rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
+    # The static joint never moves, so it influences nothing.
+    static = {index for index, name in enumerate(rig.joint_names) if name == STATIC_JOINT}
     influencing, main, count = set(partition.influencing), partition.joint, len(parents)
     paths = [joints_on_path(parents, main, joint) for joint in range(count)]
     # A half rotation is in the space of the joint's parent, and depends on the joint.
@@ -205,7 +189,9 @@ def make_joint_regression(
     relative[:, :, :, 3] -= is_skin * matrices[:, main, None, :3, 3]
     local = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ relative
     local[:, :, :, 3] += is_skin * (local[:, :, :, :3] @ center - center)
-    return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), metres_per_unit)
+    return JointRegression(
+        joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), rig.metres_per_unit
+    )
 
 
 def joints_on_path(parents: np.ndarray, first: int, second: int) -> set[int]:

@@ -63,16 +63,10 @@ class SmoothedSurface:
         """
         starts, corner_counts = self._starts[vertices], np.diff(self._starts)[vertices]
         corner_slots = np.arange(corner_counts.max())
-        is_corner, corners = (
-            corner_slots < corner_counts[:, None],
-            starts[:, None] + np.minimum(corner_slots, corner_counts[:, None] - 1),
-        )
+        is_corner = corner_slots < corner_counts[:, None]
+        corners = starts[:, None] + np.minimum(corner_slots, corner_counts[:, None] - 1)
         # Both edges of a padded corner have length 0.
-        edge_ends = np.where(
-            is_corner,
-            (self._predecessors[corners], self._successors[corners]),
-            vertices[:, None],
-        )
+        edge_ends = np.where(is_corner, (self._predecessors[corners], self._successors[corners]), vertices[:, None])
         nearby_vertices, row_indices = np.unique(np.append(edge_ends.ravel(), vertices), return_inverse=True)
         shape, completed_iterations = (len(nearby_vertices), self._smoothing_step.shape[0]), 0
         smoothing_rows = sparse.csr_array(

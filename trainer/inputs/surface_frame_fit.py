@@ -47,6 +47,7 @@ class _Candidate:
         vertex, partition, joint: indices; the joint is the partition's main joint.
         mean_square: mean squared residual that joints and earlier candidates of the partition do not explain, square
             mesh units.
+        column_space: (3 n, r) orthonormal basis of the residuals of the partition that the joints explain.
         residual: (3 n,) float64, residual that the joints do not explain, in the space of the main joint, mesh units.
     """
 
@@ -54,22 +55,8 @@ class _Candidate:
     partition: int
     joint: int
     mean_square: float
+    column_space: np.ndarray
     residual: np.ndarray
-
-
-@dataclass(frozen=True)
-class _EvaluatedPoses:
-    """The n evaluated poses.
-
-    Attributes:
-        matrices: (n, J, 4, 4) pose matrices, mesh-object space, mesh units.
-        to_local: (n, J, 3, 3) float64, rotate a vector from mesh-object space to the space of a joint's residuals.
-        column_spaces: by partition index, (3 n, r) orthonormal basis of the residuals that the nearby joints explain.
-    """
-
-    matrices: np.ndarray
-    to_local: np.ndarray
-    column_spaces: dict[int, np.ndarray]
 
 
 def select_surface_frames(recording: Recording, split: Split, tolerance_mm: float) -> SurfaceFrames:
@@ -92,7 +79,7 @@ def select_surface_frames(recording: Recording, split: Split, tolerance_mm: floa
     skin = skin_matrices(matrices, rig.rest_matrices)
     is_usable = _may_be_candidate(rig)
     min_mean_square = (tolerance_mm / (1000 * rig.metres_per_unit)) ** 2
-    candidates, column_spaces = [], {}
+    candidates: list[_Candidate] = []
     for index, partition in enumerate(recording.partitions):
         regression = joint_regression(rig, partition, skin)
         if regression.is_determined():
@@ -100,22 +87,21 @@ def select_surface_frames(recording: Recording, split: Split, tolerance_mm: floa
             vertices = partition.vertices[is_usable[partition.vertices]]
             residuals = np.asarray(recording.residuals[np.ix_(training, vertices)], np.float32)
             candidates += _select_candidates(residuals, column_space, vertices, index, partition.joint, min_mean_square)
-            column_spaces[index] = column_space
-    poses = _EvaluatedPoses(matrices, np.linalg.inv(skin[:, :, :3, :3].astype(np.float64)), column_spaces)
+    to_local = np.linalg.inv(skin[:, :, :3, :3].astype(np.float64))
     candidates.sort(key=lambda candidate: -candidate.mean_square)
     max_count = min(MEAN_CANDIDATES_PER_PARTITION * len(recording.partitions), MAX_JOINT_ENTRIES // len(rig.joints))
     candidates = candidates[:max_count]
     if not candidates:
         return NO_SURFACE_FRAMES
     smoothed_surface = SmoothedSurface(rig)
-    iteration_count = _best_iteration_count(smoothed_surface, candidates[:MAX_PROBED_CANDIDATES], poses)
+    iteration_count = _best_iteration_count(smoothed_surface, candidates[:MAX_PROBED_CANDIDATES], matrices, to_local)
     candidates.sort(key=lambda candidate: (candidate.partition, candidate.vertex))
     surface_frames = next(
         frames
         for iterations, frames in smoothed_surface.surface_frames(*_vertices_and_joints(candidates))
         if iterations == iteration_count
     )
-    lengths, explained_fractions = _fit_lengths(surface_frames, candidates, poses)
+    lengths, explained_fractions = _fit_lengths(surface_frames, candidates, matrices, to_local)
     # The condition is not inverted, because a comparison with NaN is False.
     if not (
         explained_fractions.max() >= MIN_BEST_EXPLAINED_VARIANCE
@@ -165,9 +151,8 @@ def _select_candidates(
         if mean_squares[worst_vertex] <= min_mean_square:
             break
         residual = unexplained[:, worst_vertex].astype(np.float64)
-        candidates.append(
-            _Candidate(int(vertices[worst_vertex]), partition, joint, float(mean_squares[worst_vertex]), residual)
-        )
+        vertex, mean_square = int(vertices[worst_vertex]), float(mean_squares[worst_vertex])
+        candidates.append(_Candidate(vertex, partition, joint, mean_square, column_space, residual))
         selected_residual = remaining_by_axis[:, :, worst_vertex].copy()
         gram = selected_residual.T.astype(np.float64) @ selected_residual
         ridge = MIN_SINGULAR_VALUE_RATIO**2 * np.trace(gram)
@@ -182,13 +167,15 @@ def _vertices_and_joints(candidates: Sequence[_Candidate]) -> np.ndarray:
 
 
 def _best_iteration_count(
-    smoothed_surface: SmoothedSurface, candidates: Sequence[_Candidate], poses: _EvaluatedPoses
+    smoothed_surface: SmoothedSurface, candidates: Sequence[_Candidate], matrices: np.ndarray, to_local: np.ndarray
 ) -> int:
     """Return the number of smoothing iterations at which the corners explain most of the candidates' residuals."""
     squared_residuals = np.array([candidate.residual @ candidate.residual for candidate in candidates])
     explained_by_iterations = {
         iterations: float(
-            _fit_lengths(surface_frames, candidates, poses)[1] @ squared_residuals / squared_residuals.sum()
+            _fit_lengths(surface_frames, candidates, matrices, to_local)[1]
+            @ squared_residuals
+            / squared_residuals.sum()
         )
         for iterations, surface_frames in smoothed_surface.surface_frames(*_vertices_and_joints(candidates))
     }
@@ -196,21 +183,26 @@ def _best_iteration_count(
 
 
 def _fit_lengths(
-    surface_frames: SurfaceFrames, candidates: Sequence[_Candidate], poses: _EvaluatedPoses
+    surface_frames: SurfaceFrames, candidates: Sequence[_Candidate], matrices: np.ndarray, to_local: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit the lengths of tangents and normals to the candidates' residuals.
+
+    Args:
+        surface_frames, candidates: D surface frames, each at the vertex of a candidate.
+        matrices: (n, J, 4, 4) pose matrices, mesh-object space, mesh units.
+        to_local: (n, J, 3, 3) float64, rotate a vector from mesh-object space to the space of a joint's residuals.
 
     Returns:
         (3, D, K) lengths, mesh units, and the (D,) explained fractions of the squared residuals.
     """
-    to_local = poses.to_local[:, surface_frames.main_joints]
-    local_vectors = np.einsum("ndab,nfdkb->dnafk", to_local, surface_frames.compute_corner_vectors(poses.matrices))
+    vectors = surface_frames.compute_corner_vectors(matrices)
+    local_vectors = np.einsum("ndab,nfdkb->dnafk", to_local[:, surface_frames.main_joints], vectors)
     lengths, explained_fractions = np.zeros_like(surface_frames.lengths), np.zeros(len(surface_frames))
     for index, candidate in enumerate(candidates):
         is_used, residual = surface_frames.lengths[:, index] != 0, candidate.residual
         regressors = local_vectors[index][..., is_used].reshape(len(residual), -1)
-        regressors = _remove_projection(poses.column_spaces[candidate.partition], regressors)
-        gram, ridge = regressors.T @ regressors, RIDGE_RADIANS**2 * len(poses.matrices)
+        regressors = _remove_projection(candidate.column_space, regressors)
+        gram, ridge = regressors.T @ regressors, RIDGE_RADIANS**2 * len(matrices)
         lengths[:, index][is_used] = solve_ridge(gram, regressors.T @ residual, ridge)
         error = residual - regressors @ lengths[:, index][is_used]
         explained_fractions[index] = 1 - error @ error / (residual @ residual)

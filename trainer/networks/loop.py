@@ -91,11 +91,8 @@ class _Loop:
             _padded(arrays, split.validation, device) for arrays in (inputs, targets)
         )
         self.to_mm = torch.tensor([p.residual_rms * p.mm_per_unit for p in partitions], device=device)[:, None]
-        self.validation_truncation_mm = torch.tensor(
-            np.stack([p.validation_truncation * p.mm_per_unit for p in partitions]),
-            dtype=torch.float32,
-            device=device,
-        )
+        validation_truncation_mm = np.stack([p.validation_truncation * p.mm_per_unit for p in partitions])
+        self.validation_truncation_mm = torch.tensor(validation_truncation_mm, dtype=torch.float32, device=device)
         truncation_rms_mm = [p.basis.truncation_rms * p.mm_per_unit for p in partitions]
         self.truncation_mm = torch.tensor(truncation_rms_mm, device=device)[:, None]
         self.model = PartitionNetworks(

@@ -12,12 +12,7 @@ from torch.nn import functional
 
 from ..preparation import PreparedPartition
 
-ACTIVATION_FUNCTIONS = {
-    "silu": functional.silu,
-    "gelu": functional.gelu,
-    "tanh": torch.tanh,
-    "relu": torch.relu,
-}
+ACTIVATION_FUNCTIONS = {"silu": functional.silu, "gelu": functional.gelu, "tanh": torch.tanh, "relu": torch.relu}
 
 
 @dataclass(frozen=True)
