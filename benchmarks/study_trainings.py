@@ -151,7 +151,7 @@ def _partition_entry(trained_model: TrainedModel, index: int, validation: Measur
     return {
         "vertices": len(vertices),
         "features": len(trained_model.prepared[index].columns),
-        "basis": trained_model.component_counts()[index],
+        "basis": len(trained_model.prepared[index].basis.components),
         "validation": errors(validation.fdda),
         "validation_linear": errors(validation.linear),
         "held_out": errors(held_out.fdda),

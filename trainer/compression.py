@@ -50,11 +50,7 @@ def drop_components(prepared: Sequence[TrainedPartition], split: Split) -> list[
 
 
 def dropped_components_sentence(prepared: Sequence[TrainedPartition], remaining: Sequence[TrainedPartition]) -> str:
-    """Describe which components were dropped, and what may help; empty if none was dropped.
-
-    Args:
-        prepared, remaining: the partitions before and after `drop_components`.
-    """
+    """Describe which components `drop_components` dropped, and what may help; empty if none was dropped."""
     count = sum(len(partition.basis.components) for partition in prepared)
     dropped_count = sum(partition.dropped_count for partition in remaining)
     if not dropped_count:
@@ -154,13 +150,7 @@ def _change_outputs(network: Network, change: np.ndarray) -> Network:
 def factorize_partition(
     prepared: TrainedPartition, partition: PartitionData, split: Split, tolerance: float
 ) -> TrainedPartition:
-    """Factorize a trained partition if that saves parameters (`low_rank`).
-
-    Args:
-        prepared, partition: the partition, and its data.
-        split: split of the poses.
-        tolerance: rms error that the components may leave, mesh units.
-    """
+    """Factorize a trained partition if that saves parameters; `tolerance` as in `factorize`."""
     fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
     if not may_factorize(fit, basis):
         return prepared

@@ -20,14 +20,9 @@ from .networks.networks import TrainedPartition
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A trained character.
+    """A trained character with J joints, V vertices and P partitions.
 
-    Attributes:
-        rig: rig with J joints and V vertices.
-        partitions: P partitions.
-        inputs: input features of the networks.
-        prepared: fit, components and network of each partition.
-        training_range: range of the training poses.
+    `prepared` has the fit, the components and the network of each partition.
     """
 
     rig: Rig
@@ -57,10 +52,6 @@ class TrainedModel:
             tuple(partitions),
             self.inputs.states,
         )
-
-    def component_counts(self) -> list[int]:
-        """Return K, the number of components, of each partition."""
-        return [len(prepared.basis.components) for prepared in self.prepared]
 
 
 def make_trained_model(

@@ -82,22 +82,11 @@ class PreparedPartition:
         truncated = self.validation_residuals - self.basis.reconstruct(self.coefficients[self.validation])
         return np.sqrt((truncated**2).sum(axis=1) / self.vertex_count)
 
-    def with_components(self, count: int) -> "PreparedPartition":
-        """Return the partition with only the first `count` components."""
-        coefficients = np.ascontiguousarray(self.coefficients[:, :count])
-        return replace(self, basis=self.basis.truncate(count), coefficients=coefficients)
-
 
 def partition_data(
     recording: Recording, inputs: NetworkInputs, use_half_rotations: bool = False
 ) -> list[PartitionData]:
-    """Create the data of a recording's partitions.
-
-    Args:
-        recording: recording with the poses.
-        inputs: input features of the networks.
-        use_half_rotations: whether residuals are also regressed on half-rotation matrices.
-    """
+    """Create the data of a recording's partitions; `use_half_rotations` as in `regression_matrices`."""
     rig = recording.rig
     features = inputs.compute_features(recording.pose_matrices, recording.controls)
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations)
@@ -124,8 +113,6 @@ def prepare_partition(
     components, because its mean is its best approximation.
 
     Args:
-        partition: data of all poses.
-        split: split of the poses.
         tolerance_mm: rms error that the components may leave, mm.
         seed: seed of the sample of poses from which the basis is computed.
         metres_per_unit: as in `Rig`.
@@ -174,8 +161,7 @@ def prepare_partitions(
     """Prepare partitions that share one tolerance (`allocate_components`).
 
     Args:
-        partitions, split, metres_per_unit: as in `prepare_partition`.
-        config: settings of the training.
+        metres_per_unit: as in `Rig`.
         on_progress: called after each partition with the number of partitions that are prepared.
     """
     prepared, fine_tolerance_mm = [], config.tolerance_mm / FINE_TOLERANCE_FACTOR
@@ -185,7 +171,10 @@ def prepare_partitions(
     errors, vertex_counts = [p.basis.error_by_count for p in prepared], [p.vertex_count for p in prepared]
     tolerance = config.tolerance_mm / (1000 * metres_per_unit)
     counts = allocate_components(errors, vertex_counts, tolerance, config.hidden[-1] + 1)
-    return [partition.with_components(count) for partition, count in zip(prepared, counts, strict=True)]
+    return [
+        replace(p, basis=p.basis.truncate(count), coefficients=np.ascontiguousarray(p.coefficients[:, :count]))
+        for p, count in zip(prepared, counts, strict=True)
+    ]
 
 
 def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:

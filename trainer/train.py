@@ -55,7 +55,6 @@ def train_model(
     Args:
         recording_path: folder of a complete recording.
         model_path: the .onnx file; `check_training_outputs` has checked it. All files are written at the end.
-        config: settings of the training.
         sink: receives the messages from `STARTED` to `last_message`. Errors are raised, not sent.
         stoppable: makes the context in which the process may be ended, because it writes nothing there.
         warm_start: start from the checkpoint of the model, on a recording that may have grown since.

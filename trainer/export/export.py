@@ -126,7 +126,6 @@ def measure(
     """Measure the exported model and linear skinning on poses of the recording.
 
     Args:
-        session, recording: the exported model, and what it was made from.
         poses: indices of poses.
         trained_model: model whose `reference_positions` are compared with those of the exported model.
 
@@ -192,15 +191,15 @@ def _model_info(
 ) -> ModelInfo:
     """Create the metadata of a model; arguments as in `build_model`."""
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
-    partitions = zip(trained_model.partitions, trained_model.component_counts(), strict=True)
+    partitions = zip(trained_model.partitions, trained_model.prepared, strict=True)
     return ModelInfo(
         rig.joints,
         rig.rest_matrices,
         rig.vertex_count,
         rig.fingerprint,
         tuple(
-            ModelPartition(p.joint, p.influencing, len(p.vertices), count, p.controls, p.merged)
-            for p, count in partitions
+            ModelPartition(p.joint, p.influencing, len(p.vertices), len(t.basis.components), p.controls, p.merged)
+            for p, t in partitions
         ),
         *(bound[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         trained_model.training_range.controls,
@@ -239,8 +238,6 @@ def build_model(
     """Build the model, check it against the trained networks, and measure its errors; nothing is written.
 
     Args:
-        recording: recording of the training.
-        trained_model: the result of the training.
         held_out_poses: indices of the held-out poses.
         training_info: settings and versions for the metadata.
 

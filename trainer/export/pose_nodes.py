@@ -19,7 +19,6 @@ from fdda_addon.core.rig import Rig
 from ..fits.half_rotations import add_half_rotations
 from ..graph_builder import GraphBuilder
 from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, JointVectors
-from ..inputs.joints import needed_joints
 from ..model import TrainedModel
 
 ZERO_ROW, MATRIX_ROW, ROWS_PER_SPACE = 4, 5, 6
@@ -70,7 +69,9 @@ class Features:
 def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
     """Add the nodes that compute the features of the networks and of the confidence."""
     inputs, is_needed = trained_model.inputs, _needed_features(trained_model)
-    joints_block, joints = inputs.blocks[0], needed_joints(is_needed[inputs.block_slices[0]])
+    joints_block, of_joints = inputs.blocks[0], is_needed[inputs.block_slices[0]].reshape(-1, FEATURES_PER_JOINT)
+    # At least one joint, because no gather may be empty.
+    joints = np.flatnonzero(of_joints.any(axis=1)) if of_joints.any() else np.zeros(1, np.int64)
     name, table = _add_joint_vectors(graph, trained_model.rig, joints)
     joint_vectors = JointVectors(name, joints)
     table, pose_rows = _add_half_rotations(graph, trained_model, joint_vectors, table)

@@ -34,11 +34,7 @@ class VertexOrder:
     vertex_count: int
 
     def add(self, graph: GraphBuilder, ordered_positions: str, output_name: str) -> None:
-        """Add nodes that reorder (N, ·, 3) positions in the order of the columns to (N, V, 3) positions in mesh order.
-
-        Args:
-            ordered_positions, output_name: names of the input and of the output.
-        """
+        """Add nodes that reorder (N, ·, 3) positions from the order of the columns to that of the mesh, (N, V, 3)."""
         all_columns, block_size = np.concatenate(self.columns), self.block_size
         column_of_vertex = np.zeros(-(-self.vertex_count // block_size) * block_size, np.int64)
         column_of_vertex[all_columns[all_columns >= 0]] = np.flatnonzero(all_columns >= 0)

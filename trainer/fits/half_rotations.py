@@ -35,7 +35,6 @@ def half_rotation_matrices(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-        rig: rig with J joints.
 
     Returns:
         (N, J, 3, 3) float64, no unit; zero for roots.
@@ -56,7 +55,6 @@ def regression_matrices(pose_matrices: np.ndarray, rig: Rig, use_half_rotations:
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-        rig: rig with J joints.
         use_half_rotations: whether to append half-rotation matrices.
 
     Returns:
@@ -74,7 +72,6 @@ def half_rotations_help(recording: Recording, training: np.ndarray) -> bool:
     """Return whether half-rotation features lower the error enough to justify their nodes in the graph.
 
     Args:
-        recording: recording with the residuals.
         training: (n,) indices of the training poses. Half of the evaluated poses are fitted, the others are measured.
     """
     rig = recording.rig

@@ -53,9 +53,3 @@ class JointFeatures(FeatureBlock):
         )
         # The zero vector belongs to them.
         return Vectors(joint_vectors.name, MATRIX_COLUMNS * len(joints) + 1), position
-
-
-def needed_joints(is_needed: np.ndarray) -> np.ndarray:
-    """Return the joints of which a feature is needed, ascending; at least one, because no gather may be empty."""
-    joints = np.flatnonzero(is_needed.reshape(-1, FEATURES_PER_JOINT).any(axis=1))
-    return joints if len(joints) else np.zeros(1, np.int64)

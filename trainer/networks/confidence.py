@@ -67,7 +67,6 @@ def measure_training_range(
     Args:
         features: (n, F) float32, features of the training poses from `NetworkInputs.compute_features`.
         is_length: (F,) bool, which features are lengths in mesh units.
-        rig, partitions: rig and partitions of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)
     spread, joint_columns = high - low, len(rig.joints) * FEATURES_PER_JOINT

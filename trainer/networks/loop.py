@@ -44,7 +44,6 @@ def train(
 
     Args:
         partitions: partitions with the inputs and coefficients of all poses.
-        split: split of the poses.
         config: settings of the training. Equal settings and data give equal weights on one machine.
         device: device to train on; None for `choose_device()`.
         on_epoch: called after every epoch with its number and the training and validation error: means over all

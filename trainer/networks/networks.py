@@ -93,7 +93,6 @@ class PartitionNetworks(torch.nn.Module):
         Args:
             input_counts, output_counts: numbers of features and of components of the P partitions.
             hidden, activation: as in `TrainingConfig`.
-            generator: random generator of the initial weights.
         """
         super().__init__()
         self.activation = ACTIVATION_FUNCTIONS[activation]
@@ -114,14 +113,7 @@ class PartitionNetworks(torch.nn.Module):
         self.biases = torch.nn.ParameterList(biases)
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Evaluate the networks.
-
-        Args:
-            inputs: (P, n, F) standardized features, padded.
-
-        Returns:
-            (P, n, K) coefficients in units of each partition's residual, padded.
-        """
+        """Compute (P, n, K) coefficients, in units of each partition's residual, of (P, n, F) features; both padded."""
         values = inputs
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = torch.baddbmm(bias, values, weight)

@@ -25,13 +25,7 @@ WARM_START_EPOCHS_RATIO, WARM_START_RATE_RATIO = 0.5, 0.3
 
 
 def read_initial_checkpoint(model_path: Path, recording: Recording, holdout: str, config: TrainingConfig) -> Checkpoint:
-    """Read the checkpoint to start from, and check that it fits.
-
-    Args:
-        model_path: path of the model; the checkpoint is beside it.
-        recording: recording to train on.
-        holdout: fingerprint of its held-out and validation poses.
-        config: settings of the training.
+    """Read the checkpoint beside a model, and check that it fits; `holdout` as in `Checkpoint`.
 
     Raises:
         TrainingError: there is no checkpoint, or its rig, controls, networks or split differ.
@@ -71,9 +65,7 @@ def warm_start_config(config: TrainingConfig) -> TrainingConfig:
 def initial_networks(checkpoint: Checkpoint, prepared: list[PreparedPartition]) -> list[Network | None]:
     """Convert the networks of a checkpoint to the features and bases of the current training.
 
-    Args:
-        checkpoint: checkpoint of the same rig, controls, hidden layers and activation.
-        prepared: the partitions of the current training.
+    The checkpoint is of the same rig, controls, hidden layers and activation.
 
     Returns:
         For each partition a network with nearly the former outputs; None where the partition has no network now or had

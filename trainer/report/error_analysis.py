@@ -91,9 +91,6 @@ def analyze_errors(
     """Analyze the largest errors of each partition.
 
     Args:
-        recording: recording of the training.
-        trained_model: the result of the training.
-        split: split of the poses.
         held_out_errors: (n, V) float32 errors of the held-out poses, meters.
         training_errors: (m, V) float32 errors of some training poses, meters.
     """

@@ -46,7 +46,6 @@ def fit_skin(
     """Fit the weights of a rig's V vertices to poses.
 
     Args:
-        poses: the poses.
         kind: "hard" for one joint per vertex, "smooth" for at most four.
         on_progress: called often with the number of fitted vertices.
 
@@ -138,7 +137,11 @@ class _Block:
         scores = np.sqrt(self.single_errors / self._solver.pose_count) + preferences
         if kind == "hard":
             return _pad_influences(scores.argmin(axis=1)[:, None], np.ones((len(scores), 1)))
-        scores[self._rig_candidates()] = self.tie_preference[self._rig_candidates()] - 2
+        heaviest = np.argsort(-self._rig_weights, axis=1, kind="stable")[:, :RIG_CANDIDATES]
+        is_rig_candidate = np.zeros(scores.shape, bool)
+        np.put_along_axis(is_rig_candidate, heaviest, True, axis=1)
+        is_rig_candidate &= self._rig_weights > 0
+        scores[is_rig_candidate] = self.tie_preference[is_rig_candidate] - 2
         candidates = np.argsort(scores, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES]
         weights, squared_errors = self._solve(candidates)
         for _ in range(EXCHANGE_ROUNDS if candidates.shape[1] < self._solver.joint_count else 0):
@@ -149,13 +152,6 @@ class _Block:
             candidates = np.concatenate([candidates, self._steepest_joints(candidates, weights)], axis=1)
             weights, squared_errors = self._solve(candidates)
         return _pad_influences(*self._prune(candidates, weights, squared_errors))
-
-    def _rig_candidates(self) -> np.ndarray:
-        """Return (B, J) bool, which joints are among the heaviest weights of a vertex in the rig."""
-        heaviest = np.argsort(-self._rig_weights, axis=1, kind="stable")[:, :RIG_CANDIDATES]
-        is_candidate = np.zeros(self._rig_weights.shape, bool)
-        np.put_along_axis(is_candidate, heaviest, True, axis=1)
-        return is_candidate & (self._rig_weights > 0)
 
     def _steepest_joints(self, candidates: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return (B, n) further joints: those where adding weight lowers the error fastest."""
