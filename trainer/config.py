@@ -2,7 +2,6 @@
 """The settings of a training, their checks and their command-line options."""
 
 import argparse
-import math
 import sys
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
@@ -13,7 +12,7 @@ from fdda_addon.core.errors import TrainingError
 ACTIVATIONS = ("silu", "gelu", "tanh", "relu")
 MAX_SEED = (1 << 63) - 1
 """torch takes no larger seeds."""
-ABOVE_ZERO, LARGEST = math.ulp(0.0), sys.float_info.max
+ABOVE_ZERO, LARGEST = sys.float_info.min, sys.float_info.max
 
 
 def _setting(default: Any, help_text: str, low: float = 0, high: float = LARGEST) -> Any:

@@ -16,7 +16,7 @@ from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSE_INPUT
 from fdda_addon.core.rig import Rig
 
-from ..fits.half_rotations import add_half_rotations
+from ..fits.half_rotations import MIN_DIVISOR
 from ..graph_builder import GraphBuilder
 from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE, JointVectors
 from ..model import TrainedModel
@@ -154,20 +154,43 @@ def _table_selection() -> np.ndarray:
 def _add_half_rotations(
     graph: GraphBuilder, trained_model: TrainedModel, joint_vectors: JointVectors, table: str
 ) -> tuple[str, np.ndarray]:
-    """Append the needed half-rotation matrices to the table; returns the name of the table and `Features.pose_rows`."""
-    joint_count, half_rotation_joints = len(trained_model.rig.joints), trained_model.half_rotation_joints()
-    added_space_count = len(joint_vectors.joints)
+    """Append the needed half-rotation matrices to the table; returns the name of the table and `Features.pose_rows`.
+
+    They are Q_j A_j as in `half_rotation_matrices`. Their last column is zero.
+    """
+    joint_count, joints = len(trained_model.rig.joints), trained_model.half_rotation_joints()
+    added_space_count, count = len(joint_vectors.joints), len(joints)
     matrix_rows = ROWS_PER_SPACE * (added_space_count + np.arange(joint_count)) + MATRIX_ROW
     pose_rows = np.append(matrix_rows, np.full(joint_count, -1))
-    if len(half_rotation_joints):
-        appended_rows = ROWS_PER_SPACE * (added_space_count + joint_count) + np.arange(len(half_rotation_joints))
-        pose_rows[joint_count + half_rotation_joints] = appended_rows
-        rotation_columns = joint_vectors.columns(half_rotation_joints)
-        carried_spaces = rotation_columns[:, :1] // MATRIX_COLUMNS
-        carried_columns = MATRIX_COLUMNS * (ROWS_PER_SPACE * carried_spaces + MATRIX_ROW) + np.arange(3)
-        rotation_columns[:, -1] = MATRIX_COLUMNS * added_space_count  # the zero vector
-        table = add_half_rotations(graph, joint_vectors.name, rotation_columns, table, carried_columns)
-    return table, pose_rows
+    if not count:
+        return table, pose_rows
+    pose_rows[joint_count + joints] = ROWS_PER_SPACE * (added_space_count + joint_count) + np.arange(count)
+    rotation_columns = joint_vectors.columns(joints)
+    carried_spaces = rotation_columns[:, :1] // MATRIX_COLUMNS
+    rotation_columns[:, -1] = MATRIX_COLUMNS * added_space_count  # the zero vector
+    rotation_columns = graph.integers("rotation_columns", rotation_columns)
+    rotations = graph.add("Gather", [joint_vectors.name, rotation_columns], "rotations", axis=1)
+    rotation_rows = graph.reshape(rotations, [0, count, FEATURES_PER_JOINT], "rotation_rows")
+    # The product with the selection is R - R^T, column by column, with zeros for the last column, and the trace.
+    selection = np.zeros((FEATURES_PER_JOINT, FEATURES_PER_JOINT + 1))
+    for column, axis in np.ndindex(3, 3):
+        selection[3 * column + axis, 3 * column + axis] += 1
+        selection[3 * axis + column, 3 * column + axis] -= 1
+    selection[[0, 4, 8], -1] = 1
+    terms = graph.add("MatMul", [rotation_rows, graph.floats("half_rotation_picks", selection)], "half_rotation_terms")
+    names = ["half_rotation_differences", "half_rotation_traces"]
+    differences, trace = graph.split(terms, [FEATURES_PER_JOINT, 1], names, axis=2)
+    divisor = graph.add("Add", [trace, graph.floats("three", np.full(1, 3))], "half_rotation_divisors")
+    divisor = graph.add("Max", [divisor, graph.floats("min_divisor", np.full(1, MIN_DIVISOR))], "safe_divisors")
+    half_rotations = graph.add("Div", [differences, divisor], "half_rotations_in_row")
+    matrices = graph.reshape(half_rotations, [0, count, MATRIX_COLUMNS, 3], "half_rotations")
+    table_columns = graph.reshape(table, [0, -1, 3], "table_columns")
+    carried_columns = MATRIX_COLUMNS * (ROWS_PER_SPACE * carried_spaces + MATRIX_ROW) + np.arange(3)
+    carried_columns = graph.integers("carried_columns", carried_columns)
+    carried_axes = graph.add("Gather", [table_columns, carried_columns], "carried_axes", axis=1)
+    matrices = graph.add("MatMul", [matrices, carried_axes], "half_rotation_matrices")
+    matrices = graph.reshape(matrices, [0, count, FEATURES_PER_JOINT], "half_rotation_rows")
+    return graph.add("Concat", [table, matrices], "table_with_half_rotations", axis=1), pose_rows
 
 
 def _add_inverses(graph: GraphBuilder, flat_matrices: str) -> str:
