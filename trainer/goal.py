@@ -50,7 +50,8 @@ def evaluate_goal(
     comparison = f"99.9 % of the held-out vertices are within {p999:.3g} mm and the goal is {goal_mm:g} mm"
     if p999 <= goal_mm:
         return GoalResult(goal_mm, p999, Verdict.MET, f"The goal is met: {comparison}.")
-    if not _exhausted([entry["p999"] for entry in history]):
+    errors = [entry["p999"] for entry in history]
+    if len(errors) <= PATIENCE or min(errors[-PATIENCE:]) <= MAX_IMPROVED_RATIO * min(errors[:-PATIENCE]):
         text = (
             f"The goal is missed: {comparison}. Add poses where the model is worst (record RIG.blend {recording} "
             f"--refine {model}) and train on with --warm-start, or let train do both with --refine RIG.blend."
@@ -70,10 +71,3 @@ def evaluate_goal(
     else:
         text += "Narrow the range of motion to what is animated, or accept this error."
     return GoalResult(goal_mm, p999, Verdict.EXHAUSTED, text)
-
-
-def _exhausted(errors: list[float]) -> bool:
-    """Return whether the last trainings, each on more poses, did not lower the error."""
-    if len(errors) <= PATIENCE:
-        return False
-    return min(errors[-PATIENCE:]) > MAX_IMPROVED_RATIO * min(errors[:-PATIENCE])

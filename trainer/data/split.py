@@ -92,7 +92,7 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     if blocks := _frame_blocks(sources):
         selected = split_poses(np.arange(len(blocks)), *fractions)
         parts = (selected.training, selected.validation, selected.held_out)
-        splits.append(Split(*(_poses_in_blocks(blocks, part) for part in parts)))
+        splits.append(Split(*(np.array([p for block in part for p in blocks[block]], np.int64) for part in parts)))
     training, validation, held_out = (
         np.sort(np.concatenate([getattr(split, name) for split in splits]))
         for name in ("training", "validation", "held_out")
@@ -117,10 +117,6 @@ def _frame_blocks(sources: tuple[Source, ...]) -> list[list[int]]:
                 blocks.setdefault((source.name, frame // length), []).append(first_pose + frame)
         first_pose += source.poses
     return list(blocks.values())
-
-
-def _poses_in_blocks(blocks: list[list[int]], selected: np.ndarray) -> np.ndarray:
-    return np.array([pose for block in selected for pose in blocks[block]], np.int64)
 
 
 def holdout_fingerprint(recording: Recording, split: Split) -> str:

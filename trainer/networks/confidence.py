@@ -74,8 +74,10 @@ def measure_training_range(
     min_margin, min_fade_width = (
         np.where(is_length, minimum[1] * rig.size, minimum[0]) for minimum in (MIN_MARGINS, MIN_FADE_WIDTHS)
     )
+    # Without a recorded range, the absolute value replaces it, or 1 if that is smaller: the range of most sliders.
+    control_ranges = np.array([c.high - c.low or max(1.0, abs(c.low)) for c in rig.controls])
     for minimum, ratio in ((min_margin, MIN_MARGINS[0]), (min_fade_width, MIN_FADE_WIDTHS[0])):
-        minimum[joint_columns:direct_columns] = [ratio * _control_range(control) for control in rig.controls]
+        minimum[joint_columns:direct_columns] = ratio * control_ranges
     margin = np.maximum(MARGIN_RATIO * spread, min_margin)
     fade_width = np.maximum(FADE_RATIO * spread, min_fade_width)[:direct_columns]
     control_columns = slice(joint_columns, direct_columns)
@@ -112,11 +114,3 @@ def _counting_controls(rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarra
     for index, partition in enumerate(partitions):
         counts[index, list(partition.controls)] = True
     return counts
-
-
-def _control_range(control: Control) -> float:
-    """Return the recorded range of a control.
-
-    For a control without a range, return its absolute value, or 1 if that is smaller: the range of most sliders.
-    """
-    return control.high - control.low or max(1.0, abs(control.low))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -102,7 +103,7 @@ def _partition_entry(
         "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),
         "linear": error_statistics(held_out.linear[:, vertices]).to_json(),
         "histogram": _histogram(held_out.fdda[:, vertices]),
-        "largest_errors": analysis.to_json(),
+        "largest_errors": asdict(analysis),
         "curve": {
             "training": [round(value, 6) for value in curves.training_mm],
             "validation": [round(value, 6) for value in curves.validation_mm],

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,10 +75,6 @@ class ErrorAnalysis:
     distance: float
     generalization: float
     cause: str
-
-    def to_json(self) -> dict:
-        """Convert to JSON."""
-        return asdict(self)
 
 
 def analyze_errors(
