@@ -28,16 +28,17 @@ class InputBlocks:
     Attributes:
         count: J + C; the block of control c is J + c.
         widths: (J + C,) number of columns of each block; 0 if the input does not change.
+        parents: (J,) nearest ancestor of each joint that was not removed; -1 if there is none.
     """
 
     def __init__(self, poses: FitPoses):
         """Compute the features of poses."""
-        self._size, self._parents = max(poses.rig.size, 1e-9), poses.rig.parents
+        self._size, self.parents = max(poses.rig.size, 1e-9), poses.rig.parents
         self._poses, self._rest = (
             matrices.astype(np.float64) for matrices in (poses.pose_matrices, poses.rig.rest_matrices)
         )
         self._inverse_poses, self._inverse_rest = np.linalg.inv(self._poses), np.linalg.inv(self._rest)
-        joint_count = len(self._parents)
+        joint_count = len(self.parents)
         self.count = joint_count + poses.controls.shape[1]
         self._columns = np.zeros((self.count, BLOCK_COLUMNS, len(self._poses)))
         self.widths = np.zeros(self.count, int)
@@ -58,7 +59,7 @@ class InputBlocks:
 
         A joint that follows half of a rotation is a linear function of half-rotation features (docs/method.md).
         """
-        parent, matrices, rest = self._parents[joint], self._poses[:, joint], self._rest[joint]
+        parent, matrices, rest = self.parents[joint], self._poses[:, joint], self._rest[joint]
         if parent >= 0:
             matrices, rest = self._inverse_poses[:, parent] @ matrices, self._inverse_rest[parent] @ rest
         relative = (np.linalg.inv(rest) @ matrices)[:, :3]
@@ -69,20 +70,16 @@ class InputBlocks:
         halves /= np.maximum(3 + np.trace(rotations, axis1=1, axis2=2), 0.1)[:, None]
         return np.concatenate([relative.reshape(-1, 12), 2 * halves], axis=1)
 
-    def parent(self, joint: int) -> int:
-        """Return the nearest ancestor of a joint that was not removed; -1 if there is none."""
-        return int(self._parents[joint])
-
     def children(self, joint: int) -> list[int]:
         """Return the joints, removed ones among them, whose features are relative to a joint."""
-        return np.flatnonzero(self._parents == joint).tolist()
+        return np.flatnonzero(self.parents == joint).tolist()
 
     def remove(self, joint: int) -> list[int]:
         """Remove a joint, and return its children, whose features are relative to its parent now."""
         self._is_usable[joint] = False
         children = self.children(joint)
         for child in children:
-            self._parents[child] = self._parents[joint]
+            self.parents[child] = self.parents[joint]
             self._set(child, self._joint_features(child))
         return children
 
@@ -90,7 +87,7 @@ class InputBlocks:
         """Undo `remove`."""
         self._is_usable[joint] = self.widths[joint] > 0
         for child in children:
-            self._parents[child] = joint
+            self.parents[child] = joint
             self._set(child, self._joint_features(child))
 
     def best_block(self, remaining: np.ndarray, excluded: tuple[int, ...]) -> int | None:

@@ -174,7 +174,7 @@ class KeyJointSearch:
             # Removals since the last evaluation may have made this one more expensive than others.
             if is_removable and not (queue and entry > queue[0]):
                 self._explanations |= explanations
-                parent = self._blocks.parent(joint)
+                parent = int(self._blocks.parents[joint])
                 if parent in waiting and not self._carries_children(parent):
                     waiting.remove(parent)
                     heapq.heappush(queue, self._queue_entry(parent, 0.0))
@@ -191,7 +191,7 @@ class KeyJointSearch:
 
     def _carries_children(self, joint: int) -> bool:
         """Return whether a joint has children that are kept, and is a root or does not move."""
-        if not self._is_still[joint] and self._blocks.parent(joint) >= 0:
+        if not self._is_still[joint] and self._blocks.parents[joint] >= 0:
             return False
         return bool(self._is_kept[self._blocks.children(joint)].any())
 
@@ -234,7 +234,7 @@ class KeyJointSearch:
         motion = (self._inverse_skin[:, anchor] @ moved).reshape(len(moved), 12)
         motion = motion - motion[::2].mean(axis=0)
         # What moves a root usually moves the whole character, so a root is an input only if no others are enough.
-        roots = [kept for kept in np.flatnonzero(self._is_kept).tolist() if self._blocks.parent(kept) < 0]
+        roots = [kept for kept in np.flatnonzero(self._is_kept).tolist() if self._blocks.parents[kept] < 0]
         inputs, error = self._find_inputs(motion, roots)
         if error > self._tolerance:
             inputs, error = self._find_inputs(motion)
@@ -268,7 +268,7 @@ class KeyJointSearch:
         joint_count = len(self._is_kept)
         inputs, unexplained = np.zeros((joint_count, self._blocks.count), bool), np.zeros(joint_count)
         is_independent = np.zeros(joint_count, bool)
-        roots = [joint for joint in np.flatnonzero(self._is_kept).tolist() if self._blocks.parent(joint) < 0]
+        roots = [joint for joint in np.flatnonzero(self._is_kept).tolist() if self._blocks.parents[joint] < 0]
         differences = np.abs(self._skin[:, roots] - self._skin[:, roots[:1]])
         # What moves all roots moves the whole character, and no residual follows from it.
         free_roots = set(roots) if differences.max() < MIN_SPREAD * max(1.0, self._size) else set()

@@ -91,16 +91,14 @@ class _Solver:
 
 
 class _Block:
-    """A block of B vertices, their moments with all joints, and the errors of single joints.
+    """A block of B vertices, and their moments with all joints.
 
     Attributes:
         rest: (B, 4) float64, homogeneous rest positions, mesh units.
         moments: (4 J, B), products of the skin matrices with the recorded positions.
         joint_moments: (B, J), products of the position skinned to each joint with the recorded position.
         recorded_squares: (B,), squared recorded positions.
-        single_errors: (B, J), squared error of skinning to one joint alone.
-        tie_preference: (B, J), order in which joints with equal errors are preferred: lower is better. Joints with rig
-            weights are below 0.
+        rig_weights: (B, J), weights in the rig, no unit.
 
     Moments, squares and errors are sums over the poses, in square mesh units.
     """
@@ -114,17 +112,9 @@ class _Block:
         self.moments = solver.skin_rows.T @ recorded
         self.recorded_squares = (recorded**2).sum(axis=0)
         self.joint_moments = self._project_to_joints(self.moments)
-        outer = (self.rest[:, :, None] * self.rest[:, None]).reshape(-1, 16)
-        skinned_squares = outer @ solver.gram_blocks[range(solver.joint_count), range(solver.joint_count)].T
-        self.single_errors = np.maximum(skinned_squares - 2 * self.joint_moments + self.recorded_squares[:, None], 0)
-        distances = np.linalg.norm(rest_positions[:, None] - solver.joint_heads, axis=2)
-        self.tie_preference = np.minimum(distances / solver.character_size, 1)
-        self._rig_weights = np.zeros((len(rest_positions), solver.joint_count))
-        vertex_rows = np.repeat(np.arange(len(rest_positions)), rig.skin_joints.shape[1])
-        np.add.at(
-            self._rig_weights, (vertex_rows, rig.skin_joints[vertices].ravel()), rig.skin_weights[vertices].ravel()
-        )
-        self.tie_preference = np.where(self._rig_weights > 0, -self._rig_weights, self.tie_preference)
+        self.rig_weights = np.zeros((len(rest_positions), solver.joint_count))
+        rows = np.arange(len(rest_positions))[:, None]
+        np.add.at(self.rig_weights, (rows, rig.skin_joints[vertices]), rig.skin_weights[vertices])
 
     def _project_to_joints(self, moments: np.ndarray) -> np.ndarray:
         """Multiply the (4 J, B) moments by the rest positions; returns one (B, J) value for each joint."""
@@ -132,19 +122,24 @@ class _Block:
 
     def fit(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
         """Fit the block; returns (B, 4) int32 joints and (B, 4) float32 weights as in `fit_skin`."""
-        # A small preference decides ties between rms errors.
-        preferences = TIE_RATIO * self._solver.character_size * self.tie_preference
-        scores = np.sqrt(self.single_errors / self._solver.pose_count) + preferences
+        solver, outer = self._solver, (self.rest[:, :, None] * self.rest[:, None]).reshape(-1, 16)
+        skinned_squares = outer @ solver.gram_blocks[range(solver.joint_count), range(solver.joint_count)].T
+        single_errors = np.maximum(skinned_squares - 2 * self.joint_moments + self.recorded_squares[:, None], 0)
+        # A small preference, the lower the better, decides ties between rms errors. It is below 0 for rig weights.
+        distances = np.linalg.norm(self.rest[:, None, :3] - solver.joint_heads, axis=2)
+        preferences = np.minimum(distances / solver.character_size, 1)
+        preferences = np.where(self.rig_weights > 0, -self.rig_weights, preferences)
+        scores = np.sqrt(single_errors / solver.pose_count) + TIE_RATIO * solver.character_size * preferences
         if kind == "hard":
             return _pad_influences(scores.argmin(axis=1)[:, None], np.ones((len(scores), 1)))
-        heaviest = np.argsort(-self._rig_weights, axis=1, kind="stable")[:, :RIG_CANDIDATES]
+        heaviest = np.argsort(-self.rig_weights, axis=1, kind="stable")[:, :RIG_CANDIDATES]
         is_rig_candidate = np.zeros(scores.shape, bool)
         np.put_along_axis(is_rig_candidate, heaviest, True, axis=1)
-        is_rig_candidate &= self._rig_weights > 0
-        scores[is_rig_candidate] = self.tie_preference[is_rig_candidate] - 2
+        is_rig_candidate &= self.rig_weights > 0
+        scores[is_rig_candidate] = preferences[is_rig_candidate] - 2
         candidates = np.argsort(scores, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES]
         weights, squared_errors = self._solve(candidates)
-        for _ in range(EXCHANGE_ROUNDS if candidates.shape[1] < self._solver.joint_count else 0):
+        for _ in range(EXCHANGE_ROUNDS if candidates.shape[1] < solver.joint_count else 0):
             slot_order = np.sort(
                 np.argsort(-weights, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES], axis=1
             )
