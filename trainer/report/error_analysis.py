@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
+from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.refinement import nearest_recorded_distances
 
 from ..data.split import Split
 from ..fits.half_rotations import regression_matrices
+from ..inputs.network_inputs import NetworkInputs
 from ..preparation import PreparedPartition
 
 if TYPE_CHECKING:  # The page of a report needs no torch.
@@ -90,22 +91,21 @@ def analyze_errors(
         held_out_errors: (n, V) float32 errors of the held-out poses, meters.
         training_errors: (m, V) float32 errors of some training poses, meters.
     """
-    rig = recording.rig
     training = split.training[:: max(1, len(split.training) // MAX_TRAINING_POSES)]
+    direct_blocks = [block for block in trained_model.inputs.blocks if block.is_direct]
+    inputs = NetworkInputs.of(direct_blocks, trained_model.partitions)
     held_out_features, training_features = (
-        joint_features(np.array(recording.pose_matrices[poses]), rig.rest_matrices, rig.parents)
+        inputs.compute_features(*(np.array(array[poses]) for array in (recording.pose_matrices, recording.controls)))
         for poses in (split.held_out, training)
     )
     analyses = []
-    for partition, prepared in zip(trained_model.partitions, trained_model.prepared, strict=True):
+    partitions = zip(trained_model.partitions, trained_model.prepared, inputs.columns, strict=True)
+    for partition, prepared, columns in partitions:
         errors = held_out_errors[:, partition.vertices].astype(np.float64)
         count = max(1, round(errors.size * ANALYZED_FRACTION))
         largest = np.argpartition(errors.ravel(), -count)[-count:]
         poses, vertices = np.unravel_index(largest, errors.shape)
-        held_out_values, training_values = (
-            _influencing_values(recording, partition, features, rows)
-            for features, rows in ((held_out_features, split.held_out), (training_features, training))
-        )
+        held_out_values, training_values = (f.take(columns, axis=1) for f in (held_out_features, training_features))
         nearest_distances = (
             nearest_recorded_distances(held_out_values, training_values)
             if held_out_values.shape[1]
@@ -122,14 +122,6 @@ def analyze_errors(
         counts = len(np.unique(poses)), len(np.unique(vertices))
         analyses.append(ErrorAnalysis(*counts, truncation, joint, extreme, distance, generalization, cause))
     return analyses
-
-
-def _influencing_values(
-    recording: Recording, partition: Partition, features: np.ndarray, poses: np.ndarray
-) -> np.ndarray:
-    """Return (n, f) features of the joints and controls that influence a partition; `features` (n, J, 12)."""
-    joints = features[:, list(partition.influencing)].reshape(len(features), -1)
-    return np.concatenate([joints, np.array(recording.controls[poses])[:, list(partition.controls)]], axis=1)
 
 
 def _cause(truncation: float, is_dropped: bool, distance: float, generalization: float) -> str:
@@ -157,7 +149,7 @@ def _most_extreme_joint(
     """Find the joint or control that is furthest from its mean in the analyzed poses.
 
     Args:
-        held_out_values: (n, f) values of the held-out poses from `_influencing_values`.
+        held_out_values: (n, f) features of the influencing joints and controls in the held-out poses.
         training_values: (m, f) values of training poses.
         poses: indices of the analyzed poses among the n.
 
