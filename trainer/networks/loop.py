@@ -2,6 +2,7 @@
 """The training loop, which trains the networks of all partitions together."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -59,27 +60,25 @@ def train(
     device = device or choose_device()
     # Inactive units lead to denormal numbers in the optimizer, which take twice the time.
     torch.set_flush_denormal(True)
-    networks = [Network.without_outputs(len(partition.columns), config.activation) for partition in partitions]
-    curves = [Curves() for _ in partitions]
     learning_indices = [index for index, partition in enumerate(partitions) if len(partition.basis.components)]
+    networks = [Network.without_outputs(len(p.columns), config.activation) for p in partitions]
+    trained = [
+        TrainedPartition(**vars(p), network=n, curves=Curves()) for p, n in zip(partitions, networks, strict=True)
+    ]
     if learning_indices:
-        loop = _Loop([partitions[index] for index in learning_indices], split, config, device)
+        loop = _Loop([trained[index] for index in learning_indices], split, config, device)
         if initial is not None:
             loop.start_from([initial[index] for index in learning_indices])
-        constant = [partition for partition in partitions if not len(partition.basis.components)]
-        loop.run([curves[index] for index in learning_indices], on_epoch, constant)
+        loop.run(on_epoch, [partition for partition in partitions if not len(partition.basis.components)])
         for index, network in zip(learning_indices, loop.best_networks(), strict=True):
-            networks[index] = network
-    return [
-        TrainedPartition(**vars(partition), network=network, curves=curve)
-        for partition, network, curve in zip(partitions, networks, curves, strict=True)
-    ]
+            trained[index] = replace(trained[index], network=network)
+    return trained
 
 
 class _Loop:
-    """The state of a training of P partitions."""
+    """The state of a training of P partitions; each epoch adds its errors to their curves."""
 
-    def __init__(self, partitions: list[PreparedPartition], split: Split, config: TrainingConfig, device: torch.device):
+    def __init__(self, partitions: list[TrainedPartition], split: Split, config: TrainingConfig, device: torch.device):
         self.partitions, self.config, self.device = partitions, config, device
         # Coefficients are divided by the residual of their partition, so that one loss and one learning rate suit all.
         self.target_scales = [partition.residual_rms * np.sqrt(partition.vertex_count) for partition in partitions]
@@ -152,19 +151,8 @@ class _Loop:
                 self.model.biases[layer][index, 0, :columns] = torch.from_numpy(bias * factor)
         self.model.weights[0] /= self.rescale_inputs_by_relevance().transpose(1, 2)
 
-    def run(
-        self,
-        curves: list[Curves],
-        on_epoch: Callable[[int, float, float], None],
-        constant: list[PreparedPartition],
-    ) -> None:
-        """Train for all epochs.
-
-        Args:
-            curves: learning curves of the P partitions; each epoch adds its errors.
-            on_epoch: as in `train`.
-            constant: the partitions without components, whose only error is that of their bases.
-        """
+    def run(self, on_epoch: Callable[[int, float, float], None], constant: list[PreparedPartition]) -> None:
+        """Train for all epochs; `on_epoch` as in `train`, `constant` are the partitions without components."""
         config, step_count = self.config, -(-self.inputs.shape[1] // self.config.batch_size)
         optimizer = OneCycleAdamW(
             self.model.parameters(),
@@ -185,17 +173,17 @@ class _Loop:
                 self.rescale_inputs_by_relevance()
             training_mm = self._train_epoch(optimizer, order_generator)
             validation_mm, worst_mm = self._validate()
-            self._update_best(validation_mm, epoch, curves)
+            self._update_best(validation_mm)
             if not torch.isfinite(validation_mm).all():
                 raise TrainingError(
                     f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
                     f"{config.learning_rate:g}."
                 )
             errors_mm = (training_mm.tolist(), validation_mm.tolist(), worst_mm.tolist())
-            for curve, training_error, validation_error, worst_error in zip(curves, *errors_mm, strict=True):
-                curve.training_mm.append(training_error)
-                curve.validation_mm.append(validation_error)
-                curve.worst_mm.append(worst_error)
+            for partition, training, validation, worst in zip(self.partitions, *errors_mm, strict=True):
+                partition.curves.training_mm.append(training)
+                partition.curves.validation_mm.append(validation)
+                partition.curves.worst_mm.append(worst)
             means = (
                 float(np.average(errors + constant_errors, weights=vertex_counts))
                 for errors, constant_errors in zip(errors_mm[:2], constant_mm, strict=True)
@@ -231,13 +219,11 @@ class _Loop:
         errors = (squared + self.validation_truncation_mm.square()).sqrt()
         return errors.mean(dim=1), errors.max(dim=1).values
 
-    def _update_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
+    def _update_best(self, validation_mm: torch.Tensor) -> None:
         is_better = validation_mm < self.best_mm
         self.best_mm = torch.where(is_better, validation_mm, self.best_mm)
         for best_parameter, parameter in zip(self.best_parameters, self.model.parameters(), strict=True):
             best_parameter[is_better] = parameter.detach()[is_better]
-        for index in torch.nonzero(is_better).flatten().tolist():
-            curves[index].best_epoch = epoch
 
     def best_networks(self) -> list[Network]:
         """Return the best weights of each partition without padding, for coefficients in mesh units."""

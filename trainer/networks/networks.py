@@ -52,13 +52,16 @@ class Curves:
         training_mm: mean over the training poses.
         validation_mm: mean over the validation poses.
         worst_mm: maximum over the validation poses.
-        best_epoch: epoch with the lowest `validation_mm`; epoch 1 is the first.
     """
 
     training_mm: list[float] = field(default_factory=list)
     validation_mm: list[float] = field(default_factory=list)
     worst_mm: list[float] = field(default_factory=list)
-    best_epoch: int = 0
+
+    @property
+    def best_epoch(self) -> int:
+        """The epoch with the lowest `validation_mm`; epoch 1 is the first, 0 means none."""
+        return 1 + int(np.argmin(self.validation_mm)) if self.validation_mm else 0
 
 
 @dataclass(frozen=True, kw_only=True)
