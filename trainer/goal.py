@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The accuracy goal: the error that a user asks for, and advice when a training misses it."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from fdda_addon.core.report import Verdict
@@ -14,30 +13,9 @@ UNDERFITTING_RATIO = 0.8
 """Ratio of training error to held-out error above which the networks underfit, so that more poses help little."""
 
 
-@dataclass(frozen=True)
-class GoalResult:
-    """The result of a training relative to its accuracy goal.
-
-    Attributes:
-        goal_mm: the accuracy goal, mm.
-        p999_mm: 99.9th percentile of the held-out errors.
-        verdict: whether the training meets the goal, and whether more poses may help.
-        text: the verdict in sentences, with advice.
-    """
-
-    goal_mm: float
-    p999_mm: float
-    verdict: Verdict
-    text: str
-
-    def to_json(self) -> dict:
-        """Convert to JSON."""
-        return {"goal": self.goal_mm, "p999": self.p999_mm, "verdict": self.verdict.value}
-
-
 def evaluate_goal(
     goal_mm: float, history: list[dict], training_p999_mm: float, recording: Path, model: Path
-) -> GoalResult:
+) -> tuple[Verdict, str]:
     """Compare the held-out error with the accuracy goal.
 
     Args:
@@ -45,18 +23,21 @@ def evaluate_goal(
         history: pose count and held-out error of all trainings, this one last: `{"poses", "p999"}`, mm.
         training_p999_mm: 99.9th percentile of this training's errors on its training poses, mm.
         recording, model: paths that the advice names.
+
+    Returns:
+        Whether the training meets the goal, or whether more poses may help; and this in sentences, with advice.
     """
     p999 = history[-1]["p999"]
     comparison = f"99.9 % of the held-out vertices are within {p999:.3g} mm and the goal is {goal_mm:g} mm"
     if p999 <= goal_mm:
-        return GoalResult(goal_mm, p999, Verdict.MET, f"The goal is met: {comparison}.")
+        return Verdict.MET, f"The goal is met: {comparison}."
     errors = [entry["p999"] for entry in history]
     if len(errors) <= PATIENCE or min(errors[-PATIENCE:]) <= MAX_IMPROVED_RATIO * min(errors[:-PATIENCE]):
         text = (
             f"The goal is missed: {comparison}. Add poses where the model is worst (record RIG.blend {recording} "
             f"--refine {model}) and train on with --warm-start, or let train do both with --refine RIG.blend."
         )
-        return GoalResult(goal_mm, p999, Verdict.MISSED, text)
+        return Verdict.MISSED, text
     earlier = history[-1 - PATIENCE]
     added_poses = history[-1]["poses"] - earlier["poses"]
     text = (
@@ -70,4 +51,4 @@ def evaluate_goal(
         )
     else:
         text += "Narrow the range of motion to what is animated, or accept this error."
-    return GoalResult(goal_mm, p999, Verdict.EXHAUSTED, text)
+    return Verdict.EXHAUSTED, text

@@ -24,7 +24,7 @@ from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
 from .export.export import ExportedModel, build_model, measure, measure_surface, write_model
 from .fits.half_rotations import half_rotations_help
-from .goal import GoalResult, evaluate_goal
+from .goal import evaluate_goal
 from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
 from .inputs.surface_frames import SurfaceFrameFeatures
 from .model import TrainedModel, make_trained_model
@@ -83,11 +83,11 @@ def train_model(
         report = job.measure(trained_model, exported, model_path.name)
         entry = {"poses": len(recording.pose_matrices), "p999": exported.info.held_out_mm["p999"]}
         history = [*(checkpoint.history if checkpoint else ()), entry]
-        goal_result = None
+        goal_text = ""
         if config.goal_mm:
             training_p999_mm = report["fdda"]["training"]["p999"]
-            goal_result = evaluate_goal(config.goal_mm, history, training_p999_mm, recording_path, model_path)
-            report["goal"] = goal_result.to_json()
+            verdict, goal_text = evaluate_goal(config.goal_mm, history, training_p999_mm, recording_path, model_path)
+            report["goal"] = {"goal": config.goal_mm, "p999": entry["p999"], "verdict": verdict.value}
         # The time is in the report only, so that equal recordings and settings give equal models.
         report["training"] = {**report["training"], "seconds": round(time.perf_counter() - start_time, 2)}
         report["warnings"] = [warning.to_json() for warning in warnings]
@@ -98,7 +98,7 @@ def train_model(
         write_checkpoint(checkpoint_file, trained_model.checkpoint(holdout, config, history))
         report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
-    return _send_final_messages(sink, model_path, report, goal_result, start_time, last_message)
+    return _send_final_messages(sink, model_path, report, goal_text, start_time, last_message)
 
 
 @dataclass(frozen=True)
@@ -210,12 +210,7 @@ class _Job:
 
 
 def _send_final_messages(
-    sink: MessageSink,
-    model_path: Path,
-    report: dict,
-    goal_result: GoalResult | None,
-    start_time: float,
-    last_message: MessageType,
+    sink: MessageSink, model_path: Path, report: dict, goal_text: str, start_time: float, last_message: MessageType
 ) -> dict:
     """Send the messages after the files are written; arguments and result as in `train_model`."""
     for partition in report["partitions"]:
@@ -225,14 +220,14 @@ def _send_final_messages(
             basis=partition["basis"],
             held_out_mm=partition["held_out"]["mean"],
         )
-    if goal_result:
-        sink.send(MessageType.LOG, text=goal_result.text)
+    if goal_text:
+        sink.send(MessageType.LOG, text=goal_text)
     values = {
         "model": str(model_path),
         "seconds": round(time.perf_counter() - start_time, 2),
         "held_out_mm": report["fdda"]["held_out"]["mean"],
         "held_out_p999_mm": report["fdda"]["held_out"]["p999"],
-        **({"verdict": goal_result.verdict.value} if goal_result else {}),
+        **({"verdict": report["goal"]["verdict"]} if "goal" in report else {}),
     }
     sink.send(last_message, **values)
     return values

@@ -59,7 +59,5 @@ class SurfaceFrames:
 
 
 NO_SURFACE_FRAMES = SurfaceFrames(
-    *(np.zeros(0, np.int64) for _ in range(2)),
-    np.zeros((2, 0, 1, 0)),
-    *(np.zeros((3, 0, 1)) for _ in range(2)),
+    *(np.zeros(0, np.int64) for _ in range(2)), np.zeros((2, 0, 1, 0)), *(np.zeros((3, 0, 1)) for _ in range(2))
 )

@@ -63,10 +63,7 @@ def make_report(
         "training": exported.info.training,
         "parity": exported.info.parity_mm,
         "constant_bytes": exported.info.constant_bytes,
-        "fdda": {
-            "training": error_statistics(training_errors.fdda).to_json(),
-            "held_out": exported.info.held_out_mm,
-        },
+        "fdda": {"training": error_statistics(training_errors.fdda).to_json(), "held_out": exported.info.held_out_mm},
         "linear": {"held_out": error_statistics(held_out.linear).to_json()},
         **surface,
         "histogram": {
