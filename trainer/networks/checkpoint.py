@@ -82,16 +82,9 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    metadata = {
-        "version": VERSION,
-        "fingerprint": vars(checkpoint.fingerprint),
-        "controls": checkpoint.controls,
-        "holdout": checkpoint.holdout,
-        "hidden": checkpoint.hidden,
-        "activation": checkpoint.activation,
-        "history": checkpoint.history,
-        "partitions": len(checkpoint.partitions),
-    }
+    metadata = {"version": VERSION, **vars(checkpoint), "fingerprint": vars(checkpoint.fingerprint)}
+    metadata["partitions"] = len(checkpoint.partitions)
+    del metadata["input_states"]
     arrays = {"about": np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
     for block, state in checkpoint.input_states.items():
         arrays |= {f"{INPUTS_PREFIX}{block}/{name}": array for name, array in state.items()}
