@@ -32,20 +32,19 @@ def drop_components(prepared: Sequence[TrainedPartition], split: Split) -> list[
     Returns:
         The partitions with the remaining components; a partition may lose all.
     """
-    changes, gains, total_error = [], [], 0.0
+    measured, total_error, total_cost = [], 0.0, 0
     for partition in prepared:
         predicted = partition.network.evaluate(partition.inputs[split.training]).astype(np.float64)
         # The columns are the principal directions of the predictions, largest first.
-        changes.append(np.linalg.eigh(predicted.T @ predicted)[1][:, ::-1])
-        error, partition_gains = _component_gains(partition, changes[-1], split)
-        total_error += error
-        gains.append(partition_gains)
-    costs = [3 * p.vertex_count + len(p.network.weights[-1]) + 1 for p in prepared]
-    total_cost = sum(cost * len(partition_gains) for cost, partition_gains in zip(costs, gains, strict=True))
-    min_gain_per_parameter = MIN_GAIN_RATIO * total_error / max(total_cost, 1)
+        change = np.linalg.eigh(predicted.T @ predicted)[1][:, ::-1]
+        error, gains = _component_gains(partition, change, split)
+        cost = 3 * partition.vertex_count + len(partition.network.weights[-1]) + 1
+        total_error, total_cost = total_error + error, total_cost + cost * len(gains)
+        measured.append((partition, change, gains, cost))
+    min_gain = MIN_GAIN_RATIO * total_error / max(total_cost, 1)
     return [
-        _change_basis(partition, change[:, partition_gains > min_gain_per_parameter * cost], split)
-        for partition, change, partition_gains, cost in zip(prepared, changes, gains, costs, strict=True)
+        _change_basis(partition, change[:, gains > min_gain * cost], split)
+        for partition, change, gains, cost in measured
     ]
 
 

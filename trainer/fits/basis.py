@@ -76,9 +76,8 @@ def allocate_components(
     """
     allowed_errors = [max(tolerance, NEGLIGIBLE_RMS_RATIO * float(partition_errors[0])) for partition_errors in errors]
     counts, gains = [], []
-    for index, (partition_errors, vertex_count, allowed_error) in enumerate(
-        zip(errors, vertex_counts, allowed_errors, strict=True)
-    ):
+    partitions = list(zip(errors, vertex_counts, allowed_errors, strict=True))
+    for index, (partition_errors, vertex_count, allowed_error) in enumerate(partitions):
         is_allowed = partition_errors <= MAX_ERROR_RATIO * allowed_error
         counts.append(int(np.argmax(is_allowed)) if is_allowed.any() else len(partition_errors) - 1)
         removed_squares = vertex_count * (partition_errors[:-1] ** 2 - partition_errors[1:] ** 2)[counts[-1] :]
@@ -86,14 +85,8 @@ def allocate_components(
             (removed_square / (3 * vertex_count + parameters_per_component), index, removed_square)
             for removed_square in removed_squares.tolist()
         ]
-    remaining_squares = sum(
-        vertex_count * float(partition_errors[count]) ** 2
-        for partition_errors, vertex_count, count in zip(errors, vertex_counts, counts, strict=True)
-    )
-    allowed_squares = sum(
-        vertex_count * allowed_error**2
-        for vertex_count, allowed_error in zip(vertex_counts, allowed_errors, strict=True)
-    )
+    remaining_squares = sum(n * float(e[count]) ** 2 for (e, n, _), count in zip(partitions, counts, strict=True))
+    allowed_squares = sum(vertex_count * allowed_error**2 for _, vertex_count, allowed_error in partitions)
     # The components of one partition are added in order, because each removes at most as much as the one before it.
     for _, index, removed_square in sorted(gains, key=lambda gain: -gain[0]):
         if remaining_squares <= allowed_squares:
