@@ -50,11 +50,8 @@ def choose_key_joints(
         )
     moments, acts = _measure_vertices(poses)
     blocks = InputBlocks(poses)
-    is_still, unseen_motions = (
-        blocks.widths[: len(moments)] == 0,
-        _measure_unseen_motions(all_poses, random_count, moments),
-    )
-    is_unseen = is_still & (unseen_motions > TOLERANCE_RATIO * poses.rig.size)
+    unseen_motions = _measure_unseen_motions(all_poses, random_count, moments)
+    is_unseen = (blocks.widths[: len(moments)] == 0) & (unseen_motions > TOLERANCE_RATIO * poses.rig.size)
     search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
     search.search(None if requested == AUTO else int(requested), on_progress)
     return search.result(requested, acts, metres_per_unit)
