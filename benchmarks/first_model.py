@@ -47,6 +47,24 @@ def find_character() -> bpy.types.Object:
     return max(rigged, key=lambda o: len(o.data.vertices))
 
 
+def select_character() -> None:
+    """Select the character alone, and show it."""
+    with region_override("WINDOW"):
+        bpy.ops.object.select_all(action="DESELECT")
+        find_character().select_set(True)
+        bpy.context.view_layer.objects.active = find_character()
+        bpy.ops.view3d.view_selected()
+
+
+def check_trainer() -> Iterator[float]:
+    """Press the button that checks the trainer, unless it was checked; yield the seconds to wait."""
+    session = extension_module("training.environment.session")
+    if session.check_result is None:
+        yield from sidebar.press_button("fdda.check_trainer", across=0.2)
+        yield from wait_until(lambda: session.check_result is not None, 60, "the check of the trainer does not end")
+    yield 0.3
+
+
 def make_first_model() -> Iterator[float]:
     """Go from opening the file to playing the model; yield the seconds to wait."""
     user_file = OUT / RIG.name
@@ -61,11 +79,7 @@ def make_first_model() -> Iterator[float]:
 
     bpy.ops.wm.open_mainfile(filepath=str(user_file), load_ui=False)
     yield 1.0
-    with region_override("WINDOW"):
-        bpy.ops.object.select_all(action="DESELECT")
-        find_character().select_set(True)
-        bpy.context.view_layer.objects.active = find_character()
-        bpy.ops.view3d.view_selected()
+    select_character()
     yield from sidebar.open_tab()
     yield 1.0
     yield from sidebar.open_section("rig")
@@ -89,11 +103,7 @@ def make_first_model() -> Iterator[float]:
     yield from save_screenshot(OUT / "4_recorded.png")
     note_time("recorded")
     yield from sidebar.open_section("training")
-    session = extension_module("training.environment.session")
-    if session.check_result is None:
-        yield from sidebar.press_button("fdda.check_trainer", across=0.2)
-        yield from wait_until(lambda: session.check_result is not None, 60, "the check of the trainer does not end")
-    yield 0.3
+    yield from check_trainer()
     yield from sidebar.press_button("fdda.train(")
     yield from wait_for_job("train", TIME_LIMIT_S)
     yield from save_screenshot(OUT / "5_trained.png")

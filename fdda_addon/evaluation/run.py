@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compares a model and linear skinning with the rig, on poses that were not used in training."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from ..core.poses import Channel, sample_pose, widen_ranges
 from ..core.progress import Progress
 from ..core.skinning import LinearSkinning
 from ..core.surface import Surface, SurfaceComparison, surface_errors
-from ..poses.clip import find_clips
+from ..poses.clip import Clip, find_clips
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable
 from ..rig.pose_setter import (
@@ -79,6 +79,16 @@ class EvaluationSettings:
     strips: tuple[str, ...] = ()
     target: TargetSettings = NO_TARGET
 
+    @property
+    def scaled_poses(self) -> int:
+        """Number of random poses of each factor of `range_scales`."""
+        return max(1, self.poses // 4)
+
+    def total_poses(self, clips: Iterable[Clip]) -> int:
+        """Return the number of poses, with the frames of the clips."""
+        of_clips = sum(len(clip.frames) for clip in clips)
+        return self.poses + self.scaled_poses * len(self.range_scales) + len(self.named) + of_clips
+
 
 def evaluate(
     scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings
@@ -109,9 +119,7 @@ def evaluate(
     rig = skinning.rig
     # A rig that is posed only by actions may have no channels to sample.
     channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.range_scales else ()
-    scaled_pose_count = max(1, settings.poses // 4)
-    total_poses = settings.poses + scaled_pose_count * len(settings.range_scales) + len(settings.named)
-    total_poses += sum(len(clip.frames) for clip in clips)
+    total_poses = settings.total_poses(clips)
     with ExitStack() as stack:
         if pose_setter.target:
             stack.enter_context(pose_setter.target.prepared())
@@ -127,7 +135,12 @@ def evaluate(
         for scale_index, factor in enumerate(settings.range_scales, 1):
             first_index = FIRST_HELD_OUT_INDEX * (1 + scale_index)
             poses = _random_poses(
-                scene_rig, widen_ranges(channels, factor), settings.seed, first_index, scaled_pose_count, pose_setter
+                scene_rig,
+                widen_ranges(channels, factor),
+                settings.seed,
+                first_index,
+                settings.scaled_poses,
+                pose_setter,
             )
             scaled_range_errors.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         named_errors = []

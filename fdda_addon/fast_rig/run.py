@@ -24,7 +24,7 @@ from .controls import animating_actions, control_bones, keyed_bones
 from .dependency_graph import Node
 from .driver_reader import bone_of_path, driven_node
 from .joint_poses import JointPoses, differing_joints, evaluate_joints, infinite_joints, moving_joints, rig_size
-from .removal import remove_unneeded
+from .removal import Removed, remove_unneeded
 
 TOLERANCE = 1e-5
 """Largest accepted difference of a joint between full rig and fast rig, as a ratio of the size of the rig."""
@@ -100,21 +100,9 @@ def make_fast_rig(
         )
     actions = tuple(animating_actions(armature_object))
     poses = JointPoses(armature_object, joint_names, controls, actions, rig_size(armature_object))
-    before = yield from _evaluate(poses, "full rig")
-    again = yield from _evaluate(replace(poses, actions=(), pose_count=REPEATED_POSES), "repeated poses")
-    if differences := differing_joints(poses, before[:REPEATED_POSES], again, TOLERANCE):
-        raise RigError(
-            f"Evaluating the same pose again moves {_named_bones(differences)} of '{armature_object.name}' differently"
-            ", so a fast rig cannot be compared; look for dependency cycles among constraints and drivers."
-        )
+    before = yield from _evaluate_full_rig(poses)
     bones_before = len(armature_object.data.bones)
-    for scene_rig in scene_rigs:
-        scene_rig.mesh_object.fdda.mode = "RIG"
-    removed = remove_unneeded(scene_rigs, joint_names, controls, _model_nodes(scene_rigs))
-    for scene_rig in scene_rigs:
-        scene_rig.mesh_object.fdda.is_fast_rig = True
-        scene_rig.mesh_object.fdda.mode = "FDDA"
-        _evaluate_model(scene_rig.mesh_object)
+    removed = _remove_unneeded(scene_rigs, joint_names, controls)
     after = yield from _evaluate(poses, "fast rig")
 
     if differences := differing_joints(poses, before, after, TOLERANCE):
@@ -169,6 +157,18 @@ def _bind_packed(scene_rig: SceneRig, model: Path) -> None:
     _evaluate_model(mesh_object)
 
 
+def _remove_unneeded(scene_rigs: list[SceneRig], joint_names: tuple[str, ...], controls: tuple[str, ...]) -> Removed:
+    """Remove what models and controls do not need, and play the models."""
+    for scene_rig in scene_rigs:
+        scene_rig.mesh_object.fdda.mode = "RIG"
+    removed = remove_unneeded(scene_rigs, joint_names, controls, _model_nodes(scene_rigs))
+    for scene_rig in scene_rigs:
+        scene_rig.mesh_object.fdda.is_fast_rig = True
+        scene_rig.mesh_object.fdda.mode = "FDDA"
+        _evaluate_model(scene_rig.mesh_object)
+    return removed
+
+
 def _evaluate_model(mesh_object: bpy.types.Object) -> None:
     """Evaluate the scene, and raise a ModelError if the model of an object cannot play."""
     bpy.context.view_layer.update()
@@ -186,6 +186,18 @@ def _model_nodes(scene_rigs: list[SceneRig]) -> list[Node]:
             if bone_name := bone_of_path(control.path):
                 nodes.append(bone_node(scene_rig.armature_object, bone_name))
     return nodes
+
+
+def _evaluate_full_rig(poses: JointPoses) -> Iterator[Progress]:
+    """Yield progress, and return the matrices of the full rig; raise a RigError if its poses do not repeat."""
+    matrices = yield from _evaluate(poses, "full rig")
+    again = yield from _evaluate(replace(poses, actions=(), pose_count=REPEATED_POSES), "repeated poses")
+    if differences := differing_joints(poses, matrices[:REPEATED_POSES], again, TOLERANCE):
+        raise RigError(
+            f"Evaluating the same pose again moves {_named_bones(differences)} of '{poses.armature_object.name}' "
+            "differently, so a fast rig cannot be compared; look for dependency cycles among constraints and drivers."
+        )
+    return matrices
 
 
 def _evaluate(poses: JointPoses, stage: str) -> Iterator[Progress]:

@@ -104,18 +104,23 @@ def set_limits_from_actions(
         limits = [
             _measured_limit(bone, *kind_axis, bounds, margin) for kind_axis, bounds in sorted(bone_ranges.items())
         ]
-        for kind in (ROTATION, LOCATION, SCALE):
-            settable_limits = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
-            has_constraint = find_local_limit(bone, LIMIT_CONSTRAINT_TYPES[kind]) is not None
-            if kind == ROTATION and not has_ik and not has_constraint and _can_be_ik_limits(settable_limits):
-                for limit in settable_limits:
-                    set_rotation_range(bone, limit.axis, limit.low, limit.high)
-            elif settable_limits:
-                _set_range_constraint(bone, kind, settable_limits)
+        _set_limits(bone, limits, has_ik)
         for limit in limits:
             is_near = bone.name in bones_near_gimbal_lock and limit.kind == ROTATION
             all_limits.append(replace(limit, near_gimbal_lock=is_near))
     return tuple(all_limits)
+
+
+def _set_limits(bone: bpy.types.PoseBone, limits: list[MeasuredLimit], has_ik: bool) -> None:
+    """Set the limits of a bone that can be set, as IK limits or in constraints."""
+    for kind in (ROTATION, LOCATION, SCALE):
+        settable_limits = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
+        has_constraint = find_local_limit(bone, LIMIT_CONSTRAINT_TYPES[kind]) is not None
+        if kind == ROTATION and not has_ik and not has_constraint and _can_be_ik_limits(settable_limits):
+            for limit in settable_limits:
+                set_rotation_range(bone, limit.axis, limit.low, limit.high)
+        elif settable_limits:
+            _set_range_constraint(bone, kind, settable_limits)
 
 
 def _bones_near_gimbal_lock(keyed_channel_ranges: ChannelRanges) -> set[str]:

@@ -2,7 +2,7 @@
 """Refines a recording: adds poses where a model that was trained on it has its largest errors."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from ..core.errors import RecordingError
 from ..core.features import joint_features
 from ..core.metrics import distances
 from ..core.model_info import ModelInfo
+from ..core.partition import Partition
 from ..core.poses import Channel, sample_pose
 from ..core.progress import Progress
 from ..core.recording.extension import RecordingExtension
@@ -26,6 +27,7 @@ from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
+from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig, check_full_rig
@@ -76,12 +78,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         OutputError: the recording cannot be written.
     """
     check_full_rig(scene_rig.mesh_object)
-    recording = read_recording(path)
-    if recording.info.target:
-        raise RecordingError(
-            f"The recording '{path}' is of the target '{recording.info.target.object_name}', and poses are added of "
-            "rigs alone; record more poses of the target into another folder."
-        )
+    recording = _read_rig_recording(path)
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     network, rig = opened.network, opened.rig
@@ -95,23 +92,16 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     recorded_count = len(recording.pose_matrices) - added_count
     with temporary_rig_state(scene_rig, rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
-        probe_count = max(MIN_PROBES, settings.poses)
-        probe_values = np.stack(
-            [_draw_probe_pose(channels, settings.seed, PROBE_INDEX + recorded_count + i) for i in range(probe_count)]
+        probe_poses = np.stack(
+            [
+                _draw_probe_pose(channels, settings.seed, PROBE_INDEX + recorded_count + i)
+                for i in range(max(MIN_PROBES, settings.poses))
+            ]
         )
-        probe_matrices, partition_errors = [], []
-        for probe_index, pose in enumerate(probe_values):
-            poser.set(pose)
-            pose_matrices, rig_positions, controls = evaluator.evaluate()
-            vertex_errors = distances(network.positions(pose_matrices[None], controls[None])[0], rig_positions)
-            probe_matrices.append(pose_matrices)
-            partition_errors.append([vertex_errors[partition.vertices].max() for partition in recording.partitions])
-            yield Progress("probes", probe_index + 1, probe_count)
-        probes = Probes(
-            probe_values,
-            np.array(partition_errors),
-            _distances_to_recording(recording, recorded_count, np.stack(probe_matrices)),
+        probe_matrices, errors = yield from _evaluate_probes(
+            probe_poses, poser, evaluator, network, recording.partitions
         )
+        probes = Probes(probe_poses, errors, _distances_to_recording(recording, recorded_count, probe_matrices))
         base_poses = np.stack(
             [sample_pose(channels, settings.seed, BASE_INDEX + recorded_count + i) for i in range(settings.poses)]
         )
@@ -125,6 +115,40 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
             ) as pose_counts:
                 for pose_count in pose_counts:
                     yield Progress("poses", pose_count - recorded_count, settings.poses)
+
+
+def _read_rig_recording(path: Path) -> Recording:
+    recording = read_recording(path)
+    if recording.info.target:
+        raise RecordingError(
+            f"The recording '{path}' is of the target '{recording.info.target.object_name}', and poses are added of "
+            "rigs alone; record more poses of the target into another folder."
+        )
+    return recording
+
+
+def _evaluate_probes(
+    poses: np.ndarray,
+    poser: Poser,
+    evaluator: PoseEvaluator,
+    network: Network,
+    partitions: Sequence[Partition],
+) -> Generator[Progress, None, tuple[np.ndarray, np.ndarray]]:
+    """Evaluate M poses with the rig and with the model.
+
+    Returns:
+        Pose matrices, (M, J, 4, 4), mesh-object space, mesh units; the largest error of each partition, (M, P), mesh
+        units.
+    """
+    pose_matrices, partition_errors = [], []
+    for index, pose in enumerate(poses):
+        poser.set(pose)
+        matrices, rig_positions, controls = evaluator.evaluate()
+        errors = distances(network.positions(matrices[None], controls[None])[0], rig_positions)
+        pose_matrices.append(matrices)
+        partition_errors.append([errors[partition.vertices].max() for partition in partitions])
+        yield Progress("probes", index + 1, len(poses))
+    return np.stack(pose_matrices), np.array(partition_errors)
 
 
 def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The options of the verb `record`, and which of them contradict each other."""
+
+import argparse
+from pathlib import Path
+
+from ..core.defaults import MARGIN, MIN_PARTITION_VERTICES, POSES, REFINEMENT_POSES, SPREAD
+from ..core.errors import WrongUsageError
+from ..core.joint_option import ALL, parse_joints
+from ..core.poses import MAX_MARGIN
+from ..core.recording.shard import MAX_SHARDS
+from .files import add_rig_argument
+from .target import add_repeatability_option, add_target_options, target_settings
+
+
+def add_record_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options to a parser."""
+    add_rig_argument(parser)
+    _add_mesh_options(parser)
+    _add_pose_options(parser)
+    _add_model_options(parser)
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
+    _add_shard_options(parser)
+    add_target_options(parser)
+    add_repeatability_option(parser)
+    parser.add_argument(
+        "--refine", metavar="MODEL.onnx", type=Path, help="add poses at the worst errors of this model to the recording"
+    )
+
+
+def _add_mesh_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--object",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="mesh object to record, if several have a rig; repeatable, each with a subfolder of RECORDING",
+    )
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="record all meshes that an armature deforms, each into a subfolder of RECORDING",
+    )
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
+
+
+def _add_pose_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--poses", type=int, help=f"number of random poses (default {POSES}, with --refine {REFINEMENT_POSES})"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the poses (default 0)")
+    parser.add_argument(
+        "--spread",
+        type=float,
+        default=SPREAD,
+        help=f"how far random poses spread over the limits, from their middle (default {SPREAD})",
+    )
+    parser.add_argument(
+        "--margin",
+        type=float,
+        default=MARGIN,
+        metavar="F",
+        help="take a quarter of the random poses from limits wider by this factor, and rotate locked axes too, "
+        f"so that the model stays accurate beyond the limits; 1 to stay within the limits (default {MARGIN:g})",
+    )
+    parser.add_argument(
+        "--action",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also record all frames of this action; repeatable",
+    )
+    parser.add_argument(
+        "--strip",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also record all frames of this NLA strip; repeatable",
+    )
+    parser.add_argument(
+        "--mirror",
+        action="store_true",
+        help="record the frames of actions and strips a second time, with left and right swapped",
+    )
+    parser.add_argument(
+        "--sample",
+        action="append",
+        default=[],
+        metavar="WHAT",
+        help="bones that random poses move, instead of the deforming bones: collection:NAME, action:NAME (the bones "
+        "that the action keys, in the ranges that it uses), bone:NAME, selected, or remix (every second pose takes "
+        "each limb from a random frame of the actions of --action, with noise); repeatable",
+    )
+
+
+def _add_model_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options for what the model reads and how the mesh is split."""
+    parser.add_argument(
+        "--control",
+        action="append",
+        default=[],
+        metavar="NAME[=LOW:HIGH]",
+        help="extra input of the model besides bones: the name of a shape key, shape_keys for all shape keys, "
+        "OWNER/PATH, or control bones, collection:NAME or bone:NAME: their unlocked channels and custom properties; "
+        "inputs that drivers of the mesh read are detected automatically; repeatable",
+    )
+    parser.add_argument(
+        "--fit-linear",
+        choices=("hard", "smooth"),
+        default="",
+        help="fit the skin weights of linear skinning to the poses: one bone per vertex, or at most four (smooth)",
+    )
+    parser.add_argument(
+        "--joints",
+        type=_parse_joints,
+        default=ALL,
+        metavar="auto|N|all",
+        help="bones that the model reads: the fewest from which the other bones follow (auto), their number, or all "
+        f"(default {ALL}); skin weights are fitted to these bones, and the model learns the rest",
+    )
+    parser.add_argument(
+        "--min-partition-vertices",
+        type=int,
+        default=MIN_PARTITION_VERTICES,
+        metavar="N",
+        help=f"merge body parts with fewer vertices into a neighbor; 0: none (default {MIN_PARTITION_VERTICES})",
+    )
+
+
+def _add_shard_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--shard",
+        type=_parse_shard,
+        metavar="K/N",
+        help="record only part K of N of the poses; merge-recordings joins all parts to one recording",
+    )
+    parser.add_argument(
+        "--detect-influences",
+        action="store_true",
+        help="only detect which joints influence which partitions, once for all shards",
+    )
+    parser.add_argument(
+        "--influences",
+        metavar="FOLDER",
+        type=Path,
+        help="use the influences in this folder, which --detect-influences has written for the same rig",
+    )
+
+
+def _parse_shard(text: str) -> tuple[int, int]:
+    """Parse index and count of a shard, such as "2/8".
+
+    Raises:
+        argparse.ArgumentTypeError: the text is invalid.
+    """
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count) <= MAX_SHARDS):
+        raise argparse.ArgumentTypeError(f"a shard is K/N, part K of N, with K from 1 to N and not {text!r}")
+    return int(number), int(count)
+
+
+def _parse_joints(text: str) -> str:
+    """Check the option `--joints`; raise argparse.ArgumentTypeError if it is invalid."""
+    try:
+        return parse_joints(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Check the options, as far as they need no rig.
+
+    Raises:
+        WrongUsageError: a value is out of its range, or two options contradict each other.
+    """
+    if (options.poses or 0) < 0 or options.seed < 0 or options.min_partition_vertices < 0:
+        raise WrongUsageError("--poses, --seed and --min-partition-vertices must be 0 or more.")
+    # At 10 the distribution is uniform. Above, most values would lie outside of the range and be drawn again.
+    if not 0 < options.spread <= 10:
+        raise WrongUsageError("--spread must be more than 0 and at most 10.")
+    if not 1 <= options.margin <= MAX_MARGIN:
+        raise WrongUsageError(f"--margin must be 1, for none, to {MAX_MARGIN:g} times the range of motion.")
+    target_settings(options)
+    new_recording_options = (
+        options.action,
+        options.strip,
+        options.mirror,
+        options.sample,
+        options.control,
+        options.fit_linear,
+        options.joints != ALL,
+        options.shard,
+        options.detect_influences,
+        options.influences,
+        options.target,
+    )
+    if options.refine and (any(new_recording_options) or options.poses == 0):
+        raise WrongUsageError(
+            "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
+            "--control, --fit-linear, --joints, --shard, --influences and --target out."
+        )
+    if options.detect_influences and (options.shard or options.influences):
+        raise WrongUsageError(
+            "--detect-influences finds influences for all shards; leave --shard and --influences out."
+        )
+    if options.refine and (options.all or len(options.object) > 1):
+        raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")
+    if options.all and options.object:
+        raise WrongUsageError("--all records all meshes, and --object those that it names; give one of them.")
+    if options.overwrite and (options.resume or options.refine):
+        raise WrongUsageError("--overwrite makes a new recording; leave --resume and --refine out.")
