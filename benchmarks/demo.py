@@ -19,7 +19,7 @@ from fdda_addon.core.output import write_json
 from fdda_addon.evaluation.picture import View
 from fdda_addon.evaluation.pictures import draw_comparison, draw_partitions, make_pictured_pose
 from fdda_addon.evaluation.results import Evaluation
-from fdda_addon.evaluation.run import EvaluationSettings, NamedPose
+from fdda_addon.evaluation.settings import EvaluationSettings, NamedPose
 from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.training.process import trainer_command
 

@@ -29,7 +29,8 @@ from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.mesh import evaluated_positions
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier, find_rig
 from fdda_addon.scene.temporary_state import temporary_pose
-from fdda_addon.timing.benchmark import benchmark, key_random_poses
+from fdda_addon.timing.animation import key_random_poses
+from fdda_addon.timing.benchmark import benchmark
 
 ROUNDS = 5
 CROWD_SIZE = 20

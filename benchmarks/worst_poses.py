@@ -23,7 +23,8 @@ sys.path.insert(0, str(ROOT))
 import fdda_addon  # noqa: E402
 from fdda_addon.cli.files import open_file  # noqa: E402
 from fdda_addon.evaluation.results import Evaluation  # noqa: E402
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate  # noqa: E402
+from fdda_addon.evaluation.run import evaluate  # noqa: E402
+from fdda_addon.evaluation.settings import EvaluationSettings  # noqa: E402
 from fdda_addon.runtime.opened_model import open_model  # noqa: E402
 from fdda_addon.scene.mesh import set_mesh_positions  # noqa: E402
 from fdda_addon.scene.scene_rig import SceneRig, find_rig  # noqa: E402

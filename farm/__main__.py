@@ -24,7 +24,7 @@ from fdda_addon.core.stop_signals import INTERRUPTED
 
 if TYPE_CHECKING:
     from .characters import Plan
-    from .tasks import Task
+    from .task import Task
 
 WINDOWS = "win32"
 

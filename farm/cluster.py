@@ -16,7 +16,8 @@ from .characters import Farm
 from .process import TryAgainError
 from .run import AGAIN, BLOCKED, FAILED, SUCCESS_STATES, Outcome, run_task
 from .simulation import seconds_to_end, task_seconds
-from .tasks import TRAIN, Task
+from .task import Task
+from .tasks import TRAIN
 
 if TYPE_CHECKING:
     from distributed import Client

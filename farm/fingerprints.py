@@ -15,7 +15,8 @@ from fdda_addon.core.input_file import read_input
 from fdda_addon.core.output import is_temporary_name, write_json
 
 from .characters import Farm
-from .tasks import TRAIN, Task
+from .task import Task
+from .tasks import TRAIN
 
 FORMAT, VERSION = "fdda-farm-task", 1
 MAX_JSON_BYTES = 64 << 20

@@ -9,7 +9,7 @@ from fdda_addon.core.output import write_json
 
 from .characters import Plan
 from .fingerprints import ROOT
-from .tasks import Task
+from .task import Task
 
 JOB_TYPE = "fdda-characters"
 """Name of the job type: Flamenco takes the name of the script, with - for _."""

@@ -8,7 +8,8 @@ from fdda_addon.core.output import write_json
 
 from .characters import Plan
 from .fingerprints import ROOT
-from .tasks import BIND, RECORD, TRAIN, Task
+from .task import Task
+from .tasks import BIND, RECORD, TRAIN
 
 SPECIFICATION_VERSION = "jobtemplate-2023-09"
 SHARD_PARAMETER = "Shard"

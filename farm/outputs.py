@@ -11,7 +11,7 @@ from fdda_addon.core.output import check_folder_writable, check_outputs
 
 from .characters import Plan, PlanError
 from .fingerprints import digest_file, read_manifest
-from .tasks import Task
+from .task import Task
 
 FARM_REPORT = FileKind("the report of a farm", rb'\s*\{\s*"format":\s*"fdda-farm-report"')
 FARM_PAGE = FileKind("the page of the report of a farm", rb"<!doctype html>.*: characters</title>")

@@ -11,7 +11,8 @@ from .characters import Character, Plan
 from .fingerprints import MAX_RECORDED_VALUE, TaskManifest, read_json, read_manifest
 from .page import render_page
 from .run import BLOCKED, SUCCESS_STATES, Outcome
-from .tasks import BIND, EVALUATE, EVALUATION, KINDS, PICTURE, REFINE, REPORT, Task
+from .task import REPORT, Task
+from .tasks import BIND, EVALUATE, EVALUATION, KINDS, PICTURE, REFINE
 
 FORMAT, VERSION = "fdda-farm-report", 1
 DONE_STATE, UNFINISHED_STATE, FAILED_STATE = "done", "not done", "failed"

@@ -33,7 +33,8 @@ from .fingerprints import (
 )
 from .outputs import check_published, check_task_folder_free
 from .process import ProcessResult, TryAgainError, hold_lock, run_verb
-from .tasks import BIND, EVALUATION, REPORT, Task
+from .task import REPORT, Task
+from .tasks import BIND, EVALUATION
 
 DONE, UP_TO_DATE, NOT_NEEDED, FAILED, AGAIN, BLOCKED = (
     *("done", "up to date", "not needed", "failed", "try again", "blocked"),

@@ -11,7 +11,8 @@ from fdda_addon.core.recording.estimate import format_duration
 
 from .characters import Farm
 from .fingerprints import read_manifest
-from .tasks import BIND, EVALUATE, INFLUENCES, KINDS, MERGE, RECORD, REFINE, TRAIN, Task
+from .task import Task
+from .tasks import BIND, EVALUATE, INFLUENCES, KINDS, MERGE, RECORD, REFINE, TRAIN
 
 START_SECONDS = 2.0
 """Time that each task needs to start a process and load Blender and the file, or PyTorch."""

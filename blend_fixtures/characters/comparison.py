@@ -10,7 +10,8 @@ import numpy as np
 
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.poses import Channel
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate, set_held_out_pose
+from fdda_addon.evaluation.run import evaluate, set_held_out_pose
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.poses.sampling import model_channels
 from fdda_addon.recording.run import record
 from fdda_addon.rig.modifier_stack import read_stack

@@ -12,7 +12,8 @@ from ..core.file_kind import EVALUATION, PICTURE, VIDEO
 from ..core.output import atomic_write_all, check_outputs, to_json_text
 from ..core.progress import Progress
 from ..evaluation.results import Evaluation
-from ..evaluation.run import EvaluationSettings, evaluate
+from ..evaluation.run import evaluate
+from ..evaluation.settings import EvaluationSettings
 from ..poses.clip import find_clips
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig

@@ -8,8 +8,9 @@ package. So the few relevant protobuf fields are read here
 
 import hashlib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+
+from .onnx_fields import decode_text, iterate_fields, read_integers, to_signed
 
 ITEM_BYTES = {1: 4, 6: 4, 7: 8}
 """Bytes per element, by the number of the ONNX data type: float, int32, int64."""
@@ -91,23 +92,23 @@ def read_onnx(data: bytes) -> OnnxContents:
     """
     contents, digest = OnnxContents(), hashlib.sha256()
     try:
-        for field_number, value in _iterate_fields(memoryview(data)):
+        for field_number, value in iterate_fields(memoryview(data)):
             if field_number == 7:
                 contents.has_graph = True
                 digest.update(value)
                 _read_graph(value, contents, is_main_graph=True)
             elif field_number == 8:
-                opset_fields = dict(_iterate_fields(value))
+                opset_fields = dict(iterate_fields(value))
                 if (
-                    _decode_text(opset_fields.get(1, b"")) in STANDARD_DOMAINS
+                    decode_text(opset_fields.get(1, b"")) in STANDARD_DOMAINS
                     and opset_fields.get(2) not in SUPPORTED_OPSETS
                 ):
                     contents.unsupported.append(f"operators of version {opset_fields.get(2)!r}")
             elif field_number == 20:
                 contents.unsupported.append("a training of its own")
             elif field_number == 14:
-                property_fields = dict(_iterate_fields(value))
-                contents.metadata[_decode_text(property_fields.get(1, b""))] = _decode_text(property_fields.get(2, b""))
+                property_fields = dict(iterate_fields(value))
+                contents.metadata[decode_text(property_fields.get(1, b""))] = decode_text(property_fields.get(2, b""))
             elif field_number == 25:
                 contents.custom_operators.add("a function of the file's own")
     except (IndexError, TypeError, UnicodeDecodeError) as error:
@@ -118,50 +119,10 @@ def read_onnx(data: bytes) -> OnnxContents:
     return contents
 
 
-def _iterate_fields(data: memoryview) -> Iterator[tuple[int, memoryview | int]]:
-    """Yield the number and the raw value of each field of a protobuf message."""
-    position, end = 0, len(data)
-    while position < end:
-        field_key, position = _read_varint(data, position)
-        wire_type = field_key & 7
-        if wire_type == 0:
-            value, position = _read_varint(data, position)
-        elif wire_type in (1, 5):
-            size = 8 if wire_type == 1 else 4
-            value, position = data[position : position + size], position + size
-        elif wire_type == 2:
-            size, position = _read_varint(data, position)
-            value, position = data[position : position + size], position + size
-        else:
-            raise ValueError("not an ONNX file")
-        # Other readers truncate a longer key to 32 bits. They would find a field that this reader does not.
-        if position > end or field_key >> 32:
-            raise ValueError("not an ONNX file")
-        yield field_key >> 3, value
-
-
-def _read_varint(data: memoryview, position: int) -> tuple[int, int]:
-    value = shift = 0
-    while shift < 70:
-        byte = data[position]
-        position += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, position
-        shift += 7
-    raise ValueError("not an ONNX file")
-
-
-def _decode_text(data: memoryview | bytes) -> str:
-    if isinstance(data, int):
-        raise TypeError("a number where text belongs")
-    return bytes(data).decode("utf-8")
-
-
 def _read_graph(data: memoryview, contents: OnnxContents, is_main_graph: bool = False, depth: int = 0) -> None:
     if depth > MAX_DEPTH:
         raise ValueError("its graphs are nested too deeply")
-    for field_number, value in _iterate_fields(data):
+    for field_number, value in iterate_fields(data):
         if field_number == 1:
             _read_node(value, contents, depth)
         elif field_number == 5:
@@ -181,13 +142,13 @@ def _read_graph(data: memoryview, contents: OnnxContents, is_main_graph: bool = 
 def _read_node(data: memoryview, contents: OnnxContents, depth: int) -> None:
     operator = domain = ""
     inputs, outputs, attributes = [], [], {}
-    for field_number, value in _iterate_fields(data):
+    for field_number, value in iterate_fields(data):
         if field_number in (1, 2):
-            (inputs if field_number == 1 else outputs).append(_decode_text(value))
+            (inputs if field_number == 1 else outputs).append(decode_text(value))
         elif field_number == 4:
-            operator = _decode_text(value)
+            operator = decode_text(value)
         elif field_number == 7:
-            domain = _decode_text(value)
+            domain = decode_text(value)
         elif field_number == 5:
             name, attribute = _read_attribute(value, contents, depth)
             attributes[name] = attribute
@@ -199,13 +160,13 @@ def _read_node(data: memoryview, contents: OnnxContents, depth: int) -> None:
 
 def _read_attribute(data: memoryview, contents: OnnxContents, depth: int) -> tuple[str, int | tuple[int, ...] | None]:
     name, integer, integers, has_other_field = "", None, [], False
-    for field_number, value in _iterate_fields(data):
+    for field_number, value in iterate_fields(data):
         if field_number == 1:
-            name = _decode_text(value)
+            name = decode_text(value)
         elif field_number == 3:
-            integer = _to_signed(value)
+            integer = to_signed(value)
         elif field_number == 8:
-            integers += _read_integers(value)
+            integers += read_integers(value)
         elif field_number in (5, 10):
             contents.unsupported.append("tensors inside of nodes")
             _read_tensor(value, contents)
@@ -222,34 +183,16 @@ def _read_attribute(data: memoryview, contents: OnnxContents, depth: int) -> tup
     return name, None if has_other_field else tuple(integers) or integer
 
 
-def _to_signed(value: int) -> int:
-    """Convert a 64-bit varint to a signed integer."""
-    if not isinstance(value, int):
-        raise TypeError("text where a number belongs")
-    return value - (1 << 64) if value >> 63 else value
-
-
-def _read_integers(value: int | memoryview) -> list[int]:
-    """Read one integer, or a packed list of integers."""
-    if isinstance(value, int):
-        return [_to_signed(value)]
-    integers, position = [], 0
-    while position < len(value):
-        varint, position = _read_varint(value, position)
-        integers.append(_to_signed(varint))
-    return integers
-
-
 def _read_tensor(data: memoryview, contents: OnnxContents) -> tuple[str, OnnxConstant]:
     is_external, location = False, ""
     name, element_type, shape, raw_fields, is_unsupported = "", 0, [], [], False
-    for field_number, value in _iterate_fields(data):
+    for field_number, value in iterate_fields(data):
         if field_number == 1:
-            shape += _read_integers(value)
+            shape += read_integers(value)
         elif field_number == 2:
             element_type = value
         elif field_number == 8:
-            name = _decode_text(value)
+            name = decode_text(value)
         elif field_number == 9:
             raw_fields.append(value)
         elif field_number in (3, 4, 5, 6, 7, 10, 11):
@@ -257,9 +200,9 @@ def _read_tensor(data: memoryview, contents: OnnxContents) -> tuple[str, OnnxCon
             is_unsupported = True
         if field_number == 13:
             is_external = True
-            entry_fields = dict(_iterate_fields(value))
-            if _decode_text(entry_fields.get(1, b"")) == "location":
-                location = _decode_text(entry_fields.get(2, b""))
+            entry_fields = dict(iterate_fields(value))
+            if decode_text(entry_fields.get(1, b"")) == "location":
+                location = decode_text(entry_fields.get(2, b""))
         elif field_number == 14 and value != 0:
             is_external = True
     if is_external:
@@ -279,25 +222,25 @@ def _read_tensor(data: memoryview, contents: OnnxContents) -> tuple[str, OnnxCon
 
 
 def _read_sparse_tensor(data: memoryview, contents: OnnxContents) -> None:
-    for field_number, value in _iterate_fields(data):
+    for field_number, value in iterate_fields(data):
         if field_number in (1, 2):
             _read_tensor(value, contents)
 
 
 def _read_input_or_output(data: memoryview) -> tuple[str, tuple]:
     name, shape = "", []
-    for field_number, value in _iterate_fields(data):
+    for field_number, value in iterate_fields(data):
         if field_number == 1:
-            name = _decode_text(value)
+            name = decode_text(value)
         elif field_number == 2:
-            tensor_type = dict(_iterate_fields(value)).get(1, b"")
+            tensor_type = dict(iterate_fields(value)).get(1, b"")
             for dimension in (
                 inner_value
-                for inner_number, inner_value in _iterate_fields(dict(_iterate_fields(tensor_type)).get(2, b""))
+                for inner_number, inner_value in iterate_fields(dict(iterate_fields(tensor_type)).get(2, b""))
                 if inner_number == 1
             ):
-                dimension_fields = dict(_iterate_fields(dimension))
+                dimension_fields = dict(iterate_fields(dimension))
                 shape.append(
-                    dimension_fields[1] if 1 in dimension_fields else _decode_text(dimension_fields.get(2, b"?"))
+                    dimension_fields[1] if 1 in dimension_fields else decode_text(dimension_fields.get(2, b"?"))
                 )
     return name, tuple(shape)

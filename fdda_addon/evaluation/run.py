@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compares a model and linear skinning with the rig, on poses that were not used in training."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
 from ..core.errors import FDDAError, RigError
 from ..core.mask import Mask
 from ..core.metrics import distances
@@ -16,7 +15,7 @@ from ..core.poses import Channel, sample_pose, widen_ranges
 from ..core.progress import Progress
 from ..core.skinning import LinearSkinning
 from ..core.surface import Surface, SurfaceComparison, surface_errors
-from ..poses.clip import Clip, find_clips
+from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable
 from ..rig.pose_setter import (
@@ -36,58 +35,11 @@ from ..scene.armature import Poser, clear_pose
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig, check_full_rig
 from .results import Evaluation, PoseErrors
+from .settings import EvaluationSettings, NamedPose
 
 FIRST_HELD_OUT_INDEX = 1 << 33
 """Index of the first held-out random pose. It is larger than the number of poses of any recording, so the held-out
 poses differ from all recorded poses, even with the same seed."""
-
-
-@dataclass(frozen=True)
-class NamedPose:
-    """A pose that is defined by the rotations of some bones; the other bones are at rest.
-
-    Attributes:
-        name: name of the pose.
-        rotations: Euler angles by bone name, in the rotation order of the bone, radians.
-    """
-
-    name: str
-    rotations: dict[str, tuple[float, float, float]]
-
-
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """The poses of an evaluation.
-
-    Attributes:
-        poses: number of random held-out poses; if 0, the frames of the first action or strip replace them.
-        seed: seed of the random poses.
-        actions, strips: names of actions and of NLA strips whose frames are compared too.
-        range_scales: factors that widen the range of motion for further random poses. Each factor has a quarter as many
-            poses as `poses`.
-        named: further poses, whose errors are listed separately.
-        surface: whether to compare normals and edges too, which takes longer than the rest of the evaluation.
-        target: settings of the target to compare with; by default the rig itself.
-    """
-
-    poses: int = EVALUATION_POSES
-    seed: int = EVALUATION_SEED
-    actions: tuple[str, ...] = ()
-    range_scales: tuple[float, ...] = ()
-    named: tuple[NamedPose, ...] = ()
-    surface: bool = True
-    strips: tuple[str, ...] = ()
-    target: TargetSettings = NO_TARGET
-
-    @property
-    def scaled_poses(self) -> int:
-        """Number of random poses of each factor of `range_scales`."""
-        return max(1, self.poses // 4)
-
-    def total_poses(self, clips: Iterable[Clip]) -> int:
-        """Return the number of poses, with the frames of the clips."""
-        of_clips = sum(len(clip.frames) for clip in clips)
-        return self.poses + self.scaled_poses * len(self.range_scales) + len(self.named) + of_clips
 
 
 def evaluate(
@@ -116,43 +68,33 @@ def evaluate(
     random_pose_count = settings.poses or len(settings.range_scales) or len(settings.named)
     network, skinning = _prepare(scene_rig, model, is_rig_compared=not settings.target.name)
     pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count, network.info.controls)
-    rig = skinning.rig
     # A rig that is posed only by actions may have no channels to sample.
-    channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.range_scales else ()
-    total_poses = settings.total_poses(clips)
+    channels = model_channels(scene_rig, skinning.rig, network.info) if settings.poses or settings.range_scales else ()
+    random_poses = partial(_random_poses, scene_rig, pose_setter, settings.seed)
     with ExitStack() as stack:
         if pose_setter.target:
             stack.enter_context(pose_setter.target.prepared())
-        player = stack.enter_context(temporary_rig_state(scene_rig, rig, channels, clips))
-        evaluator = PoseEvaluator(scene_rig, rig, pose_setter.target)
+        player = stack.enter_context(temporary_rig_state(scene_rig, skinning.rig, channels, clips))
+        evaluator = PoseEvaluator(scene_rig, skinning.rig, pose_setter.target)
         mask = read_mask(scene_rig.mesh_object)
-        comparison = _Comparison(evaluator, network, skinning, total_poses, settings.surface, mask)
+        comparison = _Comparison(evaluator, network, skinning, settings.total_poses(clips), settings.surface, mask)
         held_out = None
         if settings.poses:
-            poses = _random_poses(scene_rig, channels, settings.seed, FIRST_HELD_OUT_INDEX, settings.poses, pose_setter)
+            poses = random_poses(channels, FIRST_HELD_OUT_INDEX, settings.poses)
             held_out = yield from comparison.compare("held-out poses", poses)
-        scaled_range_errors = []
+        scaled_range_errors, named_errors, action_errors = [], [], []
         for scale_index, factor in enumerate(settings.range_scales, 1):
-            first_index = FIRST_HELD_OUT_INDEX * (1 + scale_index)
-            poses = _random_poses(
-                scene_rig,
-                widen_ranges(channels, factor),
-                settings.seed,
-                first_index,
-                settings.scaled_poses,
-                pose_setter,
-            )
+            wide_channels, first_index = widen_ranges(channels, factor), FIRST_HELD_OUT_INDEX * (1 + scale_index)
+            poses = random_poses(wide_channels, first_index, settings.scaled_poses)
             scaled_range_errors.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
-        named_errors = []
         for pose in settings.named:
             named_errors.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, pose_setter))))
-        action_errors = []
         for clip in clips:
-            frames = pose_setter.show_frames(player, clip, range(len(clip.frames)))
-            action_errors.append((yield from comparison.compare(clip.title, frames)))
+            poses = pose_setter.show_frames(player, clip, range(len(clip.frames)))
+            action_errors.append((yield from comparison.compare(clip.title, poses)))
     yield Evaluation(
         skinning.partitions,
-        rig.joint_names,
+        skinning.rig.joint_names,
         held_out or action_errors[0],
         action_errors,
         scaled_range_errors,
@@ -199,16 +141,16 @@ def set_held_out_pose(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: 
         index: index of the pose in the evaluation.
     """
     clear_pose(scene_rig.armature_object)
-    next(_random_poses(scene_rig, channels, seed, FIRST_HELD_OUT_INDEX + index, 1))
+    next(_random_poses(scene_rig, DIRECT_POSE_SETTER, seed, channels, FIRST_HELD_OUT_INDEX + index, 1))
 
 
 def _random_poses(
     scene_rig: SceneRig,
-    channels: tuple[Channel, ...],
+    pose_setter: PoseSetter,
     seed: int,
+    channels: tuple[Channel, ...],
     first_index: int,
     count: int,
-    pose_setter: PoseSetter = DIRECT_POSE_SETTER,
 ) -> Iterator[None]:
     poser = Poser(scene_rig, channels)
     with pose_setter.prepared():

@@ -54,7 +54,8 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_bound_model(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..evaluation.run import EvaluationSettings, evaluate, evaluate_action
+        from ..evaluation.run import evaluate, evaluate_action
+        from ..evaluation.settings import EvaluationSettings
         from ..runtime.binding import model_disabled
         from ..runtime.model_files import network_of
 

@@ -20,7 +20,7 @@ from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.poses import CONTROL, Channel
 from ..core.rig import STATIC_JOINT, Rig
 from ..poses.bone_channels import is_moved_by_constraints
-from ..rig.sources import split_bone_path
+from ..rig.bone_paths import split_bone_path
 from ..scene.armature import Poser, clear_pose
 from ..scene.bone_transform import controls_by_bone
 from ..scene.control_reader import ControlReader

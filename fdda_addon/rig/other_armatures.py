@@ -11,7 +11,8 @@ from ..core.poses import LOCATION, ROTATION, SCALE
 from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
 from ..scene.controls import fcurve_target, make_control
 from ..scene.scene_rig import SceneRig
-from .sources import Sources, is_transform_channel, split_bone_path
+from .bone_paths import is_transform_channel, split_bone_path
+from .sources import Sources
 
 _COPY_CONSTRAINTS = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}
 _FOUR_COMPONENT_MODES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}

@@ -9,11 +9,10 @@ import bpy
 from ..scene.compatibility import node_input
 from ..scene.controls import fcurve_target, owner_name
 from ..scene.scene_rig import SceneRig
+from .bone_paths import is_transform_channel, split_bone_path
 from .modifier_stack import is_fdda_modifier
 
-_BONE_PATH = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]')
 _MODIFIER_PATH = re.compile(r'modifiers\["(?P<name>(?:[^"\\]|\\.)*)"\](?P<rest>.*)')
-_TRANSFORM_CHANNEL = re.compile(r"\.(?:location|rotation_\w+|scale)(?:\[\d\])?")
 _CHANNEL_PATHS = {
     **{f"LOC_{axis}": f"location[{index}]" for index, axis in enumerate("XYZ")},
     **{f"ROT_{axis}": f"rotation_euler[{index}]" for index, axis in enumerate("XYZ")},
@@ -269,17 +268,6 @@ class Sources:
             self._add_object(target.id, uses_geometry=False)
             if variable.type == "TRANSFORMS" and (path := _CHANNEL_PATHS.get(target.transform_type)):
                 self.numbers[target.id, path] = None
-
-
-def split_bone_path(path: str) -> tuple[str, str]:
-    """Split a path of an armature object into the bone's name, empty for other paths, and the path in the bone."""
-    match = _BONE_PATH.match(path)
-    return (bpy.utils.unescape_identifier(match["bone"]), path[match.end() :]) if match else ("", path)
-
-
-def is_transform_channel(subpath: str) -> bool:
-    """Return whether a path relative to a bone is a location, a rotation or a scale."""
-    return _TRANSFORM_CHANNEL.fullmatch(subpath) is not None
 
 
 def _carriers(scene_rig: SceneRig) -> set[bpy.types.Object]:

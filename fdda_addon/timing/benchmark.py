@@ -17,19 +17,15 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from ..core.poses import CONTROL, ROTATION, ROTATION_VECTOR, Channel, sample_pose
 from ..core.progress import Progress
-from ..poses.action_range import action_frames
-from ..poses.sampling import model_channels, sampled_channels
+from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
-from ..rig.reading import read_rig
 from ..runtime import model_files, playback
 from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import open_model
-from ..scene.armature import Poser, clear_pose
-from ..scene.comparison import hidden_comparison_objects
 from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
-from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose
+from ..scene.temporary_state import temporary_attributes
+from .animation import temporary_animation
 from .frame_times import FrameTimes, compare_times
 
 ROUNDS, MAX_ROUNDS = 5, 15
@@ -38,8 +34,6 @@ MAX_RATIO_SPREAD = 0.1
 """Spread of the ratio of two times (`ratio_spread`) at which no further round is measured."""
 WARM_UP_FRAMES = 3
 """Number of frames before each measurement that are not timed."""
-RANDOM_POSE_COUNT, KEY_STEP_FRAMES = 20, 5
-"""Number of random poses that animate a rig without an action, and the number of frames from one to the next."""
 
 
 @dataclass(frozen=True)
@@ -197,51 +191,6 @@ def ratio_spread(ratios: list[float]) -> float:
     """Return the distance of the quartiles of measured ratios, relative to their median."""
     low, middle, high = np.percentile(ratios, (25, 50, 75))
     return float((high - low) / middle)
-
-
-@contextmanager
-def temporary_animation(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator[range]:
-    """Assign the action of an armature, or `key_random_poses` if it has none; restore pose and animation afterwards.
-
-    Yields:
-        The frames of the action.
-    """
-    animation = scene_rig.armature_object.animation_data
-    original_action = animation.action if animation else None
-    with (
-        hidden_comparison_objects(),
-        temporary_pose(scene_rig.armature_object, [original_action] if original_action else []),
-    ):
-        action = original_action or key_random_poses(scene_rig, channels)
-        assign_action(scene_rig.armature_object, action)
-        try:
-            yield action_frames(action)
-        finally:
-            scene_rig.armature_object.animation_data.action = None
-            if action != original_action:
-                bpy.data.actions.remove(action)
-
-
-def key_random_poses(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bpy.types.Action:
-    """Key random poses on the armature, `KEY_STEP_FRAMES` frames apart, and return its action.
-
-    Args:
-        scene_rig: the rig.
-        channels: the channels of the poses, without controls; empty for the sampled channels of the rig.
-    """
-    armature_object = scene_rig.armature_object
-    channels = [c for c in channels or sampled_channels(scene_rig, read_rig(scene_rig)) if c.kind != CONTROL]
-    clear_pose(armature_object)
-    poser = Poser(scene_rig, channels)
-    rotation_paths = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
-    for index in range(RANDOM_POSE_COUNT):
-        poser.set(sample_pose(channels, 0, index))
-        for name, kind in {(channel.name, channel.kind) for channel in channels}:
-            bone = armature_object.pose.bones[name]
-            is_rotation = kind in {ROTATION, ROTATION_VECTOR}
-            path = rotation_paths.get(bone.rotation_mode, "rotation_euler") if is_rotation else kind
-            bone.keyframe_insert(path, frame=1 + index * KEY_STEP_FRAMES)
-    return armature_object.animation_data.action
 
 
 def time_frames(animation_frames: range, first_index: int, count: int) -> list[float]:

@@ -17,7 +17,7 @@ from ..rig.modifier_stack import check_posable, deforming_modifiers, is_fdda_mod
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
 from ..scene.temporary_state import temporary_attributes
-from .benchmark import temporary_animation
+from .animation import temporary_animation
 from .bone_groups import find_expensive_groups
 from .durations import Duration, scene_times, temporary_armature_scene, time_redraws
 from .frame_profile import BONES, DRAWING, MODIFIER, REST, ROUNDS, SHAPE_KEYS, FramePart, FrameProfile

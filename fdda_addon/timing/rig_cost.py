@@ -10,7 +10,8 @@ from ..core.progress import Progress
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, check_full_rig
-from .benchmark import MAX_RATIO_SPREAD, ratio_spread, skinning_only, temporary_animation, time_frames
+from .animation import temporary_animation
+from .benchmark import MAX_RATIO_SPREAD, ratio_spread, skinning_only, time_frames
 from .frame_times import MIN_WORTHWHILE_RATIO
 
 ROUNDS, MAX_ROUNDS = 4, 12

@@ -10,7 +10,8 @@ import pytest
 from blend_fixtures.characters import stacks
 from blend_fixtures.characters.base import tube
 from fdda_addon.core.errors import RigError
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record

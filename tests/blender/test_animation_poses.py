@@ -10,7 +10,8 @@ import pytest
 from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.skinning import LinearSkinning
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import SceneRig

@@ -6,7 +6,8 @@ import pytest
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.runtime.binding import model_disabled

@@ -15,7 +15,8 @@ from fdda_addon.core.poses import sample_pose, widen_ranges
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation.results import Evaluation, PoseErrors
-from fdda_addon.evaluation.run import FIRST_HELD_OUT_INDEX, EvaluationSettings, NamedPose, evaluate, evaluate_action
+from fdda_addon.evaluation.run import FIRST_HELD_OUT_INDEX, evaluate, evaluate_action
+from fdda_addon.evaluation.settings import EvaluationSettings, NamedPose
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.network import Network

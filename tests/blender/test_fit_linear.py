@@ -19,7 +19,8 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation import heat_map
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseReader, read_rig

@@ -17,7 +17,8 @@ from fdda_addon.core.errors import ModelError, RigError
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.recording.weight_fitting import MIN_RANDOM_POSES, choose_fit_poses

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import stacks
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.rig.modifier_stack import ModifierStack, read_stack

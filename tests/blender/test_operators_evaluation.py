@@ -10,7 +10,8 @@ import pytest
 from fdda_addon.core.metrics import error_statistics, viewport_colors
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.evaluation import heat_map, last_evaluation, markers, overlay
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate, evaluate_action
+from fdda_addon.evaluation.run import evaluate, evaluate_action
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.runtime.model_files import allow_path

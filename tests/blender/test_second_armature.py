@@ -9,7 +9,8 @@ from mathutils import Euler
 from blend_fixtures.characters import second_armature
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record

@@ -10,7 +10,8 @@ import pytest
 
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.core.surface import Surface
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.mesh import topology
 from fdda_addon.scene.scene_rig import SceneRig

@@ -23,7 +23,8 @@ from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation import heat_map, last_evaluation
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.scene.unit import metres_per_unit

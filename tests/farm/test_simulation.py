@@ -16,7 +16,8 @@ from farm.simulation import (
     simulate,
     task_seconds,
 )
-from farm.tasks import RECORD, Task, make_tasks
+from farm.task import Task
+from farm.tasks import RECORD, make_tasks
 
 from .conftest import ONE_CHARACTER
 

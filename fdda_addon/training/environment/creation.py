@@ -6,7 +6,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -21,8 +20,6 @@ from .check_result import CheckResult
 from .folder import (
     PACKAGES,
     creation_lock,
-    excess_path_length,
-    has_path_limit,
     interpreter_path,
     remove_environment,
     requirements_file,
@@ -30,12 +27,9 @@ from .folder import (
     write_completion_marker,
 )
 from .interpreters import Interpreter, find_interpreters, query_interpreter
+from .source_checks import TEMPORARY_FOLDER_NAME, check_source, check_wheels
 from .subprocesses import clean_environment, popen_options
 
-MIN_FREE_GB = 9 if sys.platform.startswith("linux") else 2
-"""Free disk space that the packages and downloads need. On Linux they include CUDA."""
-TEMPORARY_FOLDER_NAME = "fdda-12345678"
-"""Name of the temporary folder on Windows, with an example of its random suffix."""
 MIN_PIP_WITH_RAW_PROGRESS = (24, 1)
 
 
@@ -73,11 +67,11 @@ class EnvironmentCreation:
 
     def _steps(self) -> Iterator[Progress | CheckResult]:
         with creation_lock(self.folder), _open_log(self.log) as log:
-            self._check_source()
+            check_source(self.folder, self.wheels)
             yield Progress("looking for a Python", 0, 0)
             interpreters = self._find_interpreters(log)
             if self.wheels is not None:
-                self._check_wheels(interpreters[0], log)
+                check_wheels(self.wheels, interpreters[0], log, self.log)
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
@@ -101,54 +95,6 @@ class EnvironmentCreation:
             self._cancelled = True
             if self._process is not None:
                 _kill(self._process)
-
-    def _check_source(self) -> None:
-        if has_path_limit() and (
-            excess := excess_path_length(self.folder, Path(tempfile.gettempdir(), TEMPORARY_FOLDER_NAME))
-        ):
-            raise TrainerEnvironmentError(
-                f"Paths in the training environment '{self.folder}' would be {excess} letters too long for Windows; "
-                "allow long paths (https://pip.pypa.io/warnings/enable-long-paths), or choose an existing Python that "
-                "has torch."
-            )
-        if self.wheels is None:
-            free_gb = shutil.disk_usage(self.folder.parent).free / 1e9
-            if free_gb < MIN_FREE_GB:
-                raise TrainerEnvironmentError(
-                    f"The training environment needs {MIN_FREE_GB} GB and '{self.folder.parent}' has {free_gb:.1f} GB "
-                    "left; make room, or choose an existing Python that has torch."
-                )
-        elif not self.wheels.is_dir():
-            raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the folder that holds the packages.")
-
-    def _check_wheels(self, interpreter: Interpreter, log: IO[str]) -> None:
-        """Check that no wheel is missing. pip would report one late, and as a version conflict."""
-        pinned = [
-            line
-            for line in requirements_file(interpreter.version).read_text(encoding="utf-8").splitlines()
-            if "==" in line
-        ]
-        pinned_versions = [line.split("==") for line in pinned if line.partition("==")[0] in PACKAGES]
-        missing = [
-            f"{name} {version}"
-            for name, version in pinned_versions
-            if not any(self.wheels.glob(f"{name}-{version}[-+]*.whl"))
-        ]
-        if missing:
-            version = f"{interpreter.version[0]}.{interpreter.version[1]}"
-            download = [
-                "pip",
-                "download",
-                "--only-binary=:all:",
-                f"--constraint={requirements_file(interpreter.version)}",
-                "--dest=wheels",
-            ]
-            log.write(f"With Python {version} on such a machine as this, but online:\n")
-            log.write(f"$ {subprocess.list2cmdline([f'python{version}', '-m', *download, *PACKAGES])}\n")
-            raise TrainerEnvironmentError(
-                f"The folder '{self.wheels}' lacks the packages {', '.join(missing)} for Python {version}; download "
-                f"them on a machine that is online, '{self.log}' has the command."
-            )
 
     def _find_interpreters(self, log: IO[str]) -> list[Interpreter]:
         """Return the suitable interpreters, the best first."""
