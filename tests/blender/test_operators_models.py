@@ -62,7 +62,7 @@ def test_a_model_of_another_rig_is_not_added(rig, elbow_files):
 
 def test_an_index_outside_the_list_is_refused(bound_elbow):
     bpy.context.view_layer.objects.active = bound_elbow
-    refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 models and none with index 3")
+    refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 model and none with index 3")
 
 
 def move_vertex() -> None:
