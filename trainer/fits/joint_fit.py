@@ -199,12 +199,9 @@ def joints_on_path(parents: np.ndarray, first: int, second: int) -> set[int]:
 
     Without a common ancestor, these are all joints from either one up to its root.
     """
-    return set(_chain_to_root(parents, first)) ^ set(_chain_to_root(parents, second))
-
-
-def _chain_to_root(parents: np.ndarray, joint: int) -> list[int]:
-    chain = []
-    while joint >= 0:
-        chain.append(joint)
-        joint = int(parents[joint])
-    return chain
+    chains: tuple[set[int], set[int]] = set(), set()
+    for chain, joint in zip(chains, (first, second), strict=True):
+        while joint >= 0:
+            chain.add(joint)
+            joint = int(parents[joint])
+    return chains[0] ^ chains[1]

@@ -1,25 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The content of `report.json`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fdda_addon.core.metrics import error_statistics
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.rig import Rig
 
-if TYPE_CHECKING:
-    from fdda_addon.core.partition import Partition
-    from fdda_addon.core.recording.reader import Recording
-    from fdda_addon.core.rig import Rig
-
-    from ..export.export import ExportedModel, Measurement
-    from ..model import TrainedModel
-    from ..networks.networks import TrainedPartition
-    from .error_analysis import ErrorAnalysis
+from ..export.export import ExportedModel, Measurement
+from ..model import TrainedModel
+from ..networks.networks import TrainedPartition
+from .error_analysis import ErrorAnalysis
 
 HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
 """Bin edges of the histogram, mm: ten bins per decade; the first bin holds all errors below 0.0001 mm."""
