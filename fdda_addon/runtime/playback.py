@@ -64,24 +64,28 @@ def _dispatch_changes(depsgraph: bpy.types.Depsgraph) -> None:
             _dispatch_object_changes(character, mesh_object, is_edited)
     # The graph of a render reports all datablocks as changed.
     is_render = depsgraph.mode == "RENDER"
+    if not is_render:
+        edited_uids = {uid for uid, is_edited in changes.meshes.items() if is_edited}
+        for object_uid in [uid for uid, (mesh_uid, *_) in session.passed_checks.items() if mesh_uid in edited_uids]:
+            del session.passed_checks[object_uid]
+    reported_uids = {mesh_object.session_uid for mesh_object, _ in changes.mesh_objects}
     for character in [c for c in session.characters.values() if c.player is not None]:
         player = character.player
         player.has_new_copy = False
         if player.mesh_uid in changes.meshes and player.mask is not None and (mesh_object := character.find_object()):
             with session.isolated_errors(character):
                 update_mask(character, mesh_object, weights_changed=True)
-        if is_render:
-            continue
-        if player.armature_uid in changes.armatures:
+        if not is_render and player.armature_uid in changes.armatures:
             session.report_change(character, BONES)
             if changes.armatures[player.armature_uid]:
                 session.report_change(character, PARENTS)
-        if player.mesh_uid in changes.meshes:
+        if not is_render and player.mesh_uid in changes.meshes:
             session.report_change(character, MESH)
-    for mesh_uid in [] if is_render else [uid for uid, is_edited in changes.meshes.items() if is_edited]:
-        for object_uid in [uid for uid, (uid_of_mesh, *_) in session.passed_checks.items() if uid_of_mesh == mesh_uid]:
-            del session.passed_checks[object_uid]
-    _dispatch_edit_modes(changes)
+        if character.object_uid in reported_uids or character.reported or character.state == State.EDITED:
+            mesh_object = character.find_object()
+            if mesh_object is not None:
+                is_stable = mesh_object.mode in STABLE_MODES
+                session.dispatch(Event.LEAVE_EDIT if is_stable else Event.EDIT, character)
 
 
 def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object, is_edited: bool) -> None:
@@ -98,21 +102,6 @@ def _dispatch_object_changes(character: Character, mesh_object: bpy.types.Object
         session.dispatch(Event.OUTDATE, character)
     elif is_edited:
         session.report_change(character, OBJECT)
-
-
-def _dispatch_edit_modes(changes: DepsgraphChanges) -> None:
-    """Dispatch the edit modes that the meshes of playing characters have entered or left."""
-    reported_uids = {mesh_object.session_uid for mesh_object, _ in changes.mesh_objects}
-    for character in [c for c in session.characters.values() if c.player is not None]:
-        is_reported = character.object_uid in reported_uids or character.reported
-        if not is_reported and character.state != State.EDITED:
-            continue
-        mesh_object = character.find_object()
-        if mesh_object is not None:
-            session.dispatch(
-                Event.LEAVE_EDIT if mesh_object.mode in STABLE_MODES else Event.EDIT,
-                character,
-            )
 
 
 def _reads_buffer(mesh_object: bpy.types.Object, character: Character) -> bool:
