@@ -2,7 +2,7 @@
 """Binds a model to a mesh object."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import bpy
@@ -113,42 +113,36 @@ def on_mask_update(mesh_object: bpy.types.Object) -> None:
 
 @contextmanager
 def temporary_mode(mesh_object: bpy.types.Object, mode: str) -> Iterator[None]:
-    """Show a bound object in a mode, even if its mode is keyed or driven, and restore its binding afterwards."""
-    binding = mesh_object.fdda
+    """Show an object in a mode, and restore its mode afterwards: no handler, driver, keyframe or user switches it."""
+    binding, object_uid = mesh_object.fdda, mesh_object.session_uid
     previous_mode = binding.mode
+    mode_stack = session.modes.setdefault(object_uid, [])
+    mode_stack.append(mode)
     try:
-        with session.override_mode(mesh_object, mode):
-            if binding.is_bound:
-                binding.mode = mode
-            yield
+        if binding.is_bound:
+            binding.mode = mode
+        yield
     finally:
+        mode_stack.pop()
+        if not mode_stack:
+            session.modes.pop(object_uid, None)
         if binding.is_bound:
             binding.mode = previous_mode
 
 
-@contextmanager
-def model_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Show the rig of a bound object, and restore its binding afterwards."""
-    with temporary_mode(mesh_object, "RIG"):
-        yield
+def model_disabled(mesh_object: bpy.types.Object) -> AbstractContextManager[None]:
+    """Show the rig of a bound object, and restore its mode afterwards."""
+    return temporary_mode(mesh_object, "RIG")
 
 
 @contextmanager
-def temporary_binding(scene_rig: SceneRig, model_path: Path | None) -> Iterator[None]:
+def temporary_binding(scene_rig: SceneRig, model_path: Path) -> Iterator[None]:
     """Play a model, and restore the binding of the object afterwards.
-
-    Args:
-        scene_rig: the rig.
-        model_path: path of the model file; None to keep the bound model and show the rig.
 
     Raises:
         FDDAError: as `bind`.
     """
     binding = scene_rig.mesh_object.fdda
-    if model_path is None:
-        with model_disabled(scene_rig.mesh_object):
-            yield
-        return
     previous_arguments = None
     if binding.is_bound:
         previous_path = Path(binding.model) if binding.packed else model_files.model_path(scene_rig.mesh_object)

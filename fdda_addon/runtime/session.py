@@ -193,19 +193,6 @@ class PlaybackSession:
         self.check_rigs()
         return None
 
-    @contextmanager
-    def override_mode(self, mesh_object: bpy.types.Object, mode: str) -> Iterator[None]:
-        """Override the mode of a bound object: no handler, driver, keyframe or user switches its modifiers."""
-        mode_stack = self.modes.setdefault(mesh_object.session_uid, [])
-        mode_stack.append(mode)
-        object_uid = mesh_object.session_uid
-        try:
-            yield
-        finally:
-            mode_stack.pop()
-            if not mode_stack:
-                del self.modes[object_uid]
-
     def overriding_mode(self, object_uid: int) -> str:
         """Return the mode that overrides the mode of an object; empty if there is none."""
         mode_stack = self.modes.get(object_uid)

@@ -151,7 +151,8 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     mesh_object = scene_rig.mesh_object
     opened_model = open_model(scene_rig, model or model_files.network_of(mesh_object))
     channels = model_channels(scene_rig, opened_model.rig, opened_model.network.info)
-    with temporary_animation(scene_rig, channels) as animation_frames, temporary_binding(scene_rig, model):
+    binding = temporary_binding(scene_rig, model) if model else model_disabled(mesh_object)
+    with temporary_animation(scene_rig, channels) as animation_frames, binding:
         show_variant = {
             "rig": model_disabled,
             "linear": skinning_only,
