@@ -8,7 +8,7 @@ move.
 """
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import chain, islice
 
 import bpy
@@ -35,8 +35,7 @@ class PlayerBatch:
 
     def __init__(self, network: Network, members: Mapping[int, Player]):
         self.network, self.members = network, dict(members)
-        self._players = list(self.members.values())
-        # Each member has a row.
+        self._rows = {player: row for row, player in enumerate(self.members.values())}
         self._execution = Execution(network, len(self.members))
 
     def batch(self) -> bpy.types.Object:
@@ -83,26 +82,21 @@ class PlayerBatch:
     def _run_model(self, players: list[Player]) -> None:
         """Run the model for players with new inputs: once for all with a strength above 0, alone for each other one."""
         batched_players = [player for player in players if player.new_inputs.strength > 0]
+        has_run = False
         if len(batched_players) > 1:
-            indices = [self._players.index(player) for player in batched_players]
-            for index, player in zip(indices, batched_players, strict=True):
-                self._execution.poses[index] = player.new_inputs.pose_matrices
-                self._execution.controls[index] = player.new_inputs.controls
-            try:
+            for player in batched_players:
+                self._execution.poses[self._rows[player]] = player.new_inputs.pose_matrices
+                self._execution.controls[self._rows[player]] = player.new_inputs.controls
+            # If this fails, each player runs the model alone, and stores its own error.
+            with suppress(FDDAError):
                 # Members without new inputs keep their rows, and so their positions.
                 self._execution.run()
-            except FDDAError:
-                # Each player runs the model alone below, and stores its own error.
-                batched_players = []
-            else:
-                for index, player in zip(indices, batched_players, strict=True):
-                    with player.capture_errors():
-                        player.set_positions(self._execution.positions[index])
-        else:
-            batched_players = []
+                has_run = True
         for player in players:
-            if player not in batched_players:
-                with player.capture_errors():
+            with player.capture_errors():
+                if has_run and player.new_inputs.strength > 0:
+                    player.set_positions(self._execution.positions[self._rows[player]])
+                else:
                     player.run_model()
 
 
