@@ -9,13 +9,11 @@ point to the text, so Blender appends and links it with them, and removes it wit
 import bpy
 
 from ..core.errors import ModelError
-from ..core.model import MAX_BYTES, check_model
+from ..core.model import check_model
 from .session import session
 
 PACKED_MODEL_KEY = "fdda_model"
 """Custom property of a text datablock that holds a model."""
-MAX_PROPERTY_BYTES = (1 << 31) - 1
-"""Blender's limit for a custom property."""
 
 
 def pack(name: str, data: bytes) -> bpy.types.Text:
@@ -31,9 +29,8 @@ def pack(name: str, data: bytes) -> bpy.types.Text:
     Raises:
         ModelError: the bytes are not a model, or too large.
     """
+    # No model is as large as Blender's limit for a custom property, 2 GB.
     check_model(data, name)
-    if len(data) > min(MAX_BYTES, MAX_PROPERTY_BYTES):
-        raise ModelError(f"'{name}' is larger than 2 GB and cannot be packed; leave it beside the file.")
     text = bpy.data.texts.new(name)
     text.use_fake_user = False
     text.write(
