@@ -61,7 +61,8 @@ def dependency_inputs(scene_rig: SceneRig, joint_names: Iterable[str]) -> list[D
 
 def set_driver_inputs(driven_object: bpy.types.Object, inputs: list[DriverInput]) -> None:
     """Make Blender evaluate an object after its inputs, whenever one of them changes."""
-    if [_read_variable(variable) for variable in _driver_variables(driven_object)] == inputs:
+    curves = driven_object.animation_data.drivers[:1] if driven_object.animation_data else ()
+    if [_read_variable(variable) for curve in curves for variable in curve.driver.variables] == inputs:
         return
     driven_object.driver_remove("location", 0)
     # The object is never shown, so its location is free for a driver. Unlike a scripted expression, a sum is evaluated
@@ -82,11 +83,6 @@ def evaluated_inputs(driven_object: bpy.types.Object, input_count: int) -> list[
     """
     variables = driven_object.animation_data.drivers[0].driver.variables
     return [variable.targets[0].id for variable in variables[1 : 1 + input_count]]
-
-
-def _driver_variables(driven_object: bpy.types.Object) -> list[bpy.types.DriverVariable]:
-    drivers = driven_object.animation_data.drivers if driven_object.animation_data else ()
-    return list(drivers[0].driver.variables) if len(drivers) else []
 
 
 def _read_variable(variable: bpy.types.DriverVariable) -> DriverInput:

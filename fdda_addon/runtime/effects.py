@@ -6,12 +6,11 @@ from contextlib import suppress
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from . import modifier_switch, playback_modifier, player_batch, position_buffer, rig_signature
+from . import modifier_switch, playback_modifier, player_batch, position_buffer
 from .player import Player
+from .rig_signature import STABLE_MODES
 from .session import Character, session
 from .transitions import Effect, Event
-
-STABLE_MODES = rig_signature.STABLE_MODES
 
 
 def apply(effect: Effect, character: Character, error: FDDAError | None) -> None:

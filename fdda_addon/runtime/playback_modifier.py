@@ -14,7 +14,7 @@ from ..scene.scene_rig import MODIFIER_NAME
 GROUP_NAME = "FDDA Playback"
 
 
-def add_modifier(mesh_object: bpy.types.Object, index: int) -> bpy.types.NodesModifier:
+def add_modifier(mesh_object: bpy.types.Object, index: int) -> None:
     """Add the FDDA modifier to a mesh object, without a position buffer, or reuse one that it already has.
 
     A library override may have the modifier from its library and cannot remove it. An override also loses its binding,
@@ -29,7 +29,7 @@ def add_modifier(mesh_object: bpy.types.Object, index: int) -> bpy.types.NodesMo
         if not is_from_library(modifier):
             current_index = mesh_object.modifiers.find(modifier.name)
             mesh_object.modifiers.move(current_index, index - (current_index < index))
-        return modifier
+        return
     modifier = mesh_object.modifiers.new(MODIFIER_NAME, "NODES")
     modifier.node_group = _ensure_node_group()
     modifier.show_viewport = modifier.show_render = False
@@ -38,7 +38,6 @@ def add_modifier(mesh_object: bpy.types.Object, index: int) -> bpy.types.NodesMo
     modifier.show_expanded = False
     # A new modifier is not the last one if another modifier is pinned to the end of the stack.
     mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), index)
-    return modifier
 
 
 def find_modifier(mesh_object: bpy.types.Object) -> bpy.types.NodesModifier | None:

@@ -53,18 +53,14 @@ def read_signature(scene_rig: SceneRig, parts: Iterable[str] = PARTS) -> dict[st
         and drivers of the object (`rig.deformation`); a digest of the rest positions of the mesh.
     """
     mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
+    modifier = armature_modifier(mesh_object)
     readers = {
-        BONES: lambda: _read_bones_once(armature, _has_envelopes(scene_rig)),
+        BONES: lambda: _read_bones_once(armature, modifier is not None and modifier.use_bone_envelopes),
         PARENTS: lambda: tuple(bone.parent.name if bone.parent else "" for bone in armature.bones),
         OBJECT: lambda: (*mesh_object.vertex_groups.keys(), str(read_modifiers_and_drivers(scene_rig))),
         MESH: lambda: (rest_digest(mesh_object.data),),
     }
     return {part: readers[part]() for part in parts}
-
-
-def _has_envelopes(scene_rig: SceneRig) -> bool:
-    modifier = armature_modifier(scene_rig.mesh_object)
-    return modifier is not None and modifier.use_bone_envelopes
 
 
 def _read_bones_once(armature: bpy.types.Armature, has_envelopes: bool) -> tuple:
