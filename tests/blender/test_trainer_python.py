@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.errors import TrainerEnvironmentError
-from fdda_addon.training.environment import check, creation, folder, interpreters
+from fdda_addon.training.environment import check, creation, folder, interpreters, source_checks
 from fdda_addon.training.environment.check_result import CheckResult
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, excess_path_length, interpreter_path
@@ -264,8 +264,8 @@ def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, 
         return excess_path_length(*(Path(rf"C:\Users\{name}\{rest}") for rest in (extension, temporary)))
 
     assert [missing(letters * "x") for letters in (15, 33, 34, 60)] == [0, 0, 1, 27]
-    monkeypatch.setattr(creation, "has_path_limit", lambda: True)
-    monkeypatch.setattr(creation, "excess_path_length", lambda *_: 7)
+    monkeypatch.setattr(source_checks, "has_path_limit", lambda: True)
+    monkeypatch.setattr(source_checks, "excess_path_length", lambda *_: 7)
     with pytest.raises(TrainerEnvironmentError, match=r"would be 7 letters too long for Windows; allow long paths \("):
         list(creation.EnvironmentCreation(tmp_path / "trainer", tmp_path / "log").steps())
     assert not (tmp_path / "trainer").exists()
