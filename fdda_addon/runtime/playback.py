@@ -162,7 +162,8 @@ def _scan_object(character: Character, mesh_object: bpy.types.Object) -> None:
         if character.state in SHOWS_MODEL or playback_modifier.buffer_of_object(mesh_object) is not None:
             session.dispatch(Event.SHOW_RIG, character)
     elif character.player is None:
-        session.dispatch(Event.CHOOSE_MODEL, character)
+        # Not CHOOSE_MODEL: only the user plays a model again that has failed.
+        session.dispatch(Event.ANIMATE_MODEL, character)
     elif not (mesh_object.fdda.is_playing and _reads_buffer(mesh_object, character)):
         session.dispatch(Event.OUTDATE, character)
     else:

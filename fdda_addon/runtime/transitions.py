@@ -27,7 +27,7 @@ class Event(Enum):
     BIND = "a bound object was found"
     UNBIND = "the object was unbound or removed"
     CHOOSE_MODEL = "a user or a script has chosen to show the model"
-    ANIMATE_MODEL = "keyframes or drivers show the model"
+    ANIMATE_MODEL = "keyframes or drivers show the model, or a scan has found that the mode shows it"
     SHOW_RIG = "the mode, its keyframes or drivers, or an override show the rig"
     SUSPEND = "the file is about to be written"
     RESUME = "the file was written"

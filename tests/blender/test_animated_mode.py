@@ -1,11 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Mode and strength set by hand, by keyframes and by drivers."""
 
+import shutil
+from pathlib import Path
+
 import bpy
 import numpy as np
 import pytest
 
-from .conftest import assert_plays, evaluated_positions, pose
+import fdda_addon
+from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.session import session
+from fdda_addon.runtime.transitions import State
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
+from .rig_changes import change_in_edit_mode
 from .test_evaluations import shown_in
 from .test_renders import FRAME, animation, set_camera
 
@@ -67,6 +77,56 @@ def curves(mesh_object: bpy.types.Object) -> list[bpy.types.FCurve]:
     from fdda_addon.scene.compatibility import curves_of
 
     return curves_of(mesh_object.animation_data.action, mesh_object)
+
+
+def remove_model(mesh_object: bpy.types.Object, path: Path) -> None:
+    path.unlink()
+
+
+def damage_model(mesh_object: bpy.types.Object, path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def remove_joint(mesh_object: bpy.types.Object, path: Path) -> None:
+    rig = bpy.data.objects[ELBOW_RIG]
+    change_in_edit_mode(rig, lambda: rig.data.edit_bones.remove(rig.data.edit_bones["lower"]))
+
+
+def key_visibility(mesh_object: bpy.types.Object) -> None:
+    for frame in (1, 30):
+        mesh_object.modifiers["FDDA"].keyframe_insert("show_viewport", frame=frame)
+
+
+def drive_mode(mesh_object: bpy.types.Object) -> None:
+    mode = type(mesh_object.fdda).bl_rna.properties["mode"].enum_items["FDDA"]
+    mesh_object.driver_add("fdda.mode").driver.expression = str(mode.value)
+
+
+@pytest.mark.parametrize("animate", [lambda o: key_mode(o, {1: "FDDA", 30: "FDDA"}), drive_mode, key_visibility])
+@pytest.mark.parametrize("spoil", [remove_model, damage_model, remove_joint])
+def test_an_animated_mode_whose_model_cannot_play_reports_one_reason(
+    bound_elbow, elbow_files, tmp_path, capfd, animate, spoil
+):
+    model, path = tmp_path / "elbow.onnx", str(tmp_path / "shot.blend")
+    shutil.copy(elbow_files.model, model)
+    bind(find_rig(), model)
+    animate(bound_elbow)
+    fdda_addon.unregister()
+    spoil(bound_elbow, model)
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    fdda_addon.register()
+    capfd.readouterr()
+    bpy.ops.wm.open_mainfile(filepath=path)
+    mesh_object = bpy.data.objects[ELBOW]
+    for frame in (7, 8, 9):
+        bpy.context.scene.frame_set(frame)
+        session.needs_scan = True
+        bpy.context.view_layer.update()
+        assert session.character_of(mesh_object).state == State.FAILED
+        assert [modifier.show_viewport for modifier in mesh_object.modifiers[:2]] == [True, True]
+    output = capfd.readouterr()
+    assert "Traceback" not in output.err and output.out.count("switched off") == 1
+    assert mesh_object.fdda.status in output.out
 
 
 @pytest.mark.parametrize("is_driven", [False, True], ids=["keyed", "driven"])
