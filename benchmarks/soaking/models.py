@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Soak test of mutated models, bound and played in Blender: each is refused, or the mesh shows its exact output."""
 
+import hashlib
 import json
 import math
 from pathlib import Path
@@ -12,7 +13,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 import fdda_addon
 from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY
-from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.rig.reading import PoseEvaluator, read_model_rig
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.model_files import network_of
@@ -84,10 +84,7 @@ def mutate_model(random: np.random.Generator, original: bytes) -> tuple[str, byt
     data = model.SerializeToString()
     if random.random() < 0.7:
         # An attacker computes a valid checksum; without one, the reader refuses the file before its other checks.
-        try:
-            checksum = read_onnx(data).checksum
-        except ValueError:
-            return kind, data
+        checksum = hashlib.sha256(model.graph.SerializeToString()).hexdigest()
         for prop in model.metadata_props:
             if prop.key == CHECKSUM_KEY:
                 prop.value = checksum

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from .controls import Control, read_controls
-from .model_graph import Budget, compute_budget
 from .partition import Partition, make_partitions
 from .poses import Channel
 from .rig import Fingerprint, Joint, Rig, read_joints
@@ -89,11 +88,6 @@ class ModelInfo:
             {p.joint: p.controls for p in self.partitions},
             {joint: p.joint for p in self.partitions for joint in p.merged},
         )
-
-    def budget(self) -> Budget:
-        """Compute the budget of the model's graph from the metadata."""
-        partitions = [(p.vertices, p.basis, len(p.influencing) + len(p.controls)) for p in self.partitions]
-        return compute_budget(len(self.joints), len(self.controls), partitions, self.training)
 
     @property
     def limits(self) -> tuple[Channel, ...]:

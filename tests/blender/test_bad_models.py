@@ -103,7 +103,7 @@ def test_a_file_that_is_not_an_onnx_file_is_refused(refusal, verb, elbow_files, 
     path = tmp_path / "m.onnx"
     path.write_bytes(content)
     assert refusal(*verb(elbow_files.rig, path)) == (
-        f"'{path}' is not a model: not an ONNX file; give an .onnx file that train made."
+        f"The model '{path}' is refused: it is not an ONNX file; give one that train made."
     )
 
 
@@ -111,7 +111,7 @@ def test_a_file_that_is_not_an_onnx_file_is_refused(refusal, verb, elbow_files, 
 def test_a_truncated_model_is_refused(refusal, verb, elbow_files, tmp_path, kept_ratio):
     path, data = tmp_path / "m.onnx", elbow_files.model.read_bytes()
     path.write_bytes(data[: int(len(data) * kept_ratio)])
-    assert f"'{path}' is not a model" in refusal(*verb(elbow_files.rig, path))
+    assert f"The model '{path}' is refused: " in refusal(*verb(elbow_files.rig, path))
 
 
 def add_input(model) -> None:
@@ -149,10 +149,10 @@ def set_version_2(model) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (add_input, "asks for inputs that no rig gives (controls); train it again"),
-        (add_custom_operator, "uses custom operators (com.example::Run), which is refused; give a model"),
-        (add_hidden_operator, "uses custom operators (com.example::Run), which is refused; give a model"),
-        (keep_data_outside, "keeps data in other files, which is refused; give a model that train made"),
+        (add_input, "it takes the inputs {"),
+        (add_custom_operator, "it has the operator set com.example, which train does not write; give one"),
+        (add_hidden_operator, "it has graphs inside of nodes, which train does not write; give one"),
+        (keep_data_outside, "it has data in other files, which train does not write; give one that train made"),
         (remove_metadata, "is an ONNX file but not a model of this add-on; give one that train made"),
         (set_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
     ],
@@ -265,7 +265,7 @@ def test_a_model_whose_output_has_another_shape_is_refused(refusal, verb, elbow_
 
 def test_a_refused_model_does_not_change_a_bound_object(bound_elbow, elbow_files, tmp_path):
     path = write_edited(elbow_files.model, tmp_path / "m.onnx", add_custom_operator)
-    with pytest.raises(FDDAError, match="custom operators"):
+    with pytest.raises(FDDAError, match="the operator set"):
         bind(find_rig(), path)
     assert bound_elbow.fdda.is_bound and bound_elbow.fdda.mode == "FDDA"
     assert [m.show_viewport for m in bound_elbow.modifiers] == [False, False, True]

@@ -10,8 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.model import CHECKSUM_KEY, check_model
 from fdda_addon.core.model_info import ModelPartition
-from fdda_addon.core.onnx_cost import OPERATORS, compute_graph_cost
-from fdda_addon.core.onnx_file import read_onnx
+from fdda_addon.core.onnx_file import infer_shapes, read_onnx
 
 from .tiny_model import JOINT_COUNT, VERTEX_COUNT, tiny_info, tiny_model, zeros_tensor
 
@@ -36,27 +35,6 @@ def make_node(operator: str, *inputs: str, **attributes) -> onnx.NodeProto:
 def integer_tensor(name: str, *values: int) -> TensorProto:
     """Return a constant of int64 values."""
     return numpy_helper.from_array(np.array(values, np.int64), name)
-
-
-def model_with_endless_loop() -> onnx.ModelProto:
-    """Return a model with a Loop node whose condition stays true."""
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["going"], ["still"])],
-        "body",
-        [
-            helper.make_tensor_value_info("i", TensorProto.INT64, []),
-            helper.make_tensor_value_info("going", TensorProto.BOOL, []),
-        ],
-        [helper.make_tensor_value_info("still", TensorProto.BOOL, [])],
-    )
-    return tiny_model(nodes=[helper.make_node("Loop", ["", ""], [], body=body)])
-
-
-def test_a_loop_is_refused():
-    assert_refused(
-        model_with_endless_loop(),
-        "m.onnx' is refused: it has graphs inside of nodes, which train does not write; give one",
-    )
 
 
 FORBIDDEN_OPERATORS = (
@@ -84,12 +62,6 @@ def test_a_forbidden_operator_is_refused(operator):
     assert_refused(model, f"it has the operator '{operator[:100]}", "which train does not write")
 
 
-def test_a_constant_in_a_node_is_refused():
-    assert_refused(
-        tiny_model(nodes=[helper.make_node("Constant", [], ["c"], value=zeros_tensor("w"))]), "tensors inside of nodes"
-    )
-
-
 def test_a_product_of_constants_is_refused():
     """Two constants of 400 kB, whose product would have 40 GB."""
     column, row = (np.zeros(shape, np.float32) for shape in ((100_000, 1), (1, 100_000)))
@@ -113,13 +85,9 @@ def test_a_growing_pose_is_refused():
             )
         )
         input_name = f"square_{repetition}"
-    assert "more than its joints, vertices and components explain" in assert_refused(
-        tiny_model(nodes=nodes, initializers=tensors)
-    )
+    assert "than its" in assert_refused(tiny_model(nodes=nodes, initializers=tensors))
     nodes[2].op_type = "Add"
-    assert_refused(
-        tiny_model(nodes=nodes[:6], initializers=tensors), "more than its joints, vertices and components explain"
-    )
+    assert_refused(tiny_model(nodes=nodes[:6], initializers=tensors), "than its")
 
 
 def test_a_product_of_poses_with_each_other_is_refused():
@@ -137,22 +105,19 @@ def test_a_product_of_poses_with_each_other_is_refused():
         helper.make_node("Transpose", ["row_matrix"], ["column_matrix"], perm=[1, 0]),
         helper.make_node("Mul", ["row_matrix", "column_matrix"], ["square"]),
     ]
-    assert_refused(tiny_model(nodes=nodes, initializers=tensors), "more than its")
+    assert_refused(tiny_model(nodes=nodes, initializers=tensors), "bytes explain")
 
 
-def test_large_unexplained_constants_are_refused():
-    large_tensor = numpy_helper.from_array(np.zeros(4_000_000, np.float32), "big")
-    assert_refused(
-        tiny_model(initializers=[large_tensor]),
-        "its constants have 16000",
-        "more than its joints, vertices and components",
-    )
-
-
-def test_too_many_nodes_are_refused():
-    assert_refused(
-        tiny_model(nodes=[helper.make_node("Relu", ["positions"], [f"r{i}"]) for i in range(1000)]), "1003 nodes"
-    )
+def test_many_large_values_are_refused():
+    """Each value is allowed, but together they fill the memory."""
+    tensors = [
+        integer_tensor("row_shape", -1, 1, 16 * JOINT_COUNT),
+        numpy_helper.from_array(np.zeros((4000, 1), np.float32), "zero_column"),
+    ]
+    nodes = [helper.make_node("Reshape", ["pose_matrices", "row_shape"], ["row"])]
+    nodes += [helper.make_node("Add", ["row", "zero_column"], [f"table_{i}"]) for i in range(10)]
+    check_model(tiny_model(nodes=nodes[:3], initializers=tensors).SerializeToString(), "m.onnx")
+    assert_refused(tiny_model(nodes=nodes, initializers=tensors), "computes more numbers for 1 poses than its")
 
 
 def damaged_tensor(tensor: TensorProto, **changes) -> TensorProto:
@@ -179,8 +144,6 @@ def damaged_tensor(tensor: TensorProto, **changes) -> TensorProto:
         damaged_tensor(zeros_tensor("w"), data_type=TensorProto.FLOAT16, raw_data=b""),
         numpy_helper.from_array(np.zeros(4, np.float16), "w"),
         damaged_tensor(zeros_tensor("w"), data_type=999),
-        helper.make_tensor("w", TensorProto.FLOAT, [2], [1.0, 2.0]),
-        helper.make_tensor("w", TensorProto.STRING, [1], [b"x" * 100]),
     ],
 )
 def test_constants_with_a_wrong_type_or_size_are_refused(tensor):
@@ -188,31 +151,21 @@ def test_constants_with_a_wrong_type_or_size_are_refused(tensor):
 
 
 def test_metadata_with_a_huge_vertex_count_is_refused():
-    """The file of a few kilobytes claims a billion vertices, which would justify any size of its tensors."""
+    """The metadata of a file of a few kilobytes claims a billion vertices."""
     vertex_count = 10**9
     partitions = (ModelPartition(0, (), 1, 0), ModelPartition(2, (1, 2), vertex_count - 1, 17))
     model = tiny_model(tiny_info(vertex_count=vertex_count, partitions=partitions).to_json())
-    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = vertex_count
-    assert "its metadata tells of a character that" in assert_refused(model)
+    assert_refused(model, "its output 'positions' comes out as (1, 4, 3), not as (1, 1000000000, 3)")
 
 
 def test_two_constants_with_one_name_are_refused():
     assert_refused(tiny_model(initializers=[zeros_tensor("zeros")]), "two constants 'zeros'")
 
 
-def test_sparse_tensors_are_refused():
-    values, indices = numpy_helper.from_array(np.ones(1, np.float32), "s"), integer_tensor("i", 0)
-    sparse_tensor = helper.make_sparse_tensor(values, indices, [1 << 40])
-    assert_refused(tiny_model(sparse=[sparse_tensor]), "sparse tensors")
-
-
-def test_a_training_graph_and_unknown_versions_are_refused():
-    model = tiny_model()
-    model.training_info.add()
-    assert_refused(model, "a training of its own")
+def test_unknown_versions_are_refused():
     model = tiny_model()
     model.opset_import[0].version = 5
-    assert_refused(model, "operators of version 5")
+    assert_refused(model, "the operator set version [5]")
 
 
 @pytest.mark.parametrize(
@@ -240,8 +193,14 @@ def test_a_training_graph_and_unknown_versions_are_refused():
     ],
 )  # fmt: skip
 def test_nodes_with_wrong_inputs_or_attributes_are_refused(wrong_node):
+    """The reader or ONNX Runtime refuses them."""
     nodes = [wrong_node, wrong_node] if wrong_node.op_type == "Relu" else [wrong_node]
-    assert_refused(tiny_model(nodes=nodes), "m.onnx' is refused: ")
+    data = tiny_model(nodes=nodes).SerializeToString()
+    with pytest.raises(Exception) as error:
+        check_model(data, "m.onnx")
+        session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+        session.run(None, {"pose_matrices": np.zeros((2, JOINT_COUNT, 4, 4), np.float32)})
+    assert isinstance(error.value, ModelError) or type(error.value).__module__.startswith("onnxruntime")
 
 
 def test_an_output_of_another_shape_is_refused():
@@ -265,13 +224,6 @@ def test_a_model_without_a_checksum_is_refused():
     model = tiny_model()
     model.metadata_props.remove(next(prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY))
     assert_refused(model, "m.onnx' is damaged: its checksum is not that of its weights")
-
-
-@pytest.mark.parametrize("value", [[], ["x"], [0], [10**9], [8] * 99, "128"])
-def test_invalid_hidden_layers_are_refused(value):
-    if value == []:
-        pytest.skip("A network without hidden layers is valid.")
-    assert_refused(tiny_model(tiny_info(training={"hidden": value}).to_json()), "hidden layers that are none")
 
 
 def test_computed_shapes_equal_those_of_onnx_runtime():
@@ -304,7 +256,6 @@ def test_computed_shapes_equal_those_of_onnx_runtime():
         helper.make_node("ReduceSum", ["y", "last"], ["rs"], keepdims=0),
         helper.make_node("ReduceSum", ["y", "last"], ["rk"]),
     ]
-    assert {n.op_type for n in nodes} == set(OPERATORS)
     outputs = [name for n in nodes for name in n.output]
     graph = helper.make_graph(
         nodes,
@@ -317,10 +268,11 @@ def test_computed_shapes_equal_those_of_onnx_runtime():
     model = onnx.shape_inference.infer_shapes(model)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for poses in (1, 4):
-        cost = compute_graph_cost(read_onnx(model.SerializeToString()), poses)
-        assert cost.products == poses * JOINT_COUNT * 3 * 16 * 5
+        shapes = infer_shapes(
+            read_onnx(model.SerializeToString()), {"pose_matrices": (poses, JOINT_COUNT, 4, 4)}, poses
+        )
         values = session.run(outputs, {"pose_matrices": rng.normal(size=(poses, JOINT_COUNT, 4, 4)).astype(np.float32)})
-        assert [cost.shapes[name] for name in outputs] == [value.shape for value in values]
+        assert [shapes[name] for name in outputs] == [value.shape for value in values]
 
 
 def test_the_tiny_model_is_accepted():

@@ -98,7 +98,7 @@ def test_an_endless_device_is_refused():
 
 @pytest.mark.parametrize("data", [b"", b"blender", bytes(500)])
 def test_a_file_of_another_kind_is_refused(tmp_path, data):
-    assert_refused(save_model(tmp_path, data), "is not a model: not an ONNX file; give an .onnx file that train made")
+    assert_refused(save_model(tmp_path, data), "is refused: it is not an ONNX file; give one that train made")
 
 
 def test_an_onnx_file_without_metadata_is_refused(tmp_path):
@@ -108,21 +108,22 @@ def test_an_onnx_file_without_metadata_is_refused(tmp_path):
 def test_external_data_is_refused(tmp_path):
     assert_refused(
         save_model(tmp_path, tiny_model(initializers=[with_external_data(zeros_tensor("w"))])),
-        "keeps data in other files",
+        "it has data in other files",
     )
 
 
 def test_custom_operators_are_refused(tmp_path):
     node = in_subgraph(helper.make_node("Run", [], ["y"], domain="com.example"))
     assert_refused(
-        save_model(tmp_path, tiny_model(nodes=[node])), "uses custom operators (com.example::Run), which is refused"
+        save_model(tmp_path, tiny_model(nodes=[node])), "it has graphs inside of nodes, which train does not write"
     )
 
 
 def test_unknown_inputs_are_refused(tmp_path):
     inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", 2]) for name in ("time", "controls")]
     assert_refused(
-        save_model(tmp_path, tiny_model(inputs=inputs)), "asks for inputs that no rig gives (controls, time)"
+        save_model(tmp_path, tiny_model(inputs=inputs)),
+        "'time': (2,), 'controls': (2,)}, not {'pose_matrices': (3, 4, 4)}",
     )
 
 
@@ -194,7 +195,7 @@ def test_a_graph_that_contradicts_the_metadata_is_refused(tmp_path):
     assert_refused(
         save_model(tmp_path, tiny_model(info_of_five_vertices.to_json())),
         "its output 'positions'",
-        "does not fit its 5 vertices",
+        "comes out as (1, 4, 3), not as (1, 5, 3)",
     )
     info_of_one_joint = tiny_info(
         joints=tiny_info().joints[:1],
@@ -203,18 +204,18 @@ def test_a_graph_that_contradicts_the_metadata_is_refused(tmp_path):
     )
     assert_refused(
         save_model(tmp_path, tiny_model(info_of_one_joint.to_json())),
-        "its input 'pose_matrices'",
-        "does not fit its 1 joints",
+        "it takes the inputs",
+        "not {'pose_matrices': (1, 4, 4)}",
     )
 
 
 def test_other_names_of_input_and_output_are_refused(tmp_path):
     model = tiny_model()
     model.graph.output[0].name = "vertices"
-    assert_refused(save_model(tmp_path, model), "its output 'positions'")
+    assert_refused(save_model(tmp_path, model), "it has no output 'positions'")
     model = tiny_model()
     model.graph.input[0].name = "pose"
-    assert_refused(save_model(tmp_path, model), "asks for inputs that no rig gives (pose)")
+    assert_refused(save_model(tmp_path, model), "it takes the inputs {'pose': ")
 
 
 def test_a_model_of_another_rig_is_refused(tmp_path):

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The add-on accepts the operators, the sizes and the checksum of exported models."""
 
-import json
+import math
 
-import numpy as np
 import onnx
 import pytest
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, check_model
-from fdda_addon.core.model_graph import COST_FACTOR, FREE_ELEMENTS
-from fdda_addon.core.onnx_cost import OPERATORS, compute_graph_cost
-from fdda_addon.core.onnx_file import read_onnx
+from fdda_addon.core.model import check_model
+from fdda_addon.core.onnx_file import FREE_ELEMENTS, infer_shapes, read_onnx
 from trainer.__main__ import main
 from trainer.config import ACTIVATIONS
 
@@ -35,21 +32,16 @@ def models(recording, tmp_path_factory) -> list[bytes]:
     return contents
 
 
-def test_the_add_on_accepts_every_exported_operator(models):
-    exported_operators = {node.op_type for data in models for node in onnx.load_from_string(data).graph.node}
-    assert exported_operators <= set(OPERATORS)
-    assert {"MatMul", "Gather", "Erf", "Tanh", "Relu", "Sigmoid"} <= exported_operators
-
-
-def test_the_limits_of_the_add_on_leave_a_margin(models):
-    """If exported graphs come near the limits, the limits must be raised before they refuse a character."""
+def test_the_add_on_accepts_every_exported_model_with_a_margin(models):
+    """If the values of exported graphs come near the limit, it must be raised before it refuses a character."""
+    operators = {node.op_type for data in models for node in onnx.load_from_string(data).graph.node}
+    assert {"MatMul", "Gather", "Erf", "Tanh", "Relu", "Sigmoid"} <= operators
     for data in models:
-        info, contents = check_model(data, "m.onnx"), read_onnx(data)
-        budget, cost = info.budget(), compute_graph_cost(contents, 1)
-        assert cost.elements < COST_FACTOR / 2 * (budget.values + FREE_ELEMENTS)
-        assert sum(len(c.data) for c in contents.constants.values()) < 4 * COST_FACTOR / 2 * (
-            budget.constants + FREE_ELEMENTS
-        )
+        check_model(data, "m.onnx")
+        contents = read_onnx(data)
+        shapes = infer_shapes(contents, {name: (1, *shape[1:]) for name, shape in contents.inputs.items()}, 1)
+        elements = sum(math.prod(shape) for name, shape in shapes.items() if name not in contents.constants)
+        assert elements < (len(data) + FREE_ELEMENTS) / 4
 
 
 def test_changed_weights_are_refused(trained):
@@ -58,17 +50,3 @@ def test_changed_weights_are_refused(trained):
     data[bytes(data).index(bytes(largest_constant)) + len(largest_constant) // 2] ^= 1
     with pytest.raises(ModelError, match="is damaged: its checksum is not that of its weights"):
         check_model(bytes(data), "m.onnx")
-
-
-def test_a_graph_larger_than_its_metadata_explains_is_refused(trained):
-    """The limits come from the metadata. A graph with more constants than its metadata explain is refused."""
-    model = onnx.load_from_string((trained / "model.onnx").read_bytes())
-    metadata_property = next(prop for prop in model.metadata_props if prop.key == METADATA_KEY)
-    metadata = json.loads(metadata_property.value)
-    added_constant = np.zeros((2000, 1000), np.float32)
-    model.graph.initializer.append(onnx.numpy_helper.from_array(added_constant, "more"))
-    metadata["training"]["hidden"] = [8]
-    metadata_property.value = json.dumps(metadata)
-    model.metadata_props.remove(next(prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY))
-    with pytest.raises(ModelError, match="more than its joints, vertices and components explain"):
-        check_model(model.SerializeToString(), "m.onnx")

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Builds the ONNX model, checks it against the trained networks, and measures its errors."""
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +23,6 @@ from fdda_addon.core.model import (
     read_model_info,
 )
 from fdda_addon.core.model_info import LIMITS_KEY, OBJECT_KEY, ModelInfo, ModelPartition
-from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.skin_fit import skin_to_text
 from fdda_addon.core.skinning import LinearSkinning
@@ -252,7 +252,7 @@ def build_model(
     constant_bytes = sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer)
     info = _model_info(recording, trained_model, held_out, training_info, constant_bytes)
     # The checksum comes first, so that a truncated file still has it.
-    model.metadata_props.add(key=CHECKSUM_KEY, value=read_onnx(model.SerializeToString()).checksum)
+    model.metadata_props.add(key=CHECKSUM_KEY, value=hashlib.sha256(model.graph.SerializeToString()).hexdigest())
     model.metadata_props.add(key=METADATA_KEY, value=info.to_json())
     if recording.info.fit:
         skin = skin_to_text(recording.rig.skin_joints, recording.rig.skin_weights)
