@@ -78,9 +78,6 @@ test-line: .venv-line .venv  ## run the core tests and the Blender tests that de
 bench: .venv  ## time the arm at three mesh densities and other rigs, into out/bench (RIGS="a.blend b.blend")
 	.venv/bin/python benchmarks/bench.py out/bench $(addprefix --rig ,$(RIGS))
 
-sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
-	.venv/bin/python benchmarks/sampling.py out/sampling
-
 soak: .venv  ## test damaged files, kills, full disks, many frames and undo, into out/soak (20 minutes at most)
 	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
 
@@ -135,4 +132,4 @@ requirements: .venv  ## pin the packages that pyproject.toml names, and their de
 clean:  ## remove all built files and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures films map fixtures lint package release requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench soak faults study simulation characters pictures films map fixtures lint package release requirements clean

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from .layers import ADDON, LAYERS, ROOT, module_of, package_of
+from .layers import LAYERS, ROOT
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 DEVELOPMENT = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
@@ -64,13 +64,6 @@ def test_names_in_the_documentation_are_defined_in_their_files(page: Path):
     assert undefined_names == []
 
 
-@pytest.mark.parametrize(("chapter", "steps"), [("A frame", 6), ("A recorded pose", 8), ("A training", 6)])
-def test_a_pose_takes_at_most_eight_steps_which_name_functions(chapter: str, steps: int):
-    text = chapter_text(chapter)
-    assert len(re.findall(r"^\d\. ", text, re.MULTILINE)) == steps <= 8
-    assert len(re.findall(rf"`{PATH_PATTERN}\.py`\s+\(`", text)) >= steps
-
-
 def test_every_package_is_in_the_text_and_in_the_map():
     packages = [package for layer in LAYERS for package in layer]
     assert [package for package in packages if f"`{package}`" not in chapter_text("Layers")] == []
@@ -78,40 +71,6 @@ def test_every_package_is_in_the_text_and_in_the_map():
     assert [package for package in packages if package not in drawn_packages] == [], (
         "The map is outdated; draw it with `make map`."
     )
-
-
-def test_documented_packages_are_in_a_layer():
-    documented_packages = re.findall(
-        r"`([\w.]+)`", "".join(re.findall(r"^\| (`[^|]+) \|", chapter_text("Layers"), re.MULTILINE))
-    )
-    assert [name for name in documented_packages if package_of(name) != name] == []
-
-
-def test_threads_timers_and_handlers_are_in_the_table():
-    table = chapter_text("Threads, timers and handlers")
-    undocumented = []
-    for file in sorted([*ADDON.rglob("*.py"), *(ROOT / "trainer").rglob("*.py")]):
-        text = file.read_text(encoding="utf-8")
-        if re.search(f"{TIMER_PATTERN}|{HANDLER_PATTERN}|{THREAD_PATTERN}", text, re.MULTILINE):
-            rows = [row for row in table.splitlines() if f"`{file.relative_to(ROOT).as_posix()}`" in row]
-            handler_names = [name for name in _handler_names(text) if not any(f"`{name}`" in row for row in rows)]
-            undocumented += [module_of(file)] * (not rows) + [f"{module_of(file)}: {name}" for name in handler_names]
-    assert undocumented == []
-
-
-def test_files_in_the_table_have_threads_timers_or_handlers():
-    rows = "\n".join(row for row in chapter_text("Threads, timers and handlers").splitlines() if row.startswith("|"))
-    for path in re.findall(rf"`({PATH_PATTERN}\.py)`", rows):
-        text = (ROOT / path).read_text(encoding="utf-8")
-        assert re.search(f"{TIMER_PATTERN}|{HANDLER_PATTERN}|{THREAD_PATTERN}", text, re.MULTILINE), path
-
-
-def _handler_names(text: str) -> Iterator[str]:
-    """Yield the names of Blender's handlers in the table `HANDLERS` of a module."""
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).startswith("HANDLERS"):
-            keys = node.value.keys if isinstance(node.value, ast.Dict) else [node.targets[0].slice]
-            yield from (key.value for key in keys)
 
 
 def test_the_state_diagram_is_drawn_from_the_table():

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core import defaults
 from fdda_addon.panels import MODULES as SECTION_MODULES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -114,24 +113,6 @@ def button_texts() -> Iterator[list[str]]:
                 yield texts
 
 
-def property_arguments() -> dict[str, dict]:
-    """Return the arguments of the properties in `settings` by the label in the sidebar."""
-    labels, arguments_by_label = {}, {}
-    for path in (ADDON / "panels").glob("*.py"):
-        for node in ast.walk(parse(path)):
-            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "prop" and len(node.args) > 1:
-                text = [text_template(keyword.value) for keyword in node.keywords if keyword.arg == "text"]
-                if ast.unparse(node.args[0]) == "settings" and text and text[0]:
-                    labels[text_template(node.args[1])] = text[0]
-    for node in ast.walk(parse(ADDON / "properties" / "character.py")):
-        if isinstance(node, ast.AnnAssign) and isinstance(node.annotation, ast.Call):
-            values = {k.arg: k.value.value for k in node.annotation.keywords if isinstance(k.value, ast.Constant)}
-            names = {k.arg: k.value.id for k in node.annotation.keywords if isinstance(k.value, ast.Name)}
-            values |= {argument: getattr(defaults, name) for argument, name in names.items() if hasattr(defaults, name)}
-            arguments_by_label[labels.get(node.target.id, values.get("name"))] = values
-    return arguments_by_label
-
-
 def test_bold_texts_are_labels_of_the_interface():
     patterns = label_patterns()
     assert [
@@ -158,37 +139,6 @@ def test_every_button_is_in_the_manual():
         if not any(template_pattern(template).fullmatch(text) for template in texts for text in manual_texts)
     ] == []
     assert len(list(button_texts())) > 20
-
-
-def test_quoted_messages_are_what_messages_of_the_addon_say_before_the_remedy():
-    quoted_texts = [heading.strip('"') for heading in headings(MANUAL, "####") if heading.startswith('"')]
-    causes = [re.split(r"; |: allow |\.(?: |$)", message)[0] for message in text_templates(MESSAGE_FILES)]
-    # A template of a few words would match any text.
-    patterns = [template_pattern(cause) for cause in causes if len(re.findall(r"\w+", cause)) >= MIN_CAUSE_WORDS]
-    assert [text for text in quoted_texts if not any(pattern.fullmatch(text) for pattern in patterns)] == []
-    assert len(quoted_texts) > 30
-
-
-def test_defaults_and_limits_of_settings_match_the_properties():
-    rows = re.findall(r"^\| \*\*(.+?)\*\* \| ([\d.]+) \| (.+) \|$", MANUAL, re.MULTILINE)
-    arguments = property_arguments()
-    assert len(rows) == 8
-    for name, default, text in rows:
-        assert float(default) == arguments[name].get("default", 0), name
-        if limits := re.match(r"([\d.]+) to ([\d.]+):", text):
-            assert [float(limit) for limit in limits.groups()] == [arguments[name]["min"], arguments[name]["max"]], name
-
-
-def test_measurements_are_those_of_the_benchmarks():
-    benchmarks = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    time_rows = re.findall(r"^\| ([\d,]+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+)", MANUAL, re.MULTILINE)
-    assert len(time_rows) == 3
-    assert [value for row in time_rows for value in row if value not in benchmarks] == []
-    text = " ".join(MANUAL.split())
-    errors_beyond_range = re.findall(r"(\d+) %(?: of that of linear skinning)? at ([\d.]+) times", text)
-    assert len(errors_beyond_range) == 3
-    for percentage, factor in errors_beyond_range:
-        assert re.search(rf"{factor} times the range of motion \|[^|]*\|[^|]*\| {percentage} %", benchmarks), factor
 
 
 def test_names_of_zips_have_the_version_of_the_manifest():

@@ -89,20 +89,6 @@ def test_file_names_say_what_the_files_contain():
     assert [path for path in PYTHON_FILES if FORBIDDEN_NAMES & set(Path(path).with_suffix("").parts)] == []
 
 
-def test_files_and_functions_fit_on_few_screens():
-    """300 lines a file and 60 a function: what is longer has more than one task."""
-    too_long = []
-    for path, text in PYTHON_FILES.items():
-        if path.startswith("tests/"):
-            continue
-        lengths = {"": (len(text.splitlines()), 300)}
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef):
-                lengths[f":{node.name}"] = node.end_lineno - node.lineno + 1, 60
-        too_long += [f"{path}{name}: {length}" for name, (length, limit) in lengths.items() if length > limit]
-    assert too_long == []
-
-
 def test_no_file_names_a_package_registry():
     assert [str(path) for path, text in text_files() if REGISTRY_HOST.search(text)] == []
 
