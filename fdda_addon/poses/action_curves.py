@@ -10,6 +10,7 @@ from mathutils import Euler, Quaternion, Vector
 
 from ..core.poses import LOCATION, ROTATION, SCALE
 from ..scene.compatibility import curves_of
+from ..scene.controls import canonical_path
 
 _BONE_CHANNEL_PATH = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?P<channel>\w+)')
 _REST_VALUES = {
@@ -28,7 +29,7 @@ def curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) 
     """Return the unmuted F-curves of an action that animate locations, rotations and scales of bones."""
     curves: dict[str, CurvesByChannel] = {}
     for curve in unmuted_curves(action, armature_object):
-        match = _BONE_CHANNEL_PATH.fullmatch(curve.data_path)
+        match = _BONE_CHANNEL_PATH.fullmatch(canonical_path(armature_object, curve.data_path))
         name = bpy.utils.unescape_identifier(match["bone"]) if match else ""
         if match and match["channel"] in _REST_VALUES and name in armature_object.pose.bones:
             curves.setdefault(name, {}).setdefault(match["channel"], {})[curve.array_index] = curve

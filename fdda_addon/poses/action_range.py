@@ -18,7 +18,7 @@ from ..core.errors import RigError
 from ..core.poses import CONTROL, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, Channel
 from ..core.rotations import euler_angles, rotation_vectors, total_range_width
 from ..scene.arrays import KEYFRAME_ELEMENTS, read
-from ..scene.controls import is_driven, is_number, make_control, owner_of
+from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_curves import CurvesByChannel, channel_values, curves_by_bone, unmuted_curves
 
@@ -203,6 +203,7 @@ def keyed_numbers(scene_rig: SceneRig, action: bpy.types.Action) -> dict[tuple[s
     for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
         datablock = owner_of(scene_rig, owner)
         for curve in unmuted_curves(action, datablock) if datablock else ():
-            if _CONTROL_PATH.fullmatch(curve.data_path):
-                numbers[owner, curve.data_path] = np.array([curve.evaluate(frame) for frame in frames])
+            path = canonical_path(datablock, curve.data_path)
+            if _CONTROL_PATH.fullmatch(path):
+                numbers[owner, path] = np.array([curve.evaluate(frame) for frame in frames])
     return numbers

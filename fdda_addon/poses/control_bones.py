@@ -15,7 +15,7 @@ from ..core.controls import ARMATURE_OBJECT, Control
 from ..core.errors import RigError
 from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..scene.bone_transform import MATRIX, MATRIX_ELEMENT_RANGE
-from ..scene.controls import custom_properties, is_driven, make_control
+from ..scene.controls import canonical_path, custom_properties, is_driven, make_control
 from ..scene.scene_rig import SceneRig
 from .sample_selection import BONE_PREFIX, COLLECTION_PREFIX, parse_bones
 
@@ -113,7 +113,9 @@ def _is_driven(armature_object: bpy.types.Object, channel: Channel) -> bool:
     animation = armature_object.animation_data
     if channel.kind in _TRANSFORM_PROPERTIES:
         return is_driven(armature_object, f"{path}.{_TRANSFORM_PROPERTIES[channel.kind]}[{channel.axis}]")
-    return animation is not None and any(curve.data_path.startswith(f"{path}.rotation_") for curve in animation.drivers)
+    return animation is not None and any(
+        canonical_path(armature_object, curve.data_path).startswith(f"{path}.rotation_") for curve in animation.drivers
+    )
 
 
 def bones_without_location_range(

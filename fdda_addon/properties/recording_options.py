@@ -154,10 +154,11 @@ def actions_of_active_rig(context: bpy.types.Context) -> list[str]:
 def action_moves_bones(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
     """Return whether an action animates a bone of an armature."""
     from ..scene.compatibility import animation_curves
+    from ..scene.controls import canonical_path
 
     bones = armature_object.pose.bones
     for curve in animation_curves(action):
-        path = curve.data_path
+        path = canonical_path(armature_object, curve.data_path)
         if path.startswith('pose.bones["') and path[12 : path.find('"]', 12)] in bones:
             return True
     return False

@@ -103,8 +103,8 @@ def follows_control_bones(scene_rig: SceneRig, rig: Rig, channels: tuple[Channel
     sampled_names = {channel.name for channel in channels}
     bones = scene_rig.armature_object.pose.bones
     animation = scene_rig.armature_object.animation_data
-    paths = [curve.data_path for curve in (animation.drivers if animation else ())]
-    driven_bones = {bone for bone, _ in map(split_bone_path, paths) if bone}
+    drivers = animation.drivers if animation else ()
+    driven_bones = {split_bone_path(scene_rig.armature_object, curve.data_path)[0] for curve in drivers}
     unsampled_joints = [name for name in rig.joint_names if name not in sampled_names and name != STATIC_JOINT]
     if any(name not in rig.joint_names for name in sampled_names if name in bones):
         return True

@@ -118,7 +118,7 @@ def override_joints(
     drivers = [
         curve
         for curve in (animation.drivers if animation else ())
-        for bone, channel_path in [split_bone_path(curve.data_path)]
+        for bone, channel_path in [split_bone_path(armature_object, curve.data_path)]
         if bone and is_transform_channel(channel_path) and is_overridden(bone) and not curve.mute
     ]
     override = JointOverride(scene_rig, joints)

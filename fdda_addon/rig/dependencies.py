@@ -9,7 +9,7 @@ import bpy
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..scene.animation import changes_value, curves_with_actions
-from ..scene.controls import make_control
+from ..scene.controls import canonical_path, make_control
 from ..scene.scene_rig import SceneRig
 from .other_armatures import controls_of_other_armatures
 from .sources import Sources
@@ -68,7 +68,8 @@ def _driver_inputs(sources: Sources) -> Iterator[str]:
 def _keyed_shape_keys(sources: Sources, actions: tuple[bpy.types.Action, ...]) -> Iterator[str]:
     """Yield the names of the controls that are values of keyed shape keys."""
     for shape_keys in (datablock for datablock in sources.datablocks if isinstance(datablock, bpy.types.Key)):
-        keyed_paths = {curve.data_path for curve in curves_with_actions(shape_keys, actions) if changes_value(curve)}
+        keyed_curves = [curve for curve in curves_with_actions(shape_keys, actions) if changes_value(curve)]
+        keyed_paths = {canonical_path(shape_keys, curve.data_path) for curve in keyed_curves}
         for block in shape_keys.key_blocks:
             if (
                 (path := block.path_from_id("value")) in keyed_paths

@@ -99,7 +99,7 @@ def _channels_read_by_drivers(
 ) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone, str]]:
     """Yield the unlocked channels of bones of other armatures that drivers read by path."""
     for datablock, path in sources.numbers:
-        name, subpath = split_bone_path(path)
+        name, subpath = split_bone_path(datablock, path)
         if name and datablock != scene_rig.armature_object and is_transform_channel(subpath):
             bone = datablock.pose.bones.get(name)
             if bone is not None and _can_vary(_channel_range(bone, path)):

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import bpy
 
 from ..scene.compatibility import node_input
-from ..scene.controls import fcurve_target, owner_name
+from ..scene.controls import canonical_path, fcurve_target, owner_name
 from ..scene.scene_rig import SceneRig
 from .bone_paths import is_transform_channel, split_bone_path
 from .modifier_stack import is_fdda_modifier
@@ -76,6 +76,7 @@ class Sources:
 
     def affects_surface(self, datablock: bpy.types.ID, path: str) -> bool:
         """Return whether a property of a found datablock can move the surface; a custom property alone cannot."""
+        path = canonical_path(datablock, path)
         if path.startswith('["'):
             return False
         if isinstance(datablock, bpy.types.Key):
@@ -87,7 +88,7 @@ class Sources:
             is_used = self._is_followed(datablock, datablock.modifiers.get(name)) or match["rest"] == ".show_viewport"
             is_ignored = self._only_active and datablock == self._root and name not in self._modifiers
             return is_used and not is_ignored and match["rest"] not in {".show_render", ".show_in_editmode"}
-        bone_name, subpath = split_bone_path(path)
+        bone_name, subpath = split_bone_path(datablock, path)
         if bone_name:
             return bone_name in self.bones.get(datablock, ()) and not subpath.startswith('["')
         return datablock != self._root and path.startswith(TRANSFORM_PREFIXES)
@@ -249,14 +250,16 @@ class Sources:
     def _follow_number(self, reader: OwnedCurve, datablock: bpy.types.ID, path: str) -> None:
         if isinstance(datablock, bpy.types.Scene):
             self.scene_reads.append((reader, datablock, path))
-        bone_name, subpath = split_bone_path(path)
+        path = canonical_path(datablock, path)
+        bone_name, subpath = split_bone_path(datablock, path)
         if bone_name and datablock == self._rig.armature_object and is_transform_channel(subpath):
             self._add_bones(datablock, [bone_name])
             return
         self.numbers[datablock, path] = None
         owner, array_path, index = fcurve_target(datablock, path)
         for curve in owner.animation_data.drivers if owner.animation_data else ():
-            if (curve.data_path, curve.array_index) == (array_path, index) and not curve.mute:
+            driven_path = canonical_path(owner, curve.data_path)
+            if (driven_path, curve.array_index) == (array_path, index) and not curve.mute:
                 self._add_driver(owner, curve)
 
     def _follow_transform(self, variable: bpy.types.DriverVariable, target: bpy.types.DriverTarget) -> None:

@@ -10,7 +10,7 @@ import bpy
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..scene.animation import changes_value, curves_with_actions, value_range
-from ..scene.controls import fcurve_target, owner_of
+from ..scene.controls import canonical_path, fcurve_target, owner_of
 from ..scene.scene_rig import SceneRig
 from .independent_objects import describe_independent_objects
 from .modifier_effects import time_dependence
@@ -94,7 +94,7 @@ def time_inputs(
     controls, actions = set(controls), tuple(actions)
     for datablock in (*sources.objects, *sources.datablocks):
         for curve in curves_with_actions(datablock, actions):
-            property_key = (datablock, curve.data_path, curve.array_index)
+            property_key = (datablock, canonical_path(datablock, curve.data_path), curve.array_index)
             if (
                 property_key not in controls
                 and sources.affects_surface(datablock, curve.data_path)
@@ -105,7 +105,7 @@ def time_inputs(
     for property_key in dict.fromkeys(fcurve_target(*number) for number in numbers):
         for curve in curves_with_actions(property_key[0], actions):
             if (
-                (curve.data_path, curve.array_index) == property_key[1:]
+                (canonical_path(property_key[0], curve.data_path), curve.array_index) == property_key[1:]
                 and property_key not in controls
                 and changes_value(curve)
             ):

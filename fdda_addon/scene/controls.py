@@ -20,6 +20,8 @@ MAX_RANGE_WIDTH = 1e4
 _CONTROL_TEXT = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
 _CUSTOM_PROPERTY_PATH = re.compile(r'(?P<owner>.*)\["(?P<name>(?:[^"\\]|\\.)*)"\]')
 _ARRAY_ELEMENT_PATH = re.compile(r"(?P<array>.+)\[(?P<index>\d+)\]")
+_STRUCT_INDEX = re.compile(r"\.?\[\s*(?P<index>\d+)\s*\](?=[.\[])")
+_AXIS_PATH = re.compile(r"(?P<array>.+)\.(?P<axis>[wxyz])")
 
 
 def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
@@ -62,8 +64,9 @@ def make_control(
     Raises:
         RigError: there is no such number, or it has no range.
     """
-    name = f"{owner}/{path}"
     datablock = owner_of(scene_rig, owner)
+    path = canonical_path(datablock, path) if datablock else path
+    name = f"{owner}/{path}"
     if not is_number(datablock, path):
         raise RigError(
             f"'{scene_rig.mesh_object.name}' has no control '{name}'; give the name of a shape key, or OWNER/PATH of a "
@@ -130,7 +133,8 @@ def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     owner, array_path, index = fcurve_target(datablock, path)
     animation = owner.animation_data
     return animation is not None and any(
-        (curve.data_path, curve.array_index) == (array_path, index) for curve in animation.drivers
+        (canonical_path(owner, curve.data_path), curve.array_index) == (array_path, index)
+        for curve in animation.drivers
     )
 
 
@@ -144,6 +148,45 @@ def custom_properties(datablock: bpy.types.ID, owner_path: str) -> list[str]:
 def is_number(datablock: bpy.types.ID | None, path: str) -> bool:
     """Return whether a path of a datablock leads to a number."""
     return datablock is not None and number_at(datablock, path) is not None
+
+
+def canonical_path(datablock: bpy.types.ID, path: str) -> str:
+    """Write a path as Blender does: elements by their names, and an axis by its index.
+
+    `pose.bones[3].location.x` becomes `pose.bones["hand"].location[0]`. A path that leads nowhere does not change.
+    """
+    position = 0
+    while match := _STRUCT_INDEX.search(path, position):
+        position, index = match.end(), int(match["index"])
+        elements = _value_at(datablock, path[: match.start()])
+        is_found = isinstance(elements, bpy.types.bpy_prop_collection) and index < len(elements)
+        if is_found and (name := _element_name(elements[index])):
+            named_path = f'{path[: match.start()]}["{bpy.utils.escape_identifier(name)}"]'
+            path, position = named_path + path[match.end() :], len(named_path)
+    match = _AXIS_PATH.fullmatch(path)
+    array = _value_at(datablock, match["array"]) if match else None
+    if hasattr(array, "__len__") and not isinstance(array, str):
+        axes = "wxyz" if match["array"].endswith(("_quaternion", "_axis_angle")) else "xyzw"
+        path = f"{match['array']}[{axes.index(match['axis'])}]"
+    return path
+
+
+def _element_name(element: bpy.types.bpy_struct) -> str:
+    """Return the name by which Blender writes an element in paths; empty if it writes its number, as of sockets."""
+    if isinstance(element, bpy.types.ID):
+        return element.name
+    try:
+        return element.name if element.path_from_id().endswith('"]') else ""
+    except (AttributeError, ValueError):
+        return ""
+
+
+def _value_at(datablock: bpy.types.ID, path: str) -> object:
+    """Return the value at a path; None if there is none."""
+    try:
+        return datablock.path_resolve(path)
+    except ValueError:
+        return None
 
 
 def _split_index(path: str) -> tuple[str, int | None]:
@@ -170,6 +213,7 @@ def fcurve_target(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.ID, str
 
     The datablock may be another one than the given one: a path of a lattice object may lead to its shape keys.
     """
+    path = canonical_path(datablock, path)
     array_path, index = _split_index(path)
     try:
         struct, name, _ = parent_and_name(datablock, path)
@@ -202,10 +246,7 @@ def write_value(datablock: bpy.types.ID, path: str, value: object) -> None:
 
 def number_at(datablock: bpy.types.ID, path: str) -> float | None:
     """Return the number at a path; None if there is none."""
-    try:
-        value = datablock.path_resolve(path)
-    except ValueError:
-        return None
+    value = _value_at(datablock, path)
     return float(value) if isinstance(value, int | float) and np.isfinite(value) else None
 
 

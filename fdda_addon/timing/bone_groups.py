@@ -129,7 +129,7 @@ def parts_by_bone(armature_object: bpy.types.Object) -> dict[str, list[Removable
         animation = datablock.animation_data
         for curve in animation.drivers if animation else ():
             if not curve.mute:
-                bone_name, _ = split_bone_path(curve.data_path)
+                bone_name, _ = split_bone_path(datablock, curve.data_path)
                 parts.setdefault(bone_name if bone_name in parts else NO_BONE, []).append(curve)
     return {name: bone_parts for name, bone_parts in parts.items() if bone_parts}
 
