@@ -16,6 +16,7 @@ from ..scene.compatibility import animation_curves
 from ..scene.mesh import rest_positions
 from ..scene.stored_paths import stored_path
 from ..scene.temporary_state import temporary_attributes
+from ..scene.time_stretching import time_ratio
 
 BAKE_MODIFIER_NAME = "FDDA Bake"
 """Name of the Mesh Cache modifier of a baked mesh."""
@@ -92,7 +93,7 @@ def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: 
     mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), index)
     modifier.cache_format, modifier.filepath = "PC2", stored_path(path)
     modifier.time_mode, modifier.play_mode = "FRAME", "SCENE"
-    modifier.frame_start, modifier.frame_scale = first_frame, 1.0
+    modifier.frame_start, modifier.frame_scale = first_frame, 1 / time_ratio()
     modifier.interpolation, modifier.deform_mode = "LINEAR", "OVERWRITE"
     # The point cache uses Blender's axes, so they must not be converted.
     modifier.forward_axis, modifier.up_axis = "POS_Y", "POS_Z"
@@ -122,15 +123,17 @@ def play_shape_keys(
     shape_keys.use_relative = False
     for eval_time, frame_positions in enumerate(positions, 1):
         # Blender gives a new absolute key the current evaluation time.
-        shape_keys.eval_time, frame = eval_time, first_frame + eval_time - 1
-        key = mesh_object.shape_key_add(name=f"Frame {frame}", from_mix=False)
+        shape_keys.eval_time = eval_time
+        key = mesh_object.shape_key_add(name=f"Frame {first_frame + eval_time - 1}", from_mix=False)
         key.interpolation = "KEY_LINEAR"
         write(key.data, COORDINATE_ELEMENT, np.ascontiguousarray(frame_positions, np.float32))
-        # With keyframes in the first and last frame alone, rounding errors would show in long actions.
-        shape_keys.keyframe_insert("eval_time", frame=frame)
-    for curve in animation_curves(shape_keys.animation_data.action):
-        for point in curve.keyframe_points:
-            point.interpolation = "LINEAR"
+    shape_keys.keyframe_insert("eval_time")
+    (curve,) = animation_curves(shape_keys.animation_data.action)
+    # With keyframes in the first and last frame alone, rounding errors would show in long actions.
+    curve.keyframe_points.add(len(positions) - 1)
+    for index, point in enumerate(curve.keyframe_points):
+        point.co, point.interpolation = ((first_frame + index) * time_ratio(), index + 1), "LINEAR"
+    curve.update()
 
 
 def _remove_object(mesh_object: bpy.types.Object) -> None:

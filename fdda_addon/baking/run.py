@@ -29,6 +29,7 @@ from ..scene.control_reader import ControlReader
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose, temporary_visibility
+from ..scene.time_stretching import frames_covering
 from .baked_mesh import check_local, play_point_cache, play_shape_keys, temporary_copy
 
 POINT_CACHE_SUFFIX, BLEND_SUFFIX = ".pc2", ".blend"
@@ -152,7 +153,9 @@ def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> t
 def _select_frames(action: bpy.types.Action | None, frames: tuple[int, int] | None) -> range:
     scene = bpy.context.scene
     if frames is None:
-        return range(scene.frame_start, scene.frame_end + 1) if action is None else action_frames(action)
+        if action is None:
+            return range(scene.frame_start, scene.frame_end + 1)
+        return frames_covering(action_frames(action))
     first, last = frames
     if first > last:
         raise WrongUsageError(f"There is nothing to bake from frame {first} to {last}; give the first frame first.")

@@ -131,6 +131,7 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
     import bpy
 
     from ..evaluation.film import FDDA, LABELS, LINEAR, RIG, FilmSettings, film
+    from ..scene.time_stretching import time_ratio
     from ..timing.benchmark import Benchmark, benchmark
 
     clip = find_clips(scene_rig.armature_object, options.action, options.strip)[0]
@@ -141,7 +142,7 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
             elif isinstance(step, Benchmark):
                 times = step.frame_times("")
         settings = FilmSettings(
-            fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base,
+            fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base * time_ratio(),
             times_ms={RIG: times.rig, LINEAR: times.linear, FDDA: times.fdda},
             reference_label=f"Target {options.target}" if options.target else LABELS[RIG],
         )

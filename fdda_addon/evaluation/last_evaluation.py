@@ -84,9 +84,17 @@ class LastEvaluation:
         return self.errors["fdda"].shape[1]
 
     def pose_at(self, frame: int) -> int | None:
-        """Return the index of the pose at a frame; None if the action does not have the frame, or for random poses."""
-        index = frame - self.first_frame
+        """Return the index of the pose at a frame of the scene; None outside the action, or for random poses."""
+        from ..scene.time_stretching import time_ratio
+
+        index = round(frame * time_ratio()) - self.first_frame
         return index if self.name and 0 <= index < self.poses else None
+
+    def scene_frame(self, index: int) -> float:
+        """Return the frame of the scene that shows a pose of the action, with a fraction."""
+        from ..scene.time_stretching import time_to_frame
+
+        return time_to_frame(self.first_frame + index)
 
     def vertex_errors(self, method: str, statistic: str, pose: int | None = None) -> "np.ndarray | None":
         """Compute the errors of all vertices.
@@ -107,7 +115,7 @@ class LastEvaluation:
         )
 
     def errors_by_frame(self) -> list[tuple[int, float]]:
-        """Return pairs of frame and largest error of the model in mm; empty for random poses."""
+        """Return pairs of frame of the action and largest error of the model in mm; empty for random poses."""
         if not self.name:
             return []
         return self._computed_once(

@@ -17,6 +17,7 @@ from ..runtime.binding import model_disabled
 from ..scene.blend_file import blender_path, report_message, silenced_stdout
 from ..scene.scene_rig import find_rig
 from ..scene.temporary_state import assign_action
+from ..scene.time_stretching import unstretched_time
 from ..timing.benchmark import time_calls
 from .controls import animating_actions
 from .joint_poses import set_random_pose
@@ -134,6 +135,7 @@ def _time_calls(calls: list[FrameCall], shows_rig: bool) -> list[float]:
     """Time the calls after those that warm up, in milliseconds, with all models or with all rigs in their place."""
     times = []
     with ExitStack() as exit_stack:
+        exit_stack.enter_context(unstretched_time())
         for scene_object in bpy.context.scene.objects if shows_rig else ():
             if scene_object.type == "MESH" and scene_object.fdda.is_bound:
                 exit_stack.enter_context(model_disabled(scene_object))

@@ -13,6 +13,7 @@ from ..core.progress import Progress
 from ..poses.action_range import action_frames
 from ..scene.armature import PoseMatrixReader, clear_pose
 from ..scene.temporary_state import assign_action, temporary_pose
+from ..scene.time_stretching import unstretched_time
 
 RANDOM_POSE_COUNT = 200
 MAX_ACTION_FRAMES = 40
@@ -60,7 +61,11 @@ def evaluate_joints(poses: JointPoses, stage: str) -> Iterator[Progress | np.nda
     reader = PoseMatrixReader(armature_object, poses.joint_names)
     shown_poses = list(_pose_setters(poses))
     matrices = np.empty((len(shown_poses), len(poses.joint_names), 4, 4), np.float32)
-    with temporary_pose(armature_object, poses.actions), _temporary_properties(armature_object, poses.control_names):
+    with (
+        temporary_pose(armature_object, poses.actions),
+        unstretched_time(),
+        _temporary_properties(armature_object, poses.control_names),
+    ):
         for index, show_pose in enumerate(shown_poses):
             show_pose()
             depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -69,6 +69,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
         from ..poses.clip import find_action
         from ..runtime.binding import model_disabled
         from ..runtime.model_files import network_of
+        from ..scene.time_stretching import time_ratio
         from ..timing.benchmark import benchmark
 
         scene_rig, scene = self.bound_rig(context), context.scene
@@ -81,7 +82,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
             times = (yield from _result(benchmark(scene_rig, None, FILM_TIMED_FRAMES))).frame_times("")
             settings = FilmSettings(
                 view=View.from_direction(self.direction) if any(self.direction) else View(),
-                fps=scene.render.fps / scene.render.fps_base,
+                fps=scene.render.fps / scene.render.fps_base * time_ratio(),
                 times_ms={RIG: times.rig, LINEAR: times.linear, FDDA: times.fdda},
             )
             evaluation = yield from _result(evaluate_action(scene_rig, network, name))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators on the worst frames: add timeline markers, and jump to them."""
 
+import math
+
 import bpy
 
 from ..core.counts import format_count
@@ -45,7 +47,7 @@ class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
         _, last, poses = self.worst_poses(context, self.count)
         if not last.name:
             raise ModelError("Random poses have no frames to mark; evaluate the active action.")
-        worst = [(last.first_frame + index, error_mm) for index, error_mm in poses]
+        worst = [(round(last.scene_frame(index)), error_mm) for index, error_mm in poses]
         markers.place(context.scene, worst)
         return (
             f"Added {format_count(len(worst), 'marker')}. The worst frame is {worst[0][0]}, with {worst[0][1]:.2f} mm."
@@ -103,8 +105,9 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
         scene_rig, last, poses = self.worst_poses(context, self.rank)
         index, error_mm = poses[-1]
         if last.name:
-            context.scene.frame_set(last.first_frame + index)
-            return f"Frame {last.first_frame + index}: max error {error_mm:.2f} mm."
+            frame = last.scene_frame(index)
+            context.scene.frame_set(math.floor(frame), subframe=frame - math.floor(frame))
+            return f"Frame {round(frame)}: max error {error_mm:.2f} mm."
         from ..evaluation.run import set_held_out_pose
 
         set_held_out_pose(scene_rig, last.channels, last.seed, index)

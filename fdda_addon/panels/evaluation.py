@@ -211,7 +211,7 @@ def _draw_worst(
         return
     column = body.column(align=True)
     for rank, (index, error_mm) in enumerate(last.worst_poses(view.markers), 1):
-        pose_label = f"Frame {last.first_frame + index}" if last.name else f"Pose {index + 1}"
+        pose_label = f"Frame {round(last.scene_frame(index))}" if last.name else f"Pose {index + 1}"
         row = column.row(align=True)
         row.operator("fdda.jump_to_worst", text=f"{pose_label}: {error_mm:.2f} mm").rank = rank
         zoom_button = row.operator("fdda.jump_to_worst", text="", icon="ZOOM_SELECTED")

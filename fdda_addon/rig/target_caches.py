@@ -94,7 +94,8 @@ def _mesh_cache(modifier: bpy.types.MeshCacheModifier, description: str) -> Cach
         frame_count = read_frame_count(path)
     except PointCacheError as error:
         raise RigError(f"{_capitalize(description)} plays a file that cannot be read. {error}") from error
-    return Cache(description, modifier.frame_start, modifier.frame_start + (frame_count - 1) / modifier.frame_scale)
+    first_sample_time, scale = modifier.frame_start, modifier.frame_scale
+    return Cache(description, first_sample_time / scale, (first_sample_time + frame_count - 1) / scale)
 
 
 def _file_cache(cache_file: bpy.types.CacheFile, description: str) -> Cache:

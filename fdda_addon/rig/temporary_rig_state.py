@@ -13,6 +13,7 @@ from ..scene.comparison import hidden_comparison_objects
 from ..scene.controls import temporary_controls
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import temporary_pose
+from ..scene.time_stretching import unstretched_time
 from .modifier_stack import downstream_disabled
 
 PosedRig = tuple[SceneRig, Rig, tuple[Channel, ...]]
@@ -34,6 +35,8 @@ def temporary_rig_states(
 ) -> Iterator[ClipPlayer]:
     """Set rigs to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
 
+    In the block, time is not stretched, so frames of the scene are frames of the clips.
+
     Args:
         rigs: rigs of one armature object.
         clips: the clips that the yielded player will show.
@@ -53,6 +56,7 @@ def temporary_rig_states(
         for scene_rig, _, _ in rigs:
             stack.enter_context(downstream_disabled(scene_rig.mesh_object))
         stack.enter_context(temporary_pose(armature_object, clip_actions(armature_object, clips)))
+        stack.enter_context(unstretched_time())
         for scene_rig, names in controlled_rigs:
             stack.enter_context(temporary_controls(scene_rig, names))
         clear_pose(armature_object)

@@ -14,6 +14,7 @@ from ..scene.armature import Poser, clear_pose
 from ..scene.comparison import hidden_comparison_objects
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import assign_action, temporary_pose
+from ..scene.time_stretching import unstretched_time
 
 RANDOM_POSE_COUNT, KEY_STEP_FRAMES = 20, 5
 """Number of random poses that animate a rig without an action, and the number of frames from one to the next."""
@@ -31,6 +32,7 @@ def temporary_animation(scene_rig: SceneRig, channels: tuple[Channel, ...] = ())
     with (
         hidden_comparison_objects(),
         temporary_pose(scene_rig.armature_object, [original_action] if original_action else []),
+        unstretched_time(),
     ):
         action = original_action or key_random_poses(scene_rig, channels)
         assign_action(scene_rig.armature_object, action)

@@ -82,6 +82,24 @@ def add_strips(rig: SceneRig, action: bpy.types.Action, start: int = 40, name: s
     return strip
 
 
+@pytest.mark.parametrize(("old", "new"), [(100, 200), (100, 30)])
+def test_time_stretching_does_not_change_the_recorded_frames(figure, tmp_path, old, new):
+    shown = positions_in_frames(figure, range(1, FRAMES + 1))
+    strip_recording_options = {"strips": ("swing",), "poses": 3, "controls": ("Smile",)}
+    add_strips(figure, bpy.data.actions[WAVE])
+    expected = positions_of(record_and_read(figure, tmp_path / "expected", **strip_recording_options))
+    render = bpy.context.scene.render
+    render.frame_map_old, render.frame_map_new = old, new
+    bpy.context.scene.frame_set(7)
+    before = scene_state(figure)
+    recording = record_and_read(figure, tmp_path / "action", actions=(WAVE,))
+    np.testing.assert_allclose(positions_of(recording), shown, atol=1e-5)
+    recording = record_and_read(figure, tmp_path / "strip", **strip_recording_options)
+    np.testing.assert_allclose(positions_of(recording), expected, atol=1e-5)
+    assert_same_state(before, scene_state(figure))
+    assert (render.frame_map_old, render.frame_map_new) == (old, new)
+
+
 def test_a_recorded_strip_includes_the_tracks_below_it(figure, tmp_path):
     add_strips(figure, bpy.data.actions[WAVE])
     shown = positions_in_frames(figure, range(40, 40 + FRAMES))

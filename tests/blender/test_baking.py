@@ -76,6 +76,27 @@ def test_without_an_action_the_animation_of_the_scene_is_baked(elbow_files, wave
     assert animation.action.name == "elbow_wave" and not animation.use_nla
 
 
+@pytest.mark.parametrize(("old", "new"), [(100, 200), (100, 50), (90, 200)])
+def test_a_bake_of_stretched_time_shows_the_model_in_every_frame(elbow_files, tmp_path, old, new):
+    def stretch(_rig) -> None:
+        render = bpy.context.scene.render
+        render.frame_map_old, render.frame_map_new = old, new
+
+    rig = save_elbow(tmp_path / "rig.blend", stretch)
+    for out, options in (("cache.blend", []), ("keys.blend", ["--shape-keys"])):
+        arguments = ["--action", "elbow_wave", *options]
+        assert run("bake", rig, elbow_files.model, tmp_path / out, *arguments) == 0
+    frames = range(-3, 5 + 30 * new // old)
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    expected = predicted_in_frames(frames, elbow_files.model)
+    assert np.ptp(expected, axis=0).max() > 0.1
+    for out in ("cache.blend", "keys.blend"):
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / out))
+        for frame, positions in zip(frames, expected, strict=True):
+            bpy.context.scene.frame_set(frame)
+            assert np.abs(evaluated_positions(bpy.data.objects[ELBOW]) - positions).max() < POSITION_TOLERANCE
+
+
 def test_a_baked_bound_file_is_not_bound(elbow_files, wave_positions, tmp_path):
     """Baking removes the binding, so the add-on ignores the file."""
     assert run("bake", elbow_files.bound, elbow_files.model, tmp_path / "a.blend") == 0

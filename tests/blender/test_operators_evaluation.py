@@ -171,11 +171,13 @@ def test_colors_do_not_change_the_file(active, evaluated_action):
         assert datablocks() == before
 
 
-def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
+@pytest.mark.parametrize("stretch", [1, 3])
+def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action, view, stretch):
     scene = bpy.context.scene
+    scene.render.frame_map_new = 100 * stretch
     own = scene.timeline_markers.new("FDDA notes", frame=3)
     largest = evaluated_action.errors["fdda"].max(axis=1)
-    worst = evaluated_action.first_frame + int(largest.argmax())
+    worst = stretch * (evaluated_action.first_frame + int(largest.argmax()))
     assert bpy.ops.fdda.add_worst_markers(count=3) == {"FINISHED"}
     found = markers.find(scene)
     assert found[0].frame == worst and found[0].name == f"FDDA 1: {largest.max() * 1000:.2f} mm"
@@ -185,6 +187,10 @@ def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
     assert [marker.frame for marker in markers.find(scene)] == [worst]
     bpy.ops.fdda.jump_to_worst()
     assert scene.frame_current == worst
+    bpy.ops.fdda.color_mesh()
+    view.statistic = "pose"
+    expected = viewport_colors(evaluated_action.errors["fdda"][largest.argmax()], view.range_mm / 1000)
+    np.testing.assert_array_equal(heat_map.colors_of(active), expected)
     bpy.ops.fdda.jump_to_worst(rank=2)
     assert abs(scene.frame_current - worst) >= last_evaluation.MIN_FRAMES_APART
     bpy.ops.fdda.remove_markers()

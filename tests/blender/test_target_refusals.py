@@ -63,14 +63,19 @@ def test_faces_in_another_order_are_accepted(tmp_path):
     assert len(of_flesh(rig, tmp_path / "recording").residuals) == FRAMES
 
 
-def test_frames_outside_a_cache_are_refused(refusal, tmp_path):
+@pytest.mark.parametrize(
+    ("start", "scale", "first", "last"),
+    [(5, 1, 5, FRAMES + 4), (2, 2, 1, (FRAMES + 1) / 2), (2, 0.5, 4, 2 * FRAMES + 2)],
+)
+def test_frames_outside_a_cache_are_refused(refusal, tmp_path, start, scale, first, last):
     def later() -> None:
-        bpy.data.objects["flesh"].modifiers["Cache"].frame_start = 5
+        cache = bpy.data.objects["flesh"].modifiers["Cache"]
+        cache.frame_start, cache.frame_scale = start, scale
 
     rig = change(targets.target_pc2, later, tmp_path / "rig.blend")
     assert refused(refusal, rig) == (
-        f"The action '{ACTION}' has the frames 1 to {FRAMES}, and the modifier 'Cache' of 'flesh' has those from 5 to "
-        f"{FRAMES + 4}; record an action within, or give it more frames."
+        f"The action '{ACTION}' has the frames 1 to {FRAMES}, and the modifier 'Cache' of 'flesh' has those from "
+        f"{first} to {last:g}; record an action within, or give it more frames."
     )
 
 
