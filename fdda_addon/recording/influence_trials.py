@@ -6,7 +6,7 @@ through constraints. So in a control rig, each joint is set to its transform in 
 muted.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
@@ -80,8 +80,8 @@ class Trials(Protocol):
     inputs: list[tuple[str, int]]
     undetectable_controls: frozenset[int]
 
-    def show(self, trial: int, moved: Sequence[int]) -> None:
-        """Set the base pose of a trial, with the inputs at the indices `moved` moved."""
+    def show(self, trial: int, moved: int | None) -> None:
+        """Set the base pose of a trial, with the input at the index `moved` moved."""
 
 
 @contextmanager
@@ -143,11 +143,11 @@ class _ChannelTrials:
             poses[distances[..., indices].sum(axis=2).argmax(axis=1)] for indices in self._channels_of_inputs
         ]
 
-    def show(self, trial: int, moved: Sequence[int]) -> None:
+    def show(self, trial: int, moved: int | None) -> None:
         values = self._base_poses[trial].copy()
-        for number in moved:
-            indices = self._channels_of_inputs[number]
-            values[indices] = self._moved_poses[number][trial, indices]
+        if moved is not None:
+            indices = self._channels_of_inputs[moved]
+            values[indices] = self._moved_poses[moved][trial, indices]
         self._poser.set(values)
 
 
@@ -208,11 +208,11 @@ class _OverrideTrials:
         values[:, :3, 3] /= self._rig.size
         return values.reshape(-1, 16)
 
-    def show(self, trial: int, moved: Sequence[int]) -> None:
+    def show(self, trial: int, moved: int | None) -> None:
         state = self._base_states[trial].copy()
-        for number in moved:
-            kind, index = self.inputs[number]
-            moved_state = self._moved_states[trial][number]
+        if moved is not None:
+            kind, index = self.inputs[moved]
+            moved_state = self._moved_states[trial][moved]
             if kind == JOINT:
                 joints = [index, *self._followers.get(index, ())]
                 state.joints[joints] = moved_state.joints[joints]

@@ -9,7 +9,6 @@ import numpy as np
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
 from fdda_addon.core.partition import joints_with_weight, make_partitions
-from fdda_addon.core.patches import divide_into_patches
 from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import are_invertible, skin_matrices
@@ -17,6 +16,9 @@ from fdda_addon.core.skinning import are_invertible, skin_matrices
 from .input_blocks import LENGTH_RATIO, InputBlocks
 from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments
 from .solver import fit_skin
+
+MAX_PATCH_VERTICES = 16
+"""Largest number of vertices that one fitted vertex represents."""
 
 
 def choose_key_joints(
@@ -68,8 +70,8 @@ def _measure_vertices(poses: FitPoses) -> tuple[np.ndarray, np.ndarray]:
         a vertex.
     """
     rig, joint_count = poses.rig, len(poses.rig.joints)
-    patches = divide_into_patches(rig, make_partitions(rig))
-    representatives = patches.vertices[patches.starts]
+    patches = [patch for partition in make_partitions(rig) for patch in _cut(rig.rest_positions, partition.vertices)]
+    representatives = np.array([patch[0] for patch in patches])
     fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives)
     moments = joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count)
     fitted_moments = joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count)
@@ -78,11 +80,19 @@ def _measure_vertices(poses: FitPoses) -> tuple[np.ndarray, np.ndarray]:
     without_vertices = poses.is_dependency & (np.trace(moments, axis1=1, axis2=2) == 0)
     moments[without_vertices] = _moments_at_heads(rig)[without_vertices]
     acts = joints_with_weight(rig.skin_joints, rig.skin_weights, joint_count)
-    patch_sizes = np.diff(np.append(patches.starts, rig.vertex_count))
-    acts[patches.vertices] |= np.repeat(
-        joints_with_weight(fitted_joints, fitted_weights, joint_count), patch_sizes, axis=0
-    )
+    fitted_acts = joints_with_weight(fitted_joints, fitted_weights, joint_count)
+    acts[np.concatenate(patches)] |= np.repeat(fitted_acts, [len(patch) for patch in patches], axis=0)
     return moments, acts
+
+
+def _cut(rest_positions: np.ndarray, vertices: np.ndarray) -> list[np.ndarray]:
+    """Cut vertices along their longest axis, until each patch has at most `MAX_PATCH_VERTICES`."""
+    if len(vertices) <= MAX_PATCH_VERTICES:
+        return [vertices]
+    axis = int(np.argmax(np.ptp(rest_positions[vertices], axis=0)))
+    ordered = vertices[np.argsort(rest_positions[vertices, axis], kind="stable")]
+    halves = ordered[: len(ordered) // 2], ordered[len(ordered) // 2 :]
+    return [patch for half in halves for patch in _cut(rest_positions, half)]
 
 
 def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
