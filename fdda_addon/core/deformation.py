@@ -7,6 +7,7 @@ Playback compares the recorded deformation with the deformation of the rig. An e
 |---|---|
 | `modifiers` | list of `{"name", "type", "settings"}` in stack order |
 | `shape_keys`, `b_bones` | settings of each shape key or B-Bone, by its name |
+| `attributes` | digest of the values of each attribute or vertex group that settings or nodes name, by its name |
 | `drivers` | hash of the drivers |
 
 A setting is a boolean, a number, a string or a list of these, and null where it is animated. An empty object means that
@@ -14,6 +15,7 @@ the deformation is unknown.
 """
 
 import math
+import re
 from collections.abc import Iterable
 from difflib import SequenceMatcher
 
@@ -23,7 +25,16 @@ MAX_ENTRIES = 10_000
 MAX_SHOWN_DIFFERENCES = 3
 SETTING_TOLERANCE = 1e-4
 """Largest relative difference of two settings that count as equal; rounding to float32 is smaller."""
-_GROUP_LABELS = {"shape_keys": "shape key", "b_bones": "bone"}
+_GROUP_LABELS = {"shape_keys": "shape key", "b_bones": "bone", "attributes": "attribute or vertex group"}
+_DIGESTS = {"shape", "values"}
+"""Settings that are digests, so that a user is not told their values."""
+_ARRAY_INDEX = re.compile(r"\[\d+\]$")
+_NODE_INPUT_PATH = re.compile(r"\.properties\.inputs\.(\w+)\.value\b")
+
+
+def versionless_path(path: str) -> str:
+    """Return the RNA path of an input of Geometry Nodes as Blender 4.5 has it; other paths are the same in 5.2."""
+    return _NODE_INPUT_PATH.sub(r'["\1"]', path)
 
 
 def check_deformation(value: object) -> dict:
@@ -98,17 +109,15 @@ def _modifier_differences(recorded: list[dict], current: list[dict], control_pat
 
 
 def _group_differences(label: str, recorded: dict, current: dict, control_paths: set[tuple[str, str]]) -> list[str]:
-    clauses = [f"the {label} '{name}' is gone" for name in recorded if name not in current and label != "bone"]
-    clauses += [
-        f"the bone '{name}' is no B-Bone any more" for name in recorded if name not in current and label == "bone"
-    ]
+    lost = "is no B-Bone any more" if label == "bone" else "is gone"
+    clauses = [f"the {label} '{name}' {lost}" for name in recorded if name not in current]
     for name, settings in current.items():
         if name in recorded:
             clauses += _setting_differences(label, name, recorded[name], settings, control_paths)
         elif label == "bone":
             clauses.append(f"the bone '{name}' was no B-Bone when it was recorded")
-        elif settings.get("value", 0.0) != 0 and not settings.get("mute"):
-            clauses.append(f"it was recorded without the shape key '{name}'")
+        elif label != "shape key" or (settings.get("value", 0.0) != 0 and not settings.get("mute")):
+            clauses.append(f"it was recorded without the {label} '{name}'")
     return clauses
 
 
@@ -125,8 +134,9 @@ def _setting_differences(
         setting_label = f"'{setting}' of the {group_label} '{name}'"
         if current[setting] is None:
             clauses.append(f"{setting_label} is animated and is no control of the model")
-        elif isinstance(recorded_value, bool | int | float | str) and setting != "shape":
-            clauses.append(f"{setting_label} was {recorded_value} and is {current[setting]}")
+        elif isinstance(recorded_value, bool | int | float | str) and setting not in _DIGESTS:
+            values = [value if value != "" else "empty" for value in (recorded_value, current[setting])]
+            clauses.append(f"{setting_label} was {values[0]} and is {values[1]}")
         else:
             clauses.append(f"{setting_label} differs")
     return clauses
@@ -134,12 +144,13 @@ def _setting_differences(
 
 def _is_control(group_label: str, name: str, setting: str, control_paths: set[tuple[str, str]]) -> bool:
     escaped = name.replace("\\", "\\\\").replace('"', '\\"')
-    owner, path = {
-        "modifier": (MESH_OBJECT, f'modifiers["{escaped}"].{setting}'),
-        "shape key": (SHAPE_KEYS, f'key_blocks["{escaped}"].{setting}'),
+    owner, struct = {
+        "modifier": (MESH_OBJECT, f'modifiers["{escaped}"]'),
+        "shape key": (SHAPE_KEYS, f'key_blocks["{escaped}"]'),
     }.get(group_label, ("", ""))
+    paths = (f"{struct}.{setting}", f'{struct}["{setting}"]')
     return any(
-        control_owner == owner and (control_path == path or control_path.startswith(f"{path}["))
+        control_owner == owner and _ARRAY_INDEX.sub("", versionless_path(control_path)) in paths
         for control_owner, control_path in control_paths
     )
 

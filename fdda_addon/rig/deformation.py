@@ -7,10 +7,13 @@ from operator import attrgetter
 
 import bpy
 
+from ..core.deformation import versionless_path
 from ..core.rig import Fingerprint
 from ..scene.arrays import COORDINATE_ELEMENT, read
-from ..scene.compatibility import node_input
+from ..scene.compatibility import node_input_settings
 from ..scene.controls import owner_name
+from ..scene.mesh import vertex_layers
+from ..scene.node_groups import read_texts
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
 from .modifier_effects import BIND_PROPERTIES
@@ -37,11 +40,18 @@ def read_deformation(scene_rig: SceneRig) -> dict:
     Raises:
         RigError: as `recorded_modifiers`.
     """
+    mesh_object = scene_rig.mesh_object
     deformation = {
         **read_modifiers_and_drivers(scene_rig),
-        "shape_keys": _read_shape_keys(scene_rig.mesh_object),
+        "shape_keys": _read_shape_keys(mesh_object),
         "b_bones": read_b_bones(scene_rig.armature_object.data),
     }
+    settings = [entry["settings"] for entry in deformation["modifiers"]] + list(deformation["shape_keys"].values())
+    texts = {value for values in settings for value in values.values() if isinstance(value, str)}
+    for modifier in recorded_modifiers(mesh_object):
+        texts.update(read_texts(getattr(modifier, "node_group", None)))
+    layers = vertex_layers(mesh_object, texts)
+    deformation["attributes"] = {name: {"values": Fingerprint.digest(values)} for name, values in layers.items()}
     return {key: value for key, value in deformation.items() if value or key == "modifiers"}
 
 
@@ -98,19 +108,22 @@ def _copy(value: object) -> object:
 def _read_modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
     """Read name, type and settings of a modifier; animated settings are None."""
     if modifier.type == "NODES":
-        settings = _node_inputs(modifier)
+        items = modifier.node_group.interface.items_tree if modifier.node_group is not None else ()
+        sockets = [item for item in items if item.item_type == "SOCKET" and item.in_out == "INPUT"]
+        settings = {k: v for socket in sockets for k, v in node_input_settings(modifier, socket.identifier).items()}
     else:
         properties = [p for p in modifier.bl_rna.properties if p.identifier not in _COMMON_PROPERTIES]
         bind_property = BIND_PROPERTIES.get(modifier.type)
         setting_names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bind_property]
+        path = modifier.path_from_id()
         settings = {
-            name: _json_property(scene_rig, modifier, name) for name in setting_names if _is_setting(modifier, name)
+            name: (f"{path}.{name}", getattr(modifier, name)) for name in setting_names if _is_setting(modifier, name)
         }
-    animated_names = animated_paths(modifier.id_data)
-    for name in settings:
-        if f"{modifier.path_from_id()}.{name}" in animated_names:
-            settings[name] = None
-    return {"name": modifier.name, "type": modifier.type, "settings": settings}
+    animated = animated_paths(modifier.id_data)
+    values = {
+        name: None if path in animated else _json_value(scene_rig, value) for name, (path, value) in settings.items()
+    }
+    return {"name": modifier.name, "type": modifier.type, "settings": values}
 
 
 def _is_setting(struct: bpy.types.bpy_struct, name: str) -> bool:
@@ -119,14 +132,6 @@ def _is_setting(struct: bpy.types.bpy_struct, name: str) -> bool:
     if prop.type == "POINTER":
         return issubclass(getattr(bpy.types, prop.fixed_type.identifier, object), bpy.types.ID)
     return prop.type != "COLLECTION"
-
-
-def _node_inputs(modifier: bpy.types.NodesModifier) -> dict:
-    group = modifier.node_group
-    items = [] if group is None else group.interface.items_tree
-    identifiers = [item.identifier for item in items if item.item_type == "SOCKET" and item.in_out == "INPUT"]
-    values = {identifier: node_input(modifier, identifier) for identifier in identifiers}
-    return {identifier: _json_value(None, value) for identifier, value in values.items() if value is not None}
 
 
 def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
@@ -145,7 +150,7 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
         if (positions == relative_positions[relative_key.name]).all():
             # The key moves no vertex.
             continue
-        settings = {name: _json_property(None, block, name) for name in _SHAPE_KEY_PROPERTIES}
+        settings = {name: _json_value(None, getattr(block, name)) for name in _SHAPE_KEY_PROPERTIES}
         for name in settings:
             if f"{block.path_from_id()}.{name}" in animated:
                 settings[name] = None
@@ -169,13 +174,13 @@ def _drivers_digest(scene_rig: SceneRig) -> str:
 def _is_rig_modifier_path(mesh_object: bpy.types.Object, path: str) -> bool:
     """Return whether a path of a mesh object leads into a modifier of its rig, not into the FDDA modifier."""
     fdda_paths = [modifier.path_from_id() for modifier in mesh_object.modifiers if is_fdda_modifier(modifier)]
-    return path.startswith("modifiers[") and not any(path.startswith(f"{fdda_path}.") for fdda_path in fdda_paths)
+    return path.startswith("modifiers[") and not path.startswith(tuple(fdda_paths))
 
 
 def _read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
     driver = curve.driver
     return [
-        *(curve.data_path, curve.array_index, curve.mute, driver.type),
+        *(versionless_path(curve.data_path), curve.array_index, curve.mute, driver.type),
         driver.expression if driver.type == "SCRIPTED" else "",
         [[_rounded(coordinate) for coordinate in point.co] for point in curve.keyframe_points],
         [list(map(_rounded, modifier.coefficients)) for modifier in curve.modifiers if modifier.type == "GENERATOR"],
@@ -200,10 +205,6 @@ def _read_target(
         yield target.data_path
     else:
         yield from (target.bone_target, target.transform_type, target.transform_space, target.rotation_mode)
-
-
-def _json_property(scene_rig: SceneRig | None, struct: bpy.types.bpy_struct, name: str) -> object:
-    return _json_value(scene_rig, getattr(struct, name))
 
 
 def _json_value(scene_rig: SceneRig | None, value: object) -> object:

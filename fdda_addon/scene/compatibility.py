@@ -58,6 +58,36 @@ def node_input(modifier: bpy.types.NodesModifier, identifier: str) -> object:
     return modifier.get(identifier)
 
 
+def node_input_settings(modifier: bpy.types.NodesModifier, identifier: str) -> dict[str, tuple[str, object]]:
+    """Return what defines an input of a Geometry Nodes modifier, by names that are the same in all versions.
+
+    IDENTIFIER is its value; it is left out if the input reads an attribute. IDENTIFIER_attribute is the name of this
+    attribute, or empty.
+
+    Returns:
+        The RNA path by which each is animated, and its value; nothing for geometry, which has no value.
+    """
+    path = modifier.path_from_id()
+    if hasattr(modifier, "properties") and hasattr(modifier.properties, "inputs"):
+        socket, path = getattr(modifier.properties.inputs, identifier, None), f"{path}.properties.inputs.{identifier}"
+        if not hasattr(socket, "value"):
+            return {}
+        attribute = socket.attribute_name if getattr(socket, "type", "") == "ATTRIBUTE" else ""
+        settings = {identifier: (f"{path}.value", socket.value), f"{identifier}_attribute": (f"{path}.type", attribute)}
+    elif identifier in modifier:
+        reads_attribute = modifier.get(f"{identifier}_use_attribute", False)
+        attribute = modifier.get(f"{identifier}_attribute_name", "") if reads_attribute else ""
+        settings = {
+            identifier: (f'{path}["{identifier}"]', modifier[identifier]),
+            f"{identifier}_attribute": (f'{path}["{identifier}_use_attribute"]', attribute),
+        }
+    else:
+        return {}
+    if attribute:
+        del settings[identifier]
+    return settings
+
+
 def is_selected(bone: bpy.types.PoseBone) -> bool:
     """Return whether a bone is selected (5.0 and later store the selection in the pose bone)."""
     return selection_owner(bone).select

@@ -5,7 +5,15 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from .arrays import COORDINATE_ELEMENT, LOOP_START_ELEMENT, VECTOR_ELEMENT, VERTEX_INDEX_ELEMENT, read, write
+from .arrays import (
+    COORDINATE_ELEMENT,
+    LOOP_START_ELEMENT,
+    VECTOR_ELEMENT,
+    VERTEX_INDEX_ELEMENT,
+    ElementProperty,
+    read,
+    write,
+)
 from .temporary_state import animated_paths
 
 
@@ -27,6 +35,30 @@ def topology(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
         loop_vertices: (L,) int32, vertex indices, face by face.
     """
     return read(mesh.polygons, LOOP_START_ELEMENT), read(mesh.loops, VERTEX_INDEX_ELEMENT)
+
+
+def vertex_layers(mesh_object: bpy.types.Object, names: set[str]) -> dict[str, np.ndarray]:
+    """Read the vertex groups and attributes of a mesh object that have one of some names.
+
+    Returns:
+        Values by name: (V,) float32 weights of a vertex group, 0 for vertices that are not in it; or the values of the
+        elements of an attribute, one row each.
+    """
+    groups = {group.index: group.name for group in mesh_object.vertex_groups if group.name in names}
+    layers = {name: np.zeros(len(mesh_object.data.vertices), np.float32) for name in groups.values()}
+    for vertex in mesh_object.data.vertices if groups else ():
+        for element in vertex.groups:
+            if element.group in groups:
+                layers[groups[element.group]][vertex.index] = element.weight
+    for attribute in mesh_object.data.attributes:
+        if attribute.name in names and len(attribute.data):
+            properties = attribute.data[0].bl_rna.properties
+            prop = next(properties[name] for name in ("value", "vector", "color") if name in properties)
+            dtype = {"FLOAT": np.float32, "INT": np.int32, "BOOLEAN": np.bool_}.get(prop.type)
+            if dtype is not None:
+                element = ElementProperty(prop.identifier, dtype, (max(prop.array_length, 1),))
+                layers[attribute.name] = read(attribute.data, element)
+    return layers
 
 
 def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:

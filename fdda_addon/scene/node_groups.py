@@ -68,6 +68,16 @@ def read_bone_names(tree: bpy.types.NodeTree | None) -> Iterator[str]:
             yield from read_bone_names(node.node_tree)
 
 
+def read_texts(tree: bpy.types.NodeTree | None) -> Iterator[str]:
+    """Yield the texts in the nodes of a group and of nested groups, among them the names of attributes."""
+    for node in tree.nodes if tree is not None else ():
+        yield from (socket.default_value for socket in node.inputs if socket.type == "STRING")
+        if node.type == "GROUP":
+            yield from read_texts(node.node_tree)
+        elif node.bl_idname == "FunctionNodeInputString":
+            yield node.string
+
+
 def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:
     """Yield the types of the nodes through which the output geometry passes, including nodes of nested groups."""
     nodes_to_visit = [n for n in tree.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output]

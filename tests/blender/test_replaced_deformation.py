@@ -7,9 +7,11 @@ import bpy
 import numpy as np
 import pytest
 
+from blend_fixtures.characters.stacks import build_node_chain
 from fdda_addon.rig.deformation import read_deformation
 from fdda_addon.runtime import playback_modifier
 from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.compatibility import node_input_settings
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, with_deformation
@@ -220,6 +222,94 @@ def test_a_change_of_a_recorded_shape_key_shows_the_rig(rig, elbow_files, what):
     change(rig.mesh_object, driver)
     trigger_check("view layer")
     assert_shows_rig(rig.mesh_object, clause)
+
+
+SOCKETS = {"Float": -1, "Vector": 2, "Int": -1, "Bool": -1}
+"""Types of sockets of Geometry Nodes, each with the index of the element that is animated."""
+
+
+def add_nodes(mesh_object: bpy.types.Object, socket_type: str = "Float") -> tuple[bpy.types.Modifier, str]:
+    """Add Geometry Nodes that move vertices by an input; return the modifier, and the identifier of the input."""
+    group = build_node_chain("Group", "GeometryNodeSetPosition")
+    socket = group.interface.new_socket("Amount", in_out="INPUT", socket_type=f"NodeSocket{socket_type}")
+    input_node, position_node = group.nodes[:2]
+    group.links.new(input_node.outputs["Amount"], position_node.inputs["Offset"])
+    modifier = mesh_object.modifiers.new("GN", "NODES")
+    modifier.node_group = group
+    return modifier, socket.identifier
+
+
+def path_of_input(modifier: bpy.types.Modifier, identifier: str) -> str:
+    return node_input_settings(modifier, identifier)[identifier][0]
+
+
+def set_attribute(modifier: bpy.types.Modifier, identifier: str, name: str) -> None:
+    """Make an input read an attribute, or its value for an empty name."""
+    if hasattr(modifier, "properties") and hasattr(modifier.properties, "inputs"):
+        socket = getattr(modifier.properties.inputs, identifier)
+        socket.type, socket.attribute_name = "ATTRIBUTE" if name else "VALUE", name
+    else:
+        modifier[f"{identifier}_use_attribute"], modifier[f"{identifier}_attribute_name"] = bool(name), name
+    modifier.id_data.update_tag()
+
+
+@pytest.mark.parametrize("socket_type", SOCKETS)
+def test_a_driven_input_of_nodes_plays_in_every_pose(rig, elbow_files, socket_type):
+    modifier, identifier = add_nodes(rig.mesh_object, socket_type)
+    driver = rig.mesh_object.driver_add(path_of_input(modifier, identifier), SOCKETS[socket_type]).driver
+    variable = driver.variables.new()
+    variable.type, variable.targets[0].id = "TRANSFORMS", rig.armature_object
+    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
+    driver.type = "SUM"
+    bpy.context.view_layer.update()
+    model = with_deformation(elbow_files.model, read_deformation(rig))
+    for angle in (1.2, 0.5):
+        pose(angle=angle)
+        bind(rig, model)
+        trigger_check("view layer")
+        assert rig.mesh_object.fdda.mode == "FDDA" and not rig.mesh_object.fdda.status
+    driver.type = "AVERAGE"
+    rig.mesh_object.update_tag()
+    trigger_check("view layer")
+    assert_shows_rig(rig.mesh_object, DRIVERS)
+
+
+def set_values(mesh_object: bpy.types.Object, name: str) -> None:
+    mesh_object.data.attributes[name].data.foreach_set("value", [0.03] * len(mesh_object.data.vertices))
+
+
+READS, LAYER = "'Socket_2_attribute' of the modifier 'GN' was mask and is", "the attribute or vertex group"
+ATTRIBUTES = {
+    "its value": (lambda o, m, i: set_attribute(m, i, ""), f"{READS} empty"),
+    "another": (lambda o, m, i: set_attribute(m, i, "other"), f"{READS} other"),
+    "another name": (lambda o, m, i: setattr(o.data.attributes["mask"], "name", "other"), f"{LAYER} 'mask' is gone"),
+    "other values": (lambda o, m, i: set_values(o, "mask"), f"'values' of {LAYER} 'mask' differs"),
+    "no attribute": (lambda o, m, i: o.data.attributes.remove(o.data.attributes["mask"]), f"{LAYER} 'mask' is gone"),
+    "in a node": (
+        lambda o, m, i: o.vertex_groups["inner"].add([3], 0.5, "ADD"),
+        f"'values' of {LAYER} 'inner' differs",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", ATTRIBUTES)
+def test_another_attribute_that_nodes_read_shows_the_rig(rig, elbow_files, what):
+    mesh_object = rig.mesh_object
+    modifier, identifier = add_nodes(mesh_object)
+    node = modifier.node_group.nodes.new("GeometryNodeInputNamedAttribute")
+    node.inputs["Name"].default_value = mesh_object.vertex_groups.new(name="inner").name
+    mesh_object.data.attributes.new("mask", "FLOAT", "POINT")
+    set_attribute(modifier, identifier, "mask")
+    bpy.context.view_layer.update()
+    bind(rig, with_deformation(elbow_files.model, read_deformation(rig)))
+    pose(angle=1.0)
+    assert mesh_object.fdda.mode == "FDDA" and not mesh_object.fdda.status
+    change, clause = ATTRIBUTES[what]
+    change(mesh_object, modifier, identifier)
+    # The interface tags the mesh too.
+    mesh_object.data.update()
+    trigger_check("view layer")
+    assert_shows_rig(mesh_object, clause)
 
 
 def test_a_copied_character_with_copied_drivers_plays(rig, elbow_files):

@@ -183,6 +183,23 @@ def test_other_deformations_are_named(rig, change):
     )
 
 
+@pytest.mark.parametrize("path", ['["Socket_2"]', ".properties.inputs.Socket_2.value"], ids=["4.5", "5.2"])
+@pytest.mark.parametrize("index", ["", "[2]"])
+def test_an_input_of_nodes_that_is_a_control_may_differ(rig, path, index):
+    def with_input(identifier):
+        settings = {"Socket_2": 0.0, "Socket_3": 0.0} | {identifier: 0.5}
+        deformation = {"modifiers": [{"name": "GN", "type": "NODES", "settings": settings}]}
+        return replace(rig.fingerprint, deformation=deformation)
+
+    recorded_rig, controls = (
+        replace(rig, fingerprint=with_input("none")),
+        (Control("mesh_object", f'modifiers["GN"]{path}{index}', 0.0, 1.0),),
+    )
+    assert not differences(recorded_rig, fingerprint=with_input("Socket_2"), controls=controls)
+    clauses = differences(recorded_rig, fingerprint=with_input("Socket_3"), controls=controls)
+    assert clauses == ["'Socket_3' of the modifier 'GN' was 0.0 and is 0.5"]
+
+
 @pytest.mark.parametrize(
     "value",
     [
