@@ -5,8 +5,9 @@ from collections.abc import Iterable, Iterator
 
 import bpy
 
-from .bone_reader import bone_node, bones_of_modifier, datablock_node, deforming_bones, is_armature
+from .bone_reader import bones_of_modifier, deforming_bones
 from .dependency_graph import Node
+from .struct_reader import bone_node, datablock_node, is_armature
 
 
 def unread_curves(

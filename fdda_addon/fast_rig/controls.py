@@ -6,8 +6,8 @@ from collections.abc import Iterable
 import bpy
 
 from ..core.errors import RigError, WrongUsageError
+from ..rig.bone_paths import split_bone_path
 from ..scene.compatibility import curves_of, is_bone_hidden
-from .driver_reader import bone_of_path
 
 VISIBLE, KEYED, COLLECTION = "visible", "keyed", "collection:"
 
@@ -78,6 +78,6 @@ def keyed_bones(armature_object: bpy.types.Object, action: bpy.types.Action) -> 
     """Return how many channels of each bone an action keys, by the name of the bone, which may be missing."""
     counts: dict[str, int] = {}
     for curve in curves_of(action, armature_object):
-        if curve.data_path.startswith("pose.bones[") and (name := bone_of_path(curve.data_path)):
+        if name := split_bone_path(armature_object, curve.data_path)[0]:
             counts[name] = counts.get(name, 0) + 1
     return counts

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import bpy
 
-from .bone_reader import bone_node, datablock_node, is_armature
 from .dependency_graph import DependencyGraph, Node
+from .struct_reader import bone_node, datablock_node, is_armature, struct_needs
 
 _BONE_PATH = re.compile(r'(?:^|\.)bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]')
 _QUOTED_TEXT = re.compile(r"""(["'])(?P<text>(?:(?!\1).)+)\1""")
@@ -59,15 +59,17 @@ def add_drivers(
 ) -> None:
     """Add what the drivers of a datablock need, and what needs them.
 
-    A driver of a custom property is needed only where another driver reads the property.
+    Shaders may read custom properties, but not those of armatures: of these, a driver needs another one that reads it.
 
     Args:
         graph: the graph.
         datablock: the datablock.
-        optional_paths: prefixes of further paths whose drivers the datablock does not need.
+        optional_paths: prefixes of paths whose drivers the datablock does not need.
         straight: names of bones that do not need the drivers of their B-Bone properties.
     """
     drivers = drivers_of(datablock)
+    if is_armature(datablock) or isinstance(datablock, bpy.types.Armature):
+        optional_paths += ('["',)
     nodes = [(driven_node(owner, curve.data_path), bone_of_path(curve.data_path)) for owner, curve in drivers]
     for owner, curve in drivers:
         path = curve.data_path
@@ -81,25 +83,19 @@ def add_drivers(
         if bone_name := bone_of_path(path):
             for armature_object in _armature_objects(datablock):
                 graph.add(bone_node(armature_object, bone_name), node)
-        elif not path.startswith(('["', *optional_paths)):
+        elif not path.startswith(optional_paths):
             graph.add(datablock_node(datablock), node)
 
 
 def driver_needs(driver: bpy.types.Driver) -> Iterator[Node]:
     """Yield the datablocks, bones and driven properties that a driver reads."""
+    yield from struct_needs(driver)
     for variable in driver.variables:
         for target in variable.targets:
             if variable.type == "CONTEXT_PROP":
                 yield from _context_needs(target)
-            elif target.id is None:
-                continue
-            elif variable.type == "SINGLE_PROP":
-                yield datablock_node(target.id)
+            elif variable.type == "SINGLE_PROP" and target.id is not None:
                 yield from _path_needs(target.id, target.data_path)
-            else:
-                yield datablock_node(target.id)
-                if is_armature(target.id) and target.bone_target:
-                    yield bone_node(target.id, target.bone_target)
     if driver.type == "SCRIPTED":
         yield from _expression_needs(driver.expression)
 

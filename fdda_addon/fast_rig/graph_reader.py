@@ -6,22 +6,14 @@ from collections.abc import Iterable, Iterator
 import bpy
 
 from ..rig.sources import Sources
-from ..scene.compatibility import node_input
+from ..scene.compatibility import curves_of, curves_of_slot, node_input, slot_of
 from ..scene.node_groups import read_bone_names
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
-from .bone_reader import (
-    add_bones,
-    bone_node,
-    bones_of_modifier,
-    constraint_needs,
-    datablock_node,
-    deforming_bones,
-    is_armature,
-    pointer_needs,
-)
+from .bone_reader import add_bones, bones_of_modifier, deforming_bones
 from .dependency_graph import DependencyGraph, Node
 from .driver_reader import add_drivers
+from .struct_reader import bone_node, datablock_node, is_armature, struct_needs
 
 _INVISIBLE_TYPES = {"ARMATURE", "LATTICE", "SPEAKER", "LIGHT_PROBE"}
 """Types of objects that no render shows."""
@@ -31,7 +23,7 @@ _COLLIDING_MODIFIERS = {"CLOTH", "SOFT_BODY", "PARTICLE_SYSTEM"}
 _SURFACE_MODIFIERS = {"NODES", "SCREW", "MESH_SEQUENCE_CACHE"}
 """Modifiers that can give a curve a surface."""
 _UNFOLLOWED_TYPES = (bpy.types.Scene, bpy.types.WindowManager, bpy.types.Screen, bpy.types.WorkSpace)
-"""Datablocks that use all objects, and need none of them."""
+"""Datablocks that use all objects, and need none of them except through drivers."""
 
 
 def read_graph(
@@ -49,11 +41,10 @@ def read_graph(
     mesh_objects = {rig.mesh_object for rig in scene_rigs}
     armatures, none = {armature_object, armature_object.data}, frozenset()
     shape_keys = {mesh_object.data.shape_keys for mesh_object in mesh_objects} - {None}
-    for datablock, used in _used_datablocks().items():
+    for datablock, used in used_datablocks().items():
         node = datablock_node(datablock)
         if isinstance(datablock, _UNFOLLOWED_TYPES):
-            # A driven property of a scene counts where another driver reads it.
-            add_drivers(graph, datablock, ("",))
+            add_drivers(graph, datablock)
             continue
         if datablock in mesh_objects:
             replaced = replaced_modifiers[datablock.name]
@@ -68,12 +59,14 @@ def read_graph(
         add_drivers(graph, datablock, optional_paths, straight if datablock in armatures else none)
         if datablock in shape_keys:
             continue
-        if not isinstance(datablock, bpy.types.Object):
-            graph.add(node, *map(datablock_node, used))
-            continue
-        graph.add(node, *_object_needs(datablock, datablock.modifiers))
+        if isinstance(datablock, bpy.types.Object):
+            graph.add(node, *_object_needs(datablock, datablock.modifiers))
+        elif any(map(is_armature, used)):
+            graph.add(node, *struct_needs(datablock))
         if is_armature(datablock):
-            add_bones(graph, datablock, animated_paths(datablock), straight if datablock == armature_object else none)
+            keyed = {c.data_path for action in bpy.data.actions for c in curves_of(action, datablock)}
+            animated = keyed | animated_paths(datablock)
+            add_bones(graph, datablock, animated, straight if datablock == armature_object else none)
             if datablock != armature_object:
                 graph.add(node, *(Node(node.datablock, bone=bone.name) for bone in datablock.data.bones))
         else:
@@ -96,10 +89,21 @@ def shown_objects(scene_rigs: list[SceneRig]) -> list[bpy.types.Object]:
         or scene_object.display_type in _CAGE_DISPLAY_TYPES
     }
     scene = bpy.context.scene
-    rendered = set(_rendered_objects(bpy.context.view_layer.layer_collection))
+    rendered = {o for layer in scene.view_layers for o in _rendered_objects(layer.layer_collection)}
     candidates = [o for o in bpy.data.objects if o in rendered or (o.name not in scene.objects and o.users_scene)]
     shown = [o for o in candidates if o not in cages and o.type not in _INVISIBLE_TYPES]
-    return [o for o in shown if not o.hide_render or "hide_render" in animated_paths(o)]
+    return [o for o in shown if not o.hide_render or "hide_render" in animated_paths(o) or _is_shown_by_action(o)]
+
+
+def _is_shown_by_action(scene_object: bpy.types.Object) -> bool:
+    """Return whether an action that is not assigned may show an object: its slot has the name of this or of none."""
+    slots = [(action, slot) for action in bpy.data.actions if (slot := slot_of(action, scene_object)) is not None]
+    return any(
+        curve.data_path == "hide_render"
+        for action, slot in slots
+        if slot.name_display == scene_object.name or slot.name_display not in bpy.data.objects
+        for curve in curves_of_slot(action, slot)
+    )
 
 
 def _has_surface(curve_object: bpy.types.Object) -> bool:
@@ -110,7 +114,7 @@ def _has_surface(curve_object: bpy.types.Object) -> bool:
     return is_filled or is_modified or bool(curve.bevel_depth or curve.extrude or curve.bevel_object)
 
 
-def _used_datablocks() -> dict[bpy.types.ID, set[bpy.types.ID]]:
+def used_datablocks() -> dict[bpy.types.ID, set[bpy.types.ID]]:
     """Return the datablocks that each datablock of the file uses."""
     used: dict[bpy.types.ID, set[bpy.types.ID]] = {}
     for datablock, users in bpy.data.user_map().items():
@@ -122,17 +126,9 @@ def _used_datablocks() -> dict[bpy.types.ID, set[bpy.types.ID]]:
 
 def _object_needs(scene_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[Node]:
     """Yield what an object needs, with the given modifiers; not its bones and drivers."""
-    if scene_object.data is not None:
-        yield datablock_node(scene_object.data)
-    parent = scene_object.parent
-    if parent is not None:
-        yield datablock_node(parent)
-        if is_armature(parent) and scene_object.parent_type == "BONE":
-            yield Node(datablock_node(parent).datablock, bone=scene_object.parent_bone)
-        elif is_armature(parent) and scene_object.parent_type == "ARMATURE":
-            yield from deforming_bones(scene_object, parent)
-    for constraint in scene_object.constraints:
-        yield from constraint_needs(constraint)
+    yield from struct_needs(scene_object, "pose", "modifiers")
+    if is_armature(scene_object.parent) and scene_object.parent_type == "ARMATURE":
+        yield from deforming_bones(scene_object, scene_object.parent)
     if scene_object.rigid_body is not None:
         # All rigid bodies may collide, and constraints connect them.
         yield from (datablock_node(o) for o in bpy.data.objects if o.rigid_body or o.rigid_body_constraint)
@@ -142,7 +138,7 @@ def _object_needs(scene_object: bpy.types.Object, modifiers: Iterable[bpy.types.
 
 def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier) -> Iterator[Node]:
     """Yield the datablocks and bones that a modifier reads, except through drivers."""
-    yield from pointer_needs(modifier)
+    yield from struct_needs(modifier)
     yield from bones_of_modifier(scene_object, modifier)
     if modifier.type in _COLLIDING_MODIFIERS:
         yield from (datablock_node(o) for o in bpy.data.objects if _moves_simulations(o))

@@ -9,9 +9,9 @@ import bpy
 from ..core.errors import RigError
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import temporary_attributes
-from .bone_reader import bone_node, constraint_needs, datablock_node
 from .dependency_graph import Node
 from .driver_reader import bone_of_path, driven_node, driver_needs, drivers_of, is_segment_path
+from .struct_reader import bone_node, datablock_node, struct_needs
 
 
 def remove_bones(armature_object: bpy.types.Object, kept: set[Node]) -> list[str]:
@@ -84,7 +84,7 @@ def _remove_idle_constraints(armature_object: bpy.types.Object, removed_bones: s
     """Remove the muted constraints that read removed bones: nothing else reads these, and Blender would complain."""
     removed = {bone_node(armature_object, name) for name in removed_bones}
     for bone in armature_object.pose.bones:
-        for constraint in [c for c in bone.constraints if c.mute and not removed.isdisjoint(constraint_needs(c))]:
+        for constraint in [c for c in bone.constraints if c.mute and not removed.isdisjoint(struct_needs(c))]:
             bone.constraints.remove(constraint)
 
 

@@ -6,13 +6,17 @@ from typing import NamedTuple
 
 import bpy
 
+from ..core.errors import RigError
 from ..rig.modifier_stack import deforming_modifiers, recorded_modifiers
+from ..scene.compatibility import curves_of
+from ..scene.controls import canonical_path
 from ..scene.scene_rig import SceneRig
 from .bendy_bones import unread_curves
-from .bone_reader import bone_node, datablock_node
 from .dependency_graph import Node
+from .driver_reader import drivers_of
 from .graph_reader import read_graph, shown_objects
 from .pruning import check_armature, remove_bones, remove_drivers, remove_modifiers, remove_objects
+from .struct_reader import bone_node, datablock_node
 
 
 class Removed(NamedTuple):
@@ -29,7 +33,8 @@ def remove_unneeded(
 ) -> Removed:
     """Remove everything that joints, controls, shown objects and other nodes do not need, and the replaced modifiers.
 
-    The first Armature modifier stays, because it tells which armature a mesh has. All actions stay.
+    The first Armature modifier stays, because it tells which armature a mesh has. So do modifiers whose settings
+    something kept reads; they are off, as in the full rig while a model plays. All actions stay.
 
     Args:
         scene_rigs: the rigs whose meshes models deform; they share one armature object.
@@ -38,22 +43,25 @@ def remove_unneeded(
         nodes: further nodes to keep.
 
     Raises:
-        RigError: as `deforming_modifiers` and `check_armature`.
+        RigError: as `deforming_modifiers` and `check_armature`, or something kept reads if a replaced modifier is on.
     """
     armature_object = scene_rigs[0].armature_object
     check_armature(armature_object)
     for action in (action for action in bpy.data.actions if action.library is None):
         # Saving would drop the actions that only removed objects and constraints use.
         action.use_fake_user = True
+    _write_names_in_paths(scene_rigs)
     shown = [*shown_objects(scene_rigs), armature_object, *(rig.mesh_object for rig in scene_rigs)]
     worlds = [scene.world for scene in bpy.data.scenes if scene.world is not None]
-    roots = [*map(datablock_node, (*shown, *worlds)), *nodes]
+    roots = [*map(datablock_node, (*shown, *bpy.data.scenes, *worlds)), *nodes]
     roots += [bone_node(armature_object, name) for name in (*joint_names, *controls)]
     replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
     kept_with_curves = read_graph(scene_rigs, replaced).kept(roots)
     straight = unread_curves(armature_object, replaced, controls, kept_with_curves)
     graph = read_graph(scene_rigs, replaced, straight)
     kept = graph.kept(roots)
+    for scene_rig in scene_rigs:
+        replaced[scene_rig.mesh_object.name] -= _read_modifiers(scene_rig.mesh_object, kept)
     drivers = remove_drivers(scene_rigs, graph.nodes, kept, straight)
     for name in straight:
         armature_object.data.bones[name].bbone_segments = 1
@@ -67,6 +75,47 @@ def remove_unneeded(
 def _replaced_modifiers(mesh_object: bpy.types.Object) -> set[str]:
     """Return the names of the modifiers that a model of an object replaces, on or off."""
     return {m.name for m in (*deforming_modifiers(mesh_object), *recorded_modifiers(mesh_object))}
+
+
+def _write_names_in_paths(scene_rigs: list[SceneRig]) -> None:
+    """Write names into the paths of drivers and actions, because removing elements changes the numbers of others."""
+    for datablock in bpy.data.user_map():
+        for owner, curve in drivers_of(datablock) if datablock.library is None else ():
+            _write_names(curve, owner)
+            for target in (target for variable in curve.driver.variables for target in variable.targets):
+                _write_names(target, bpy.context.scene if target.id is None else target.id)
+    armature_object = scene_rigs[0].armature_object
+    for datablock in (armature_object, armature_object.data, *(rig.mesh_object for rig in scene_rigs)):
+        for action in (action for action in bpy.data.actions if action.library is None):
+            for curve in curves_of(action, datablock):
+                _write_names(curve, datablock)
+
+
+def _write_names(owner: bpy.types.FCurve | bpy.types.DriverTarget, datablock: bpy.types.ID) -> None:
+    path = canonical_path(datablock, owner.data_path)
+    if path != owner.data_path:
+        owner.data_path = path
+
+
+def _read_modifiers(mesh_object: bpy.types.Object, kept: set[Node]) -> set[str]:
+    """Return the names of the modifiers of an object whose settings kept drivers read.
+
+    Raises:
+        RigError: a driver reads if a modifier is on.
+    """
+    key = datablock_node(mesh_object).datablock
+    paths = [node.driven_path for node in kept if node.datablock == key]
+    read = set()
+    for modifier in mesh_object.modifiers:
+        prefix = modifier.path_from_id()
+        if {f"{prefix}.show_viewport", f"{prefix}.show_render"} & set(paths):
+            raise RigError(
+                f"A driver reads if the modifier '{modifier.name}' of '{mesh_object.name}' is on, but a model turns it "
+                "off; let the driver read another property."
+            )
+        if any(path.startswith(f"{prefix}.") for path in paths):
+            read.add(modifier.name)
+    return read
 
 
 def _remove_replaced(scene_rig: SceneRig, names: set[str]) -> list[str]:

@@ -19,12 +19,12 @@ from ..runtime.model_files import network_of
 from ..scene.blend_file import save_copy
 from ..scene.controls import owner_of
 from ..scene.scene_rig import SceneRig
-from .bone_reader import bone_node, datablock_node
 from .controls import animating_actions, control_bones, keyed_bones
 from .dependency_graph import Node
 from .driver_reader import bone_of_path, driven_node
 from .joint_poses import JointPoses, differing_joints, evaluate_joints, infinite_joints, moving_joints, rig_size
 from .removal import Removed, remove_unneeded
+from .struct_reader import bone_node, datablock_node
 
 TOLERANCE = 1e-5
 """Largest accepted difference of a joint between full rig and fast rig, as a ratio of the size of the rig."""

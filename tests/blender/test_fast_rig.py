@@ -11,9 +11,9 @@ import pytest
 from blend_fixtures.characters.dependencies import DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.fast_rig import frame_times
 from fdda_addon.fast_rig import removal as fast_rig_removal
-from fdda_addon.fast_rig.bone_reader import bone_node
 from fdda_addon.fast_rig.graph_reader import read_graph
 from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, infinite_joints
+from fdda_addon.fast_rig.struct_reader import bone_node
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rig

@@ -8,13 +8,13 @@ import pytest
 from blend_fixtures.characters.bones import NewBone, add_bones
 from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
-from fdda_addon.fast_rig.bone_reader import bone_node
 from fdda_addon.fast_rig.controls import control_bones
 from fdda_addon.fast_rig.dependency_graph import Node
 from fdda_addon.fast_rig.graph_reader import read_graph
 from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, evaluate_joints
 from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
 from fdda_addon.fast_rig.removal import remove_unneeded
+from fdda_addon.fast_rig.struct_reader import bone_node
 from fdda_addon.scene.node_groups import BONE_NODE
 from fdda_addon.scene.scene_rig import SceneRig
 

@@ -5,10 +5,14 @@ import bpy
 import pytest
 
 from blend_fixtures.characters.base import link
-from blend_fixtures.characters.dependencies import studio_arm
+from blend_fixtures.characters.dependencies import UNUSED, studio_arm
+from fdda_addon.core.errors import RigError
 from fdda_addon.fast_rig.removal import remove_unneeded
 from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import SceneRig
+
+from .waves import wave
 
 
 def add_mesh_object(name: str, is_rendered: bool = True) -> bpy.types.Object:
@@ -97,3 +101,159 @@ def test_actions_that_only_removed_objects_use_are_saved(tmp_path):
     save_copy(tmp_path / "fast.blend")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "fast.blend"))
     assert "cage" not in bpy.data.objects and "of the cage" in bpy.data.actions
+
+
+def drive(struct: bpy.types.bpy_struct, name: str, target_id: bpy.types.ID, path: str) -> None:
+    """Set the first element of a property to the value at a path of a datablock."""
+    driver = struct.driver_add(name) if name.startswith("[") else struct.driver_add(name, 0)
+    driver.driver.type = "SUM"
+    target = driver.driver.variables.new().targets[0]
+    target.id, target.data_path = target_id, path
+
+
+class NamedBone(bpy.types.PropertyGroup):
+    """What an add-on may store with an object."""
+
+    rig: bpy.props.PointerProperty(type=bpy.types.Object)
+    bone: bpy.props.StringProperty()
+
+
+@pytest.mark.parametrize(
+    ("kind", "object_property", "bone_property"),
+    [
+        ("DISPLACE", "texture_coords_object", "texture_coords_bone"),
+        ("WAVE", "texture_coords_object", "texture_coords_bone"),
+        ("WARP", "object_to", "bone_to"),
+        ("UV_WARP", "object_from", "bone_from"),
+        ("VERTEX_WEIGHT_EDIT", "mask_tex_map_object", "mask_tex_map_bone"),
+        ("HOOK", "object", "subtarget"),
+        ("camera", "focus_object", "focus_subtarget"),
+        ("constraint", "space_object", "space_subtarget"),
+        ("strokes", "parent", "parent_bone"),
+        ("property of an add-on", "rig", "bone"),
+    ],
+)
+def test_bones_that_properties_of_shown_objects_name_stay(kind, object_property, bone_property):
+    scene_rig = SceneRig(*studio_arm())
+    prop = add_mesh_object("prop")
+    if kind == "camera":
+        struct = bpy.data.cameras.new("camera").dof
+        link(bpy.data.objects.new("camera", struct.id_data))
+    elif kind == "constraint":
+        struct = prop.constraints.new("LIMIT_LOCATION")
+    elif kind == "strokes":
+        bpy.ops.object.grease_pencil_add(type="STROKE")
+        struct = bpy.context.object.data.layers[0]
+    elif kind == "property of an add-on":
+        bpy.utils.register_class(NamedBone)
+        bpy.types.Object.named_bone = bpy.props.PointerProperty(type=NamedBone)
+        struct = prop.named_bone
+    else:
+        struct = prop.modifiers.new("Modifier", kind)
+    setattr(struct, object_property, scene_rig.armature_object)
+    setattr(struct, bone_property, UNUSED)
+    try:
+        assert remove_unneeded([scene_rig], ["lower"], ["control"]).bones == {f"{UNUSED}_child"}
+        assert getattr(struct, bone_property) == UNUSED
+    finally:
+        if kind == "property of an add-on":
+            del bpy.types.Object.named_bone
+            bpy.utils.unregister_class(NamedBone)
+
+
+@pytest.mark.parametrize("reader", ["object", "material"])
+def test_custom_properties_that_shaders_may_read_keep_their_drivers(reader):
+    scene_rig = SceneRig(*studio_arm())
+    prop = add_mesh_object("prop")
+    material = bpy.data.materials.new("material")
+    prop.data.materials.append(material)
+    owner = prop if reader == "object" else material
+    owner["wetness"] = 0.0
+    drive(owner, '["wetness"]', scene_rig.armature_object, f'pose.bones["{UNUSED}"].location[0]')
+    assert remove_unneeded([scene_rig], ["lower"], ["control"]).bones == {f"{UNUSED}_child"}
+    assert len(owner.animation_data.drivers) == 1
+
+
+def test_objects_that_another_view_layer_renders_stay():
+    scene_rig = SceneRig(*studio_arm())
+    collection = bpy.data.collections.new("second pass")
+    bpy.context.scene.collection.children.link(collection)
+    prop = add_mesh_object("prop")
+    bpy.context.scene.collection.objects.unlink(prop)
+    collection.objects.link(prop)
+    bpy.context.scene.view_layers.new("second")
+    bpy.context.view_layer.layer_collection.children["second pass"].exclude = True
+    assert remove(scene_rig) == ("cage",)
+
+
+@pytest.mark.parametrize("name", ["prop", "another"])
+def test_objects_that_an_action_shows_stay_if_it_may_be_theirs(name):
+    """The action is not assigned now."""
+    scene_rig = SceneRig(*studio_arm())
+    prop = add_mesh_object("prop", is_rendered=False)
+    another = add_mesh_object("another", is_rendered=False)
+    another.keyframe_insert("location", frame=1)
+    owner = bpy.data.objects[name]
+    owner.keyframe_insert("hide_render", frame=1)
+    owner.animation_data.action.use_fake_user = True
+    prop.animation_data_clear()
+    another.animation_data_clear()
+    assert set(remove(scene_rig)) == {"cage", "prop", "another"} - {name}
+
+
+def test_a_constraint_that_an_action_unmutes_counts():
+    """The action is not assigned now."""
+    scene_rig = SceneRig(*studio_arm())
+    armature_object = scene_rig.armature_object
+    armature_object.animation_data_create().action = wave(armature_object, "control")
+    constraint = armature_object.pose.bones["control"].constraints.new("COPY_ROTATION")
+    constraint.target, constraint.subtarget, constraint.mute = armature_object, UNUSED, True
+    constraint.keyframe_insert("mute", frame=1)
+    armature_object.animation_data.action = None
+    assert remove_unneeded([scene_rig], ["lower"], ["control"]).bones == {f"{UNUSED}_child"}
+
+
+def test_paths_with_numbers_lead_to_the_same_elements_afterwards():
+    """Removing bones and constraints changes the numbers of others."""
+    scene_rig = SceneRig(*studio_arm())
+    armature_object = scene_rig.armature_object
+    bones = armature_object.pose.bones
+    action = wave(armature_object, UNUSED)
+    constraints = bones[UNUSED].constraints
+    constraints.new("COPY_ROTATION").mute = True
+    constraints[0].target, constraints[0].subtarget = armature_object, f"{UNUSED}_child"
+    constraints.new("LIMIT_SCALE").influence = 0.3
+    # Of the three bones without weights, only the first is no control.
+    number = bones.find(UNUSED)
+    prop = add_mesh_object("prop")
+    drive(prop, "location", armature_object, f"pose.bones[{number}].constraints[1].influence")
+    drive(bones[UNUSED], "scale", armature_object, 'pose.bones["control"].location[0]')
+    for curve in (*animation_curves(action), *armature_object.animation_data.drivers):
+        curve.data_path = curve.data_path.replace(f'["{UNUSED}"]', f"[{number}]")
+    add_mesh_object("another")
+    removed = remove_unneeded([scene_rig], ["lower"], ["upper"])
+    assert removed.bones == {f"{UNUSED}_child"} and len(armature_object.animation_data.drivers) == 1
+    path = f'pose.bones["{UNUSED}"]'
+    assert {curve.data_path for curve in animation_curves(action)} == {f"{path}.rotation_euler"}
+    target = prop.animation_data.drivers[0].driver.variables[0].targets[0]
+    assert target.data_path == f'{path}.constraints["Limit Scale"].influence'
+    bpy.context.view_layer.update()
+    assert prop.location.x == pytest.approx(0.3)
+
+
+def test_modifiers_whose_settings_drivers_read_stay_and_are_read():
+    scene_rig = SceneRig(*studio_arm())
+    mesh_object, prop = scene_rig.mesh_object, add_mesh_object("prop")
+    mesh_object.modifiers["Mush"].factor = 0.7
+    drive(prop, "location", mesh_object, 'modifiers["Mush"].factor')
+    assert remove_unneeded([scene_rig], ["lower"], ["control"]).modifiers == ("Lattice",)
+    bpy.context.view_layer.update()
+    assert prop.location.x == pytest.approx(0.7)
+
+
+def test_a_driver_that_reads_if_a_replaced_modifier_is_on_is_refused():
+    """A model turns it off, so the object would be somewhere else."""
+    scene_rig = SceneRig(*studio_arm())
+    drive(add_mesh_object("prop"), "location", scene_rig.mesh_object, 'modifiers["Mush"].show_viewport')
+    with pytest.raises(RigError, match="A driver reads if the modifier 'Mush' of 'elbow' is on, but a model turns it"):
+        remove(scene_rig)
