@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from fdda_addon.core.child_process import child_environment
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError
 from fdda_addon.core.file_lock import wait_for_lock
 
@@ -75,18 +76,13 @@ def verb_command(farm: Farm, verb: tuple[str, ...]) -> list[str]:
 def verb_environment(farm: Farm, verb: tuple[str, ...]) -> dict[str, str]:
     """Return the environment of a verb, without Dask's variables and with a fixed number of threads."""
     is_training = verb[0] == "train"
-    environment = {name: value for name, value in os.environ.items() if name not in DASK_VARIABLES}
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), *_inherited_paths()])
+    environment = {name: value for name, value in child_environment(ROOT).items() if name not in DASK_VARIABLES}
     environment |= dict.fromkeys(THREAD_VARIABLES, str(farm.threads) if is_training else "1")
     if farm.trainer_python:
         environment["FDDA_TRAINER_PYTHON"] = farm.trainer_python
     if is_training and not farm.gpu:
         environment["CUDA_VISIBLE_DEVICES"] = ""
     return environment
-
-
-def _inherited_paths() -> list[str]:
-    return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path and path != str(ROOT)]
 
 
 def run_verb(

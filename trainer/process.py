@@ -8,6 +8,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import TextIO
 
 from fdda_addon.core.errors import (
     TRY_AGAIN,
@@ -84,14 +85,16 @@ def run_with_messages(run_job: Callable[[], None], sink: MessageSink) -> int:
     try:
         run_job()
     except BrokenPipeError:
-        _close_output()
+        _discard_output(sys.stdout)
         return 1
     except Exception as error:  # The add-on waits for a last message, whatever happened.
         text, status = _describe_error(error)
         values = {"text": text, **({"try_again": True} if status == TRY_AGAIN else {})}
         status = _send_last_message(sink, status, MessageType.FAILED, **values)
-        with suppress(OSError):
-            print(text, file=sys.stderr)
+        try:
+            print(text, file=sys.stderr, flush=True)
+        except OSError:
+            _discard_output(sys.stderr)
         return status
     return 0
 
@@ -101,15 +104,15 @@ def _send_last_message(sink: MessageSink, status: int, message_type: MessageType
     try:
         sink.send(message_type, **values)
     except OSError as error:
-        _close_output()
+        _discard_output(sys.stdout)
         return 1 if isinstance(error, BrokenPipeError) else status
     return status
 
 
-def _close_output() -> None:
+def _discard_output(stream: TextIO) -> None:
     """Discard buffered output, because flushing it at exit would fail again and change the exit status."""
     with suppress(OSError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _describe_error(error: Exception) -> tuple[str, int]:

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 
+from ..core.child_process import child_environment
 from ..core.errors import FDDAError
 from ..training.environment.folder import ROOT
 
@@ -39,5 +40,4 @@ def _has_farm() -> bool:
 
 
 def _farm_command(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
-    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return [sys.executable, "-P", "-m", "farm", *arguments], {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    return [sys.executable, "-P", "-m", "farm", *arguments], child_environment(ROOT)

@@ -2,22 +2,19 @@
 """Encodes pictures as a video, with the FFmpeg that is part of Blender, in another Blender that can be ended."""
 
 import json
-import os
-import queue
 import re
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import bpy
 
+from ..core.child_process import OutputLines, child_options, end_process
 from ..core.errors import OutputError, WrongUsageError
 from ..core.output import atomic_write
 from ..scene.blend_file import blender_path
-from ..training.environment.subprocesses import UTF8_OUTPUT, popen_options
 
 ENCODINGS = {".mp4": ("MPEG4", "H264", "H.264"), ".webm": ("WEBM", "WEBM", "VP9")}
 """Blender's names of container and codec, and the name of the codec in messages, by the extension of the file."""
@@ -70,7 +67,7 @@ def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) 
         }
         count, problem = 0, ""
         with _other_blender(json.dumps(job)) as (process, lines):
-            while (line := _next_line(lines)) is not None:
+            while (line := lines.next(WAIT_SECONDS)) is not None:
                 if match := _ENCODED_LINE.match(line):
                     count = int(match["count"])
                 elif match := _FAILURE_LINE.match(line):
@@ -87,12 +84,8 @@ def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) 
 
 
 @contextmanager
-def _other_blender(job: str) -> Iterator[tuple[subprocess.Popen, "queue.SimpleQueue[str | None]"]]:
-    """Start a Blender that encodes, and end it afterwards.
-
-    Yields:
-        Its process, and the lines that it prints, None after the last one.
-    """
+def _other_blender(job: str) -> Iterator[tuple[subprocess.Popen, OutputLines]]:
+    """Start a Blender that encodes, and end it afterwards; yield its process, and the lines that it prints."""
     package = Path(__file__).resolve().parents[1]
     script = (
         f"import importlib, sys; sys.path.insert(0, {str(package.parent)!r}); "
@@ -104,42 +97,19 @@ def _other_blender(job: str) -> Iterator[tuple[subprocess.Popen, "queue.SimpleQu
     else:
         # The bpy module in a Python has no program.
         command = [sys.executable, "-c", script]
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=os.environ | UTF8_OUTPUT,
-        text=True,
-        encoding="utf-8",
-        errors="replace",
-        **popen_options(),
-    )
-    lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    # In a thread, because writing a long job and reading a line block, and the window must not.
-    thread = threading.Thread(target=_communicate, args=(process, job, lines), daemon=True)
-    thread.start()
+    options = child_options() | {"stdin": subprocess.PIPE}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options)
+    lines = OutputLines(_communicate(process, job))
     try:
         yield process, lines
     finally:
-        process.kill()
-        process.wait()
-        thread.join()
+        end_process(process)
+        lines.join()
         process.stdout.close()
 
 
-def _communicate(process: subprocess.Popen, job: str, lines: "queue.SimpleQueue[str | None]") -> None:
+def _communicate(process: subprocess.Popen, job: str) -> Iterator[str]:
     # A Blender that has ended already says why in its output.
     with suppress(OSError), process.stdin:
         process.stdin.write(job)
-    for line in process.stdout:
-        lines.put(line)
-    lines.put(None)
-
-
-def _next_line(lines: "queue.SimpleQueue[str | None]") -> str | None:
-    """Return the next line, empty if there is none yet, None at the end."""
-    try:
-        return lines.get(timeout=WAIT_SECONDS)
-    except queue.Empty:
-        return ""
+    yield from process.stdout

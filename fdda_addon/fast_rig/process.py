@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Runs a verb in another Blender, so that the open file stays unchanged and the window usable."""
 
-import os
-import queue
 import re
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Self, TextIO
+from typing import Self
 
 import bpy
 
+from ..core.child_process import OutputLines, child_options, end_process
 from ..core.errors import FDDAError, os_error_text
 from ..core.progress import Progress
 from ..core.temporary import temporary_folder_error
-from ..training.environment.subprocesses import UTF8_OUTPUT, popen_options
 
 ROOT = Path(__file__).resolve().parents[2]
 KILL_AFTER_SECONDS = 5.0
@@ -44,37 +41,24 @@ class VerbProcess:
         Raises:
             FDDAError: Blender cannot be started, or no temporary file can be written.
         """
-        command, environment = _command()
+        command = _command()
         try:
-            self._output = _new_output()
+            self._output = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - `__exit__` closes it
         except OSError as error:
             raise temporary_folder_error(error) from error
         try:
             self._process = subprocess.Popen(
                 [*command, verb, *arguments],
-                stdin=subprocess.DEVNULL,
                 stdout=self._output,
                 stderr=subprocess.PIPE,
-                env=environment,
-                text=True,
-                encoding="utf-8",
-                errors="replace",
-                **popen_options(),
+                **child_options(ROOT),
             )
         except OSError as error:
             self._output.close()
             raise FDDAError(
                 f"'{command[0]}' cannot be started ({os_error_text(error)}); use the verb {verb} in a terminal."
             ) from error
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        # In a thread, because reading a line blocks and Blender must not.
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        for line in self._process.stderr:
-            self._lines.put(line)
-        self._lines.put(None)
+        self._lines = OutputLines(self._process.stderr)
 
     @property
     def is_running(self) -> bool:
@@ -88,15 +72,10 @@ class VerbProcess:
             FDDAError: the verb has failed; its text is that of the verb.
         """
         error_text = ""
-        while True:
-            try:
-                line = self._lines.get_nowait()
-            except queue.Empty:
+        while (line := self._lines.next()) is not None:
+            if not line:
                 yield None
-                continue
-            if line is None:
-                break
-            if match := _PROGRESS_LINE.match(line):
+            elif match := _PROGRESS_LINE.match(line):
                 yield Progress(match["stage"], int(match["done"]), int(match["total"]))
             elif line.startswith(_ERROR_PREFIX):
                 error_text = line.removeprefix(_ERROR_PREFIX).strip()
@@ -114,26 +93,15 @@ class VerbProcess:
     def __exit__(self, *_: object) -> None:
         if self.is_running:
             self._process.terminate()
-            try:
-                self._process.wait(KILL_AFTER_SECONDS)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        self._reader.join(KILL_AFTER_SECONDS)
-        if not self._reader.is_alive():
+        end_process(self._process, KILL_AFTER_SECONDS)
+        if self._lines.join(KILL_AFTER_SECONDS):
             self._process.stderr.close()
         self._output.close()
 
 
-def _new_output() -> TextIO:
-    return tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
-
-
-def _command() -> tuple[list[str], dict[str, str]]:
-    """Return the start of the command line that runs a verb, and its environment variables."""
-    environment = os.environ | UTF8_OUTPUT
+def _command() -> list[str]:
+    """Return the start of the command line that runs a verb."""
     if bpy.app.binary_path:
-        return [bpy.app.binary_path, "--python-expr", _REGISTER, "--command", "fdda"], environment
+        return [bpy.app.binary_path, "--python-expr", _REGISTER, "--command", "fdda"]
     # The bpy module in a Python has no program.
-    paths = [str(ROOT), *filter(None, [environment.get("PYTHONPATH")])]
-    return [sys.executable, "-m", "fdda_addon"], environment | {"PYTHONPATH": os.pathsep.join(paths)}
+    return [sys.executable, "-m", "fdda_addon"]

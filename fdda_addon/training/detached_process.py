@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
@@ -22,7 +23,6 @@ from ..core.errors import OutputError, os_error_text
 from ..core.file_lock import try_lock
 from ..core.output import write_json
 from .environment.folder import user_folder
-from .environment.subprocesses import popen_options
 from .process import Training
 
 SIGNAL_CHECKS = 4 if sys.platform == "win32" else 1
@@ -63,18 +63,11 @@ class DetachedTraining(Training):
     def _new_errors(self) -> TextIO:
         return self._files.new_errors()
 
-    def _start(self, command: list[str], environment: dict[str, str]) -> subprocess.Popen:
+    def _start(self, command: list[str]) -> subprocess.Popen:
         with self._files.new_messages() as file:
-            return subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=self._errors,
-                env=environment,
-                **popen_options(own_session=True),
-            )
+            return self._popen(command, file, own_session=True)
 
-    def _read(self) -> None:
+    def _read(self) -> Iterator[str]:
         offset, incomplete_line = 0, b""
         while not self._is_detached:
             # Checked before reading, so that all output of an ended process is read.
@@ -92,12 +85,10 @@ class DetachedTraining(Training):
                 break
             offset += len(chunk)
             *lines, incomplete_line = (incomplete_line + chunk).split(b"\n")
-            for line in lines:
-                self._lines.put(line.decode("utf-8", "replace"))
+            yield from (line.decode("utf-8", "replace") for line in lines)
             if not is_alive and not chunk:
                 break
             time.sleep(0 if lines else POLL_SECONDS)
-        self._lines.put(None)
 
     def detach(self) -> None:
         """Let the training continue after the `with` block."""
@@ -107,7 +98,7 @@ class DetachedTraining(Training):
 
     def __exit__(self, *error: object) -> None:
         if self._is_detached:
-            self._reader.join()
+            self._lines.join()
             self._errors.close()
             return
         super().__exit__(*error)

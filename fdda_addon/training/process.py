@@ -4,20 +4,18 @@
 torch runs outside of Blender's process, because it has its own threads and libraries, and Blender's Python lacks it.
 """
 
-import os
-import queue
 import secrets
 import shutil
 import subprocess
 import tempfile
-import threading
 import time
 import weakref
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Self, TextIO
+from typing import IO, Self, TextIO
 
+from ..core.child_process import OutputLines, child_environment, child_options, end_process
 from ..core.errors import TRY_AGAIN, TrainingDiedError, TrainingError, WrongUsageError, os_error_text
 from ..core.messages import STOP_FILE_VARIABLE, Message, MessageType
 from ..core.native_library import runtime_advice
@@ -25,7 +23,6 @@ from ..core.stop_signals import INTERRUPTED
 from ..core.temporary import temporary_folder_error
 from .environment.choice import select_python
 from .environment.folder import ROOT
-from .environment.subprocesses import UTF8_OUTPUT, popen_options
 from .process_exit import explain_exit_status
 
 KILL_AFTER_SECONDS = 20.0
@@ -51,10 +48,8 @@ def trainer_command(
         python: path of the interpreter; None for `trainer_python()`.
         module: name of the module to run.
     """
-    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     # -P, so that a folder `trainer` in the current folder is not run instead.
-    command = [python or trainer_python(), "-P", "-m", module, *arguments]
-    return command, {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    return [python or trainer_python(), "-P", "-m", module, *arguments], child_environment(ROOT)
 
 
 class TrainerProcess:
@@ -83,16 +78,15 @@ class TrainerProcess:
             OutputError: the file for stderr cannot be written.
         """
         advice = select_python().origin.value if python is None else "name a Python that has torch"
-        command, environment = trainer_command(arguments, python, self.module)
+        command, _ = trainer_command(arguments, python, self.module)
         try:
             self._stop_file, self._errors = self._new_stop_file(), self._new_errors()
         except OSError as error:
             raise temporary_folder_error(error) from error
-        environment |= {STOP_FILE_VARIABLE: str(self._stop_file), **UTF8_OUTPUT}
         # Ctrl-C may arrive between the start of the process and the `with` block that ends it.
         self._finalizer = weakref.finalize(self, Path.touch, self._stop_file)
         try:
-            self._process = self._start(command, environment)
+            self._process = self._start(command)
         except OSError as error:
             self._finalizer.detach()
             self._errors.close()
@@ -108,30 +102,20 @@ class TrainerProcess:
     def _new_errors(self) -> TextIO:
         return tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
 
-    def _start(self, command: list[str], environment: dict[str, str]) -> subprocess.Popen:
-        return subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            env=environment,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            **popen_options(),
-        )
+    def _start(self, command: list[str]) -> subprocess.Popen:
+        return self._popen(command, subprocess.PIPE)
+
+    def _popen(self, command: list[str], output: IO | int, own_session: bool = False) -> subprocess.Popen:
+        options = child_options(ROOT, own_session=own_session)
+        options["env"][STOP_FILE_VARIABLE] = str(self._stop_file)
+        return subprocess.Popen(command, stdout=output, stderr=self._errors, **options)
 
     def _start_reader(self) -> None:
         self._canceled_at: float | None = None
-        # In a thread, because reading a line blocks and Blender must not.
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self._lines = OutputLines(self._read())
 
-    def _read(self) -> None:
-        for line in self._process.stdout:
-            self._lines.put(line)
-        self._lines.put(None)
+    def _read(self) -> Iterator[str]:
+        yield from self._process.stdout
 
     def cancel(self) -> None:
         """Request the trainer to stop, without waiting. `messages` ends when the trainer has stopped."""
@@ -158,15 +142,14 @@ class TrainerProcess:
         while True:
             if self._canceled_at is not None and time.monotonic() > self._canceled_at + KILL_AFTER_SECONDS:
                 self._process.kill()
-            try:
-                # A short timeout, because on Windows a blocked thread receives no Ctrl-C.
-                line = self._lines.get(block=wait, timeout=POLL_SECONDS)
-            except queue.Empty:
+            # A short timeout, because on Windows a blocked thread receives no Ctrl-C.
+            line = self._lines.next(POLL_SECONDS if wait else 0)
+            if line is None:
+                break
+            if not line:
                 if not wait:
                     yield None
                 continue
-            if line is None:
-                break
             try:
                 message = Message.decode(line)
             except ValueError:
@@ -225,20 +208,14 @@ class TrainerProcess:
         try:
             if self._process.poll() is None:
                 self.cancel()
-                with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(KILL_AFTER_SECONDS)
         finally:
-            # Reached also if Ctrl-C interrupts the wait.
-            if self._process.poll() is None:
-                self._process.kill()
-                self._process.wait()
+            end_process(self._process, KILL_AFTER_SECONDS)
             if self._finalizer is not None:
                 self._finalizer.detach()
             with suppress(OSError):
                 self._stop_file.unlink(missing_ok=True)
         # A child process of the trainer may keep the pipe open; then the reader thread continues.
-        self._reader.join(READER_JOIN_SECONDS)
-        if not self._reader.is_alive() and self._process.stdout is not None:
+        if self._lines.join(READER_JOIN_SECONDS) and self._process.stdout is not None:
             self._process.stdout.close()
         self._errors.close()
 

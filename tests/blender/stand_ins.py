@@ -23,14 +23,20 @@ if "trainer" in sys.orig_argv:
 """
 
 
+def import_from(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let this Python and its child processes import from a folder, as if this Python was started with PYTHONPATH."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(folder)])
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+
+
 def stand_in_trainer(folder: Path, monkeypatch: pytest.MonkeyPatch, *lines: str, status: int = 0) -> None:
     """Run lines of Python code instead of the trainer, and exit with a status."""
     packages = folder / "packages"
     packages.mkdir()
     code = "\n".join(f"        {line}" for line in (f"status = {status}", *lines))
     (packages / "sitecustomize.py").write_text(_SITE_CUSTOMIZE.format(code=code), encoding="utf-8")
-    monkeypatch.setenv("PYTHONPATH", str(packages))
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    import_from(packages, monkeypatch)
     monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
 
 

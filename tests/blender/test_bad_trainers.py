@@ -18,7 +18,7 @@ from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 from fdda_addon.training.process import trainer_command
 
 from .conftest import run
-from .stand_ins import print_message_code, stand_in_trainer
+from .stand_ins import import_from, print_message_code, stand_in_trainer
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -41,8 +41,7 @@ def test_a_python_without_torch_is_reported(train_refusal, tmp_path, monkeypatch
     packages = tmp_path / "packages"
     packages.mkdir()
     (packages / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")
-    monkeypatch.setenv("PYTHONPATH", str(packages))
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    import_from(packages, monkeypatch)
     text = train_refusal()
     python = os.environ.get(PYTHON_VARIABLE) or sys.executable
     assert text.startswith(f"Training needs the Python package 'torch', which {python} does not have; install torch")
@@ -150,7 +149,7 @@ def test_a_trainer_whose_disk_is_full_is_reported(elbow_files, train_refusal, tm
     packages.mkdir()
     code = "\n".join(["import os, sys", "if 'trainer' in sys.orig_argv:", *(f"    {line}" for line in lines), ""])
     (packages / "sitecustomize.py").write_text(code)
-    monkeypatch.setenv("PYTHONPATH", str(packages))
+    import_from(packages, monkeypatch)
     text = train_refusal("--epochs", 1, status=TRY_AGAIN)
     assert is_silent or "No space left on device; make room, end other programs, or try again." in text
 

@@ -137,8 +137,7 @@ def test_an_attached_training_ends_when_another_blender_has_removed_its_files(tm
         files.write_process_id(1)
         with detached_process.AttachedTraining(tmp_path / "m.onnx") as training:
             files.remove()
-            training._reader.join(5)
-            assert not training._reader.is_alive() and training._lines.get_nowait() is None
+            assert training._lines.join(5) and training._lines.next() is None
 
 
 def test_an_invalid_process_file_is_ignored(tmp_path):

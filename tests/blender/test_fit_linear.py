@@ -32,6 +32,7 @@ from .conftest import ELBOW, assert_plays, evaluated_positions, pose, run, train
 from .refusals import save_elbow
 from .resuming import check_resuming
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
+from .stand_ins import import_from
 
 SMOOTH_SETTINGS = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
 
@@ -172,8 +173,7 @@ def test_a_python_without_scipy_leaves_no_recording(refusal, tmp_path, monkeypat
     packages = tmp_path / "packages"
     packages.mkdir()
     (packages / "sitecustomize.py").write_text("import sys\nsys.modules['scipy'] = None\n")
-    monkeypatch.setenv("PYTHONPATH", str(packages))
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    import_from(packages, monkeypatch)
     text = refusal("record", path, tmp_path / "recording", "--poses", 12, "--fit-linear", "smooth")
     assert text.startswith("Fitting skin weights needs the Python package 'scipy', which ")
 
@@ -181,8 +181,7 @@ def test_a_python_without_scipy_leaves_no_recording(refusal, tmp_path, monkeypat
 def test_a_fit_whose_process_dies_prints_an_error(refusal, tmp_path, monkeypatch):
     path = save_elbow(tmp_path / "elbow.blend")
     (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(3)\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    import_from(tmp_path, monkeypatch)
     assert refusal("record", path, tmp_path / "recording", "--poses", 12, "--fit-linear", "smooth") == (
         "The trainer ended with status 3 before it was done; no skin weights were fitted, record again."
     )

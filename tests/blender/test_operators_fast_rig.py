@@ -101,7 +101,7 @@ def test_a_canceled_job_ends_the_other_blender_and_writes_nothing(saved, elbow_f
 def test_the_other_blender_registers_an_add_on_that_it_does_not_load(monkeypatch):
     """Blender evaluates the expression before it runs the command."""
     monkeypatch.setattr(verb_process, "bpy", SimpleNamespace(app=SimpleNamespace(binary_path="/blender")))
-    (program, option, expression, *command), _ = verb_process._command()
+    program, option, expression, *command = verb_process._command()
     assert (program, option, command) == ("/blender", "--python-expr", ["--command", "fdda"])
     script = f"{expression}\n{expression}\nassert sys.modules['fdda_addon'].is_registered()\nprint('done')"
     result = subprocess.run([sys.executable, "-P", "-c", script], cwd="/", capture_output=True, text=True, check=False)

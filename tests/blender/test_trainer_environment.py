@@ -2,6 +2,7 @@
 """The training environment that the add-on creates: real virtual environments with tiny packages."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -83,6 +84,38 @@ def test_the_environment_is_created_from_a_folder_of_wheels(user: Path, wheels: 
     assert "-m venv" in log and "Successfully installed" in log and "Ready to train" in log
     assert sorted(path.name for path in user.iterdir()) == ["trainer", "trainer.lock", "trainer.log"]
     assert not (folder.environment_folder() / "temporary").exists()
+
+
+PIP_SETTINGS = """
+[global]
+user = true
+prefix = /nowhere
+find-links = /nowhere
+no-index = true
+[install]
+require-hashes = true
+python = /nowhere
+find-links =
+    {wheels}
+"""
+
+
+def test_settings_of_pip_and_of_a_launcher_do_not_change_where_and_what_is_installed(
+    user: Path, wheels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The settings that a download needs are used: here the folder of packages, which overrides another."""
+    (tmp_path / "pip.conf").write_text(PIP_SETTINGS.format(wheels=wheels))
+    for name in [name for name in os.environ if name.startswith("PIP_")]:
+        monkeypatch.delenv(name)
+    variables = {"PIP_CONFIG_FILE": str(tmp_path / "pip.conf"), "PIP_ROOT": str(tmp_path / "root"), "PIP_QUIET": "3"}
+    for name, value in (variables | {"PIP_PROXY": "http://me:secret@nowhere", "PYTHONHOME": "/nowhere"}).items():
+        monkeypatch.setenv(name, value)
+    log = tmp_path / "log"
+    *_, answer = EnvironmentCreation(tmp_path / "trainer", log, base=sys.executable).steps()
+    assert answer.level == "INFO" and folder.folder_state(tmp_path / "trainer") is FolderState.READY
+    used = re.search(r"Settings of pip that are used: (.*)", log.read_text())[1].split(", ")
+    assert {"find-links", "no-index", "proxy"} <= set(used) <= {"find-links", "no-index", "proxy", "cert"}
+    assert "secret" not in log.read_text() and not (tmp_path / "root").exists()
 
 
 def test_preferences_and_variable_come_before_the_own_environment(

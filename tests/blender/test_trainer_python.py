@@ -19,7 +19,7 @@ from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, 
 from fdda_addon.training.environment.interpreters import find_interpreters, query_interpreter
 
 from .conftest import run
-from .stand_ins import write_program
+from .stand_ins import import_from, write_program
 from .tiny_wheels import TORCH
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,7 +33,7 @@ def asked(python: object) -> CheckResult:
 @pytest.fixture
 def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The first folder of Python's import path, with a module for each package."""
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "packages"))
+    import_from(tmp_path / "packages", monkeypatch)
     for name in PACKAGES:
         (tmp_path / "packages" / name).mkdir(parents=True)
         (tmp_path / "packages" / name / "__init__.py").write_text(

@@ -18,7 +18,7 @@ MAP = (ROOT / "docs" / "pictures" / "map.svg").read_text(encoding="utf-8")
 PATH_PATTERN = r"(?:fdda_addon|trainer|tests|benchmarks|blend_fixtures|examples|setup|docs)/[\w./-]*"
 TIMER_PATTERN = r"timers\.register\(|event_timer_add\("
 HANDLER_PATTERN = r"draw_handler_add\(|draw_handler_add$|bpy\.app\.handlers\b|atexit\.register\(|signal\.signal\("
-THREAD_PATTERN = r"Thread\(|ThreadPoolExecutor\(|subprocess\.(?:run|Popen)\("
+THREAD_PATTERN = r"Thread\(|ThreadPoolExecutor\(|subprocess\.(?:run|Popen)\(|\._popen\("
 
 
 def chapter_text(name: str) -> str:

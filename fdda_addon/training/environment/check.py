@@ -2,15 +2,14 @@
 """Checks whether a Python can train: its version, its packages, and the device that torch would use."""
 
 import json
-import os
 import subprocess
 
+from ...core.child_process import child_options
 from ...core.errors import os_error_text
 from ...core.native_library import runtime_advice
 from ..process_exit import explain_exit_status
 from .check_result import CheckResult
 from .folder import PACKAGES, ROOT
-from .subprocesses import UTF8_OUTPUT, popen_options
 
 MIN_VERSION = (3, 11)
 TIMEOUT_SECONDS = 180.0
@@ -49,14 +48,7 @@ def check(python: str, advice: str) -> CheckResult:
     try:
         # With -c Python imports from the current folder, which must contain the trainer's modules.
         result = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=TIMEOUT_SECONDS,
-            cwd=ROOT,
-            env={**os.environ, **UTF8_OUTPUT},
-            check=False,
-            **popen_options(),
+            command, capture_output=True, timeout=TIMEOUT_SECONDS, cwd=ROOT, check=False, **child_options(ROOT)
         )
     except OSError as error:
         return CheckResult(
@@ -66,12 +58,11 @@ def check(python: str, advice: str) -> CheckResult:
         return CheckResult(
             "ERROR", f"The trainer's Python '{python}' did not answer in {TIMEOUT_SECONDS:.0f} s; {advice}."
         )
-    output_lines = result.stdout.decode("utf-8", "replace").strip().splitlines()
     try:
-        report = json.loads(output_lines[-1])
+        report = json.loads(result.stdout.strip().splitlines()[-1])
         return _evaluate_report(python, report, advice)
     except (IndexError, ValueError, TypeError, KeyError):
-        error_lines = result.stderr.decode("utf-8", "replace").strip().splitlines()
+        error_lines = result.stderr.strip().splitlines()
         process_exit = explain_exit_status(result.returncode, is_silent=True)
         reason = process_exit.text if process_exit.is_machine_fault else f"status {result.returncode}"
         reason = error_lines[-1].strip() if error_lines else reason

@@ -8,11 +8,12 @@ import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from ...core.child_process import child_options
 from ...core.errors import TrainerEnvironmentError, os_error_text
 from ...core.progress import Progress
 from .check import check
@@ -28,9 +29,8 @@ from .folder import (
 )
 from .interpreters import Interpreter, find_interpreters, query_interpreter
 from .source_checks import TEMPORARY_FOLDER_NAME, check_source, check_wheels
-from .subprocesses import clean_environment, popen_options
 
-MIN_PIP_WITH_RAW_PROGRESS = (24, 1)
+RUN_PIP = Path(__file__).with_name("run_pip.py")
 
 
 class EnvironmentCreation:
@@ -151,31 +151,23 @@ class EnvironmentCreation:
         # Packages are installed into the folder itself, because paths in site-packages are 18 characters longer.
         # This .pth file makes Python import from there.
         (packages / "fdda.pth").write_text(os.path.relpath(self.folder, packages) + "\n", encoding="ascii")
-        pip = [str(interpreter_path(self.folder)), "-I", "-m", "pip"]
-        command = [*pip, "install", "--no-input", "--disable-pip-version-check", "--no-cache-dir"]
+        command = [str(interpreter_path(self.folder)), "-I", str(RUN_PIP), "install"]
+        command += ["--no-input", "--disable-pip-version-check", "--no-cache-dir"]
         command += ["--target", str(self.folder)]
         command += ["--only-binary=:all:", "--constraint", str(requirements_file(interpreter.version)), *PACKAGES]
-        if (yield from self._run([*pip, "--version"], log)) == 0:
-            version = re.search(r"pip (\d+)\.(\d+)", "\n".join(self._last_lines))
-            has_raw_progress = version is not None and tuple(map(int, version.groups())) >= MIN_PIP_WITH_RAW_PROGRESS
-            command.append(f"--progress-bar={'raw' if has_raw_progress else 'off'}")
         if self.wheels is not None:
             command += ["--no-index", "--find-links", str(self.wheels)]
-        if (yield from self._run(command, log, self._pip_environment(temporary))) != 0:
+        if (yield from self._run(command, log, dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)))) != 0:
             source = f"of '{self.wheels}'" if self.wheels else "of the package index"
-            advice = "add what is missing" if self.wheels else "is this machine online, the disk full?"
+            advice = (
+                "add what is missing"
+                if self.wheels
+                else "does the index have them, is this machine online, the disk full?"
+            )
             raise TrainerEnvironmentError(
                 f"The packages {source} could not be installed ({self._error_line()}); {advice}; the log is "
                 f"'{self.log}'."
             )
-
-    def _pip_environment(self, temporary: Path) -> dict[str, str]:
-        environment = clean_environment()
-        if self.wheels is not None:
-            # Ignore the settings of pip, which may name other sources of packages.
-            environment = {name: value for name, value in environment.items() if not name.startswith("PIP_")}
-            environment["PIP_CONFIG_FILE"] = os.devnull
-        return environment | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
 
     def _check(self, log: IO[str]) -> CheckResult:
         result = check(str(interpreter_path(self.folder)), f"the log is '{self.log}'")
@@ -185,31 +177,27 @@ class EnvironmentCreation:
             raise TrainerEnvironmentError(f"The packages were installed but do not work: {result.message}")
         return result
 
-    def _run(self, command: list[str], log: IO[str], environment: dict[str, str] | None = None) -> Iterator[Progress]:
-        """Run a command and return its exit status.
+    def _run(self, command: list[str], log: IO[str], variables: Mapping[str, str] = {}) -> Iterator[Progress]:
+        """Run a command with further environment variables, and return its exit status.
 
         Its current folder is outside of the environment, which Windows could not remove otherwise.
         """
         log.write(f"$ {subprocess.list2cmdline(command)}\n")
         self._last_lines = []
+        options = child_options(own_session=True)
+        options["env"] |= variables
         with self._lock:
             self._stop_if_cancelled()
             try:
                 self._process = process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT,
-                    env=environment or clean_environment(),
-                    cwd=self.folder.parent,
-                    **popen_options(own_session=True),
+                    command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=self.folder.parent, **options
                 )
             except OSError as error:
                 self._last_lines.append(str(error))
                 return 1
         try:
             for line in process.stdout:
-                yield from self._log_line(line.decode("utf-8", "replace").strip(), log)
+                yield from self._log_line(line.strip(), log)
             status = process.wait()
         finally:
             with self._lock:
@@ -263,7 +251,7 @@ def _kill(process: subprocess.Popen) -> None:
     if os.name == "nt":
         # The module venv starts another Python, which would continue.
         subprocess.run(
-            ["taskkill", "/F", "/T", "/PID", str(process.pid)], capture_output=True, check=False, **popen_options()
+            ["taskkill", "/F", "/T", "/PID", str(process.pid)], capture_output=True, check=False, **child_options()
         )
         process.kill()
     else:

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from ...core.child_process import child_options
 from .folder import PINNED_REQUIREMENTS
-from .subprocesses import clean_environment, popen_options
 
 TIMEOUT_SECONDS = 30.0
 # The versions that Blender itself has come first.
@@ -70,16 +70,12 @@ def find_interpreters(candidates: Iterator[list[str]] | None = None) -> Iterator
 def query_interpreter(command: list[str]) -> Interpreter | None:
     """Run a command line, and return its interpreter; None if it starts no Python."""
     try:
+        options = child_options()
+        options["env"] |= NO_DOWNLOAD_ENVIRONMENT
         result = subprocess.run(
-            [*command, "-I", "-c", _PROBE_SCRIPT],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=TIMEOUT_SECONDS,
-            env=clean_environment() | NO_DOWNLOAD_ENVIRONMENT,
-            check=True,
-            **popen_options(),
+            [*command, "-I", "-c", _PROBE_SCRIPT], capture_output=True, timeout=TIMEOUT_SECONDS, check=True, **options
         )
-        version, is_64_bit, missing, path = json.loads(result.stdout.decode("utf-8", "replace").splitlines()[-1])
+        version, is_64_bit, missing, path = json.loads(result.stdout.splitlines()[-1])
     except (OSError, subprocess.SubprocessError, ValueError, TypeError, IndexError):
         return None
     problem = ""
