@@ -22,6 +22,7 @@ from fdda_addon.core.rig import STATIC_JOINT_LABEL
 from .compression import drop_components, dropped_components_sentence, factorize_partition
 from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
+from .device import CPU, WARNING_NAME, choose_device, error_summary, unusable_card_text
 from .export.export import ExportedModel, build_model, measure, measure_surface, write_model
 from .fits.half_rotations import half_rotations_help
 from .goal import evaluate_goal
@@ -29,7 +30,7 @@ from .inputs.network_inputs import NetworkInputs, fit_inputs, make_inputs
 from .inputs.surface_frames import SurfaceFrameFeatures
 from .model import TrainedModel, make_trained_model
 from .networks.checkpoint import Checkpoint, write_checkpoint
-from .networks.loop import choose_device, train
+from .networks.loop import train
 from .networks.networks import TrainedPartition
 from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import training_outputs
@@ -101,7 +102,7 @@ def train_model(
     return _send_final_messages(sink, model_path, report, goal_text, start_time, last_message)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Job:
     """The steps of a training that send messages; `checkpoint` is that of a warm start, others as in `train_model`."""
 
@@ -110,9 +111,13 @@ class _Job:
     recording: Recording
     split: Split
     checkpoint: Checkpoint | None
+    device: str = CPU
 
     def log(self, text: str) -> None:
         self.sink.send(MessageType.LOG, text=text)
+
+    def warn_of_card(self, card: str, problem: str) -> None:
+        self.sink.send(MessageType.WARNING, name=WARNING_NAME, text=unusable_card_text(card, problem))
 
     def start(self, strict: bool) -> list[RecordingWarning]:
         """Send what is trained on which device, check the recording, and return its warnings.
@@ -120,13 +125,17 @@ class _Job:
         Raises:
             RecordingError: there are warnings, and `strict` is set.
         """
+        chosen = choose_device()
+        self.device = chosen.device
         self.sink.send(
             MessageType.STARTED,
             partitions=len(self.recording.partitions),
             poses=len(self.recording.pose_matrices),
             vertices=self.recording.rig.vertex_count,
-            device=str(choose_device()),
+            device=self.device,
         )
+        if chosen.problem:
+            self.warn_of_card(chosen.card, chosen.problem)
         self.log(training_size_sentence(self.recording))
         warnings = check_recording(self.recording)
         for warning in warnings:
@@ -174,7 +183,15 @@ class _Job:
             errors = {"training_mm": round(training_mm, 6), "validation_mm": round(validation_mm, 6)}
             self.sink.send(MessageType.PROGRESS, epoch=epoch, epochs=config.epochs, **errors)
 
-        return train(prepared, self.split, config, on_epoch=send_progress, initial=initial)
+        try:
+            return train(prepared, self.split, config, self.device, send_progress, initial)
+        except RuntimeError as error:
+            if self.device == CPU:
+                raise
+            # Another program may take the memory of the card meanwhile.
+            self.warn_of_card(choose_device().card, error_summary(error))
+        self.device = CPU
+        return train(prepared, self.split, config, self.device, send_progress, initial)
 
     def compress(self, prepared: list[TrainedPartition], partitions: list[PartitionData]) -> list[TrainedPartition]:
         """Drop components that the networks do not predict, and factorize large partitions."""
@@ -190,7 +207,7 @@ class _Job:
             **self.config.to_json(),
             "torch": str(torch.__version__),
             "onnxruntime": onnxruntime.__version__,
-            "device": str(choose_device()),
+            "device": self.device,
             "training_poses": len(self.split.training),
             "validation_poses": len(self.split.validation),
             "held_out_poses": len(self.split.held_out),

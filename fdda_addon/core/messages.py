@@ -30,7 +30,8 @@ class MessageType(enum.Enum):
     LOG = "log"
     """text: str."""
     WARNING = "warning"
-    """name: str, text: str. A property of the recording that makes a bad model likely (`core.checks.warning`)."""
+    """name: str, text: str. A property of the recording that makes a bad model likely (`core.checks.warning`), or a
+    graphics card that cannot be used. Then the next `PROGRESS` may have epoch 1 again."""
     MODEL_FINISHED = "model_finished"
     """The keys of `FINISHED`, for one of several models that are trained one after the other. Each of these models
     has its own `STARTED` message."""

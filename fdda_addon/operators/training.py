@@ -96,6 +96,8 @@ class TrainingOperator(RigOperator):
             return Progress("partitions prepared", values["done"], values["total"])
         if message.type is MessageType.PROGRESS:
             for name, curve in state.curves.items():
+                if values["epoch"] == 1:
+                    curve.clear()  # the graphics card failed, and the CPU starts again
                 curve.append(float(values[f"{name}_mm"]))
             return Progress("epochs", values["epoch"], values["epochs"])
         if message.type is MessageType.WARNING:

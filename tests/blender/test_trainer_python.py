@@ -62,13 +62,31 @@ def test_check_trainer_prints_the_result(packages: Path, monkeypatch: pytest.Mon
     )
 
 
+CARD = """
+from unittest.mock import MagicMock
+__version__ = "9"
+class cuda(MagicMock):
+    is_available = staticmethod(lambda: True)
+    get_device_name = staticmethod(lambda index: f"Card {index}")
+    synchronize = MagicMock()
+ones = MagicMock()
+"""
+
+
 def test_the_device_is_named(packages: Path):
-    (packages / "torch/__init__.py").write_text(
-        "__version__ = '9'\nclass cuda:\n    is_available = staticmethod(lambda: True)\n"
-        "    get_device_name = staticmethod(lambda index: f'Card {index}')\n"
-    )
+    (packages / "torch/__init__.py").write_text(CARD)
     answer = asked(sys.executable)
     assert "Ready to train on Card 0: " in answer.message and answer.details[-1] == "Device: Card 0 (CUDA)"
+
+
+def test_a_card_that_cannot_be_used_is_named(packages: Path):
+    error = "RuntimeError('CUDA error: no kernel image is available\\nCompile with `TORCH_USE_CUDA_DSA`')"
+    (packages / "torch/__init__.py").write_text(f"{CARD}ones.side_effect = {error}\n")
+    answer = asked(sys.executable)
+    assert answer.level == "INFO" and answer.details[-1] == "Device: the CPU"
+    assert answer.message.startswith(
+        "Ready to train on the CPU, because Card 0 cannot be used (CUDA error: no kernel image is available): Python"
+    )
 
 
 def test_output_of_imported_packages_is_ignored(packages: Path):

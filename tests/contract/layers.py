@@ -41,7 +41,7 @@ TRAINER_LAYERS: tuple[tuple[str, ...], ...] = (
     ("skin",),
     ("fits",),
     ("data",),
-    ("config", "goal", "graph_builder", "outputs", "process"),
+    ("config", "device", "goal", "graph_builder", "outputs", "process"),
     ("blocks", "progress"),
 )
 """The folders and root files of trainer/ from the top down. Each imports from its own folder and lower layers."""

@@ -28,16 +28,11 @@ LOSS_EPSILON = 1e-6
 """Added to squared relative errors, so that the loss, a distance, is smooth at zero."""
 
 
-def choose_device() -> torch.device:
-    """Return the GPU where torch finds one, else the CPU."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
 def train(
     partitions: Sequence[PreparedPartition],
     split: Split,
     config: TrainingConfig,
-    device: torch.device | None = None,
+    device: str,
     on_epoch: Callable[[int, float, float], None] = lambda *_: None,
     initial: Sequence[Network | None] | None = None,
 ) -> list[TrainedPartition]:
@@ -46,7 +41,7 @@ def train(
     Args:
         partitions: partitions with the inputs and coefficients of all poses.
         config: settings of the training. Equal settings and data give equal weights on one machine.
-        device: device to train on; None for `choose_device()`.
+        device: device to train on.
         on_epoch: called after every epoch with its number and the training and validation error: means over all
             partitions, weighted by their vertices, mm. Epoch 1 is the first.
         initial: for each partition the network to start from, or None for random weights.
@@ -56,8 +51,8 @@ def train(
 
     Raises:
         TrainingError: the training diverged.
+        RuntimeError: the device cannot run the training, for instance because its memory is too small.
     """
-    device = device or choose_device()
     # Inactive units lead to denormal numbers in the optimizer, which take twice the time.
     torch.set_flush_denormal(True)
     learning_indices = [index for index, partition in enumerate(partitions) if len(partition.basis.components)]
@@ -78,7 +73,7 @@ def train(
 class _Loop:
     """The state of a training of P partitions; each epoch adds its errors to their curves."""
 
-    def __init__(self, partitions: list[TrainedPartition], split: Split, config: TrainingConfig, device: torch.device):
+    def __init__(self, partitions: list[TrainedPartition], split: Split, config: TrainingConfig, device: str):
         self.partitions, self.config, self.device = partitions, config, device
         # Coefficients are divided by the residual of their partition, so that one loss and one learning rate suit all.
         self.target_scales = [partition.residual_rms * np.sqrt(partition.vertex_count) for partition in partitions]
@@ -244,7 +239,7 @@ class _Loop:
         return networks
 
 
-def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: torch.device) -> torch.Tensor:
+def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: str) -> torch.Tensor:
     """Stack (n, width) arrays of the selected poses into one (P, n, max width) float32 tensor, padded with 0."""
     columns = [torch.as_tensor(array[poses].T, dtype=torch.float32) for array in arrays]
     return pad_sequence(columns, batch_first=True).transpose(1, 2).contiguous().to(device)

@@ -30,8 +30,8 @@ for name in sys.argv[1:] if sys.version_info[:2] >= (3, 11) else []:
     except Exception as error:
         answer["broken"][name] = repr(error)
 if answer["packages"].get("torch"):
-    import torch
-    answer["device"] = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "cpu"
+    from trainer.device import choose_device
+    device, answer["card"], answer["problem"] = choose_device()
 print()
 print(json.dumps(answer))
 """
@@ -86,7 +86,8 @@ def _evaluate_report(python: str, report: dict, advice: str) -> CheckResult:
         name, reason = next(iter(broken.items()))
         advice = runtime_advice(reason) or advice
         return CheckResult("ERROR", f"{name} of '{python}' cannot be imported ({reason}); {advice}.", tuple(details))
-    device = report["device"]
-    details.append(f"Device: {'the CPU' if device == 'cpu' else f'{device} (CUDA)'}")
-    where = "on the CPU" if device == "cpu" else f"on {device}"
-    return CheckResult("INFO", f"Ready to train {where}: Python {version}, torch {packages['torch']}.", tuple(details))
+    card, problem = report["card"], report["problem"]
+    details.append(f"Device: {f'{card} (CUDA)' if card and not problem else 'the CPU'}")
+    where = f"the CPU, because {card} cannot be used ({problem})" if problem else card or "the CPU"
+    message = f"Ready to train on {where}: Python {version}, torch {packages['torch']}."
+    return CheckResult("INFO", message, tuple(details))
