@@ -55,6 +55,7 @@ def main() -> None:
         model = options.out / f"{'x'.join(map(str, units))}-{activation}-{seed}" / "arm.onnx"
         models.setdefault((units, activation), []).append(model)
         if not model.exists():
+            model.parent.mkdir(exist_ok=True)
             print(f"{model.parent.name} …", file=sys.stderr, flush=True)
             settings = ("--hidden", *units, "--activation", activation, "--seed", seed, "--tolerance-mm", TOLERANCE_MM)
             run("trainer", recording, model, *settings)
