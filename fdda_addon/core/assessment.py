@@ -4,12 +4,10 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from .defaults import TOLERANCE_MM
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from .metrics import ErrorStatistics
+from .metrics import ErrorStatistics
 
 MAX_GOOD_RATIO = 0.7
 """Largest ratio of an error of the model to that of skinning alone at which the model clearly beats it."""

@@ -3,16 +3,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
+import numpy as np
 
-if TYPE_CHECKING:  # Blender starts without numpy.
-    import numpy as np
-
-    from ..core.metrics import ErrorStatistics
-    from ..core.poses import Channel
-    from .results import Evaluation
+from ..core.metrics import ErrorStatistics, error_statistics, worst_poses
+from ..core.poses import Channel
+from ..scene.time_stretching import time_ratio, time_to_frame
+from .results import Evaluation
 
 MAX_STORED_EVALUATIONS = 4
 """Largest number of stored evaluations, because the errors of a dense mesh take much memory."""
@@ -85,15 +84,11 @@ class LastEvaluation:
 
     def pose_at(self, frame: int) -> int | None:
         """Return the index of the pose at a frame of the scene; None outside the action, or for random poses."""
-        from ..scene.time_stretching import time_ratio
-
         index = round(frame * time_ratio()) - self.first_frame
         return index if self.name and 0 <= index < self.poses else None
 
     def scene_frame(self, index: int) -> float:
         """Return the frame of the scene that shows a pose of the action, with a fraction."""
-        from ..scene.time_stretching import time_to_frame
-
         return time_to_frame(self.first_frame + index)
 
     def vertex_errors(self, method: str, statistic: str, pose: int | None = None) -> "np.ndarray | None":
@@ -128,8 +123,6 @@ class LastEvaluation:
         return self._computed_once(("worst_poses", count), lambda: self._find_worst_poses(count))
 
     def _find_worst_poses(self, count: int) -> list[tuple[int, float]]:
-        from ..core.metrics import worst_poses
-
         errors = self.errors["fdda"]
         indices = worst_poses(errors, count, MIN_FRAMES_APART if self.name else 1)
         return [(index, float(errors[index].max()) * 1000) for index in indices]
@@ -159,8 +152,6 @@ def store(
         first_frame: first frame of the action; 0 for random poses.
         seed: seed of the random poses.
     """
-    from ..core.metrics import error_statistics
-
     errors = {method: getattr(evaluation.held_out, method) for method in METHODS}
     partitions = [
         PartitionErrors(

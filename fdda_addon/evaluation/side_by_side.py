@@ -10,6 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Vector
 
+from ..runtime.binding import unbind
 from ..scene.comparison import COMPARISON_KEY, comparison_objects
 from ..scene.draw_cache import draw_cached
 
@@ -48,8 +49,6 @@ def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> Non
         mode: `BESIDE`, `OVERLAY`, or `NONE` to hide the rig.
         distance: distance of `BESIDE` along the X axis of the world, Blender units; 0 for the default.
     """
-    from ..runtime.binding import unbind
-
     hide(mesh_object)
     if mode == NONE:
         return

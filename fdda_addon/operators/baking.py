@@ -6,8 +6,10 @@ from pathlib import Path
 
 import bpy
 
+from ..baking.run import BakeSettings, bake
 from ..core.counts import format_count
 from ..core.errors import OutputError
+from ..runtime.model_files import network_of
 from .confirm import ChooseFileFirst
 from .model_operator import ModelOperator
 
@@ -67,9 +69,6 @@ class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         pass
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..baking.run import BakeSettings, bake
-        from ..runtime.model_files import network_of
-
         scene_rig = self.bound_rig(context)
         if not self.filepath:
             raise OutputError("No file was chosen; give the name of a .pc2 or .blend file.")

@@ -9,6 +9,7 @@ from ..core.errors import RigError
 from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import planned_pose_count
+from ..scene.scene_rig import SceneRig, armature_of
 from .job import JobOperator
 from .playback import bind_model
 from .recording import is_recorded, record_rigs, recording_plan
@@ -57,8 +58,6 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
                 return
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
-        from ..scene.scene_rig import SceneRig, armature_of
-
         self.add_trained_models_to_list()
         sentences = []
         for uid, model in self.trained_models:

@@ -7,6 +7,8 @@ and passes the event on if no model plays. It cannot replace the entry in the Ob
 
 import bpy
 
+from ..runtime import playback
+
 
 class FDDA_OT_copy_objects(bpy.types.Operator):
     bl_idname = "fdda.copy_objects"
@@ -21,8 +23,6 @@ class FDDA_OT_copy_objects(bpy.types.Operator):
         return bpy.ops.view3d.copybuffer.poll()
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        from ..runtime import playback
-
         with playback.suspended_playback():
             result = bpy.ops.view3d.copybuffer()
         return result

@@ -11,13 +11,20 @@ from ..core.defaults import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..core.errors import ModelError, RigError
 from ..core.progress import Progress
 from ..core.report import REPORT_HTML, page_path
-from ..evaluation import last_evaluation, side_by_side
+from ..evaluation import heat_map, last_evaluation, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
+from ..evaluation.run import evaluate, evaluate_action
+from ..evaluation.settings import EvaluationSettings
+from ..models import model_list
 from ..models.entries import bound_entry, bound_model_name
+from ..poses.action_range import action_frames
 from ..properties.recording_options import target_settings
 from ..properties.view import show_graph
+from ..runtime.binding import model_disabled
+from ..runtime.model_files import network_of
 from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import check_full_rig
+from ..scene.viewport import redraw_views
 from .job import JobOperator
 from .model_operator import ModelOperator
 
@@ -54,11 +61,6 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_bound_model(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..evaluation.run import evaluate, evaluate_action
-        from ..evaluation.settings import EvaluationSettings
-        from ..runtime.binding import model_disabled
-        from ..runtime.model_files import network_of
-
         rigs = self.bound_rigs(context)
         self._action = self._action_name(rigs[0].armature_object) if self.source == "ACTION" else ""
         self._evaluations: list[tuple[int, object]] = []
@@ -83,9 +85,6 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         yield self._evaluations
 
     def finish(self, context: bpy.types.Context, result: list[tuple[int, object]]) -> str:
-        from ..poses.action_range import action_frames
-        from ..scene.viewport import redraw_views
-
         first_frame = action_frames(bpy.data.actions[self._action]).start if self._action else 0
         sentences = []
         for uid, evaluation in result:
@@ -168,8 +167,6 @@ class FDDA_OT_color_mesh(EvaluationOperator, bpy.types.Operator):
         return cls.can_change_scene(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..evaluation import heat_map
-
         if self.colors == "ERRORS":
             scene_rig, _ = self.last_evaluation(context)
             heat_map.paint_errors(scene_rig.mesh_object)
@@ -196,8 +193,6 @@ class FDDA_OT_fit_color_range(EvaluationOperator, bpy.types.Operator):
         return cls.has_evaluation(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..evaluation import heat_map
-
         scene_rig, _ = self.last_evaluation(context)
         range_mm = heat_map.suggested_range_mm(scene_rig.mesh_object)
         if not range_mm:
@@ -229,8 +224,6 @@ class FDDA_OT_open_report(ModelOperator, bpy.types.Operator):
 
     def _report_page(self, mesh_object: bpy.types.Object) -> Path:
         """Return the path of the training report of the bound model, an HTML page."""
-        from ..models import model_list
-
         entry = bound_entry(mesh_object)
         if entry is None:
             model_list.add_bound_model(mesh_object)

@@ -9,7 +9,11 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import OutputError, RigError, os_error_text
-from ..scene.scene_rig import SceneRig
+from ..core.model import read_model
+from ..fast_rig.process import VerbProcess
+from ..runtime import packed_model
+from ..runtime.model_files import model_path
+from ..scene.scene_rig import SceneRig, armature_of
 from .confirm import ChooseFileFirst
 from .model_operator import ModelOperator
 
@@ -63,8 +67,6 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         return self.bound_rig(context).mesh_object.session_uid
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..fast_rig.process import VerbProcess
-
         scene_rig = self.bound_rig(context)
         self._check_saved(scene_rig)
         choices = [*(["visible"] if self.visible else []), *(["keyed"] if self.keyed else [])]
@@ -114,8 +116,6 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
 
 
 def _uses_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
-    from ..scene.scene_rig import armature_of
-
     return armature_of(mesh_object) == armature_object
 
 
@@ -128,10 +128,6 @@ def _write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
         ModelError: a model cannot be read.
         OutputError: a file cannot be written.
     """
-    from ..core.model import read_model
-    from ..runtime import packed_model
-    from ..runtime.model_files import model_path
-
     for index, mesh_object in enumerate(mesh_objects):
         binding = mesh_object.fdda
         data = packed_model.read(binding.packed) if binding.packed else read_model(model_path(mesh_object))[1]

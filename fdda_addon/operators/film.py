@@ -9,7 +9,19 @@ import bpy
 from ..core.counts import format_count
 from ..core.defaults import FILM_TIMED_FRAMES
 from ..core.errors import RigError
+from ..core.file_kind import VIDEO
+from ..core.output import check_outputs
 from ..core.progress import Progress
+from ..evaluation.film import FDDA, LINEAR, RIG, FilmSettings, film
+from ..evaluation.picture import View
+from ..evaluation.run import evaluate_action
+from ..evaluation.video import check_video_path
+from ..poses.action_range import action_frames
+from ..poses.clip import find_action
+from ..runtime.binding import model_disabled
+from ..runtime.model_files import network_of
+from ..scene.time_stretching import time_ratio
+from ..timing.benchmark import benchmark
 from .confirm import ChooseFileFirst
 from .model_operator import ModelOperator
 
@@ -59,19 +71,6 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
         self.layout.prop_search(self, "action", bpy.data, "actions")
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..core.file_kind import VIDEO
-        from ..core.output import check_outputs
-        from ..evaluation.film import FDDA, LINEAR, RIG, FilmSettings, film
-        from ..evaluation.picture import View
-        from ..evaluation.run import evaluate_action
-        from ..evaluation.video import check_video_path
-        from ..poses.action_range import action_frames
-        from ..poses.clip import find_action
-        from ..runtime.binding import model_disabled
-        from ..runtime.model_files import network_of
-        from ..scene.time_stretching import time_ratio
-        from ..timing.benchmark import benchmark
-
         scene_rig, scene = self.bound_rig(context), context.scene
         path = Path(bpy.path.abspath(self.filepath))
         check_video_path(path)

@@ -6,18 +6,19 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import FDDAError
 from ..core.temporary import temporary_folder_error
+from ..fast_rig.process import VerbProcess
+from ..scene.blend_file import save_copy
 from ..timing import measurements
+from ..timing.fast_rig_saving import FastRigSaving
+from ..timing.frame_profile import FrameProfile
+from ..timing.profiling import profile_frame
 from .job import JobOperator
 from .rig_operator import RigOperator
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..timing.frame_profile import FrameProfile
 
 
 def last_profile(mesh_object: bpy.types.Object) -> "FrameProfile | None":
@@ -41,8 +42,6 @@ class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..timing.profiling import profile_frame
-
         scene_rig = self.rig(context)
         for step in profile_frame(scene_rig):
             yield step
@@ -61,10 +60,6 @@ def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object
     Yields:
         Progress, None while there is none, and at the end the profile with the result.
     """
-    from ..fast_rig.process import VerbProcess
-    from ..scene.blend_file import save_copy
-    from ..timing.fast_rig_saving import FastRigSaving
-
     try:
         with tempfile.TemporaryDirectory(prefix="fdda-", ignore_cleanup_errors=True) as folder:
             file, result_file = Path(folder) / "rig.blend", Path(folder) / "saving.json"

@@ -7,6 +7,9 @@ import bpy
 
 from ..core.counts import format_count
 from ..core.errors import RigError
+from ..poses.human_ranges import human_ranges
+from ..poses.mirror import flipped_name
+from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
 from ..scene.compatibility import is_selected
 from .pose_operator import LimitsOperator
 
@@ -33,8 +36,6 @@ class _SelectedBonesOperator(LimitsOperator):
 
 def _copy_limits(from_bone: bpy.types.PoseBone, to_bone: bpy.types.PoseBone, is_mirrored: bool = False) -> None:
     """Copy the rotation limits of one bone to another. Mirroring negates the limits about Y and Z."""
-    from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
-
     for axis, limit in enumerate(rotation_ranges(from_bone)):
         is_negated = is_mirrored and axis > 0
         low, high = (-limit.high, -limit.low) if is_negated else (limit.low, limit.high)
@@ -60,8 +61,6 @@ class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        from ..poses.motion_range import rotation_ranges
-
         try:
             ranges = rotation_ranges(self.selected_bones(context)[0])
         except RigError as error:
@@ -83,8 +82,6 @@ class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
             fields.prop(self, "high", index=axis, text="")
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import set_rotation_range
-
         bones = self.selected_bones(context)
         for axis in (axis for axis in range(3) if self.axes[axis]):
             if not self.low[axis] < self.high[axis]:
@@ -124,8 +121,6 @@ class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.mirror import flipped_name
-
         bones = self.rig(context).armature_object.pose.bones
         pairs = [(bone, bones.get(flipped_name(bone.name))) for bone in self.selected_bones(context)]
         pairs = [
@@ -155,9 +150,6 @@ class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
     replace: bpy.props.BoolProperty(name="Replace", description="Overwrite the limits of bones that already have some")
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.human_ranges import human_ranges
-        from ..poses.motion_range import DEFAULT, rotation_ranges, set_rotation_range
-
         armature_object = self.rig(context).armature_object
         count = 0
         for bone in armature_object.pose.bones:
@@ -188,8 +180,6 @@ class FDDA_OT_clear_limits(_SelectedBonesOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import clear_rotation_range
-
         bones = self.selected_bones(context)
         for bone in bones:
             for axis in range(3):

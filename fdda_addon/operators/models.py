@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section "Model Library": add, remove, pack and check models."""
 
+from pathlib import Path
+
 import bpy
 
 from ..core.counts import format_count
 from ..core.errors import ModelError
+from ..models import model_list
+from ..models.changes import find_changes
 from ..models.entries import format_file_size
 from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import remaining_rig_note
@@ -42,8 +46,6 @@ class ModelListOperator(ModelOperator):
         Raises:
             FDDAError: there is no rig, or no such model.
         """
-        from ..models import model_list
-
         scene_rig = self.rig(context)
         mesh_object = scene_rig.mesh_object
         model_list.add_bound_model(mesh_object)
@@ -71,8 +73,6 @@ class FDDA_OT_add_model(ModelOperator, ModelFileOperator, bpy.types.Operator):
         return self.execute(context) if self.filepath else self.open_file_browser(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..models import model_list
-
         scene_rig = self.rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; choose a model file.")
@@ -93,8 +93,6 @@ class FDDA_OT_remove_model(ModelListOperator, bpy.types.Operator):
         return cls.has_models(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..models import model_list
-
         scene_rig, entry = self.active_entry(context)
         mesh_object = scene_rig.mesh_object
         was_bound = mesh_object.fdda.is_bound
@@ -114,8 +112,6 @@ class FDDA_OT_pack_model(ModelListOperator, bpy.types.Operator):
         return cls.has_models(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..models import model_list
-
         scene_rig, entry = self.active_entry(context)
         if entry.packed:
             raise ModelError(f"{entry.name} is already packed.")
@@ -141,9 +137,6 @@ class FDDA_OT_unpack_model(ModelListOperator, bpy.types.Operator):
         return cls.has_models(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from pathlib import Path
-
-        from ..models import model_list
 
         scene_rig, entry = self.active_entry(context)
         if not entry.packed:
@@ -167,8 +160,6 @@ class FDDA_OT_check_model(ModelListOperator, bpy.types.Operator):
         return cls.has_models(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..models.changes import find_changes
-
         scene_rig, entry = self.active_entry(context)
         changes = find_changes(scene_rig, entry)
         if changes.prevents_playback:

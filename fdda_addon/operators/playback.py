@@ -8,10 +8,14 @@ import bpy
 
 from ..core.errors import FDDAError, ModelError
 from ..evaluation import side_by_side
+from ..models import model_list
 from ..models.entries import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
+from ..runtime.binding import model_disabled, unbind
 from ..scene.scene_rig import SceneRig, check_full_rig, remaining_rig_note
+from ..timing import frame_times
+from ..timing.benchmark import benchmark
 from .job import JobOperator
 from .model_operator import ModelFileOperator, ModelOperator
 
@@ -27,8 +31,6 @@ def _has_model(mesh_object: bpy.types.Object) -> bool:
 
 def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
     """Return the file of the model that Bind would use; None if there is no model, or it is packed."""
-    from ..models import model_list
-
     entry = active_entry(mesh_object)
     if entry is None:
         return trained_file(mesh_object)
@@ -46,8 +48,6 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
     Raises:
         FDDAError: the file is not a model of this rig, or the model cannot play.
     """
-    from ..models import model_list
-
     mesh_object = scene_rig.mesh_object
     model_list.add_bound_model(mesh_object)
     if path is None and active_entry(mesh_object) is None:
@@ -64,8 +64,6 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
 
 def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pack_large: bool = False) -> str:
     """Pack a model if the preferences say so and it is not large; return a text to append to the message."""
-    from ..models import model_list
-
     if entry.packed or not packs_models():
         return ""
     size = model_list.entry_path(mesh_object, entry).stat().st_size
@@ -142,9 +140,6 @@ class FDDA_OT_unbind(ModelOperator, bpy.types.Operator):
         return cls.has_bound_model(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..models import model_list
-        from ..runtime.binding import unbind
-
         names, notes = [], []
         for scene_rig in self.bound_rigs(context):
             mesh_object = scene_rig.mesh_object
@@ -208,8 +203,6 @@ class FDDA_OT_relink(ModelOperator, ModelFileOperator, bpy.types.Operator):
         return self.execute(context) if self.filepath else self.open_file_browser(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..models import model_list
-
         scene_rig = self.bound_rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; give the model's file.")
@@ -236,16 +229,11 @@ class FDDA_OT_measure_model(ModelOperator, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_bound_model(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..runtime.binding import model_disabled
-        from ..timing.benchmark import benchmark
-
         scene_rig = self.bound_rig(context)
         with model_disabled(scene_rig.mesh_object):
             yield from benchmark(scene_rig, None, self.frames)
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
-        from ..timing import frame_times
-
         mesh_object = self.bound_rig(context).mesh_object
         times = result.frame_times(mesh_object.fdda.model)
         frame_times.store(mesh_object, times)

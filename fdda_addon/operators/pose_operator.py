@@ -8,6 +8,7 @@ import bpy
 from ..core.errors import FDDAError
 from ..jobs.job import current
 from ..properties.recording_options import recording_settings
+from ..recording.preview import show_random_pose, shows_random_pose
 from .rig_operator import RigOperator
 
 
@@ -39,8 +40,6 @@ class LimitsOperator(PoseOperator):
     """Mixin for an operator that changes limits. A random pose that the rig shows is then posed within the new ones."""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..recording.preview import show_random_pose, shows_random_pose
-
         try:
             rig = self.rig(context)
             is_preview = shows_random_pose(rig)

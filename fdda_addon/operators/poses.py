@@ -7,7 +7,11 @@ import bpy
 
 from ..core.counts import format_count
 from ..core.errors import RigError
+from ..poses.measured_limits import set_limits_from_actions
+from ..poses.motion_range import clear_rotation_range, set_rotation_range
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
+from ..recording.preview import show_random_pose, show_rest_pose
+from ..scene.compatibility import select_bone
 from .pose_operator import LimitsOperator, PoseOperator
 from .rig_operator import RigOperator
 
@@ -28,8 +32,6 @@ class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
     step: bpy.props.IntProperty(name="Step", description="Number to add to the index", options={"SKIP_SAVE"})
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..recording.preview import show_random_pose
-
         rig, session = self.rig(context), context.window_manager.fdda
         start = self.number if self.number >= 0 else max(session.pose_index, 0 if self.step <= 0 else -1)
         session.pose_index = show_random_pose(rig, recording_settings(rig), max(0, start + self.step))
@@ -43,8 +45,6 @@ class FDDA_OT_rest_pose(PoseOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..recording.preview import show_rest_pose
-
         rig = self.rig(context)
         show_rest_pose(rig, complete_settings(rig))
         context.window_manager.fdda.pose_index = -1
@@ -90,8 +90,6 @@ class FDDA_OT_set_limit(_LimitOperator, bpy.types.Operator):
     )
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import set_rotation_range
-
         bone = self.pose_bone(context)
         set_rotation_range(bone, self.axis_index, self.low, self.high)
         low, high = math.degrees(self.low), math.degrees(self.high)
@@ -105,8 +103,6 @@ class FDDA_OT_clear_limit(_LimitOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import clear_rotation_range
-
         bone = self.pose_bone(context)
         clear_rotation_range(bone, self.axis_index)
         return f"Removed the limit of '{bone.name}' about {self.axis}."
@@ -127,8 +123,6 @@ class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
     )
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.measured_limits import set_limits_from_actions
-
         rig = self.rig(context)
         names = recorded_actions(rig.armature_object)
         if not names:
@@ -164,8 +158,6 @@ class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
         return cls.has_rig(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.compatibility import select_bone
-
         armature_object = self.rig(context).armature_object
         bone = armature_object.pose.bones.get(self.bone)
         if bone is None:

@@ -10,11 +10,16 @@ import bpy
 from ..core.counts import format_count
 from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import FDDAError
+from ..core.recording.folder import remove_recording
+from ..core.recording.index import read_index
 from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import copy_sampling_settings, planned_pose_count, recording_settings
+from ..recording.refinement import RefinementSettings, refine
+from ..recording.run import record_meshes
+from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
 from .rig_operator import RigOperator
@@ -26,9 +31,6 @@ def record_rigs(shown_rig: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: 
     Raises:
         FDDAError: the errors of `recording.run.record_meshes`.
     """
-    from ..recording.run import record_meshes
-    from ..runtime.binding import model_disabled
-
     with ExitStack() as stack:
         for rig, _ in rigs:
             stack.enter_context(model_disabled(rig.mesh_object))
@@ -48,8 +50,6 @@ def recording_plan(rig: SceneRig) -> list[JobStep]:
 
 def is_recorded(path: Path) -> bool:
     """Return whether a folder has a complete recording."""
-    from ..core.recording.index import read_index
-
     try:
         index = read_index(path)
     except FDDAError:
@@ -123,9 +123,6 @@ class FDDA_OT_refine(RigOperator, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..recording.refinement import RefinementSettings, refine
-        from ..runtime.binding import model_disabled
-
         rig = self.rig(context)
         self._path, model = recording_folder(rig.mesh_object), model_file(rig.mesh_object)
         settings = RefinementSettings(self.poses, rig.mesh_object.fdda.settings.seed)
@@ -167,8 +164,6 @@ class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
 
     def _deletion_message(self, context: bpy.types.Context) -> str:
         """Return a message about what would be deleted."""
-        from ..core.recording.index import read_index
-
         try:
             path = recording_folder(self.rig(context).mesh_object)
             count = read_index(path)["complete"]
@@ -179,8 +174,6 @@ class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
         return f"{size_text}, in '{path}'. This cannot be undone. Models are kept."
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..core.recording.folder import remove_recording
-
         try:
             path = recording_folder(self.rig(context).mesh_object)
             remove_recording(path)

@@ -2,17 +2,16 @@
 """Operators of the section "Rig": add the sample arm, measure the speed of the rig."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import bpy
 from mathutils import Matrix
 
+from ..arm.rig import build_arm
+from ..scene.viewport import frame_objects
 from ..timing import measurements
+from ..timing.rig_cost import RigCost, measure
 from .job import JobOperator
 from .rig_operator import RigOperator
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..timing.rig_cost import RigCost
 
 
 def measured_cost(mesh_object: bpy.types.Object) -> "RigCost | None":
@@ -48,9 +47,6 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..arm.rig import build_arm
-        from ..scene.viewport import frame_objects
-
         scene = context.scene
         hidden = _hide_startup_cube(context)
         frames = (scene.frame_start, scene.frame_end, scene.frame_current)
@@ -103,8 +99,6 @@ class FDDA_OT_measure(RigOperator, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..timing.rig_cost import measure
-
         yield from measure(self.rig(context))
 
     def finish(self, context: bpy.types.Context, result: "RigCost") -> str:

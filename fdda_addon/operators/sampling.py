@@ -6,7 +6,11 @@ from dataclasses import replace
 import bpy
 
 from ..core.errors import RigError
+from ..poses.control_bones import describe_control_bones
 from ..properties.recording_options import recorded_actions, recording_settings
+from ..recording.plan import RecordingSettings, listed_controls
+from ..scene.compatibility import is_selected
+from ..scene.control_names import control_at
 from .pose_operator import PoseOperator
 
 
@@ -19,8 +23,6 @@ class FDDA_OT_use_selected_bones(PoseOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..scene.compatibility import is_selected
-
         rig = self.rig(context)
         names = [bone.name for bone in rig.armature_object.pose.bones if is_selected(bone)]
         if not names:
@@ -46,9 +48,6 @@ class FDDA_OT_add_control(PoseOperator, bpy.types.Operator):
     )
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..recording.plan import RecordingSettings, listed_controls
-        from ..scene.control_names import control_at
-
         rig = self.rig(context)
         settings = rig.mesh_object.fdda.settings
         name = control_at(rig, self.name)
@@ -76,10 +75,6 @@ class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..poses.control_bones import describe_control_bones
-        from ..recording.plan import RecordingSettings, listed_controls
-        from ..scene.compatibility import is_selected
-
         rig = self.rig(context)
         settings = rig.mesh_object.fdda.settings
         names = [f"bone:{bone.name}" for bone in rig.armature_object.pose.bones if is_selected(bone)]

@@ -19,6 +19,7 @@ from ..jobs.state import ENVIRONMENT, JobState
 from ..properties.preferences import wheels_folder
 from ..training.environment import choice, folder, session
 from ..training.environment.check_result import CheckResult
+from ..training.environment.creation import EnvironmentCreation
 
 WAIT_SECONDS = 0.05
 _EnvironmentJob = tuple[Iterator[Progress | CheckResult], Callable[[], None] | None]
@@ -148,8 +149,6 @@ class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operato
     )
 
     def steps(self) -> _EnvironmentJob:
-        from ..training.environment.creation import EnvironmentCreation
-
         wheels = self.wheels or wheels_folder()
         if reason := folder.creation_obstacle(wheels):
             raise TrainerEnvironmentError(f"{reason}.")

@@ -10,11 +10,17 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
+from ..core.messages import WARNING_LINE, MessageType
 from ..core.progress import Progress
+from ..core.recording.index import read_index
 from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, training_steps
+from ..models.former_model import add_former_model, keep_former_model
+from ..models.model_list import add_model, check_matches_rig
 from ..properties.character import model_file, recording_folder
 from ..scene.scene_rig import armature_of
+from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
+from ..training.process import Training
 from .confirm import ConfirmFirst
 from .rig_operator import RigOperator
 
@@ -36,8 +42,6 @@ class TrainingOperator(RigOperator):
         Raises:
             FDDAError: the recording is not complete, or the training fails.
         """
-        from ..core.messages import MessageType
-
         # No data of Blender is used from here on, because the user may change it.
         mesh_uid, start = mesh_object.session_uid, time.monotonic()
         state = self.state
@@ -69,10 +73,6 @@ class TrainingOperator(RigOperator):
         return training_steps(len(mesh_object.vertex_groups), len(mesh.vertices), pose_count, epochs)
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
-        from ..models.former_model import keep_former_model
-        from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
-        from ..training.process import Training
-
         if not bpy.app.background and is_detached(model):
             return AttachedTraining(model)
         _check_recording(recording)
@@ -89,8 +89,6 @@ class TrainingOperator(RigOperator):
 
     def _to_progress(self, message: object) -> object:
         """Convert a message of the trainer to `Progress` or the result; return None for other messages."""
-        from ..core.messages import WARNING_LINE, MessageType
-
         values, state = message.values, self.state
         if message.type is MessageType.PREPARING:
             return Progress("partitions prepared", values["done"], values["total"])
@@ -108,9 +106,6 @@ class TrainingOperator(RigOperator):
 
     def add_trained_models_to_list(self) -> None:
         """Add the trained models to the Model Library of their meshes."""
-        from ..models.former_model import add_former_model
-        from ..models.model_list import add_model
-
         self.changes_file = bool(self.trained_models)
         for uid, model in self.trained_models:
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
@@ -190,9 +185,6 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
 
     def _models_of_other_rigs(self, context: bpy.types.Context) -> str:
         """Return a message about models of other rigs that training would overwrite; empty without one."""
-        from ..models.model_list import check_matches_rig
-        from ..training.detached_process import is_detached
-
         try:
             for rig in self.rigs(context):
                 model = self._files(rig.mesh_object)[1]
@@ -230,8 +222,6 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
 
 def _check_recording(path: Path) -> None:
     """Raise an error before the trainer starts if the recording is missing or incomplete."""
-    from ..core.recording.index import read_index
-
     index = read_index(path)
     if index["complete"] < index["poses"]:
         raise RecordingError(
@@ -241,8 +231,6 @@ def _check_recording(path: Path) -> None:
 
 def _pose_count(recording: Path) -> int:
     """Return the number of poses of a recording; 0 if it cannot be read, which the training reports."""
-    from ..core.recording.index import read_index
-
     try:
         return read_index(recording)["poses"]
     except FDDAError:
@@ -260,8 +248,6 @@ def _make_folder(model: Path) -> None:
 
 def _follow_detached_training() -> None:
     """Follow a training that an earlier Blender session has started for a mesh of the open file."""
-    from ..training.detached_process import is_detached
-
     windows = bpy.context.window_manager.windows
     if current() is not None or not windows:
         return

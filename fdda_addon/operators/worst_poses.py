@@ -9,6 +9,8 @@ from ..core.counts import format_count
 from ..core.defaults import MARKERS
 from ..core.errors import ModelError
 from ..evaluation import markers
+from ..evaluation.run import set_held_out_pose
+from ..scene.viewport import center_views
 from .evaluation import EvaluationOperator
 from .model_operator import ModelOperator
 
@@ -108,7 +110,6 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
             frame = last.scene_frame(index)
             context.scene.frame_set(math.floor(frame), subframe=frame - math.floor(frame))
             return f"Frame {round(frame)}: max error {error_mm:.2f} mm."
-        from ..evaluation.run import set_held_out_pose
 
         set_held_out_pose(scene_rig, last.channels, last.seed, index)
         context.view_layer.update()
@@ -118,8 +119,6 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
 
 def _look_at_vertex(mesh_object: bpy.types.Object, index: int) -> None:
     """Look at a vertex of a mesh object in all viewports, from as near as a tenth of the object."""
-    from ..scene.viewport import center_views
-
     evaluated_object = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
     # Modifiers that add vertices, such as a subdivision, keep the first ones.
     position = evaluated_object.matrix_world @ evaluated_object.data.vertices[index].co

@@ -2,7 +2,6 @@
 """Checks rigs for the panels. A timer runs a check after a change; drawing a panel never runs one."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import bpy
 from bpy.app.handlers import persistent
@@ -10,11 +9,11 @@ from bpy.app.handlers import persistent
 from ..core.errors import RigError
 from ..jobs import job
 from ..properties.recording_options import recording_settings
+from ..recording.plan import RecordingSettings
+from ..recording.rig_check import RigCheck, check_recordable_rig
 from ..scene import draw_cache
+from ..scene.arrays import REST_MATRIX_ELEMENT, read
 from ..scene.scene_rig import SceneRig, armature_of
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..recording.rig_check import RigCheck
 
 CHECK_INTERVAL_SECONDS = 0.3
 """Time between two checks of a rig that changes continuously."""
@@ -86,9 +85,6 @@ def last_check(scene_rig: SceneRig) -> "RigCheck | None":
 
 def check_now(scene_rig: SceneRig) -> "RigCheck":
     """Check a rig now, without reading unchanged data again, and return the result."""
-    from ..recording.plan import RecordingSettings
-    from ..recording.rig_check import check_recordable_rig
-
     try:
         settings, problems = recording_settings(scene_rig), ()
     except RigError as error:
@@ -121,8 +117,6 @@ def _run_requested_checks() -> None:
 
 def _change_signature(scene_rig: SceneRig) -> tuple:
     """Return values that are cheap to read and change when a check may change; the first are those of the rest pose."""
-    from ..scene.arrays import REST_MATRIX_ELEMENT, read
-
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     mesh, bones = mesh_object.data, armature_object.data.bones
     rest_values = (

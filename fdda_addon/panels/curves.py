@@ -2,12 +2,11 @@
 """Draws the error curves of a training in a panel. The curves are a preview image in memory."""
 
 import math
-from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
 
-if TYPE_CHECKING:  # Blender starts without numpy.
-    import numpy as np
+from ..scene.arrays import write_pixels
 
 WIDTH, HEIGHT = 224, 224
 MARGIN_LEFT, MARGIN_BOTTOM = 34, 16
@@ -40,8 +39,6 @@ class CurvesImage:
     def icon(self, curves: dict[str, list[float]]) -> int:
         """Return the icon of the curves. Paint it again when the curves have new values."""
         import bpy.utils.previews
-
-        from ..scene.arrays import write_pixels
 
         if self._previews is None:
             self._previews = bpy.utils.previews.new()
@@ -76,8 +73,6 @@ def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
 
 def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
     """Return an image of the curves with axes: (HEIGHT, WIDTH, 4) float32 RGBA, rows from the bottom."""
-    import numpy as np
-
     pixels = np.empty((HEIGHT, WIDTH, 4), np.float32)
     pixels[:] = BACKGROUND_COLOR
     log_errors = {name: np.log10(np.maximum(curves[name], 1e-6)) for name in LEGEND}

@@ -2,17 +2,14 @@
 """Draws the profile of a frame in the section "Rig": a bar with the shares of its parts, and the slowest bones."""
 
 from string import ascii_uppercase
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..jobs import job
 from ..operators.frame_profile import last_profile
 from ..scene.scene_rig import SceneRig
+from ..timing.frame_profile import FrameProfile
 from .section import draw_job, draw_wrapped
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..timing.frame_profile import FrameProfile
 
 MIN_SHOWN_SHARE = 0.01
 """A part with a smaller share of the evaluation is not drawn. Drawing may take many times as long as the evaluation."""

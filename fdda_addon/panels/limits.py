@@ -3,11 +3,13 @@
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import bpy
 
+from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from ..operators.poses import FDDA_OT_set_limit
+from ..poses.bone_channels import is_moved_by_constraints
+from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, find_local_limit, location_ranges, rotation_ranges
 from ..properties.recording_options import recorded_actions
 from ..scene.compatibility import is_selected, selection_owner
 from ..scene.draw_cache import computed_once, draw_cached
@@ -15,9 +17,6 @@ from ..scene.scene_rig import SceneRig
 from . import checks, sampling
 from .bone_names import short_bone_name
 from .section import panel_rig
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..core.poses import Channel
 
 AXES = "xyz"
 WIDE_SIDEBAR_PIXELS = 380
@@ -71,9 +70,6 @@ def _visible_bone_flags(rig: SceneRig, search_text: str, flag: int) -> tuple[int
 @draw_cached
 def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
     """Return icon, name and limits of a bone for the list, and whether limits are set for the bone."""
-    from ..poses.bone_channels import is_moved_by_constraints
-    from ..poses.motion_range import DEFAULT, rotation_ranges
-
     name = short_bone_name(rig.armature_object, bone.name)
     channels = sampled_channels_by_bone(rig)
     if channels is not None:
@@ -103,8 +99,6 @@ def has_any_limits(rig: SceneRig) -> bool:
 
 
 def _have_limits(bones: Iterable[bpy.types.PoseBone]) -> bool:
-    from ..poses.motion_range import DEFAULT, rotation_ranges
-
     return any(r.source != DEFAULT or r.is_locked for bone in bones for r in rotation_ranges(bone))
 
 
@@ -114,7 +108,6 @@ def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None"
     check = checks.last_check(rig)
     if rig.mesh_object.fdda.settings.sample == "WEIGHTS" or check is None or not check.channels:
         return None
-    from ..core.poses import CONTROL
 
     by_bone: dict[str, list[Channel]] = {}
     for channel in check.channels:
@@ -125,8 +118,6 @@ def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None"
 
 def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
     """Return the rotation ranges of a bone, and the axes along which random poses move it, as text."""
-    from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
-
     channels = [channel for channel in channels if channel.low < channel.high]
     rotations = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
     location_axes = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
@@ -207,8 +198,6 @@ def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBo
 @draw_cached
 def _read_limits(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tuple[int, ...]]:
     """Return a label with name and kind of limits of a bone, its rotation ranges, and its location axes."""
-    from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, location_ranges, rotation_ranges
-
     ranges = rotation_ranges(bone)
     names = {CONSTRAINT: "Limit Rotation", IK: "IK Limits"}
     sources = {r.source for r in ranges if r.moves and r.source != DEFAULT}
@@ -218,8 +207,6 @@ def _read_limits(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tu
 
 def _draw_limits(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
     """Draw the limits of a bone as fields of Blender's own properties."""
-    from ..poses.motion_range import CONSTRAINT, DEFAULT, find_local_limit
-
     text, ranges, locations = _read_limits(rig, bone)
     box.label(text=text, icon="BONE_DATA")
     column = box.column(align=True)

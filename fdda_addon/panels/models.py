@@ -1,27 +1,25 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Section "Model Library": lists and packs the models of a mesh, and shows changes of the rig since their training."""
 
-from typing import TYPE_CHECKING
-
 import bpy
 
 from ..core.errors import FDDAError
+from ..core.model_info import ModelInfo
+from ..core.poses import CONTROL, Channel
+from ..models.changes import compare_with_model
 from ..models.entries import active_entry, format_file_size, is_bound
+from ..models.model_list import entry_info
+from ..rig.reading import read_model_rig
 from ..scene.draw_cache import computed_once
+from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
 from . import checks
 from .section import Section, draw_wrapped, panel_rig
 from .timed_value import timed_values
 
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..core.model_info import ModelInfo
-    from ..core.poses import Channel
-
 
 def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
     """Return a rig with the joints of a model, read from the scene if the checked rig has other joints."""
-    from ..rig.reading import read_model_rig
-
     if set(rig.joint_names) == set(info.joint_names):
         return rig
     name, inputs = ("rig of a model", scene_rig.mesh_object.session_uid), (rig, info.joint_names)
@@ -30,10 +28,6 @@ def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
 
 def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     """Return icon and message of each model of a mesh that has a problem, by `_entry_key`."""
-    from ..models.changes import compare_with_model
-    from ..models.model_list import entry_info
-    from ..scene.scene_rig import SceneRig, armature_of
-
     armature_object = armature_of(mesh_object)
     scene_rig = SceneRig(mesh_object, armature_object)
     check = checks.last_check(scene_rig) if armature_object else None
@@ -57,8 +51,6 @@ def _compared_channels(
     mesh_object: bpy.types.Object, channels: "tuple[Channel, ...]", info: "ModelInfo"
 ) -> "tuple[Channel, ...]":
     """Return the rig's ranges to compare with those of a model; the model's own if the user chose the posed bones."""
-    from ..core.poses import CONTROL
-
     if mesh_object.fdda.settings.sample != "WEIGHTS":
         return info.limits
     return tuple(channel for channel in channels if channel.kind != CONTROL)

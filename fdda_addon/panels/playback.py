@@ -8,6 +8,7 @@ import bpy
 from ..jobs import job
 from ..models.entries import active_entry, bound_model_name
 from ..rig.modifier_stack import is_fdda_modifier
+from ..runtime.confidence import partition_confidence
 from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of, remaining_rig_note
@@ -40,8 +41,6 @@ def mask_problem(mesh_object: bpy.types.Object) -> str:
 
 
 def _read_confidence(mesh_object: bpy.types.Object) -> object:
-    from ..runtime.confidence import partition_confidence
-
     return partition_confidence(mesh_object) or "No confidence values: the model has none, or the pose cannot be read."
 
 

@@ -4,24 +4,23 @@
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.counts import format_count
 from ..core.errors import FDDAError
+from ..core.recording.folder import FolderContent, FolderState, read_folder
+from ..core.recording.index import INDEX_NAME
 from ..jobs import job
+from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder
 from ..properties.recording_options import recorded_actions, recording_settings
+from ..recording.plan import RecordingSettings, make_sampling
+from ..recording.rig_check import RigCheck
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
 from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..core.recording.folder import FolderContent
-    from ..recording.plan import RecordingSettings
-    from ..recording.rig_check import RigCheck
 
 
 @draw_cached
@@ -36,9 +35,6 @@ def read_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
 
 def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     """Return the content of a recording folder. Read it again after a change of the folder, the rig or the settings."""
-    from ..core.recording.folder import read_folder
-    from ..core.recording.index import INDEX_NAME
-
     check, settings = checks.last_check(rig), recording_settings(rig)
     try:
         modified_ns = os.stat(path / INDEX_NAME).st_mtime_ns
@@ -57,8 +53,6 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
 
 def _current_sampling(rig: SceneRig, settings: "RecordingSettings", check: "RigCheck") -> dict:
     """Return the sampling of the settings, converted to JSON and back, so that it equals the one of a recording."""
-    from ..recording.plan import make_sampling
-
     return json.loads(json.dumps(make_sampling(rig, settings, check.channels).to_json()))
 
 
@@ -70,8 +64,6 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
-        from ..core.recording.folder import FolderState
-
         rig = panel_rig(context)[0]
         running_job = job.current()
         if rig is None or (running_job and running_job.verb == "record"):
@@ -97,8 +89,6 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """Draw the folder, the button of the next step, and below it the state of the recording."""
-    from ..core.recording.folder import FolderState
-
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording", default_recording(rig.mesh_object))
     folder_content = read_content(rig)
@@ -164,8 +154,6 @@ def _draw_record(
 
 @draw_cached
 def _describe_poses(rig: SceneRig) -> str:
-    from ..poses.action_range import action_frames
-
     settings = rig.mesh_object.fdda.settings
     frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig.armature_object)]
     parts = [format_count(settings.poses, "random pose")] if settings.poses or not frames else []

@@ -2,18 +2,15 @@
 """Draws the part of the section "Training Poses" that chooses the bones and extra inputs of random poses."""
 
 import math
-from typing import TYPE_CHECKING
 
 import bpy
 
+from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from ..properties.recording_options import ALL_SHAPE_KEYS, recorded_actions
+from ..recording.rig_check import RigCheck
 from ..scene.scene_rig import SceneRig
 from . import checks
 from .section import draw_wrapped
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..core.poses import Channel
-    from ..recording.rig_check import RigCheck
 
 MAX_SHOWN_CONTROLS = 8
 """Largest number of detected extra inputs that the panel lists."""
@@ -64,8 +61,6 @@ def draw_channel_counts(layout: bpy.types.UILayout, context: bpy.types.Context, 
 
 def describe_channels(check: "RigCheck") -> str:
     """Return a sentence with the numbers of bones and extra inputs that random poses move."""
-    from ..core.poses import CONTROL
-
     channels = [channel for channel in check.channels if channel.kind != CONTROL]
     bone_count, control_count = len({channel.name for channel in channels}), len(check.channels) - len(channels)
     parts = []
@@ -82,8 +77,6 @@ def _count_text(count: int, noun: str) -> str:
 
 def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "list[Channel]") -> None:
     """Draw the ranges of a bone as labels, because ranges from actions cannot be edited."""
-    from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
-
     box.label(text=f"{bone.name} (from actions)", icon="BONE_DATA")
     column = box.column(align=True)
     kind_labels = {ROTATION: "Rotation", ROTATION_VECTOR: "Rotation", LOCATION: "Location"}

@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core.errors import FDDAError
+from ..core.model import read_model_info
+from ..core.rig import rig_differences
 from ..properties.character import trained_file
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
+from .models import rig_of_model
 
 
 @dataclass(frozen=True)
@@ -45,10 +48,6 @@ def _find_trained_file(rig: SceneRig) -> tuple[TrainedFile | None]:
 
 
 def _describe_mismatch(scene_rig: SceneRig, rig: object, path: Path) -> str:
-    from ..core.model import read_model_info
-    from ..core.rig import rig_differences
-    from .models import rig_of_model
-
     try:
         info = read_model_info(path)
         current_rig = rig_of_model(scene_rig, rig, info)

@@ -8,6 +8,7 @@ import bpy
 
 from ..core.assessment import Assessment, assess_training
 from ..core.errors import TrainingError
+from ..core.recording.folder import FolderState
 from ..core.report import Verdict, checkpoint_path, read_report, report_path
 from ..jobs import job
 from ..jobs.state import JobState
@@ -131,8 +132,6 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
 def _draw_settings(
     layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile | None, can_train: bool
 ) -> None:
-    from ..core.recording.folder import FolderState
-
     settings = rig.mesh_object.fdda.settings
     column = layout.column()
     column.use_property_split = True

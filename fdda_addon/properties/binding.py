@@ -12,6 +12,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..runtime.binding import on_mask_update, on_property_update
 from .character import FDDA_PG_character
 from .not_animatable import not_animatable
 
@@ -22,14 +23,10 @@ INSERTABLE = OVERRIDABLE | {"USE_INSERTION"}
 
 
 def _on_update(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
-    from ..runtime.binding import on_property_update
-
     on_property_update(binding.id_data)
 
 
 def _on_mask_update(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
-    from ..runtime.binding import on_mask_update
-
     on_mask_update(binding.id_data)
 
 

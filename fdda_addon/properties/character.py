@@ -19,6 +19,7 @@ from bpy.props import (
 
 from ..core.defaults import EPOCHS, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, TOLERANCE_MM
 from ..core.errors import OutputError
+from ..scene.control_names import control_at, suggested_controls
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
 from .not_animatable import not_animatable
@@ -32,8 +33,6 @@ class FDDA_PG_bone(bpy.types.PropertyGroup):
 
 
 def _suggested_controls(control: "FDDA_PG_control", _context: bpy.types.Context, _text: str) -> list[str]:
-    from ..scene.control_names import suggested_controls
-
     mesh_object = control.id_data
     armature_object = armature_of(mesh_object)
     return suggested_controls(SceneRig(mesh_object, armature_object)) if armature_object else []
@@ -41,8 +40,6 @@ def _suggested_controls(control: "FDDA_PG_control", _context: bpy.types.Context,
 
 def _shorten_data_path(control: "FDDA_PG_control", _context: bpy.types.Context) -> None:
     """Replace a pasted full data path with the name of its control."""
-    from ..scene.control_names import control_at
-
     armature_object = armature_of(control.id_data)
     if armature_object is None:
         return

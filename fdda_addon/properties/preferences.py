@@ -2,6 +2,7 @@
 """The preferences of the add-on: packing of models, trusted folders, and the Python for training."""
 
 import os
+import textwrap
 from pathlib import Path
 
 import bpy
@@ -193,8 +194,6 @@ def draw_check_result(layout: bpy.types.UILayout, result: CheckResult | None) ->
 
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str = "NONE", alert: bool = False) -> None:
     """Draw text, wrapped to the width of the region."""
-    import textwrap
-
     region = bpy.context.region
     scale = bpy.context.preferences.system.ui_scale
     width = int(((region.width if region else 600) / scale - 90) / 6.3)

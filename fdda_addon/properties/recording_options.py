@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Converts the properties of a character to the settings of a recording."""
 
-from typing import TYPE_CHECKING
-
 import bpy
 
 from ..core.errors import RigError
+from ..poses.action_range import action_frames
+from ..recording.plan import RecordingSettings
+from ..rig.pose_setter import TargetSettings
 from ..scene.active_rig import cached_active_rig
+from ..scene.compatibility import animation_curves
+from ..scene.controls import canonical_path
 from ..scene.scene_rig import SceneRig
 from .character import FDDA_PG_character
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..recording.plan import RecordingSettings
-    from ..rig.pose_setter import TargetSettings
 
 ALL_SHAPE_KEYS = "shape_keys"
 """Name of an extra input that stands for all shape keys without drivers (`scene.controls.parse_controls`)."""
@@ -24,8 +23,6 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
     Raises:
         RigError: the bones to pose have not been chosen.
     """
-    from ..recording.plan import RecordingSettings
-
     settings = scene_rig.mesh_object.fdda.settings
     actions = recorded_actions(scene_rig.armature_object)
     return RecordingSettings(
@@ -66,8 +63,6 @@ def complete_settings(scene_rig: SceneRig) -> "RecordingSettings | None":
 
 def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
     """Return the settings of the target object of a character."""
-    from ..rig.pose_setter import TargetSettings
-
     if not settings.target:
         return TargetSettings()
     return TargetSettings(settings.target, settings.pre_roll, settings.max_settle_frames)
@@ -138,8 +133,6 @@ def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
 
 def planned_pose_count(scene_rig: SceneRig) -> int:
     """Return the number of poses that a recording with the settings of a character has."""
-    from ..poses.action_range import action_frames
-
     settings = scene_rig.mesh_object.fdda.settings
     frames = sum(len(action_frames(bpy.data.actions[name])) for name in recorded_actions(scene_rig.armature_object))
     return settings.poses + frames * (2 if settings.mirror else 1)
@@ -153,9 +146,6 @@ def actions_of_active_rig(context: bpy.types.Context) -> list[str]:
 
 def action_moves_bones(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
     """Return whether an action animates a bone of an armature."""
-    from ..scene.compatibility import animation_curves
-    from ..scene.controls import canonical_path
-
     bones = armature_object.pose.bones
     for curve in animation_curves(action):
         path = canonical_path(armature_object, curve.data_path)

@@ -8,6 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, 
 
 from ..core.errors import FDDAError
 from ..jobs.job import current
+from ..recording.preview import show_random_pose, show_rest_pose
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
 from .not_animatable import not_animatable
@@ -16,8 +17,6 @@ from .recording_options import actions_of_active_rig, complete_settings, recordi
 
 def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
     """Show the random pose with the number that was entered in the sidebar: 1 is the first, 0 is the rest pose."""
-    from ..recording.preview import show_random_pose, show_rest_pose
-
     context, job = bpy.context, current()
     rig = cached_active_rig(context)
     if rig is None or context.mode not in {"OBJECT", "POSE"} or (job is not None and job.changes_scene):

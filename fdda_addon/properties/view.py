@@ -5,8 +5,10 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from ..core.defaults import EVALUATION_SEED, MARKERS, SIDEBAR_EVALUATION_POSES
+from ..evaluation.timeline import graph
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
+from ..scene.temporary_state import assign_action
 from ..scene.viewport import redraw_views
 from .recording_options import actions_of_active_rig
 
@@ -17,8 +19,6 @@ def _redraw(_view: "FDDA_PG_view", _context: bpy.types.Context) -> None:
 
 def show_graph(is_shown: bool) -> None:
     """Show or hide the error graph in the timeline."""
-    from ..evaluation.timeline import graph
-
     (graph.start if is_shown else graph.stop)()
 
 
@@ -31,8 +31,6 @@ def _active_action(_view: "FDDA_PG_view") -> str:
 
 def _set_active_action(_view: "FDDA_PG_view", name: str) -> None:
     """Make an action the active one of the armature that the sidebar shows; an empty name removes the active one."""
-    from ..scene.temporary_state import assign_action
-
     rig, action = cached_active_rig(bpy.context), bpy.data.actions.get(name)
     if rig is None or (name and action is None):
         return

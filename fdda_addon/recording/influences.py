@@ -73,7 +73,7 @@ def detect_influences(
         name = joint_name(rig, index) if kind == JOINT else rig.controls[index].name
         note = (
             f"Some positions of '{scene_rig.mesh_object.name}' are not finite in {len(infinite_tests)} tests of its "
-            f"influences, as when '{name}' moves from {'the rest pose' if trial == 0 else f'random pose {trial}'}; that "
+            f"influences, as when '{name}' moves from {f'random pose {trial}' if trial else 'the rest pose'}; that "
             "counts as an influence. Look for a constraint, driver or modifier that fails in extreme poses."
         )
         yield Progress("influences", done, total, note)

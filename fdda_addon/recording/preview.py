@@ -3,15 +3,15 @@
 
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ..core.errors import RigError
+from ..scene.armature import Poser, clear_pose, pose_values
+from ..scene.control_names import control_default
+from ..scene.controls import can_be_set, is_driven, owner_of, set_control
 from ..scene.scene_rig import SceneRig
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    import numpy as np
-
-    from .plan import RecordingSettings
+from .plan import RecordingSettings, make_pose_sampler, make_recording_margin, read_sample_selection, read_sampled_rig
 
 _shown_pose: "tuple[int, np.ndarray] | None" = None
 """Session id of the armature object that shows a random pose, and the values of the pose."""
@@ -35,8 +35,6 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
         RigError: there is no channel to sample.
     """
     global _shown_pose
-    from ..scene.armature import Poser, clear_pose, pose_values
-    from .plan import make_pose_sampler, make_recording_margin, read_sampled_rig
 
     settings = replace(settings, poses=max(1, settings.poses))
     index = min(index, settings.poses - 1)
@@ -54,8 +52,6 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
 
 def shows_random_pose(scene_rig: SceneRig) -> bool:
     """Return whether the rig is still in the pose that `show_random_pose` has set."""
-    from ..scene.armature import pose_values
-
     armature_object = scene_rig.armature_object
     if _shown_pose is None or _shown_pose[0] != armature_object.session_uid:
         return False
@@ -70,11 +66,6 @@ def show_rest_pose(scene_rig: SceneRig, settings: "RecordingSettings | None") ->
         scene_rig: the rig.
         settings: settings of the recording; None to keep the extra inputs.
     """
-    from ..scene.armature import clear_pose
-    from ..scene.control_names import control_default
-    from ..scene.controls import can_be_set, is_driven, owner_of, set_control
-    from .plan import read_sample_selection
-
     clear_pose(scene_rig.armature_object)
     if settings is None:
         return

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tells what one modifier does to a mesh: whether it moves vertices, changes the topology or depends on time.
-
-This module does not import numpy, because Blender starts without it.
-"""
+"""Tells what one modifier does to a mesh: whether it moves vertices, changes the topology or depends on time."""
 
 from enum import Enum, auto
 

@@ -2,8 +2,7 @@
 """Sorts the modifiers of a rig into those that a model replaces, those that stay on, and those that prevent a model.
 
 A model replaces all modifiers up to the last one that moves vertices. The modifiers after it that are on, such as a
-subdivision, are downstream: they apply to the output of the rig, and in the same way to the output of the model. This
-module does not import numpy, because Blender starts without it.
+subdivision, are downstream: they apply to the output of the rig, and in the same way to the output of the model.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.errors import RigError
+from ..scene.mesh import topology
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
 from .modifier_effects import INDIRECT_TYPES, ModifierEffect, effect_of, is_unbound, time_dependence
 
@@ -256,8 +256,6 @@ def _evaluated_object(mesh_object: bpy.types.Object) -> bpy.types.Object:
 
 
 def _keeps_topology(mesh_object: bpy.types.Object) -> bool:
-    # Blender starts without numpy.
-    from ..scene.mesh import topology
 
     original_mesh, evaluated_mesh = mesh_object.data, _evaluated_object(mesh_object).data
     if any(

@@ -1,45 +1,32 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The entry points that Blender calls: the getter that plays models during an evaluation, and the handlers after it.
 
-Each only passes on what Blender reports. `registration.handler_table` adds and removes the handlers. numpy and the
-playback modules are imported with the first bound object, not when Blender starts.
+Each only passes on what Blender reports. `registration.handler_table` adds and removes the handlers.
 """
-
-from types import ModuleType
 
 import bpy
 from bpy.app.handlers import persistent
 
+from . import model_files, playback
 from .session import session
 
 
 def _get_playback_property(driven_object: bpy.types.Object) -> float:
     """Play the models of an evaluated object. The value is 0, because a driver variable has to be a number."""
     if driven_object.is_evaluated and session.characters:
-        from . import playback
-
         playback.on_evaluate(driven_object)
     return 0.0
 
 
-def _playback() -> ModuleType | None:
-    """Return the module `playback`; None if the file has no bound object."""
-    if not session.has_bound_objects():
-        return None
-    from . import playback
-
-    return playback
-
-
 @persistent
 def _on_frame_change_post(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if playback := _playback():
+    if session.has_bound_objects():
         playback.on_frame_change(depsgraph)
 
 
 @persistent
 def _on_depsgraph_update_post(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if playback := _playback():
+    if session.has_bound_objects():
         playback.on_depsgraph_update(depsgraph)
 
 
@@ -47,23 +34,21 @@ def _on_depsgraph_update_post(_scene: bpy.types.Scene, depsgraph: bpy.types.Deps
 def _on_load_post(*_: object) -> None:
     session.reset()
     if session.networks:
-        from . import model_files
-
         model_files.release_unused_networks()
-    if playback := _playback():
+    if session.has_bound_objects():
         playback.scan()
 
 
 @persistent
 def _on_undo_pre(*_: object) -> None:
-    if playback := _playback():
+    if session.has_bound_objects():
         playback.begin_undo()
 
 
 @persistent
 def _on_undo_post(*_: object) -> None:
     session.reset(keep_checks=True)
-    if playback := _playback():
+    if session.has_bound_objects():
         playback.end_undo()
 
 
@@ -75,13 +60,13 @@ def _on_blend_import_pre(*_: object) -> None:
 
 @persistent
 def _on_save_pre(*_: object) -> None:
-    if playback := _playback():
+    if session.has_bound_objects():
         playback.suspend()
 
 
 @persistent
 def _on_save_post(*_: object) -> None:
-    if playback := _playback():
+    if session.has_bound_objects():
         playback.resume()
 
 
@@ -118,7 +103,7 @@ def unregister() -> None:
     for timer in (_on_load_post, session.check_timer):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    if playback := _playback():
+    if session.has_bound_objects():
         # Without the property nothing updates the buffers.
         playback.suspend()
         playback.effects.remove_buffers()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The playback session: what the add-on knows about the open file. `session` is the only global of this package.
 
-Blender starts with this module and without numpy: `effects` and the players are imported with the first bound object.
 The session holds names and session ids, never RNA objects, which an undo or the load of a file invalidates. Players,
 batches and models have the type `Any`, because their modules import this one.
 """
@@ -77,7 +76,7 @@ class PlaybackSession:
             before Blender writes the file itself.
         skips_models: whether players keep their last positions instead of running models.
         is_switching: whether an animated mode is being applied.
-        apply_effect: applies an effect to a character; `effects` sets it when it is imported.
+        apply_effect: applies an effect to a character; `effects`, which imports this module, sets it.
         check_timer: the timer that checks changed rigs.
     """
 

@@ -6,6 +6,8 @@ from contextlib import ExitStack, contextmanager
 
 import bpy
 
+from .temporary_state import temporary_attributes
+
 COMPARISON_KEY = "fdda_compared"
 """Custom property of a comparison object that refers to the mesh object with which it is compared."""
 
@@ -23,8 +25,6 @@ def comparison_objects() -> list[bpy.types.Object]:
 @contextmanager
 def hidden_comparison_objects() -> Iterator[None]:
     """Hide all comparison objects, so that Blender does not evaluate them."""
-    from .temporary_state import temporary_attributes  # Blender starts without numpy.
-
     with ExitStack() as stack:
         for comparison_object in comparison_objects():
             stack.enter_context(temporary_attributes(comparison_object, hide_viewport=True))

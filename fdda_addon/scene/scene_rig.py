@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the rigs of a scene, without evaluating anything and without numpy."""
+"""Finds the rigs of a scene, without evaluating anything."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import bpy
 
 from ..core.errors import RigError
 from .comparison import is_comparison
+from .temporary_state import animated_paths
 
 MODIFIER_NAME = "FDDA"
 """Name of the FDDA modifier, which shows a model's positions with Geometry Nodes and is never part of the rig."""
@@ -78,8 +79,6 @@ def check_full_rig(mesh_object: bpy.types.Object) -> None:
 
 def remaining_rig_note(mesh_object: bpy.types.Object) -> str:
     """Say when no model deforms a mesh of a fast rig; empty if a model always does, or for a full rig."""
-    from .temporary_state import animated_paths  # It imports numpy.
-
     binding = mesh_object.fdda
     if not binding.is_fast_rig:
         return ""

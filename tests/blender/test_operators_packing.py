@@ -47,7 +47,7 @@ def test_find_model_with_an_unsuitable_file_changes_nothing(packed_elbow, elbow_
     entry = packed_elbow.fdda.models[0]
     before = entry.name, entry.path, entry.packed, entry.packed_bytes, packed_elbow.fdda.model_index
     paint_weight()
-    for name, words in (("other.onnx", "the skin weights differ"), ("none.onnx", "is not a model")):
+    for name, words in (("other.onnx", "the skin weights differ"), ("none.onnx", "it is not an ONNX file")):
         refused(lambda name=name: bpy.ops.fdda.relink(filepath=str(tmp_path / name)), words)
         (entry,) = packed_elbow.fdda.models
         assert before == (entry.name, entry.path, entry.packed, entry.packed_bytes, packed_elbow.fdda.model_index)
@@ -122,11 +122,11 @@ def test_a_damaged_packed_model_is_refused(packed_elbow, elbow_files):
     bpy.ops.wm.open_mainfile(filepath=str(path))
     mesh_object = bpy.data.objects[ELBOW]
     bpy.context.view_layer.update()
-    assert "is not a model" in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
+    assert "it is not an ONNX file" in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
     del mesh_object.fdda.packed[packed_model.PACKED_MODEL_KEY]
     with pytest.raises(ModelError, match="does not hold a model any more"):
         packed_model.read(mesh_object.fdda.packed)
-    with pytest.raises(ModelError, match="is not a model"):
+    with pytest.raises(ModelError, match="it is not an ONNX file"):
         packed_model.pack("text", b"no model")
 
 

@@ -62,7 +62,7 @@ def test_bind_with_the_armature_active(rig, elbow_files):
 def test_a_file_that_is_not_a_model_is_not_listed(rig, elbow_files, tmp_path):
     path = tmp_path / "text.onnx"
     path.write_text("no model")
-    refused(lambda: bpy.ops.fdda.bind(filepath=str(path)), "is not a model")
+    refused(lambda: bpy.ops.fdda.bind(filepath=str(path)), "it is not an ONNX file")
     refused(lambda: bpy.ops.fdda.bind(filepath=str(tmp_path / "none.onnx")), "cannot be read")
     assert not rig.mesh_object.fdda.models and not rig.mesh_object.fdda.is_bound
 

@@ -189,7 +189,7 @@ class TestTraining:
         image, painted = curves.CurvesImage(), []
         preview = SimpleNamespace(icon_id=1)
         monkeypatch.setattr(image, "_previews", {"curves": preview})
-        monkeypatch.setattr(arrays, "write_pixels", lambda _preview, values: painted.append(values))
+        monkeypatch.setattr(curves, "write_pixels", lambda _preview, values: painted.append(values))
         monkeypatch.setattr(curves, "paint", lambda shown: list(shown["training"]))
         live = {"training": [0.9, 0.5], "validation": [1.0, 0.6]}
         for _ in range(2):

@@ -152,7 +152,7 @@ def test_only_registration_and_entry_points_are_outside_packages():
 
 
 def test_package_files_import_nothing():
-    """Importing a module also imports the `__init__.py` of its package; at Blender's start it must not import numpy."""
+    """Importing a module also imports the `__init__.py` of its package."""
     importing_packages = [
         module
         for module, imported in import_graph("fdda_addon").items()

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from .check import check
 from .check_result import CheckResult
 from .folder import environment_python, interpreter_path
 
@@ -56,7 +57,5 @@ def select_python() -> TrainerPython:
 
 def check_trainer_python(python: TrainerPython | None = None) -> CheckResult:
     """Check the Python that runs the trainer. Takes seconds, so never call it while drawing."""
-    from .check import check
-
     python = python or select_python()
     return check(python.path, python.origin.value)

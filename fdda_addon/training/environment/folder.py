@@ -6,7 +6,9 @@ updates the extension, and removes it when it uninstalls the extension.
 """
 
 import enum
+import hashlib
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -160,8 +162,6 @@ def remove_environment(folder: Path) -> None:
     Raises:
         TrainerEnvironmentError: a file cannot be removed.
     """
-    import shutil
-
     try:
         (folder / COMPLETION_MARKER).unlink(missing_ok=True)
         # On Windows a virus scanner may have new files open.
@@ -204,7 +204,5 @@ def creation_lock(folder: Path) -> Iterator[None]:
 
 
 def _requirements_fingerprint(requirements: Path) -> str:
-    import hashlib
-
     text = requirements.read_text(encoding="utf-8") + repr(PACKAGES)
     return hashlib.sha256(text.encode()).hexdigest()
