@@ -22,7 +22,7 @@ from fdda_addon.panels.training import _read_report
 from fdda_addon.properties.character import model_file, recording_folder
 from fdda_addon.recording.rig_check import RigCheck
 from fdda_addon.rig.dependencies import read_dependencies
-from fdda_addon.scene import arrays, draw_cache
+from fdda_addon.scene import draw_cache
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing.rig_cost import RigCost, estimate_playback_ms
 
