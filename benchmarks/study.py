@@ -47,9 +47,9 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rig, recording = options.out / "arm.blend", options.out / "recording"
-    if not rig.exists():
+    if not recording.exists():
         run("fdda_addon", "build-arm", rig)
-    run("fdda_addon", "record", rig, recording, "--poses", options.poses, "--resume")
+        run("fdda_addon", "record", rig, recording, "--poses", options.poses)
     models = {}
     for (units, activation), seed in itertools.product(CONFIGURATIONS, range(options.seeds)):
         model = options.out / f"{'x'.join(map(str, units))}-{activation}-{seed}" / "arm.onnx"
