@@ -84,7 +84,7 @@ soak: .venv  ## test damaged files, kills, full disks, many frames and undo, int
 faults: .venv  ## seed faults into a copy of the code and list the tests that catch them, into out/faults (OPTIONS="--only ID"; 6 minutes)
 	.venv/bin/python benchmarks/faults.py out/faults $(OPTIONS)
 
-study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
+study: .venv  ## compare sizes and activations of the networks, into out/study (an hour)
 	.venv/bin/python benchmarks/study.py out/study
 
 simulation: .venv  ## learn a simulated deformation, for docs/simulations.md, into out/simulation (20 minutes)
