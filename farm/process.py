@@ -15,7 +15,7 @@ from pathlib import Path
 
 from fdda_addon.core.child_process import child_environment
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError
-from fdda_addon.core.file_lock import wait_for_lock
+from fdda_addon.core.file_lock import NoLocksError, wait_for_lock
 
 from .characters import Farm
 from .fingerprints import ROOT
@@ -60,7 +60,12 @@ def hold_lock(path: Path) -> Iterator[int]:
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
-        wait_for_lock(descriptor)
+        try:
+            wait_for_lock(descriptor)
+        except NoLocksError as error:
+            raise FDDAError(
+                f"The farm locks its tasks, and cannot lock '{path}': {error.strerror}; put the farm on another drive."
+            ) from error
         yield descriptor
     finally:
         os.close(descriptor)

@@ -25,6 +25,19 @@ NOT_FOUND = os.strerror(errno.ENOENT)
 BELOW_A_FILE = os.strerror(errno.ENOENT if WINDOWS else errno.ENOTDIR)
 """Part of the error message for a path below a file."""
 
+NO_LOCKS_ERRNOS = [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, 45]
+"""Values of errno for a file system without locks; 45 is ENOTSUP of macOS."""
+
+
+def refuse_locks(monkeypatch: pytest.MonkeyPatch, number: int = errno.ENOLCK) -> None:
+    """Let locks fail as on a drive that has none."""
+
+    def lock(*_: int) -> None:
+        raise OSError(number, "Operation not supported")
+
+    monkeypatch.setattr(*(("msvcrt.locking", lock) if WINDOWS else ("fcntl.flock", lock)))
+
+
 symbolic_links = pytest.mark.skipif(WINDOWS, reason="Windows lets only administrators make symbolic links.")
 named_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders.")
 devices = pytest.mark.skipif(WINDOWS, reason="Windows has no devices in folders.")

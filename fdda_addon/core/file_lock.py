@@ -4,7 +4,9 @@
 docs/development.md has the reasons against the package `filelock`.
 """
 
+import errno
 import os
+import socket
 import sys
 import time
 
@@ -18,6 +20,10 @@ LOCKED_BYTE_OFFSET = 1 << 30
 """Offset of the byte that Windows locks: past the end of the file, because Windows denies reading locked bytes."""
 
 
+class NoLocksError(OSError):
+    """The file system of a file cannot lock it, as some network drives."""
+
+
 def try_lock(descriptor: int, is_shared: bool = False) -> bool:
     """Lock an open file without waiting; return False if another process holds a lock on it.
 
@@ -26,7 +32,7 @@ def try_lock(descriptor: int, is_shared: bool = False) -> bool:
         is_shared: whether other processes may also hold shared locks; on Windows all locks are exclusive.
 
     Raises:
-        OSError: the file system has no locks.
+        NoLocksError: the file system has no locks.
     """
     try:
         if sys.platform == "win32":
@@ -40,14 +46,32 @@ def try_lock(descriptor: int, is_shared: bool = False) -> bool:
             fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError):
         return False
+    except OSError as error:
+        if error.errno == errno.EBADF:
+            raise
+        # Systems and network drives have different values of errno for this.
+        raise NoLocksError(error.errno, f"its drive cannot lock files ({error.strerror})") from error
     return True
+
+
+def has_ended(process_id: int, host: str) -> bool:
+    """Return whether a process has ended for certain. Unknown are those of other machines and, on Windows, all."""
+    if host != socket.gethostname() or sys.platform == "win32":
+        return False
+    try:
+        os.kill(process_id, 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def wait_for_lock(descriptor: int) -> None:
     """Wait until `try_lock` locks an open file.
 
     Raises:
-        OSError: the file system has no locks.
+        NoLocksError: the file system has no locks.
     """
     while not try_lock(descriptor):
         time.sleep(POLL_SECONDS)

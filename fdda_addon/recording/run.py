@@ -234,6 +234,8 @@ class RecordingSession:
                 writer = stack.enter_context(RecordingWriter(mesh.path, mesh.rig, mesh.partitions, info, *options))
                 skinning = LinearSkinning(mesh.rig, mesh.partitions)
                 appenders.append(PoseAppender(mesh.evaluator, skinning, writer, pose_setter))
+                if writer.note:
+                    yield Progress("poses", 0, pose_count, writer.note)
             done = min(appender.pose_count for appender in appenders)
             yield Progress("poses", done, pose_count, self._describe_estimate(meshes, pose_count - done))
             remaining_poses = self.poses.show_poses(player, self.pose_indices[done:])

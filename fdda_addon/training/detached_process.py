@@ -12,6 +12,7 @@ import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import BinaryIO, TextIO
 
 from ..core.errors import OutputError, os_error_text
-from ..core.file_lock import try_lock
+from ..core.file_lock import NoLocksError, has_ended, try_lock
 from ..core.output import write_json
 from .environment.folder import user_folder
 from .process import Training
@@ -172,18 +173,28 @@ class _ProcessFiles:
         Raises:
             OutputError: the file cannot be written.
         """
-        write_json(self._path, {"process": process_id})
+        write_json(self._path, {"process": process_id, "host": socket.gethostname()})
 
     @property
     def process_id(self) -> int:
         """Return the process id; 0 without a detached training."""
-        try:
-            return int(json.loads(self._path.read_text(encoding="utf-8"))["process"]) * self.messages.is_file()
-        except (OSError, ValueError, KeyError, TypeError):
-            return 0
+        return self._read()[0] * self.messages.is_file()
 
-    def is_running(self) -> bool:
-        """Return whether a process has the file of messages open. Its id may have been reused by another process."""
+    def _read(self) -> tuple[int, str]:
+        """Return process id and host; id 0 without a detached training."""
+        try:
+            values = json.loads(self._path.read_text(encoding="utf-8"))
+            return int(values["process"]), str(values["host"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return 0, ""
+
+    def is_running(self, is_certain: bool = False) -> bool:
+        """Return whether a process has the file of messages open. Its id may have been reused by another process.
+
+        Args:
+            is_certain: whether to return False on a drive that cannot lock files. Otherwise the process counts as
+                running there until it has ended for certain.
+        """
         if sys.platform == "win32":
             # Windows cannot rename an open file.
             try:
@@ -194,6 +205,8 @@ class _ProcessFiles:
         try:
             with self.messages.open("rb") as file:
                 return not try_lock(file.fileno(), is_shared=True)
+        except NoLocksError:
+            return not is_certain and not has_ended(*self._read())
         except OSError:
             return False
 
@@ -209,10 +222,10 @@ class _ForeignProcess:
     stdout = None
 
     def __init__(self, pid: int, files: _ProcessFiles):
-        self.pid, self._files = pid, files
+        self.pid, self._files, self._is_killed = pid, files, False
 
     def poll(self) -> str | None:
-        return None if self._files.is_running() else "ended"
+        return None if self._files.is_running() and not self._is_killed else "ended"
 
     def wait(self, seconds: float = float("inf")) -> None:
         deadline = time.monotonic() + seconds
@@ -226,11 +239,13 @@ class _ForeignProcess:
 
     def kill(self) -> None:
         self._send_signal(getattr(signal, "SIGKILL", signal.SIGTERM))
+        # The signal may not have been sent, and then nobody waits for the process.
+        self._is_killed = True
 
     def _send_signal(self, signal_number: int) -> None:
         # The process id may be reused by another process.
         for _ in range(SIGNAL_CHECKS):
-            if not self._files.is_running():
+            if not self._files.is_running(is_certain=True):
                 return
             time.sleep(POLL_SECONDS / 3)
         with contextlib.suppress(OSError):

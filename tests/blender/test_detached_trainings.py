@@ -14,6 +14,8 @@ from fdda_addon.core.messages import MessageType
 from fdda_addon.core.model import read_model_info
 from fdda_addon.training import detached_process
 
+from .. import systems
+
 pytestmark = pytest.mark.one_blender_version
 
 DETACHING_CODE = """
@@ -128,6 +130,24 @@ def test_another_process_with_the_same_id_is_not_killed(tmp_path):
     finally:
         other_process.kill()
         other_process.wait()
+
+
+@systems.forks
+def test_a_training_on_a_drive_without_locks_runs_until_its_process_has_ended(tmp_path, monkeypatch):
+    systems.refuse_locks(monkeypatch)
+    files = detached_process._ProcessFiles(tmp_path / "m.onnx")
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as process:
+        files.new_messages().close()
+        files.write_process_id(process.pid)
+        assert files.is_running()
+        with detached_process.AttachedTraining(tmp_path / "m.onnx") as training:
+            assert training._process.poll() is None
+            # It is not certain that the process with this id is the training, so it gets no signal.
+            training._process.kill()
+            assert process.poll() is None and training._process.poll() == "ended"
+        files.new_messages().close()
+        files.write_process_id(process.pid)
+    assert not files.is_running()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open files")

@@ -21,6 +21,7 @@ from fdda_addon.training.environment.choice import Origin
 from fdda_addon.training.environment.creation import EnvironmentCreation
 from fdda_addon.training.environment.folder import FolderState
 
+from .. import systems
 from .conftest import run
 from .stand_ins import write_program
 from .tiny_wheels import pinned_version, write_wheel, write_wheels
@@ -220,6 +221,12 @@ def test_a_python_that_cannot_create_environments_is_refused(user: Path, wheels:
     assert "'/none/python' is no Python that runs; " in refused(
         bpy.ops.fdda.create_trainer_environment, python="/none/python", wheels=str(wheels)
     )
+
+
+@pytest.mark.one_blender_version
+def test_an_environment_on_a_drive_without_locks_is_removed(own: Path, monkeypatch: pytest.MonkeyPatch):
+    systems.refuse_locks(monkeypatch)
+    assert bpy.ops.fdda.remove_trainer_environment() == {"FINISHED"} and not own.exists()
 
 
 @pytest.mark.one_blender_version

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A lock on a file excludes other processes, and ends with the last process that has the file open."""
 
+import os
+import socket
 import subprocess
 import sys
 import threading
@@ -8,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.file_lock import try_lock, wait_for_lock
+from fdda_addon.core.file_lock import NoLocksError, has_ended, try_lock, wait_for_lock
 
 from .. import systems
 
@@ -84,6 +86,22 @@ def test_a_waiting_process_gets_the_lock_when_its_holder_ends(path, hold_lock):
         holder.stdin.close()
         waiting_thread.join(20)
         assert not waiting_thread.is_alive()
+
+
+@pytest.mark.parametrize("number", systems.NO_LOCKS_ERRNOS)
+def test_a_drive_without_locks_is_told_from_a_held_lock(path, monkeypatch, number):
+    systems.refuse_locks(monkeypatch, number)
+    with path.open("r+b") as file, pytest.raises(NoLocksError, match="its drive cannot lock files") as error:
+        try_lock(file.fileno())
+    assert error.value.errno == number
+
+
+@systems.forks
+def test_only_processes_of_this_machine_have_ended_for_certain():
+    host = socket.gethostname()
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as process:
+        assert not has_ended(process.pid, host) and not has_ended(os.getppid(), host)
+    assert has_ended(process.pid, host) and has_ended(10**30, host) and not has_ended(process.pid, "render-07")
 
 
 @systems.forks

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.errors import OutputError, RecordingError
+from fdda_addon.core.errors import BusyError, OutputError, RecordingError
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.lock import LOCK_NAME, RecordingLock
@@ -139,6 +139,29 @@ def test_a_lock_on_a_full_disk_refuses_others(small_disk):
         RecordingLock(small_disk).acquire()
     lock.release()
     assert not (small_disk / LOCK_NAME).exists()
+
+
+@systems.forks
+def test_the_lock_file_is_the_lock_on_a_drive_that_cannot_lock_files(tmp_path, monkeypatch):
+    systems.refuse_locks(monkeypatch)
+    with make_writer(tmp_path / "r") as writer:
+        assert writer.note.startswith(f"The drive of '{tmp_path / 'r'}' cannot lock files; ")
+        with pytest.raises(RecordingError, match="This Blender is recording into"):
+            make_writer(tmp_path / "r", resume=True)
+    path = tmp_path / "r" / LOCK_NAME
+    assert not path.exists()
+    advice = f"wait for it, or remove '{LOCK_NAME}' there if it has ended: the drive cannot lock files."
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as process:
+        path.write_text(json.dumps({"pid": process.pid, "host": socket.gethostname()}))
+        for text in (path.read_text(), STALE_LOCKS["of another machine"], ""):
+            path.write_text(text)
+            with pytest.raises(BusyError, match="is recording into") as error:
+                make_writer(tmp_path / "r", resume=True)
+            assert str(error.value).endswith(advice) and path.read_text() == text
+    path.write_text(json.dumps({"pid": process.pid, "host": socket.gethostname()}))
+    with make_writer(tmp_path / "r", resume=True):
+        assert json.loads(path.read_text())["pid"] == os.getpid()
+    assert not path.exists()
 
 
 def test_one_process_cannot_open_two_writers_of_a_recording(tmp_path):

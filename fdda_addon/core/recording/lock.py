@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Lock file of a recording folder, which permits one writer at a time.
 
-The content of the file serves only to name the owner in messages.
+The content of the file names the owner. On a drive that cannot lock files, the existence of the file is the lock.
 """
 
 import contextlib
@@ -14,12 +14,12 @@ import sys
 from pathlib import Path
 
 from ..errors import BusyError
-from ..file_lock import try_lock
+from ..file_lock import NoLocksError, has_ended, try_lock
 
 LOCK_NAME = "recording.lock"
 MAX_OWNER_BYTES = 1000
 _OPTIONAL_FLAGS = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
-_OPEN_FLAGS = os.O_RDWR | os.O_CREAT | sum(_OPTIONAL_FLAGS)
+_OPEN_FLAGS = os.O_RDWR | sum(_OPTIONAL_FLAGS)
 
 _held_lock_paths: set[Path] = set()
 
@@ -31,6 +31,8 @@ class RecordingLock:
         self._folder = folder
         self._path = folder.absolute() / LOCK_NAME
         self._handle = -1
+        self.note = ""
+        """A sentence for the user about a drive that cannot lock files; else empty."""
 
     @property
     def is_held(self) -> bool:
@@ -41,18 +43,31 @@ class RecordingLock:
 
         Raises:
             BusyError: another process holds the lock.
-            OSError: the folder cannot be written, or its file system has no locks.
+            OSError: the folder cannot be written.
         """
         while True:
-            handle = os.open(self._path, _OPEN_FLAGS, 0o666)
+            try:
+                handle, is_new = os.open(self._path, _OPEN_FLAGS | os.O_CREAT | os.O_EXCL, 0o666), True
+            except FileExistsError:
+                try:
+                    handle, is_new = os.open(self._path, _OPEN_FLAGS), False
+                except FileNotFoundError:
+                    continue
             try:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
                     raise OSError(errno.EINVAL, f"'{LOCK_NAME}' is not a regular file")
-                if not try_lock(handle):
-                    raise BusyError(
-                        f"{self._owner(handle)} is recording into '{self._folder}'; wait for it, or choose another "
-                        "folder."
+                advice, owner = "wait for it, or choose another folder", self._read_owner(handle)
+                try:
+                    is_locked = try_lock(handle)
+                except NoLocksError:
+                    is_locked = is_new or (self._path not in _held_lock_paths and owner and has_ended(*owner))
+                    advice = f"wait for it, or remove '{LOCK_NAME}' there if it has ended: the drive cannot lock files"
+                    self.note = (
+                        f"The drive of '{self._folder}' cannot lock files; the file '{LOCK_NAME}' there keeps other "
+                        "processes out. Remove it if a recording on another machine was ended."
                     )
+                if not is_locked:
+                    raise BusyError(f"{self._describe(owner)} is recording into '{self._folder}'; {advice}.")
                 if self._is_current_file(handle):
                     break
             except BaseException:
@@ -65,6 +80,7 @@ class RecordingLock:
         # A full disk may refuse the content, which the lock does not need.
         with contextlib.suppress(OSError):
             os.ftruncate(handle, 0)
+            os.lseek(handle, 0, os.SEEK_SET)
             os.write(handle, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
 
     def release(self) -> None:
@@ -88,14 +104,19 @@ class RecordingLock:
         except FileNotFoundError:
             return False
 
-    def _owner(self, handle: int) -> str:
-        """Describe the owner of the lock for a message."""
-        if self._path in _held_lock_paths:
-            return "This Blender"
+    def _read_owner(self, handle: int) -> tuple[int, str] | None:
+        """Return process ID and host of the owner; None if the file does not name them."""
         try:
             os.lseek(handle, 0, os.SEEK_SET)
             owner = json.loads(os.read(handle, MAX_OWNER_BYTES))
-            pid, host = int(owner["pid"]), str(owner["host"])[:80]
+            return int(owner["pid"]), str(owner["host"])[:80]
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            return None
+
+    def _describe(self, owner: tuple[int, str] | None) -> str:
+        if self._path in _held_lock_paths:
+            return "This Blender"
+        if owner is None:
             return "Another process"
+        pid, host = owner
         return f"Another Blender (process {pid}{'' if host == socket.gethostname() else f' on {host!r}'})"

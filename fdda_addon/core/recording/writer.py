@@ -99,6 +99,11 @@ class RecordingWriter:
                 raise self._write_error(error) from error
             raise
 
+    @property
+    def note(self) -> str:
+        """Return a sentence for the user about the drive; may be empty."""
+        return self._lock.note
+
     def _check_resumable(self) -> int:
         """Check that the recording at `path` can be continued, and return its number of complete poses."""
         previous = read_index(self.path)

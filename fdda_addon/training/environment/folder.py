@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ...core.errors import TrainerEnvironmentError, os_error_text
-from ...core.file_lock import try_lock
+from ...core.file_lock import NoLocksError, try_lock
 from ...core.path_limits import MAX_WINDOWS_PATH_LENGTH
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
@@ -191,6 +191,8 @@ def creation_lock(folder: Path) -> Iterator[None]:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             is_locked = try_lock(stack.enter_context(path.open("a+b")).fileno())
+        except NoLocksError:
+            is_locked = True  # the folder is the user's own, so another process is unlikely
         except OSError as error:
             raise TrainerEnvironmentError(
                 f"The folder '{folder.parent}' cannot be written ({os_error_text(error)}); see to its permissions, or "
