@@ -78,7 +78,7 @@ test-line: .venv-line .venv  ## run the core tests and the Blender tests that de
 bench: .venv  ## time the arm at three mesh densities and other rigs, into out/bench (RIGS="a.blend b.blend")
 	.venv/bin/python benchmarks/bench.py out/bench $(addprefix --rig ,$(RIGS))
 
-soak: .venv  ## test damaged files, kills, full disks, many frames and undo, into out/soak (20 minutes at most)
+soak: .venv  ## test damaged files, kills and full disks, into out/soak (10 minutes at most)
 	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
 
 faults: .venv  ## seed faults into a copy of the code and list the tests that catch them, into out/faults (OPTIONS="--only ID"; 6 minutes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Test the add-on with many damaged files, killed processes and random actions, and count the cases that fail:
+"""Test the add-on with many damaged files, killed processes and full disks, and count the cases that fail:
 
     python benchmarks/soak.py out/soak [--seed 1] [--part NAME ...] [--scale 1.0]
 
@@ -48,17 +48,6 @@ SOAK_PARTS = (
     SoakPart("recordings", 2000, 500),
     SoakPart("kills", 45, 45),
     SoakPart(DISKS, 40, 40),
-    SoakPart("outputs", 60, 60),
-    SoakPart("signals", 20, 20),
-    SoakPart("frames", 10_000, 10_000),
-    SoakPart("undo", 1000, 1000),
-    SoakPart("loads", 200, 200),
-    SoakPart("paths", 17, 17),
-    SoakPart("time", 300, 100),
-    SoakPart("armatures", 200, 100),
-    SoakPart("mode", 1000, 1000),
-    SoakPart("topology", 1000, 1000),
-    SoakPart("controls", 300, 300),
 )
 
 
@@ -76,28 +65,12 @@ def run_part(part: str, folder: Path, seed: int, first_case: int, end_case: int)
     """Run cases of a part in this process, which then ends."""
     if part == "recordings":
         from benchmarks.soaking.recordings import run
-    elif part == "signals":
-        from benchmarks.soaking.signals import run
     elif part == "models":
         from benchmarks.soaking.models import run
-    elif part == "outputs":
-        from benchmarks.soaking.outputs import run
-    elif part in ("kills", DISKS):
+    else:
         from benchmarks.soaking import interruptions
 
         run = interruptions.run_kills if part == "kills" else interruptions.run_full_disks
-    elif part in ("time", "armatures"):
-        from benchmarks.soaking import inputs
-
-        run = inputs.run_time if part == "time" else inputs.run_armatures
-    elif part in ("mode", "topology", "controls"):
-        from benchmarks.soaking import changes
-
-        run = getattr(changes, f"run_{part}")
-    else:
-        from benchmarks.soaking import playback
-
-        run = getattr(playback, f"run_{part}")
     run(folder, seed, first_case, end_case)
     sys.stdout.flush()
     # Blender's own shutdown is not part of the test.
@@ -109,19 +82,11 @@ def watch_part(part: SoakPart, folder: Path, seed: int, add_case: Callable[[Case
     case_index = 0
     while case_index < part.count:
         end_case = min(case_index + part.cases_per_process, part.count)
-        command = [
-            sys.executable,
-            __file__,
-            str(folder),
-            "--seed",
-            str(seed),
-            "--work",
-            part.name,
-            str(case_index),
-            str(end_case),
-        ]
+        work = (str(folder), "--seed", str(seed), "--work", part.name, str(case_index), str(end_case))
         with open(folder / f"{part.name}.log", "a", encoding="utf-8") as log:
-            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, errors="replace")
+            process = subprocess.Popen(
+                [sys.executable, __file__, *work], stdout=subprocess.PIPE, stderr=log, text=True, errors="replace"
+            )
             lines: queue.Queue[str] = queue.Queue()
             threading.Thread(target=_read_lines, args=(process, lines), daemon=True).start()
             timeout_seconds, first_case = START_TIMEOUT_SECONDS, case_index
@@ -235,7 +200,7 @@ def main() -> int:
 
         for part in select_parts(options.part):
             part_started = time.perf_counter()
-            count = part.count if part.name == "paths" else max(1, round(part.count * options.scale))
+            count = max(1, round(part.count * options.scale))
             watch_part(SoakPart(part.name, count, part.cases_per_process), folder, options.seed, add_case)
             print(f"{part.name}: {time.perf_counter() - part_started:.0f} s", flush=True)
     print(format_table(cases))
