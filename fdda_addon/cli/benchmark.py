@@ -11,10 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import FDDAError, WrongUsageError
+from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
 from ..core.file_kind import BENCHMARK
 from ..core.output import check_outputs, write_json
 from ..core.progress import Progress
+from ..core.temporary import check_temporary_folder
 from ..fast_rig.saving import measure_saving
 from ..runtime.binding import model_disabled
 from ..timing.benchmark import benchmark
@@ -56,6 +57,8 @@ def run(options: argparse.Namespace) -> None:
     if (options.model is not None) != needs_model:
         raise WrongUsageError("Give a model to measure, or --profile or --fast-rig without a model.")
     check_outputs({options.json: BENCHMARK}, list(filter(None, (options.rig, options.model))), options.overwrite)
+    if not needs_model:
+        check_temporary_folder()  # before the measurements, which take a minute
     if options.profile:
         _profile(options)
         return
@@ -75,15 +78,17 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _profile(options: argparse.Namespace) -> None:
-    scene_rig = open_rig(options)
+    scene_rig, failure = open_rig(options), None
     with ProgressPrinter() as progress:
         profile = _last_step(profile_frame(scene_rig), progress)
         try:
             profile = replace(profile, fast_rig=_last_step(measure_saving(scene_rig, options.rig), progress))
         except FDDAError as error:
-            profile = replace(profile, fast_rig_problem=str(error))
+            profile, failure = replace(profile, fast_rig_problem=str(error)), error
     write_json(options.json, profile.to_json())
     print(profile.table())
+    if failure is not None and exit_status(failure) == TRY_AGAIN:
+        raise failure
 
 
 def _last_step(steps: Iterator[Any], progress: ProgressPrinter) -> Any:

@@ -4,7 +4,6 @@
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
@@ -14,7 +13,7 @@ import bpy
 from ..core.child_process import OutputLines, child_options, end_process
 from ..core.errors import FDDAError, os_error_text
 from ..core.progress import Progress
-from ..core.temporary import temporary_folder_error
+from ..core.temporary import new_temporary_file
 
 ROOT = Path(__file__).resolve().parents[2]
 KILL_AFTER_SECONDS = 5.0
@@ -42,10 +41,7 @@ class VerbProcess:
             FDDAError: Blender cannot be started, or no temporary file can be written.
         """
         command = _command()
-        try:
-            self._output = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - `__exit__` closes it
-        except OSError as error:
-            raise temporary_folder_error(error) from error
+        self._output = new_temporary_file()
         try:
             self._process = subprocess.Popen(
                 [*command, verb, *arguments],

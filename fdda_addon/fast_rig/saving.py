@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measures what a fast rig would save, also for a character without a model."""
 
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 from ..core.errors import RigError
 from ..core.progress import Progress
 from ..core.rig import STATIC_JOINT
+from ..core.temporary import temporary_folder
 from ..rig.dependencies import read_dependencies
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import unbind
@@ -57,8 +57,8 @@ def measure_saving(scene_rig: SceneRig, file: Path) -> Iterator[Progress | FastR
     bone_count = len(armature_object.data.bones)
     remove_unneeded([scene_rig], joints, controls)
     kept_count = len(armature_object.data.bones)
-    with tempfile.TemporaryDirectory(prefix="fdda-") as folder:
-        pruned_file = Path(folder) / "pruned.blend"
+    with temporary_folder() as folder:
+        pruned_file = folder / "pruned.blend"
         save_copy(pruned_file)
         for step in measure_frames(file, pruned_file, object_name, controls, ROUNDS * FRAMES_PER_ROUND, size, ROUNDS):
             if isinstance(step, Progress):

@@ -2,14 +2,14 @@
 """The operator that makes a fast rig of the saved file, in another Blender."""
 
 import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import OutputError, RigError, os_error_text
+from ..core.errors import OutputError, RigError
 from ..core.model import read_model
+from ..core.temporary import temporary_folder
 from ..fast_rig.process import VerbProcess
 from ..runtime import packed_model
 from ..runtime.model_files import model_path
@@ -82,8 +82,8 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
             for o in context.scene.objects
             if o.type == "MESH" and o.fdda.is_bound and _uses_armature(o, scene_rig.armature_object)
         ]
-        with tempfile.TemporaryDirectory(prefix="fdda-") as folder:
-            model = _write_models(mesh_objects, Path(folder))
+        with temporary_folder() as folder:
+            model = _write_models(mesh_objects, folder)
             names = [f"--object={mesh_objects[0].name}"] if len(mesh_objects) == 1 else []
             arguments = [bpy.data.filepath, str(model), out, *names, "--controls", *choices]
             with VerbProcess("fast-rig", arguments) as process:
@@ -126,18 +126,15 @@ def _write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
 
     Raises:
         ModelError: a model cannot be read.
-        OutputError: a file cannot be written.
+        OSError: a file cannot be written.
     """
     for index, mesh_object in enumerate(mesh_objects):
         binding = mesh_object.fdda
         data = packed_model.read(binding.packed) if binding.packed else read_model(model_path(mesh_object))[1]
         # Clean names of different objects may be equal.
         file = folder / str(index) / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
-        try:
-            file.parent.mkdir()
-            file.write_bytes(data)
-        except OSError as error:
-            raise OutputError(f"Cannot write '{file}': {os_error_text(error)}.") from error
+        file.parent.mkdir()
+        file.write_bytes(data)
     return file if len(mesh_objects) == 1 else folder
 
 

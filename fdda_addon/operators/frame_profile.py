@@ -2,15 +2,13 @@
 """The operator of the section "Rig" that profiles a frame."""
 
 import json
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import bpy
 
 from ..core.errors import FDDAError
-from ..core.temporary import temporary_folder_error
+from ..core.temporary import temporary_folder
 from ..fast_rig.process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements
@@ -61,8 +59,8 @@ def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object
         Progress, None while there is none, and at the end the profile with the result.
     """
     try:
-        with tempfile.TemporaryDirectory(prefix="fdda-", ignore_cleanup_errors=True) as folder:
-            file, result_file = Path(folder) / "rig.blend", Path(folder) / "saving.json"
+        with temporary_folder() as folder:
+            file, result_file = folder / "rig.blend", folder / "saving.json"
             save_copy(file)
             arguments = [str(file), "--fast-rig", f"--object={object_name}", "--json", str(result_file)]
             with VerbProcess("benchmark", arguments) as process:
@@ -71,8 +69,6 @@ def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object
         yield replace(profile, fast_rig=saving)
     except FDDAError as error:
         yield replace(profile, fast_rig_problem=str(error))
-    except OSError as error:
-        yield replace(profile, fast_rig_problem=str(temporary_folder_error(error)))
 
 
 CLASSES = (FDDA_OT_profile_frame,)

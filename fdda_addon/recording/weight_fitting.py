@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fits skin weights to poses of a rig, and chooses key joints, in the trainer's Python."""
 
-import tempfile
 import time
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from ..core.progress import Progress
 from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted_weights, read_key_joints
 from ..core.rig import STATIC_JOINT, Rig
 from ..core.skin_fit import DEFAULT_KIND, SkinFit
-from ..core.temporary import temporary_folder_error
+from ..core.temporary import temporary_folder
 from ..rig.dependencies import read_dependencies
 from ..rig.reading import PoseEvaluator, read_key_joints_rig
 from ..scene.scene_rig import SceneRig
@@ -162,13 +161,7 @@ def fit_weights(
         TrainingError: the trainer's Python cannot fit the weights.
         OutputError: the poses cannot be written.
     """
-    try:
-        # On Windows a virus scanner may still have a file open.
-        temporary_folder = tempfile.TemporaryDirectory(prefix="fdda-fit-", ignore_cleanup_errors=True)
-    except OSError as error:
-        raise temporary_folder_error(error) from error
-    with temporary_folder as folder_name:
-        folder = Path(folder_name)
+    with temporary_folder("fdda-fit-") as folder:
         with FitPosesWriter(folder, rig, len(request.poses), request.dependencies, request.sampled) as writer:
             for pose_number, _ in enumerate(poses, 1):
                 writer.append(*evaluator.evaluate())

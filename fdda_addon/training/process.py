@@ -20,7 +20,7 @@ from ..core.errors import TRY_AGAIN, TrainingDiedError, TrainingError, WrongUsag
 from ..core.messages import STOP_FILE_VARIABLE, Message, MessageType
 from ..core.native_library import runtime_advice
 from ..core.stop_signals import INTERRUPTED
-from ..core.temporary import temporary_folder_error
+from ..core.temporary import check_temporary_folder, new_temporary_file
 from .environment.choice import select_python
 from .environment.folder import ROOT
 from .process_exit import explain_exit_status
@@ -79,10 +79,7 @@ class TrainerProcess:
         """
         advice = select_python().origin.value if python is None else "name a Python that has torch"
         command, _ = trainer_command(arguments, python, self.module)
-        try:
-            self._stop_file, self._errors = self._new_stop_file(), self._new_errors()
-        except OSError as error:
-            raise temporary_folder_error(error) from error
+        self._stop_file, self._errors = self._new_stop_file(), self._new_errors()
         # Ctrl-C may arrive between the start of the process and the `with` block that ends it.
         self._finalizer = weakref.finalize(self, Path.touch, self._stop_file)
         try:
@@ -97,10 +94,11 @@ class TrainerProcess:
 
     def _new_stop_file(self) -> Path:
         # The file exists only after a cancellation. Its random name keeps other users from creating it.
+        check_temporary_folder()
         return Path(tempfile.gettempdir(), f"fdda-stop-{secrets.token_hex(12)}")
 
     def _new_errors(self) -> TextIO:
-        return tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+        return new_temporary_file()
 
     def _start(self, command: list[str]) -> subprocess.Popen:
         return self._popen(command, subprocess.PIPE)
@@ -191,10 +189,10 @@ class TrainerProcess:
 
     def _find_full_disk(self) -> Path | None:
         """Return a folder that the trainer writes to and whose disk is full; None if no disk is full."""
-        for folder in (self._stop_file.parent, Path(tempfile.gettempdir())):
+        for get_folder in (lambda: str(self._stop_file.parent), tempfile.gettempdir):
             with suppress(OSError):
-                if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
-                    return folder
+                if shutil.disk_usage(folder := get_folder()).free < MIN_FREE_BYTES:
+                    return Path(folder)
         return None
 
     def _error_text(self) -> str:

@@ -12,6 +12,7 @@ import bpy
 import pytest
 
 from blend_fixtures.characters.bones import NewBone, add_bones
+from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.jobs import job
 from fdda_addon.operators.frame_profile import last_profile
 from fdda_addon.panels import frame_profile as frame_profile_panel
@@ -230,15 +231,28 @@ def fail_to_write(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_the_profile_stays_if_the_fast_rig_cannot_be_written(slow_rig, tmp_path, monkeypatch):
+def test_the_profile_stays_if_the_fast_rig_cannot_be_written(slow_rig, tmp_path, monkeypatch, capfd):
     """The measurement of the frame has taken minutes on large rigs."""
     hide_extra_bones(slow_rig)
     file, path = tmp_path / "rig.blend", tmp_path / "profile.json"
     bpy.ops.wm.save_as_mainfile(filepath=str(file))
     monkeypatch.setattr(blend_file, "remove_file", fail_to_write)
-    assert run("benchmark", file, "--profile", "--json", path) == 0
+    assert run("benchmark", file, "--profile", "--json", path) == TRY_AGAIN
     profile = json.loads(path.read_text())["profile"]
-    assert profile["parts"] and "No space left" in profile["fast_rig_problem"]
+    problem = "No temporary file can be written (No space left on device); make room there, or name another folder in"
+    assert profile["parts"] and profile["fast_rig_problem"].startswith(problem)
+    assert problem in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--profile", "--fast-rig"])
+def test_a_full_temporary_disk_is_refused_before_the_measurement(elbow_files, tmp_path, monkeypatch, capfd, option):
+    path = tmp_path / "out.json"
+    with monkeypatch.context() as patch:  # capfd writes temporary files, too
+        patch.setattr(tempfile, "tempdir", None)
+        patch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "missing")])
+        assert run("benchmark", elbow_files.rig, option, "--json", path) == TRY_AGAIN
+    assert not path.exists()
+    assert capfd.readouterr().err.startswith("Error: No temporary file can be written (No usable temporary directory")
 
 
 def test_the_button_keeps_the_profile_without_a_temporary_folder(slow_rig, monkeypatch):

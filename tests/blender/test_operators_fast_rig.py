@@ -3,6 +3,7 @@
 
 import subprocess
 import sys
+import tempfile
 import time
 from types import SimpleNamespace
 
@@ -113,6 +114,13 @@ def test_unsaved_files_and_missing_choices_are_refused(saved):
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, visible=False, keyed=False), "No controls were chosen")
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, collection="Faces"), "has no bone collection 'Faces'")
     refused(bpy.ops.fdda.fast_rig, "No file was chosen; give the name of a .blend file.")
+
+
+def test_a_missing_temporary_folder_is_reported(saved, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(saved / "missing"))
+        text = "No temporary file can be written (No such file or directory"
+        refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.blend")), text)
 
 
 def test_a_point_in_the_name_of_the_file_is_kept(saved):

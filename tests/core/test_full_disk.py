@@ -4,15 +4,17 @@
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.errors import OutputError
+from fdda_addon.core.errors import DiskFullError, OutputError
 from fdda_addon.core.output import write_text
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.temporary import temporary_folder
 
 from .. import systems
 from .conftest import SMALL_DISK_BYTES
@@ -37,6 +39,28 @@ def test_a_recording_that_does_not_fit_is_refused_before_the_first_pose(small_di
     ):
         record_limb(small_disk / "recording", poses=2000, complete=10)
     assert list(small_disk.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["write", "output", "blender"])
+def test_a_full_temporary_disk_is_the_machines_fault(small_disk, monkeypatch, kind):
+    monkeypatch.setattr(tempfile, "tempdir", str(small_disk))
+    with (
+        pytest.raises(DiskFullError, match=rf"^No temporary file can be written \(.*{FULL_DISK_ERROR}.*\); make room"),
+        temporary_folder() as folder,
+    ):
+        if kind == "write":
+            (folder / "a").write_bytes(bytes(2 * SMALL_DISK_BYTES))
+        if kind == "output":
+            write_text(folder / "a", "x" * 2 * SMALL_DISK_BYTES)
+        raise OutputError(f"Cannot write '{folder / 'a'}': {FULL_DISK_ERROR}")  # as of Blender, without an errno
+    assert list(small_disk.iterdir()) == []
+
+
+def test_an_error_of_another_folder_is_no_error_of_the_temporary_folder():
+    for error in (OutputError("Cannot write '/other/a'"), FileNotFoundError(2, "missing", "/other/a")):
+        with pytest.raises(type(error)) as raised, temporary_folder() as folder:
+            raise error
+        assert raised.value is error and not folder.exists()
 
 
 @pytest.fixture
