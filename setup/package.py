@@ -18,9 +18,13 @@ import subprocess
 import sys
 import sysconfig
 import tomllib
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT))
+from fdda_addon.core.windows_library import needed_cpp_library_version, read_imports  # noqa: E402
+
 DIST_FOLDER = ROOT / "dist"
 STAGE_FOLDER = DIST_FOLDER / "stage"
 
@@ -37,6 +41,28 @@ ALL_PLATFORMS = "all"
 # the system's Python: in 2026 Debian, Arch and Fedora have 3.14.
 PYTHON_VERSIONS = ("3.11", "3.13")
 SYSTEM_PYTHON_VERSIONS = ("3.14",)
+# By platform and Python version: the oldest version of Microsoft's C++ library that a Blender from blender.org brings.
+# Crash reports of Blender list the version of MSVCP140.dll: 4.5 and 5.0 have 14.29, 5.1 and 5.2 have 14.44. On ARM, the
+# linker of the DLLs of Blender 4.5 has version 14.42.
+CPP_LIBRARY_VERSIONS = {
+    ("windows-x64", "3.11"): (14, 29),
+    ("windows-x64", "3.13"): (14, 44),
+    ("windows-arm64", "3.11"): (14, 42),
+    ("windows-arm64", "3.13"): (14, 44),
+}
+# Names of libraries of Microsoft's compilers, and those that each Blender brings.
+COMPILER_LIBRARY = re.compile(r"(msvc[pr]|vcruntime|concrt|vccorlib|vcomp|mfc|atl)\d+\w*\.dll")
+BLENDERS_COMPILER_LIBRARIES = {
+    "concrt140.dll",
+    "msvcp140.dll",
+    "msvcp140_1.dll",
+    "msvcp140_2.dll",
+    "msvcp140_atomic_wait.dll",
+    "msvcp140_codecvt_ids.dll",
+    "vccorlib140.dll",
+    "vcruntime140.dll",
+    "vcruntime140_1.dll",
+}
 # Limit for the size of a zip. Users download the zip by hand, and Blender keeps a second copy when it installs it.
 MAX_PACKAGE_MB = 60
 
@@ -85,10 +111,16 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
     """Return the pinned onnxruntime wheels of a platform; pip downloads those that are not in dist/wheels.
 
     The dependencies of onnxruntime are left out: Blender includes numpy, and playback needs no other package.
+
+    Raises:
+        PackageError: a wheel does not run in all Blenders, as for `check_wheel`.
+        CalledProcessError: pip failed.
     """
     wheels = []
     for python in pythons:
-        pins = (ROOT / "requirements" / f"python-{python}.txt").read_text().splitlines()
+        # The version of Python 3.11 has no wheel for Windows on ARM, where Blender's C++ library is newer.
+        pinned_python = "3.13" if name == "windows-arm64" else python
+        pins = (ROOT / "requirements" / f"python-{pinned_python}.txt").read_text().splitlines()
         requirement = next(pin for pin in pins if pin.startswith("onnxruntime=="))
         folder = DIST_FOLDER / "wheels" / f"{requirement}-{python}-{name}"
         if not list(folder.glob("*.whl")):
@@ -96,8 +128,43 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
             command += [f"--dest={folder}", f"--python-version={python}", requirement]
             command += [f"--platform={tag}" for tag in PLATFORMS[name]]
             subprocess.run(command, check=True)
-        wheels += folder.glob("*.whl")
+        for wheel in folder.glob("*.whl"):
+            check_wheel(wheel, name, python)
+            wheels.append(wheel)
     return wheels
+
+
+def check_wheel(wheel: Path, name: str, python: str) -> None:
+    """Check that each Blender with a Python version on a platform can load the DLLs of a wheel.
+
+    Raises:
+        PackageError: a DLL needs a library that Blender does not bring, or a newer one than Blender has.
+    """
+    if (name, python) not in CPP_LIBRARY_VERSIONS:
+        return
+    brought_version = CPP_LIBRARY_VERSIONS[name, python]
+    with zipfile.ZipFile(wheel) as archive:
+        dlls = [path for path in archive.namelist() if path.lower().endswith((".dll", ".pyd"))]
+        available = BLENDERS_COMPILER_LIBRARIES | {path.rpartition("/")[2].lower() for path in dlls}
+        for path in dlls:
+            data = archive.read(path)
+            try:
+                needed_version, (_, imports) = needed_cpp_library_version(data), read_imports(data)
+            except ValueError as error:
+                raise PackageError(
+                    f"'{path}' of {wheel.name} cannot be read ({error}); download the wheel again."
+                ) from error
+            lacking = sorted(
+                library for library in imports if COMPILER_LIBRARY.fullmatch(library) and library not in available
+            )
+            if needed_version > brought_version:
+                lacking = ["msvcp140.dll {}.{}".format(*needed_version)]
+            if lacking:
+                raise PackageError(
+                    f"'{path}' of {wheel.name} needs {lacking[0]}, and the Blenders with Python {python} bring "
+                    "msvcp140.dll {}.{}; ".format(*brought_version)
+                    + f"pin another version in pyproject.toml for Python {python}, and try it with make test-windows."
+                )
 
 
 def stage_manual(folder: Path) -> None:
@@ -188,7 +255,7 @@ def build_packages(names: list[str], website: str = "") -> list[Path]:
         The paths of the zips.
 
     Raises:
-        PackageError: there are no wheels for a platform, or a zip is too large.
+        PackageError: there are no wheels for a platform, one does not run in Blender, or a zip is too large.
         CalledProcessError: pip or the extension tool failed.
     """
     packages = []

@@ -48,8 +48,8 @@ INT64 = 7
 """Number of the ONNX data type int64."""
 MAX_CONSTANT_INTEGERS = 1 << 16
 """Largest number of elements of a constant whose integers are read; the longest one has the sizes of all partitions."""
-SUPPORTED_OPSETS = range(13, 24)
-"""Versions of the operator set between which the operators of models do not differ."""
+SUPPORTED_OPSETS = range(13, 22)
+"""Versions of the operator set in which the operators of models do not differ; ONNX Runtime 1.20 runs all of them."""
 FREE_ELEMENTS = 1 << 20
 """Number of elements that the values of a graph may have beside one element per byte of the file, for each pose."""
 

@@ -162,10 +162,11 @@ def test_two_constants_with_one_name_are_refused():
     assert_refused(tiny_model(initializers=[zeros_tensor("zeros")]), "two constants 'zeros'")
 
 
-def test_unknown_versions_are_refused():
+@pytest.mark.parametrize("version", [5, 22])
+def test_unknown_versions_are_refused(version: int):
     model = tiny_model()
-    model.opset_import[0].version = 5
-    assert_refused(model, "the operator set version [5]")
+    model.opset_import[0].version = version
+    assert_refused(model, f"the operator set version [{version}]")
 
 
 @pytest.mark.parametrize(
