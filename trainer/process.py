@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import TextIO
 
 from fdda_addon.core.errors import (
+    MACHINE_WINERRORS,
     TRY_AGAIN,
     FDDAError,
     TrainingError,
@@ -19,7 +20,7 @@ from fdda_addon.core.errors import (
     to_single_line,
 )
 from fdda_addon.core.messages import STOP_FILE_VARIABLE, MessageType
-from fdda_addon.core.native_library import runtime_advice
+from fdda_addon.core.native_library import loader_winerror, runtime_advice
 from fdda_addon.core.stop_signals import INTERRUPTED, handle_stop_signals
 
 from .progress import OUTPUT_LOCK, MessageSink
@@ -119,6 +120,12 @@ def _describe_error(error: Exception) -> tuple[str, int]:
     """Return a sentence for an error that ended the job, and the exit status."""
     if isinstance(error, FDDAError):
         return str(error), exit_status(error)
+    # Without the name of a library, an error that the machine causes may be about the data.
+    lacks_resources = loader_winerror(str(error)) in MACHINE_WINERRORS
+    is_load_error = isinstance(error, ImportError) or not lacks_resources or 'Error loading "' in str(error)
+    if is_load_error and (advice := runtime_advice(str(error))):
+        status = TRY_AGAIN if lacks_resources else 1
+        return to_single_line(f"A library of '{sys.executable}' cannot be loaded ({error}); {advice}."), status
     cause: BaseException = error
     while cause.__cause__ is not None and not isinstance(cause, OSError | MemoryError):
         cause = cause.__cause__
@@ -128,8 +135,6 @@ def _describe_error(error: Exception) -> tuple[str, int]:
         ), TRY_AGAIN
     if text := machine_fault_sentence(cause):
         return text, TRY_AGAIN
-    if advice := runtime_advice(str(error)):
-        return to_single_line(f"A library of '{sys.executable}' cannot be loaded ({error}); {advice}."), 1
     with suppress(OSError):
         traceback.print_exc()
     return f"The trainer stopped on an error of its own ({error!r}); please report it.", 1

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import ModelError
+from ..core.errors import MACHINE_WINERRORS, TRY_AGAIN, ModelError
 from ..core.model import (
     CONFIDENCE_OUTPUT,
     CONTROLS_INPUT,
@@ -18,8 +18,9 @@ from ..core.model import (
     read_model,
     read_skin,
 )
-from ..core.native_library import runtime_advice
+from ..core.native_library import loader_winerror, runtime_advice
 from ..core.rig import Rig
+from ..core.windows_library import check_cpp_library
 
 MIN_MULTITHREADED_VERTICES = 100_000
 """Smallest number of vertices for which several threads run the model; starting them takes time too."""
@@ -48,15 +49,20 @@ class Network:
         self.info, data = read_model(path) if data is None else (check_model(data, path), data)
         self._skin = read_skin(data, self.info, path)
         try:
+            # Another extension may have brought a newer version than Blender can load.
+            check_cpp_library("onnxruntime")
             # Imported here so that Blender starts without ONNX Runtime.
             import onnxruntime
         except ImportError as error:
             version = ".".join(map(str, sys.version_info[:2]))
-            advice = runtime_advice(str(error)) or (
+            advice = runtime_advice(str(error), in_blender=True) or (
                 f"install the extension's zip for this platform and for Python {version}: 3.11 and 3.13 are in one, "
                 "3.14 has its own"
             )
-            raise ModelError(f"ONNX Runtime cannot be loaded by Python {version} ({error}); {advice}.") from error
+            refusal = ModelError(f"ONNX Runtime cannot be loaded by Python {version} ({error}); {advice}.")
+            if loader_winerror(str(error)) in MACHINE_WINERRORS:
+                refusal.exit_status = TRY_AGAIN
+            raise refusal from error
         onnxruntime.set_default_logger_severity(3)
         onnxruntime.disable_telemetry_events()
         session_options = onnxruntime.SessionOptions()

@@ -188,17 +188,21 @@ def test_a_training_without_blenders_program_finds_the_environment_that_blender_
 
 
 @pytest.mark.parametrize(
-    ("error", "is_runtime"),
+    ("error", "advice"),
     [
-        ("ImportError('DLL load failed while importing onnxruntime_pybind11_state: Le module est introuvable.')", True),
-        ("OSError('[WinError 126] Das angegebene Modul wurde nicht gefunden. Error loading \"c10.dll\"')", True),
-        ("OSError('libtorch.so: cannot open shared object file')", False),
+        (
+            "OSError('[WinError 1114] … Error loading \"c10.dll\"')",
+            "install Microsoft's Visual C++ runtime from https:",
+        ),
+        (
+            "OSError('libtorch.so: cannot open shared object file')",
+            "install the package of this Linux that has 'libtorch",
+        ),
     ],
 )
-def test_a_missing_runtime_of_windows_is_named(packages: Path, error: str, is_runtime: bool):
+def test_the_advice_on_a_library_that_cannot_be_loaded_is_shown(packages: Path, error: str, advice: str):
     (packages / "torch/__init__.py").write_text(f"raise {error}\n")
-    advice = "install Microsoft's Visual C++ runtime from https://aka.ms/vs/17/release/vc_redist."
-    assert (advice in asked(sys.executable).message) is is_runtime
+    assert f"); {advice}" in asked(sys.executable).message
 
 
 @pytest.fixture
@@ -292,5 +296,5 @@ def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, 
 @pytest.mark.one_blender_version
 def test_package_names_match_the_trainer_group_of_pyproject():
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
-    assert sorted(folder.PACKAGES) == sorted(requirement.partition("==")[0] for requirement in groups["trainer"])
+    assert set(folder.PACKAGES) == {requirement.partition("==")[0] for requirement in groups["trainer"]}
     assert all(path.is_file() for path in map(folder.requirements_file, folder.PINNED_REQUIREMENTS))

@@ -214,11 +214,10 @@ FULL_DISK_ERROR = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")
         (OSError(errno.ENOMEM, "Cannot allocate memory"), 75, "The training lacks memory ("),
         (MemoryError(), 75, "The training lacks memory ("),
         (RuntimeError("DefaultCPUAllocator: not enough memory: you tried"), 75, "The training lacks memory ("),
-        (
-            ImportError("DLL load failed while importing _C: …"),
-            1,
-            "runtime from https://aka.ms/vs/17/release/vc_redist.",
-        ),
+        (OSError("[WinError 1455] The paging file is too small"), 75, "The training lacks memory ("),
+        (OSError('[WinError 1455] … Error loading "x.dll"'), 75, 'x.dll"); enlarge the paging file of Windows, or end'),
+        (OSError('[WinError 1114] … Error loading "c10.dll"'), 1, "install Microsoft's Visual C++ runtime from https:"),
+        (ImportError("libgomp.so.1: cannot open shared object file: No such file"), 1, "Linux that has 'libgomp.so.1'"),
         (KeyError("x"), 1, "The trainer stopped on an error of its own (KeyError('x')); please report it."),
     ],
 )
