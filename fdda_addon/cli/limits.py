@@ -35,6 +35,7 @@ def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
     from ..core.file_kind import BLEND
     from ..core.output import check_outputs
+    from ..poses.action_range import measured_ranges
     from ..poses.clip import find_action
     from ..poses.measured_limits import describe_limits, set_limits_from_actions
     from ..scene.blend_file import save_copy
@@ -44,9 +45,13 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError("--margin must be 0 to 10.")
     check_outputs({options.out: BLEND}, (options.rig,), options.overwrite)
     scene_rig = open_rig(options)
-    limits = set_limits_from_actions(scene_rig, [find_action(name) for name in options.action], options.margin)
+    actions = [find_action(name) for name in options.action]
+    limits = set_limits_from_actions(scene_rig, actions, options.margin)
     save_copy(options.out)
     for line in describe_limits(scene_rig.armature_object, limits):
         print(line)
+    for action in actions:
+        if not measured_ranges(scene_rig.armature_object, [action]):
+            print(f"The action '{action.name}' moves no bone of '{scene_rig.armature_object.name}'.")
     bone_count = len({limit.bone for limit in limits if not limit.reason_unset})
     print(f"{options.out}: set the limits of {format_count(bone_count, 'bone')} of '{scene_rig.armature_object.name}'")

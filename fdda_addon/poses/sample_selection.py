@@ -12,7 +12,7 @@ from ..core.poses import Channel
 from ..core.remix import Remix
 from ..scene.compatibility import is_selected
 from ..scene.scene_rig import SceneRig
-from .action_range import constant_controls, keyed_ranges, measured_controls
+from .action_range import constant_controls, keyed_controls, keyed_ranges, measured_controls
 from .clip import find_action
 from .remix import read_remix
 
@@ -83,6 +83,13 @@ def select_bones(
             remix = read_remix(scene_rig, recorded_actions)
         elif text.startswith(ACTION_PREFIX):
             actions.append(find_action(text.removeprefix(ACTION_PREFIX)))
+            if not keyed_ranges(scene_rig.armature_object, actions[-1:]) and not keyed_controls(
+                scene_rig, actions[-1:]
+            ):
+                raise RigError(
+                    f"The action '{actions[-1].name}' chooses nothing to sample: it keys no bone of "
+                    f"'{scene_rig.armature_object.name}' and no number of the rig; choose another action."
+                )
         else:
             selected_bones |= parse_bones(scene_rig, text)
     keyed_channel_ranges = keyed_ranges(scene_rig.armature_object, actions)
@@ -103,18 +110,27 @@ def parse_bones(scene_rig: SceneRig, text: str) -> set[str]:
     """Return the names of the bones that a text chooses: `selected`, `collection:NAME` or `bone:NAME`.
 
     Raises:
-        RigError: there is no such collection or bone.
+        RigError: there is no such collection or bone, or no bone is chosen.
     """
     armature_object = scene_rig.armature_object
     bones, armature = armature_object.pose.bones, armature_object.data
     if text == SELECTED_BONES:
-        return {bone.name for bone in bones if is_selected(bone)}
+        names = {bone.name for bone in bones if is_selected(bone)}
+        if not names:
+            raise RigError(f"No bone of '{armature_object.name}' is selected; select bones in Pose Mode.")
+        return names
     if text.startswith(COLLECTION_PREFIX):
         name = text.removeprefix(COLLECTION_PREFIX)
         if name not in armature.collections_all:
             names = ", ".join(f"'{c.name}'" for c in armature.collections_all) or "none"
             raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {names}.")
-        return {bone.name for bone in armature.collections_all[name].bones_recursive}
+        names = {bone.name for bone in armature.collections_all[name].bones_recursive}
+        if not names:
+            raise RigError(
+                f"The bone collection '{name}' of '{armature_object.name}' has no bones; assign bones to it, or choose "
+                "another collection."
+            )
+        return names
     name = text.removeprefix(BONE_PREFIX)
     if not text.startswith(BONE_PREFIX) or name not in bones:
         raise RigError(
