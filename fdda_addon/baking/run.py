@@ -16,19 +16,18 @@ from ..core.mask import SkinningBlend
 from ..core.output import atomic_write, atomic_write_all, check_outputs
 from ..core.point_cache import PointCacheWriter, read_point_cache
 from ..core.progress import Progress
-from ..poses.action_range import action_frames
-from ..poses.clip import find_action
+from ..poses.clip import Clip, find_clips
+from ..poses.clip_player import clip_player
 from ..rig.modifier_stack import check_evaluable, read_stack
 from ..rig.reading import PoseReader
 from ..runtime.binding import model_disabled
 from ..runtime.network import Network
 from ..runtime.opened_model import OpenedModel, open_model
-from ..scene.armature import clear_pose
 from ..scene.blend_file import save_copy
 from ..scene.control_reader import ControlReader
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
-from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose, temporary_visibility
+from ..scene.temporary_state import temporary_attributes, temporary_pose, temporary_visibility
 from ..scene.time_stretching import frames_covering
 from .baked_mesh import check_local, play_point_cache, play_shape_keys, temporary_copy
 
@@ -96,15 +95,18 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
         OutputError: a file cannot be written.
     """
     files = output_files(out, settings, [model.path if isinstance(model, Network) else model])
-    action = find_action(settings.action) if settings.action else None
-    frames = _select_frames(action, settings.frames)
+    clips = find_clips([scene_rig], [settings.action] if settings.action else [])
+    frames = _select_frames(clips, settings.frames)
     if out.suffix == BLEND_SUFFIX:
         check_local(scene_rig.mesh_object)
     with model_disabled(scene_rig.mesh_object), ExitStack() as exit_stack:
         check_evaluable(scene_rig)
         reader = FrameReader(scene_rig, open_model(scene_rig, model), settings.strength)
         stack = read_stack(scene_rig.mesh_object)
-        exit_stack.enter_context(_temporary_action(scene_rig.armature_object, action))
+        if clips:
+            exit_stack.enter_context(clip_player([(scene_rig, ())], clips)).start(clips[0])
+        else:
+            exit_stack.enter_context(temporary_pose(scene_rig.armature_object, keep_animation=True))
         if out.suffix == POINT_CACHE_SUFFIX:
             with atomic_write(out) as cache:
                 yield from _write_frames(cache, reader, frames)
@@ -150,12 +152,10 @@ def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> t
     return files
 
 
-def _select_frames(action: bpy.types.Action | None, frames: tuple[int, int] | None) -> range:
+def _select_frames(clips: tuple[Clip, ...], frames: tuple[int, int] | None) -> range:
     scene = bpy.context.scene
     if frames is None:
-        if action is None:
-            return range(scene.frame_start, scene.frame_end + 1)
-        return frames_covering(action_frames(action))
+        return frames_covering(clips[0].frames) if clips else range(scene.frame_start, scene.frame_end + 1)
     first, last = frames
     if first > last:
         raise WrongUsageError(f"There is nothing to bake from frame {first} to {last}; give the first frame first.")
@@ -251,16 +251,6 @@ def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Pr
             yield Progress("frames", frame_count, len(frames))
         writer.finish()
     scene.frame_set(original_frame, subframe=original_subframe)
-
-
-@contextmanager
-def _temporary_action(armature_object: bpy.types.Object, action: bpy.types.Action | None) -> Iterator[None]:
-    """Replace the animation of an armature by an action, or keep it if the action is None; restore it afterwards."""
-    with temporary_pose(armature_object, [action] if action else (), keep_animation=action is None):
-        if action is not None:
-            clear_pose(armature_object)
-            assign_action(armature_object, action)
-        yield
 
 
 @contextmanager

@@ -134,7 +134,7 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
     from ..scene.time_stretching import time_ratio
     from ..timing.benchmark import Benchmark, benchmark
 
-    clip = find_clips(scene_rig.armature_object, options.action, options.strip)[0]
+    clip = find_clips([scene_rig], options.action, options.strip)[0]
     with ProgressPrinter() as progress:
         for step in benchmark(scene_rig, model, FILM_TIMED_FRAMES):
             if isinstance(step, Progress):

@@ -62,7 +62,7 @@ def evaluate(
         RigError: the rig cannot be evaluated.
         ModelError: the model cannot be read, or was trained for another rig.
     """
-    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips)
+    clips = find_clips([scene_rig], settings.actions, settings.strips)
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     random_pose_count = settings.poses or len(settings.range_scales) or len(settings.named)

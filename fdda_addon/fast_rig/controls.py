@@ -7,7 +7,8 @@ import bpy
 
 from ..core.errors import RigError, WrongUsageError
 from ..rig.bone_paths import split_bone_path
-from ..scene.compatibility import curves_of, is_bone_hidden
+from ..scene.action_slots import curves_of_actions
+from ..scene.compatibility import is_bone_hidden
 
 VISIBLE, KEYED, COLLECTION = "visible", "keyed", "collection:"
 
@@ -54,6 +55,11 @@ def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> 
                 raise RigError(
                     f"'{armature_object.name}' has no bone collection '{collection_name}'; its collections: {known}."
                 )
+            if not collection.bones_recursive:
+                raise RigError(
+                    f"The bone collection '{collection_name}' of '{armature_object.name}' has no bones; assign bones "
+                    "to it, or choose another collection."
+                )
             names |= {bone.name for bone in collection.bones_recursive}
     return names
 
@@ -77,7 +83,8 @@ def animating_actions(armature_object: bpy.types.Object) -> list[bpy.types.Actio
 def keyed_bones(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, int]:
     """Return how many channels of each bone an action keys, by the name of the bone, which may be missing."""
     counts: dict[str, int] = {}
-    for curve in curves_of(action, armature_object):
+    (curves,) = curves_of_actions([action], armature_object)
+    for curve in curves.get(armature_object, ()):
         if name := split_bone_path(armature_object, curve.data_path)[0]:
             counts[name] = counts.get(name, 0) + 1
     return counts

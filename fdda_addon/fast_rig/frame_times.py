@@ -14,6 +14,7 @@ from ..core.errors import FDDAError
 from ..core.progress import Progress
 from ..poses.action_range import action_frames
 from ..runtime.binding import model_disabled
+from ..scene.action_slots import dependencies, slots_of_action
 from ..scene.blend_file import blender_path, report_message, silenced_stdout
 from ..scene.scene_rig import find_rig
 from ..scene.temporary_state import assign_action
@@ -126,7 +127,8 @@ def _frame_calls(
             for index in indices
         ]
     action = bpy.data.actions[action_name]
-    assign_action(armature_object, action)
+    for datablock, slot in slots_of_action(action, dependencies(armature_object)).items():
+        assign_action(datablock, action, slot)
     frames = action_frames(action)
     return [(lambda: None, partial(bpy.context.scene.frame_set, frames[index % len(frames)])) for index in indices]
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 import bpy
 
 from ..rig.sources import Sources
-from ..scene.compatibility import curves_of, curves_of_slot, node_input, slot_of
+from ..scene.compatibility import accepts_slot, curves_of_slot, node_input
 from ..scene.node_groups import read_bone_names
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
@@ -64,7 +64,9 @@ def read_graph(
         elif any(map(is_armature, used)):
             graph.add(node, *struct_needs(datablock))
         if is_armature(datablock):
-            keyed = {c.data_path for action in bpy.data.actions for c in curves_of(action, datablock)}
+            # Any of these slots may be assigned later.
+            slots = [(a, slot) for a in bpy.data.actions for slot in a.slots if accepts_slot(datablock, slot)]
+            keyed = {curve.data_path for action, slot in slots for curve in curves_of_slot(action, slot)}
             animated = keyed | animated_paths(datablock)
             add_bones(graph, datablock, animated, straight if datablock == armature_object else none)
             if datablock != armature_object:
@@ -97,7 +99,7 @@ def shown_objects(scene_rigs: list[SceneRig]) -> list[bpy.types.Object]:
 
 def _is_shown_by_action(scene_object: bpy.types.Object) -> bool:
     """Return whether an action that is not assigned may show an object: its slot has the name of this or of none."""
-    slots = [(action, slot) for action in bpy.data.actions if (slot := slot_of(action, scene_object)) is not None]
+    slots = [(a, slot) for a in bpy.data.actions for slot in a.slots if accepts_slot(scene_object, slot)]
     return any(
         curve.data_path == "hide_render"
         for action, slot in slots

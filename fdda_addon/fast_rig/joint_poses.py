@@ -11,6 +11,7 @@ from mathutils import Euler, Quaternion
 
 from ..core.progress import Progress
 from ..poses.action_range import action_frames
+from ..scene.action_slots import dependencies, slots_of_action
 from ..scene.armature import PoseMatrixReader, clear_pose
 from ..scene.temporary_state import assign_action, temporary_pose
 from ..scene.time_stretching import unstretched_time
@@ -154,7 +155,10 @@ def _pose_setters(poses: JointPoses) -> Iterator[Callable[[], None]]:
 
     def show_first_frame(action: bpy.types.Action, frame: int) -> None:
         clear_pose(armature_object)
-        assign_action(armature_object, action)
+        # An action of removed bones alone has no slot any more.
+        assign_action(armature_object, None, None)
+        for datablock, slot in slots_of_action(action, dependencies(armature_object)).items():
+            assign_action(datablock, action, slot)
         bpy.context.scene.frame_set(frame)
 
     for seed in range(poses.pose_count):

@@ -8,7 +8,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..rig.modifier_stack import deforming_modifiers, recorded_modifiers
-from ..scene.compatibility import curves_of
+from ..scene.action_slots import curves_of_actions
 from ..scene.controls import canonical_path
 from ..scene.scene_rig import SceneRig
 from .bendy_bones import unread_curves
@@ -84,10 +84,11 @@ def _write_names_in_paths(scene_rigs: list[SceneRig]) -> None:
             _write_names(curve, owner)
             for target in (target for variable in curve.driver.variables for target in variable.targets):
                 _write_names(target, bpy.context.scene if target.id is None else target.id)
-    armature_object = scene_rigs[0].armature_object
-    for datablock in (armature_object, armature_object.data, *(rig.mesh_object for rig in scene_rigs)):
-        for action in (action for action in bpy.data.actions if action.library is None):
-            for curve in curves_of(action, datablock):
+    roots = (scene_rigs[0].armature_object, *(rig.mesh_object for rig in scene_rigs))
+    actions = [action for action in bpy.data.actions if action.library is None]
+    for curves_by_datablock in curves_of_actions(actions, *roots):
+        for datablock, curves in curves_by_datablock.items():
+            for curve in curves:
                 _write_names(curve, datablock)
 
 

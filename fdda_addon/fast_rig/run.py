@@ -102,6 +102,7 @@ def make_fast_rig(
     poses = JointPoses(armature_object, joint_names, controls, actions, rig_size(armature_object))
     before = yield from _evaluate_full_rig(poses)
     bones_before = len(armature_object.data.bones)
+    keyed = {action.name: keyed_bones(armature_object, action) for action in actions}
     removed = _remove_unneeded(scene_rigs, joint_names, controls)
     after = yield from _evaluate(poses, "fast rig")
 
@@ -121,7 +122,7 @@ def make_fast_rig(
         removed.objects,
         removed.modifiers,
         removed.drivers,
-        _lost_channels(poses, removed.bones),
+        _lost_channels(keyed, removed.bones),
         len(before),
         max(differing_joints(poses, before, after, -1.0).values(), default=0.0),
         len(moving_joints(poses, before, TOLERANCE)),
@@ -216,11 +217,9 @@ def _named_bones(differences: dict[str, float]) -> str:
     return f"{format_count(len(names), 'bone')} ({shown}{more})"
 
 
-def _lost_channels(poses: JointPoses, removed_bones: set[str]) -> dict[str, dict[str, int]]:
-    """Count the keyed channels whose bones were removed, by action and bone."""
-    lost: dict[str, dict[str, int]] = {}
-    for action in poses.actions:
-        keyed = keyed_bones(poses.armature_object, action)
-        if counts := {name: count for name, count in keyed.items() if name in removed_bones}:
-            lost[action.name] = counts
-    return lost
+def _lost_channels(keyed: dict[str, dict[str, int]], removed_bones: set[str]) -> dict[str, dict[str, int]]:
+    """Select from the numbers of keyed channels, by action and bone, those of removed bones."""
+    lost = {
+        action: {bone: n for bone, n in counts.items() if bone in removed_bones} for action, counts in keyed.items()
+    }
+    return {action: counts for action, counts in lost.items() if counts}

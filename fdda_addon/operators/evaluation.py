@@ -19,11 +19,11 @@ from ..models import model_list
 from ..models.entries import bound_entry, bound_model_name
 from ..poses.action_range import action_frames
 from ..properties.recording_options import target_settings
-from ..properties.view import show_graph
+from ..properties.view import active_action_name, show_graph
 from ..runtime.binding import model_disabled
 from ..runtime.model_files import network_of
 from ..scene.active_rig import any_mesh_object
-from ..scene.scene_rig import check_full_rig
+from ..scene.scene_rig import SceneRig, check_full_rig
 from ..scene.viewport import redraw_views
 from .job import JobOperator
 from .model_operator import ModelOperator
@@ -62,7 +62,7 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         rigs = self.bound_rigs(context)
-        self._action = self._action_name(rigs[0].armature_object) if self.source == "ACTION" else ""
+        self._action = self._action_name(rigs[0]) if self.source == "ACTION" else ""
         self._evaluations: list[tuple[int, object]] = []
         for scene_rig in rigs:
             mesh_object = scene_rig.mesh_object
@@ -107,14 +107,14 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         redraw_views()
         return " ".join(sentences)
 
-    def _action_name(self, armature_object: bpy.types.Object) -> str:
-        animation = armature_object.animation_data
-        if not self.action and (animation is None or animation.action is None):
+    def _action_name(self, scene_rig: SceneRig) -> str:
+        name = self.action or active_action_name(scene_rig)
+        if not name:
             raise RigError(
-                f"'{armature_object.name}' has no active action; choose one under Compare On, or compare on random "
-                "poses."
+                f"'{scene_rig.armature_object.name}' has no active action; choose one under Compare On, or compare on "
+                "random poses."
             )
-        return self.action or animation.action.name
+        return name
 
 
 class EvaluationOperator(ModelOperator):

@@ -18,8 +18,10 @@ from ..evaluation.run import evaluate_action
 from ..evaluation.video import check_video_path
 from ..poses.action_range import action_frames
 from ..poses.clip import find_action
+from ..properties.view import active_action_name
 from ..runtime.binding import model_disabled
 from ..runtime.model_files import network_of
+from ..scene.scene_rig import SceneRig
 from ..scene.time_stretching import time_ratio
 from ..timing.benchmark import benchmark
 from .confirm import ChooseFileFirst
@@ -41,7 +43,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
     filter_glob: bpy.props.StringProperty(default="*.mp4;*.webm", options={"HIDDEN"})
     action: bpy.props.StringProperty(
         name="Action",
-        description="Action to show. Empty for the active action of the armature",
+        description="Action to show. Empty for the active action of the rig",
         options={"SKIP_SAVE"},
     )
     direction: bpy.props.FloatVectorProperty(
@@ -56,7 +58,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
 
     def suggested_path(self, context: bpy.types.Context) -> str:
         scene_rig = self.bound_rig(context)
-        self.action = self._action_name(scene_rig.armature_object)
+        self.action = self._action_name(scene_rig)
         if context.region_data is not None:
             self.direction = context.region_data.view_matrix.inverted().to_3x3().col[2]
         file = Path(bpy.data.filepath).stem or "character"
@@ -75,7 +77,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
         path = Path(bpy.path.abspath(self.filepath))
         check_video_path(path)
         check_outputs([(path, VIDEO)], [Path(bpy.data.filepath)])
-        name = self._action_name(scene_rig.armature_object)
+        name = self._action_name(scene_rig)
         network = network_of(scene_rig.mesh_object)
         with model_disabled(scene_rig.mesh_object):
             times = (yield from _result(benchmark(scene_rig, None, FILM_TIMED_FRAMES))).frame_times("")
@@ -93,11 +95,11 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
         path, film = result
         return f"Rendered {format_count(film.frames, 'frame')} to {path.name}."
 
-    def _action_name(self, armature_object: bpy.types.Object) -> str:
-        animation = armature_object.animation_data
-        if not self.action and (animation is None or animation.action is None):
-            raise RigError(f"'{armature_object.name}' has no action; give it one.")
-        return self.action or animation.action.name
+    def _action_name(self, scene_rig: SceneRig) -> str:
+        name = self.action or active_action_name(scene_rig)
+        if not name:
+            raise RigError(f"'{scene_rig.armature_object.name}' has no action; give it one.")
+        return name
 
 
 def _result(steps: Iterator[object]) -> Iterator[object]:

@@ -124,7 +124,7 @@ class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         rig = self.rig(context)
-        names = recorded_actions(rig.armature_object)
+        names = recorded_actions(rig)
         if not names:
             raise RigError(
                 "No action is checked; check the actions under Also Record Actions that show how the rig moves."

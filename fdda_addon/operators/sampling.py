@@ -83,7 +83,7 @@ class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
         new_names = [name for name in names if name not in settings.controls]
         if not new_names:
             raise RigError("The selected bones are already in the list.")
-        actions = recorded_actions(rig.armature_object)
+        actions = recorded_actions(rig)
         controls = listed_controls(rig, RecordingSettings(controls=tuple(new_names), actions=actions))
         for name in new_names:
             settings.controls.add().name = name

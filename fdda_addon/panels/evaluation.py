@@ -68,8 +68,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         source_column.row(align=True).prop(view, "source", expand=True)
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
-        animation = scene_rig.armature_object.animation_data
-        action = animation.action if animation else None
+        action = bpy.data.actions.get(view.action)
         if view.source == "RANDOM":
             column.prop(view, "poses")
             column.prop(view, "seed")

@@ -145,7 +145,7 @@ def draw_limit_sources(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     column.operator("fdda.human_limits", text="Human Limits (All Bones)", icon="OUTLINER_OB_ARMATURE")
     row = column.row(align=True)
     # It can be pressed, so that its message says what to do first.
-    row.active = bool(recorded_actions(rig.armature_object))
+    row.active = bool(recorded_actions(rig))
     row.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
 
 

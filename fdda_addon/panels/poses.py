@@ -3,21 +3,20 @@
 
 import bpy
 
-from ..properties.recording_options import action_moves_bones
-from ..scene.draw_cache import draw_cached
+from ..properties.recording_options import actions_of_rig
 from ..scene.scene_rig import SceneRig
 from . import limits, sampling
 from .section import Section, draw_advanced, draw_wrapped, panel_rig
 
 
 class FDDA_UL_actions(bpy.types.UIList):
-    """List of the actions that move the rig, each with a checkbox."""
+    """List of the actions that animate the rig, each with a checkbox."""
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
         text = self.filter_name.lower()
         flags = [
-            self.bitflag_filter_item if rig and text in action.name.lower() and action in _actions_of_rig(rig) else 0
+            self.bitflag_filter_item if rig and text in action.name.lower() and action in actions_of_rig(rig) else 0
             for action in getattr(data, name)
         ]
         return flags, []
@@ -70,7 +69,7 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
     column = box.column()
     column.use_property_split, column.use_property_decorate = True, False
     column.prop(settings, "poses", text="Random Poses")
-    actions = _actions_of_rig(rig)
+    actions = actions_of_rig(rig)
     if not actions:
         return
     box.label(text="Also Record Actions")
@@ -93,12 +92,7 @@ def _draw_sentences(layout: bpy.types.UILayout, context: bpy.types.Context, rig:
 
 def _has_poses(rig: SceneRig) -> bool:
     """Return whether there is something to record."""
-    return bool(rig.mesh_object.fdda.settings.poses) or any(action.fdda.record for action in _actions_of_rig(rig))
-
-
-@draw_cached
-def _actions_of_rig(rig: SceneRig) -> "tuple[bpy.types.Action, ...]":
-    return tuple(action for action in bpy.data.actions if action_moves_bones(action, rig.armature_object))
+    return bool(rig.mesh_object.fdda.settings.poses) or any(action.fdda.record for action in actions_of_rig(rig))
 
 
 CLASSES = (limits.FDDA_UL_bones, sampling.FDDA_UL_controls, FDDA_UL_actions, FDDA_PT_poses)

@@ -155,7 +155,7 @@ def _draw_record(
 @draw_cached
 def _describe_poses(rig: SceneRig) -> str:
     settings = rig.mesh_object.fdda.settings
-    frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig.armature_object)]
+    frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig)]
     parts = [format_count(settings.poses, "random pose")] if settings.poses or not frames else []
     if frames:
         parts.append(f"{format_count(sum(frames), 'frame')} of {format_count(len(frames), 'action')}")

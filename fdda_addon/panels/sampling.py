@@ -43,7 +43,7 @@ def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, r
     column.prop(settings, "sample", text="")
     if settings.sample == "COLLECTION":
         column.prop_search(settings, "bone_collection", rig.armature_object.data, "collections_all", text="")
-    elif settings.sample in {"ACTIONS", "REMIX"} and not recorded_actions(rig.armature_object):
+    elif settings.sample in {"ACTIONS", "REMIX"} and not recorded_actions(rig):
         draw_wrapped(column, context, "Check the actions below that show how the rig moves.", "INFO")
     elif settings.sample == "SELECTED":
         count = len(settings.sampled_bones)

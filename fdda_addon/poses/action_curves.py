@@ -9,7 +9,7 @@ import numpy as np
 from mathutils import Euler, Quaternion, Vector
 
 from ..core.poses import LOCATION, ROTATION, SCALE
-from ..scene.compatibility import curves_of
+from ..scene.action_slots import CurvesByDatablock
 from ..scene.controls import canonical_path
 
 _BONE_CHANNEL_PATH = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?P<channel>\w+)')
@@ -25,22 +25,15 @@ CurvesByChannel = dict[str, dict[int, bpy.types.FCurve]]
 """F-curves of a bone, by channel and array index."""
 
 
-def curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, CurvesByChannel]:
-    """Return the unmuted F-curves of an action that animate locations, rotations and scales of bones."""
+def curves_by_bone(armature_object: bpy.types.Object, action_curves: CurvesByDatablock) -> dict[str, CurvesByChannel]:
+    """Return the F-curves of an action that animate locations, rotations and scales of the bones of an armature."""
     curves: dict[str, CurvesByChannel] = {}
-    for curve in unmuted_curves(action, armature_object):
+    for curve in action_curves.get(armature_object, ()):
         match = _BONE_CHANNEL_PATH.fullmatch(canonical_path(armature_object, curve.data_path))
         name = bpy.utils.unescape_identifier(match["bone"]) if match else ""
         if match and match["channel"] in _REST_VALUES and name in armature_object.pose.bones:
             curves.setdefault(name, {}).setdefault(match["channel"], {})[curve.array_index] = curve
     return curves
-
-
-def unmuted_curves(action: bpy.types.Action, datablock: bpy.types.ID) -> Iterator[bpy.types.FCurve]:
-    """Yield the F-curves of a datablock that are not muted, neither themselves nor with their group."""
-    for curve in curves_of(action, datablock):
-        if not (curve.mute or (curve.group and curve.group.mute)):
-            yield curve
 
 
 def channel_values(

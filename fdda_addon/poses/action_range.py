@@ -17,10 +17,11 @@ from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, 
 from ..core.errors import RigError
 from ..core.poses import CONTROL, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, Channel
 from ..core.rotations import euler_angles, rotation_vectors, total_range_width
+from ..scene.action_slots import curves_of_actions
 from ..scene.arrays import KEYFRAME_ELEMENTS, read
 from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_of
 from ..scene.scene_rig import SceneRig
-from .action_curves import CurvesByChannel, channel_values, curves_by_bone, unmuted_curves
+from .action_curves import CurvesByChannel, channel_values, curves_by_bone
 
 _CONTROL_PATH = re.compile(r'.*(?:\]\.influence|key_blocks\["(?:[^"\\]|\\.)*"\]\.value|\["(?:[^"\\]|\\.)*"\])')
 
@@ -93,7 +94,9 @@ def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.
     """
     ranges: ChannelRanges = {}
     rotations: dict[str, list[np.ndarray]] = {}
-    for measurement in [_measure(armature_object, action) for action in actions]:
+    actions = list(actions)
+    for action, curves in zip(actions, curves_of_actions(actions, armature_object), strict=True):
+        measurement = _measure(armature_object, action, curves_by_bone(armature_object, curves))
         for key, (low, high) in measurement.ranges.items():
             lowest, highest = ranges.get(key, (np.inf, -np.inf))
             ranges[key] = min(lowest, low), max(highest, high)
@@ -115,9 +118,11 @@ def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> ChannelRanges:
     return {(bone, kind, axis): low_high for axis, low_high in enumerate(bounds)}
 
 
-def _measure(armature_object: bpy.types.Object, action: bpy.types.Action) -> _Measurement:
+def _measure(
+    armature_object: bpy.types.Object, action: bpy.types.Action, curves: dict[str, CurvesByChannel]
+) -> _Measurement:
     """Measure an action, and cache the result until its keyframes change, because many bones take a second."""
-    frames, curves = action_frames(action), curves_by_bone(armature_object, action)
+    frames = action_frames(action)
     content_key = _keyframe_content_key(armature_object, frames, curves)
     cache_key = armature_object.session_uid, action.session_uid
     measurement = _cache.get(cache_key)
@@ -186,24 +191,28 @@ def keyed_controls(
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Measure the lowest and highest value of keyed numbers, by owner and path."""
     ranges: dict[tuple[str, str], tuple[float, float]] = {}
-    for action in actions:
-        for key, values in keyed_numbers(scene_rig, action).items():
+    for numbers in keyed_numbers(scene_rig, actions):
+        for key, values in numbers.items():
             low, high = ranges.get(key, (np.inf, -np.inf))
             ranges[key] = min(low, float(values.min())), max(high, float(values.max()))
     return ranges
 
 
-def keyed_numbers(scene_rig: SceneRig, action: bpy.types.Action) -> dict[tuple[str, str], np.ndarray]:
-    """Evaluate the numbers, besides the channels of bones, that an action keys.
+def keyed_numbers(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> list[dict[tuple[str, str], np.ndarray]]:
+    """Evaluate the numbers, besides the channels of bones, that actions key.
 
     Returns:
-        (F,) float64 values in the frames of the action, by owner and path as in `Control`.
+        For each action, (F,) float64 values in its frames, by owner and path as in `Control`.
     """
-    frames, numbers = action_frames(action), {}
-    for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
-        datablock = owner_of(scene_rig, owner)
-        for curve in unmuted_curves(action, datablock) if datablock else ():
-            path = canonical_path(datablock, curve.data_path)
-            if _CONTROL_PATH.fullmatch(path):
-                numbers[owner, path] = np.array([curve.evaluate(frame) for frame in frames])
-    return numbers
+    actions, numbers_by_action = list(actions), []
+    curves_by_action = curves_of_actions(actions, scene_rig.mesh_object, scene_rig.armature_object)
+    for action, curves in zip(actions, curves_by_action, strict=True):
+        frames, numbers = action_frames(action), {}
+        for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
+            datablock = owner_of(scene_rig, owner)
+            for curve in curves.get(datablock, ()):
+                path = canonical_path(datablock, curve.data_path)
+                if _CONTROL_PATH.fullmatch(path):
+                    numbers[owner, path] = np.array([curve.evaluate(frame) for frame in frames])
+        numbers_by_action.append(numbers)
+    return numbers_by_action

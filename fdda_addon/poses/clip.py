@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Clip: an action, or a strip of an armature's NLA, whose whole frames are used as poses."""
+"""Clip: an action, or a strip of the NLA, whose whole frames are used as poses."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import bpy
 
 from ..core.errors import RigError
 from ..core.recording.index import ACTION, MIRRORED, STRIP, Source
+from ..scene.action_slots import dependencies, slots_of_action, unmuted_curves
+from ..scene.compatibility import animation_curves
+from ..scene.scene_rig import SceneRig
 from .action_range import action_frames
 
 
@@ -41,23 +44,43 @@ class Clip:
 
 
 def find_clips(
-    armature_object: bpy.types.Object, actions: Iterable[str], strips: Iterable[str] = (), mirror: bool = False
+    scene_rigs: Sequence[SceneRig], actions: Iterable[str], strips: Iterable[str] = (), mirror: bool = False
 ) -> tuple[Clip, ...]:
     """Find clips by the names of actions and strips, actions first.
 
     Args:
-        armature_object: the armature object with the strips in its NLA.
+        scene_rigs: the rigs that the clips animate.
         actions, strips: names.
         mirror: add each clip a second time, mirrored, right after the first.
 
     Raises:
-        RigError: there is no action or strip of a name, or a strip is muted.
+        RigError: there is no action or strip of a name, it animates nothing of the rigs, or a strip is muted.
     """
-    clips = [Clip(ACTION, name, action_frames(find_action(name))) for name in actions]
-    clips += [Clip(STRIP, name, _strip_frames(find_strip(armature_object, name))) for name in strips]
+    roots = [scene_rigs[0].armature_object, *(scene_rig.mesh_object for scene_rig in scene_rigs)]
+    actions, strips = list(actions), list(strips)
+    datablocks = dependencies(*roots) if actions or strips else []
+    clips = []
+    for name in actions:
+        action = find_action(name)
+        if not slots_of_action(action, datablocks):
+            raise RigError(_no_effect_message(action, roots))
+        clips.append(Clip(ACTION, name, action_frames(action)))
+    clips += [Clip(STRIP, name, _strip_frames(find_strip(datablocks, name))) for name in strips]
     if mirror:
         clips = [version for clip in clips for version in (clip, replace(clip, is_mirrored=True))]
     return tuple(clips)
+
+
+def _no_effect_message(action: bpy.types.Action, roots: Sequence[bpy.types.Object]) -> str:
+    curves = animation_curves(action)
+    identifiers = ", ".join(f"'{slot.identifier}'" for slot in action.slots)
+    reason = f"its slots are for something else: {identifiers}" if curves else "it has no F-curves"
+    if curves and not any(unmuted_curves(action, slot) for slot in action.slots):
+        reason = "its F-curves are muted"
+    return (
+        f"The action '{action.name}' animates neither '{roots[0].name}' nor anything that moves '{roots[1].name}': "
+        f"{reason}; choose another action, or assign it to the object that it animates."
+    )
 
 
 def find_action(name: str) -> bpy.types.Action:
@@ -73,24 +96,30 @@ def find_action(name: str) -> bpy.types.Action:
     return action
 
 
-def find_strip(armature_object: bpy.types.Object, name: str) -> bpy.types.NlaStrip:
-    """Find a strip of an armature's NLA by its name.
+def find_strip(datablocks: Sequence[bpy.types.ID], name: str) -> bpy.types.NlaStrip:
+    """Find a strip by its name in the NLA of the datablocks of a rig, of which the first is the armature object.
 
     Raises:
-        RigError: there is no such strip, or it is muted.
+        RigError: there is no such strip, it is muted, or several have the name and other frames.
     """
-    animation = armature_object.animation_data
-    strips = [(track, strip) for track in (animation.nla_tracks if animation else ()) for strip in track.strips]
-    for track, strip in strips:
-        if strip.name == name:
-            if strip.mute or track.mute:
-                raise RigError(
-                    f"The strip '{name}' of '{armature_object.name}' is muted and shows nothing; unmute it and its "
-                    f"track '{track.name}'."
-                )
-            return strip
-    names = ", ".join(f"'{strip.name}'" for _, strip in strips) or "none"
-    raise RigError(f"The NLA of '{armature_object.name}' has no strip '{name}'; its strips: {names}.")
+    animations = [animation for d in datablocks if (animation := getattr(d, "animation_data", None)) is not None]
+    strips = [(track, strip) for animation in animations for track in animation.nla_tracks for strip in track.strips]
+    named_strips = [(track, strip) for track, strip in strips if strip.name == name]
+    shown_strips = [strip for track, strip in named_strips if not (strip.mute or track.mute)]
+    if not named_strips:
+        names = ", ".join(sorted({f"'{strip.name}'" for _, strip in strips})) or "none"
+        raise RigError(f"The NLA of '{datablocks[0].name}' has no strip '{name}'; its strips: {names}.")
+    if not shown_strips:
+        track, strip = named_strips[0]
+        raise RigError(
+            f"The strip '{name}' of '{strip.id_data.name}' is muted and shows nothing; unmute it and its track "
+            f"'{track.name}'."
+        )
+    owners = {_strip_frames(strip): strip.id_data.name for strip in shown_strips}
+    if len(owners) > 1:
+        names = " and ".join(f"'{owner}'" for owner in owners.values())
+        raise RigError(f"{names} have strips '{name}' with different frames; rename one of them.")
+    return shown_strips[0]
 
 
 def _strip_frames(strip: bpy.types.NlaStrip) -> range:

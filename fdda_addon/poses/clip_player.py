@@ -1,21 +1,27 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shows the frames of clips: assigns an action to all datablocks of a rig, or enables their NLA, and restores them."""
+"""Shows the frames of clips: assigns an action to the datablocks that it animates, or enables their NLA."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import bpy
 import numpy as np
 
 from ..core.recording.index import ACTION
+from ..scene.action_slots import dependencies, slots_of_action
 from ..scene.animated_values import animated_values, driving_actions, read_value, set_value
 from ..scene.armature import clear_pose
 from ..scene.arrays import POSE_CHANNELS, read, write
-from ..scene.compatibility import curves_of
 from ..scene.controls import can_be_set, owner_of, set_control
 from ..scene.scene_rig import SceneRig
-from ..scene.temporary_state import assign_action
+from ..scene.temporary_state import (
+    AnimationState,
+    animation_state,
+    assign_action,
+    restore_animation,
+    temporary_pose,
+)
 from .clip import Clip
 from .mirror import Mirror
 
@@ -31,19 +37,24 @@ class ClipFrame:
     """The values that a clip sets in a frame.
 
     Attributes:
-        channels: channels of the pose bones, an array for each of `POSE_CHANNELS`.
+        channels: channels of the pose bones by armature object, an array for each of `POSE_CHANNELS`.
         numbers: values of other animated properties.
     """
 
-    channels: tuple[np.ndarray, ...]
+    channels: dict[bpy.types.Object, tuple[np.ndarray, ...]]
     numbers: PropertyValues
 
 
 class ClipPlayer:
     """Shows frames of clips. Each frame looks the same, whatever frames were shown before.
 
-    Bones that an action does not key are in the rest pose, and other numbers have their values in the file. An action
-    also animates the shape keys, the mesh object and the armature's data if it has F-curves for them.
+    A clip animates all datablocks on which the rigs depend and for which it has F-curves (`slots_of_action`), such as
+    another armature with the control rig, or shape keys. Bones that an action does not key are in the rest pose, and
+    other numbers have their values in the file.
+
+    Attributes:
+        armature_objects: the armature object of the rigs, then others that a clip animates.
+        other_datablocks: further datablocks that a clip animates.
     """
 
     def __init__(self, rigs: ControlledRigs, clips: tuple[Clip, ...]):
@@ -56,20 +67,32 @@ class ClipPlayer:
         Raises:
             RigError: a clip is mirrored, and the rig is not symmetric.
         """
-        self._armature_object, self._clip = rigs[0][0].armature_object, None
-        self._other_datablocks = [d for d in _other_datablocks(rigs) if any(_animates(clip, d) for clip in clips)]
-        self._idle_states: list[tuple] | None = None
+        armature_object, self._clip = rigs[0][0].armature_object, None
+        mesh_objects = [scene_rig.mesh_object for scene_rig, _ in rigs]
+        datablocks = dependencies(armature_object, *mesh_objects) if clips else []
+        self._slots = {clip: _animated_datablocks(clip, datablocks) for clip in clips}
+        animated_datablocks = dict.fromkeys(datablock for slots in self._slots.values() for datablock in slots)
+        is_armature = {d: getattr(d, "type", "") == "ARMATURE" for d in animated_datablocks}
+        self.armature_objects = list(dict.fromkeys([armature_object, *filter(is_armature.get, animated_datablocks)]))
+        self.other_datablocks = [d for d in animated_datablocks if not is_armature[d]]
+        self._idle_states: list[AnimationState] | None = None
         animated_numbers = {
             (datablock, path): value
-            for datablock in (self._armature_object, *self._other_datablocks)
-            for path, value in animated_values(datablock, _actions_of_clips(clips, datablock)).items()
+            for datablock in (*self.armature_objects, *self.other_datablocks)
+            for path, value in animated_values(datablock, actions_of_clips(clips, datablock)).items()
             if not _is_pose_channel(path)
         }
-        self._mirror = None
+        self._mirrors: list[Mirror] = []
         if any(clip.is_mirrored for clip in clips):
-            self._mirror = Mirror(self._armature_object, animated_numbers)
+            # Armatures that only follow the animated ones need not be symmetric.
+            mirrored = [a for a in self.armature_objects if a in animated_datablocks] or [armature_object]
+            for armature in mirrored:
+                others = {*mirrored, *(self.other_datablocks if armature != mirrored[0] else ())} - {armature}
+                self._mirrors.append(Mirror(armature, [key for key in animated_numbers if key[0] not in others]))
             animated_numbers |= {
-                (datablock, path): datablock.path_resolve(path) for datablock, path in self._mirror.numbers
+                (datablock, path): datablock.path_resolve(path)
+                for mirror in self._mirrors
+                for datablock, path in mirror.numbers
             }
         self._numbers: PropertyValues = animated_numbers
         self._controls: list[tuple[SceneRig, str, float]] = []
@@ -79,30 +102,32 @@ class ClipPlayer:
                 self._controls.append((scene_rig, name, owner_of(scene_rig, owner).path_resolve(path)))
 
     def show(self, clip: Clip, frame: int) -> None:
-        """Show a frame of a clip. The armature must have no animation of its own (`temporary_pose`)."""
+        """Show a frame of a clip."""
         if clip != self._clip:
-            self._start(clip)
+            self.start(clip)
         elif clip.is_mirrored:
-            self._reset_pose()
+            self.reset_pose()
         bpy.context.scene.frame_set(frame)
         if clip.is_mirrored:
-            self._mirror.apply()
+            for mirror in self._mirrors:
+                mirror.apply()
 
     @property
     def current_clip_frame(self) -> ClipFrame:
         """Return the values of the frame that is shown."""
-        bones = self._armature_object.pose.bones
+        channels = {a: tuple(read(a.pose.bones, channel) for channel in POSE_CHANNELS) for a in self.armature_objects}
         numbers = {(datablock, path): read_value(datablock, path) for datablock, path in self._numbers}
-        return ClipFrame(tuple(read(bones, channel) for channel in POSE_CHANNELS), numbers)
+        return ClipFrame(channels, numbers)
 
     def set_clip_frame(self, clip_frame: ClipFrame, frame: int) -> None:
         """Set the values of a clip frame at any frame of the scene, without animation."""
         self.stop()
-        for channel, values in zip(POSE_CHANNELS, clip_frame.channels, strict=True):
-            write(self._armature_object.pose.bones, channel, values)
+        for armature_object, channel_values in clip_frame.channels.items():
+            for channel, values in zip(POSE_CHANNELS, channel_values, strict=True):
+                write(armature_object.pose.bones, channel, values)
         for (datablock, path), value in clip_frame.numbers.items():
             set_value(datablock, path, value)
-        for datablock in {self._armature_object, *(datablock for datablock, _ in clip_frame.numbers)}:
+        for datablock in {*self.armature_objects, *(datablock for datablock, _ in clip_frame.numbers)}:
             datablock.update_tag()
         bpy.context.scene.frame_set(frame)
 
@@ -110,27 +135,30 @@ class ClipPlayer:
         """Remove the animation of the rig, and set the rest pose and the values that the numbers have in the file."""
         if self._clip is not None:
             self._clip = None
-            animation = self._armature_object.animation_data
-            if animation is not None:
-                animation.use_nla, animation.action = False, None
-            for datablock, state in zip(self._other_datablocks, self._idle_states, strict=True):
-                _restore_animation(datablock, state)
-            self._reset_pose()
+            for armature_object in self.armature_objects:
+                if (animation := armature_object.animation_data) is not None:
+                    animation.use_nla, animation.action = False, None
+            for datablock, state in zip(self.other_datablocks, self._idle_states, strict=True):
+                restore_animation(datablock, state)
+            self.reset_pose()
 
-    def _start(self, clip: Clip) -> None:
+    def start(self, clip: Clip) -> None:
+        """Let a clip animate the rigs, from the rest pose, at any frame that the caller sets."""
         self.stop()
         if self._idle_states is None:
-            self._idle_states = [_animation_state(datablock) for datablock in self._other_datablocks]
+            self._idle_states = [animation_state(datablock) for datablock in self.other_datablocks]
         self._clip = clip
-        self._reset_pose()
-        for datablock in [d for d in (self._armature_object, *self._other_datablocks) if _animates(clip, d)]:
+        self.reset_pose()
+        for datablock, slot in self._slots[clip].items():
             if clip.kind == ACTION:
-                assign_action(datablock, bpy.data.actions[clip.name])
+                assign_action(datablock, bpy.data.actions[clip.name], slot)
             else:
                 datablock.animation_data.action, datablock.animation_data.use_nla = None, True
 
-    def _reset_pose(self) -> None:
-        clear_pose(self._armature_object)
+    def reset_pose(self) -> None:
+        """Set the rest pose, and the numbers to their values in the file."""
+        for armature_object in self.armature_objects:
+            clear_pose(armature_object)
         self.restore_numbers()
 
     def restore_numbers(self) -> None:
@@ -145,51 +173,46 @@ class ClipPlayer:
 
 @contextmanager
 def clip_player(rigs: ControlledRigs, clips: tuple[Clip, ...]) -> Iterator[ClipPlayer]:
-    """Yield a player of clips; afterwards restore the animation of the rigs and the numbers that the clips animate.
+    """Yield a player of clips, with the armatures that it animates in the rest pose and without animation.
 
-    Enter it before `temporary_pose`, which restores the animation of the armature object and the frame.
+    Afterwards restore poses, animation, the numbers that the clips animate, and the frame.
 
     Raises:
         RigError: as `ClipPlayer`.
     """
     player = ClipPlayer(rigs, clips)
-    states = [(datablock, _animation_state(datablock)) for datablock in _other_datablocks(rigs)]
+    states = [(datablock, animation_state(datablock)) for datablock in player.other_datablocks]
     try:
-        yield player
+        with ExitStack() as stack:
+            for armature_object in player.armature_objects:
+                stack.enter_context(temporary_pose(armature_object, actions_of_clips(clips, armature_object)))
+                clear_pose(armature_object)
+            yield player
     finally:
         for datablock, state in states:
-            _restore_animation(datablock, state)
+            restore_animation(datablock, state)
         # Evaluate the restored animation first, because the numbers may differ from its keyframes.
         bpy.context.view_layer.update()
         player.restore_numbers()
         bpy.context.view_layer.update()
 
 
-def clip_actions(armature_object: bpy.types.Object, clips: tuple[Clip, ...]) -> list[bpy.types.Action]:
-    """Return the actions that animate the armature object while clips are shown, for `temporary_pose`."""
-    return _actions_of_clips(clips, armature_object)
-
-
-def _other_datablocks(rigs: ControlledRigs) -> list[bpy.types.ID]:
-    """Return the datablocks of rigs except the armature object, without duplicates."""
-    meshes = [scene_rig.mesh_object for scene_rig, _ in rigs]
-    datablocks = [rigs[0][0].armature_object.data]
-    datablocks += [datablock for mesh_object in meshes for datablock in (mesh_object, mesh_object.data.shape_keys)]
-    return list(dict.fromkeys(datablock for datablock in datablocks if datablock is not None))
-
-
-def _actions_of_clips(clips: tuple[Clip, ...], datablock: bpy.types.ID) -> list[bpy.types.Action]:
+def actions_of_clips(clips: tuple[Clip, ...], datablock: bpy.types.ID) -> list[bpy.types.Action]:
+    """Return the actions that may animate a datablock while clips are shown."""
     actions = [bpy.data.actions[clip.name] for clip in clips if clip.kind == ACTION]
     if datablock.animation_data is not None and any(clip.kind != ACTION for clip in clips):
         actions += driving_actions(datablock.animation_data)
     return actions
 
 
-def _animates(clip: Clip, datablock: bpy.types.ID) -> bool:
-    """Return whether a clip animates a datablock."""
+def _animated_datablocks(
+    clip: Clip, datablocks: Sequence[bpy.types.ID]
+) -> "dict[bpy.types.ID, bpy.types.ActionSlot | None]":
+    """Return the datablocks that a clip animates, each with the slot of the action; None for strips."""
     if clip.kind == ACTION:
-        return bool(curves_of(bpy.data.actions[clip.name], datablock))
-    return datablock.animation_data is not None and len(datablock.animation_data.nla_tracks) > 0
+        return slots_of_action(bpy.data.actions[clip.name], datablocks)
+    animations = [(datablock, getattr(datablock, "animation_data", None)) for datablock in datablocks]
+    return {datablock: None for datablock, animation in animations if animation and len(animation.nla_tracks)}
 
 
 def _is_pose_channel(path: str) -> bool:
@@ -201,26 +224,3 @@ def _is_pose_channel(path: str) -> bool:
         "rotation_quaternion",
         "rotation_axis_angle",
     }
-
-
-def _animation_state(datablock: bpy.types.ID) -> tuple | None:
-    """Return action, slot and NLA state of a datablock; None without animation data."""
-    animation = datablock.animation_data
-    if animation is None:
-        return None
-    return animation.action, getattr(animation, "action_slot", None), animation.use_nla
-
-
-def _restore_animation(datablock: bpy.types.ID, state: tuple | None) -> None:
-    """Restore the state that `_animation_state` returned, if it has changed."""
-    if state == _animation_state(datablock):
-        return
-    if state is None:
-        datablock.animation_data_clear()
-        return
-    animation, (action, slot, use_nla) = datablock.animation_data, state
-    animation.action = action
-    if action is not None and hasattr(animation, "action_slot"):
-        # Blender chooses a slot when an action is assigned, even if there was none before.
-        animation.action_slot = slot
-    animation.use_nla = use_nla

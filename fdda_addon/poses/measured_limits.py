@@ -9,6 +9,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
+from ..scene.action_slots import curves_of_actions
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
 from .action_range import ChannelRanges, has_width, keyed_ranges, moving_ranges
@@ -92,7 +93,10 @@ def set_limits_from_actions(
     }
     if not moving_channel_ranges:
         names = ", ".join(f"'{action.name}'" for action in actions) or "none"
-        raise RigError(f"The actions ({names}) move no bone of '{armature_object.name}'; choose actions of this rig.")
+        animated = {d.name for curves in curves_of_actions(actions, armature_object) for d in curves}
+        others = " and ".join(f"'{name}'" for name in sorted(animated - {armature_object.name}))
+        remedy = f"they animate {others}" if others else "choose actions of this rig"
+        raise RigError(f"The actions ({names}) move no bone of '{armature_object.name}'; {remedy}.")
     bones_near_gimbal_lock = _bones_near_gimbal_lock(keyed_channel_ranges)
     # An IK solver uses the limits of any bone that it moves.
     has_ik = any(constraint.type == "IK" for bone in armature_object.pose.bones for constraint in bone.constraints)

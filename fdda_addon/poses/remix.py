@@ -11,6 +11,7 @@ from ..core.errors import RigError
 from ..core.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION_VECTOR, SCALE, Channel
 from ..core.remix import Remix, find_limbs
 from ..core.rotations import rotation_vectors
+from ..scene.action_slots import curves_of_actions
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_curves import CurvesByChannel, axis_angle_to_quaternion, curves_by_bone, evaluate_curves
@@ -33,8 +34,13 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
     Raises:
         RigError: the actions move no bone, or have one pose.
     """
-    clips = [(action_frames(action), curves_by_bone(scene_rig.armature_object, action)) for action in actions]
-    bones = [bone for bone in scene_rig.armature_object.pose.bones if any(bone.name in curves for _, curves in clips)]
+    armature_object = scene_rig.armature_object
+    curves_by_action = curves_of_actions(actions, scene_rig.mesh_object, armature_object)
+    clips = [
+        (action_frames(action), curves_by_bone(armature_object, curves))
+        for action, curves in zip(actions, curves_by_action, strict=True)
+    ]
+    bones = [bone for bone in armature_object.pose.bones if any(bone.name in curves for _, curves in clips)]
     limbs = dict(zip((bone.name for bone in bones), find_limbs(_parents(bones)).tolist(), strict=True))
     columns: list[tuple[Channel, np.ndarray, int, bool]] = []
     for bone in bones:
@@ -47,14 +53,14 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
                     columns.append((channel, values[:, axis], limbs[bone.name], has_noise))
     names = ", ".join(f"'{action.name}'" for action in actions)
     if not columns:
-        raise RigError(f"There is no pose to remix: {names} moves no bone of '{scene_rig.armature_object.name}'.")
+        raise RigError(f"There is no pose to remix: {names} moves no bone of '{armature_object.name}'.")
     limbs_by_path = {bone.path_from_id(): limbs[bone.name] for bone in bones}
     for (owner, path), values in _number_values(scene_rig, actions).items():
         limb = limbs_by_path.get(path[: path.find('"]') + 2], len(bones))
         columns.append((Channel(f"{owner}/{path}", CONTROL, 0, *_bounds(values)), values, limb, False))
     if not any(has_width(_bounds(values)) for _, values, _, _ in columns):
         raise RigError(
-            f"There is only one pose to remix: nothing of '{scene_rig.armature_object.name}' moves in {names}; record "
+            f"There is only one pose to remix: nothing of '{armature_object.name}' moves in {names}; record "
             "other actions."
         )
     channels, values, channel_limbs, has_noise = zip(*columns, strict=True)
@@ -107,7 +113,7 @@ def _number_values(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> 
 
     A number has its current value in the frames of an action that does not key it.
     """
-    numbers_by_action = [keyed_numbers(scene_rig, action) for action in actions]
+    numbers_by_action = keyed_numbers(scene_rig, actions)
     values: dict[tuple[str, str], np.ndarray] = {}
     for owner, path in dict.fromkeys(key for numbers in numbers_by_action for key in numbers):
         datablock = owner_of(scene_rig, owner)

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Converts the properties of a character to the settings of a recording."""
 
+from contextlib import suppress
+
 import bpy
 
 from ..core.errors import RigError
 from ..poses.action_range import action_frames
 from ..recording.plan import RecordingSettings
 from ..rig.pose_setter import TargetSettings
+from ..scene.action_slots import dependencies, slots_of_action
 from ..scene.active_rig import cached_active_rig
-from ..scene.compatibility import animation_curves
-from ..scene.controls import canonical_path
+from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from .character import FDDA_PG_character
 
@@ -24,7 +26,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         RigError: the bones to pose have not been chosen.
     """
     settings = scene_rig.mesh_object.fdda.settings
-    actions = recorded_actions(scene_rig.armature_object)
+    actions = recorded_actions(scene_rig)
     return RecordingSettings(
         poses=settings.poses,
         seed=settings.seed,
@@ -124,31 +126,33 @@ def _control_options(settings: FDDA_PG_character) -> tuple[str, ...]:
     )
 
 
-def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
-    """Return the names of the checked actions that move a bone of an armature."""
-    return tuple(
-        action.name for action in bpy.data.actions if action.fdda.record and action_moves_bones(action, armature_object)
-    )
+def recorded_actions(scene_rig: SceneRig) -> tuple[str, ...]:
+    """Return the names of the checked actions that animate a rig."""
+    return tuple(action.name for action in actions_of_rig(scene_rig) if action.fdda.record)
 
 
 def planned_pose_count(scene_rig: SceneRig) -> int:
     """Return the number of poses that a recording with the settings of a character has."""
     settings = scene_rig.mesh_object.fdda.settings
-    frames = sum(len(action_frames(bpy.data.actions[name])) for name in recorded_actions(scene_rig.armature_object))
+    frames = sum(len(action_frames(bpy.data.actions[name])) for name in recorded_actions(scene_rig))
     return settings.poses + frames * (2 if settings.mirror else 1)
 
 
 def actions_of_active_rig(context: bpy.types.Context) -> list[str]:
-    """Return the names of the actions that move a bone of the rig that the sidebar shows."""
+    """Return the names of the actions that animate the rig that the sidebar shows."""
     rig = cached_active_rig(context)
-    return [a.name for a in bpy.data.actions if rig is not None and action_moves_bones(a, rig.armature_object)]
+    return [action.name for action in actions_of_rig(rig)] if rig is not None else []
 
 
-def action_moves_bones(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
-    """Return whether an action animates a bone of an armature."""
-    bones = armature_object.pose.bones
-    for curve in animation_curves(action):
-        path = canonical_path(armature_object, curve.data_path)
-        if path.startswith('pose.bones["') and path[12 : path.find('"]', 12)] in bones:
-            return True
-    return False
+@draw_cached
+def actions_of_rig(scene_rig: SceneRig) -> tuple[bpy.types.Action, ...]:
+    """Return the actions that animate a rig or something on which it depends."""
+    datablocks = dependencies(scene_rig.armature_object, scene_rig.mesh_object)
+    actions = []
+    for action in bpy.data.actions:
+        # If several datablocks fit, the recording asks for one.
+        with suppress(RigError):
+            if not slots_of_action(action, datablocks):
+                continue
+        actions.append(action)
+    return tuple(actions)

@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Settings of the section "Compare with Rig": `WindowManager.fdda_view`, which is not saved in the .blend file."""
 
+from contextlib import suppress
+
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from ..core.defaults import EVALUATION_SEED, MARKERS, SIDEBAR_EVALUATION_POSES
+from ..core.errors import RigError
 from ..evaluation.timeline import graph
 from ..scene import undo
+from ..scene.action_slots import active_action, dependencies, slots_of_action
 from ..scene.active_rig import cached_active_rig
+from ..scene.draw_cache import draw_cached
+from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import assign_action
 from ..scene.viewport import redraw_views
 from .recording_options import actions_of_active_rig
@@ -23,21 +29,35 @@ def show_graph(is_shown: bool) -> None:
 
 
 def _active_action(_view: "FDDA_PG_view") -> str:
-    """Return the name of the active action of the armature that the sidebar shows; empty without one."""
+    """Return the name of the active action of the rig that the sidebar shows; empty without one."""
     rig = cached_active_rig(bpy.context)
-    animation = rig.armature_object.animation_data if rig is not None else None
-    return animation.action.name if animation is not None and animation.action is not None else ""
+    return active_action_name(rig) if rig is not None else ""
+
+
+@draw_cached
+def active_action_name(scene_rig: SceneRig) -> str:
+    """Return the name of the action that animates a rig, or what it depends on; empty without one."""
+    action = active_action(scene_rig.armature_object, scene_rig.mesh_object)
+    return action.name if action is not None else ""
 
 
 def _set_active_action(_view: "FDDA_PG_view", name: str) -> None:
-    """Make an action the active one of the armature that the sidebar shows; an empty name removes the active one."""
+    """Make an action the active one of the rig that the sidebar shows; an empty name removes the active one."""
     rig, action = cached_active_rig(bpy.context), bpy.data.actions.get(name)
     if rig is None or (name and action is None):
         return
+    roots = (rig.armature_object, rig.mesh_object)
+    datablocks = dependencies(*roots)
     if action is not None:
-        assign_action(rig.armature_object, action)
-    elif rig.armature_object.animation_data is not None:
-        rig.armature_object.animation_data.action = None
+        # If several datablocks fit, none gets the action.
+        with suppress(RigError):
+            for datablock, slot in slots_of_action(action, datablocks).items():
+                assign_action(datablock, action, slot)
+    elif (old_action := active_action(*roots)) is not None:
+        animations = [getattr(datablock, "animation_data", None) for datablock in datablocks]
+        for animation in animations:
+            if animation is not None and animation.action == old_action:
+                animation.action = None
     undo.push_undo_soon("Choose Action")
 
 
@@ -48,14 +68,14 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
         name="Compare On",
         description="Poses to compare the model with the rig on",
         items=(
-            ("ACTION", "Active Action", "All frames of the armature's action"),
+            ("ACTION", "Active Action", "All frames of the action of the rig"),
             ("RANDOM", "Random Poses", "New random poses within the limits, which are in no recording"),
         ),
         default="ACTION",
     )
     action: StringProperty(
         name="Action",
-        description="Active action of the armature; the model is compared with the rig in all of its frames",
+        description="Active action of the rig; the model is compared with the rig in all of its frames",
         get=_active_action,
         set=_set_active_action,
         search=lambda _view, context, _text: actions_of_active_rig(context),

@@ -4,8 +4,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import bpy
-
 from ..core.errors import RigError
 from ..rig.dependencies import deforming_mesh_objects
 from ..rig.modifier_stack import read_stack
@@ -13,8 +11,8 @@ from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, listed_controls
 
 
-def common_armature(rigs: Sequence[SceneRig]) -> bpy.types.Object:
-    """Return the armature object that all meshes follow.
+def check_common_armature(rigs: Sequence[SceneRig]) -> None:
+    """Check that all meshes follow the same armature object.
 
     Raises:
         RigError: the meshes follow different armatures.
@@ -27,7 +25,6 @@ def common_armature(rigs: Sequence[SceneRig]) -> bpy.types.Object:
                 f"'{other_rig.mesh_object.name}' follows '{other_rig.armature_object.name}'; record the meshes of each "
                 "armature by themselves, with --object."
             )
-    return armature_object
 
 
 def split_controls(rigs: Sequence[SceneRig], settings: RecordingSettings) -> list[tuple[str, ...]]:

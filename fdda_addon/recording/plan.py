@@ -177,7 +177,7 @@ def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tu
     """
     name = REMIX if REMIX in settings.sample else ""
     sources = [Source(RANDOM, settings.poses, name)] if settings.poses else []
-    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
+    clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
     sampled_channels_of_recording = channels if settings.poses else ()
     margin = make_recording_margin(scene_rig, settings, sampled_channels_of_recording)

@@ -29,7 +29,7 @@ from ..scene.scene_rig import SceneRig, check_full_rig
 from .appender import PoseAppender, append_poses
 from .influence_trials import InfluenceSearch
 from .influences import detect_influences
-from .mesh_group import common_armature, group_into_passes, split_controls
+from .mesh_group import check_common_armature, group_into_passes, split_controls
 from .plan import RecordingSettings, find_actions, make_pose_sampler, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
 from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
@@ -96,7 +96,8 @@ class RecordingSession:
     def __init__(self, rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings):
         """Plan the recordings of meshes and their poses, and raise all errors that can be found in advance."""
         scene_rigs, self.settings = [scene_rig for scene_rig, _ in rigs], settings
-        self.clips = find_clips(common_armature(scene_rigs), settings.actions, settings.strips, settings.mirror)
+        check_common_armature(scene_rigs)
+        self.clips = find_clips(scene_rigs, settings.actions, settings.strips, settings.mirror)
         if settings.mirror and not self.clips:
             raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
         controls = [settings.controls] if len(rigs) == 1 else split_controls(scene_rigs, settings)

@@ -12,7 +12,6 @@ from ..core.features import FLOAT32_ROUNDING_RATIO
 from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.recording.target import POSE
 from ..poses.clip_player import ClipPlayer
-from ..scene.armature import clear_pose
 from .pose_plan import PosePlan
 from .recorded_mesh import RecordedMesh
 
@@ -54,8 +53,7 @@ def check_follows_pose(meshes: Sequence[RecordedMesh], plan: PosePlan, player: C
                         _compare_surfaces(mesh, (frame, other_frame), first_evaluation, evaluator.evaluate())
     finally:
         player.stop()
-        clear_pose(meshes[0].scene_rig.armature_object)
-        player.restore_numbers()
+        player.reset_pose()
         scene.frame_set(frame, subframe=subframe)
 
 

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the bones and numbers that drivers and modifiers of a mesh read, so that the mesh depends on them."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
+from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.animation import changes_value, curves_with_actions
 from ..scene.controls import canonical_path, make_control
 from ..scene.scene_rig import SceneRig
@@ -36,8 +37,9 @@ def read_dependencies(scene_rig: SceneRig, actions: Iterable[bpy.types.Action] =
         actions: further actions that may be played.
     """
     sources = Sources(scene_rig, scene_rig.mesh_object)
+    curves_by_action = curves_of_actions(actions, scene_rig.mesh_object, scene_rig.armature_object)
     controls = {control.name: control for control in controls_of_other_armatures(scene_rig, sources)}
-    for name in (*_driver_inputs(sources), *_keyed_shape_keys(sources, tuple(actions))):
+    for name in (*_driver_inputs(sources), *_keyed_shape_keys(sources, curves_by_action)):
         owner, _, path = name.partition("/")
         try:
             control = make_control(scene_rig, owner, path)
@@ -65,11 +67,11 @@ def _driver_inputs(sources: Sources) -> Iterator[str]:
             yield name
 
 
-def _keyed_shape_keys(sources: Sources, actions: tuple[bpy.types.Action, ...]) -> Iterator[str]:
+def _keyed_shape_keys(sources: Sources, curves_by_action: Sequence[CurvesByDatablock]) -> Iterator[str]:
     """Yield the names of the controls that are values of keyed shape keys."""
     for shape_keys in (datablock for datablock in sources.datablocks if isinstance(datablock, bpy.types.Key)):
-        keyed_curves = [curve for curve in curves_with_actions(shape_keys, actions) if changes_value(curve)]
-        keyed_paths = {canonical_path(shape_keys, curve.data_path) for curve in keyed_curves}
+        keyed_curves = curves_with_actions(shape_keys, curves_by_action)
+        keyed_paths = {canonical_path(shape_keys, curve.data_path) for curve in keyed_curves if changes_value(curve)}
         for block in shape_keys.key_blocks:
             if (
                 (path := block.path_from_id("value")) in keyed_paths

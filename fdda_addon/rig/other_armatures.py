@@ -9,12 +9,12 @@ from ..core.controls import OTHER_OBJECT, Control
 from ..core.errors import RigError
 from ..core.poses import LOCATION, ROTATION, SCALE
 from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
+from ..scene.action_slots import is_overridden
 from ..scene.controls import fcurve_target, make_control
 from ..scene.scene_rig import SceneRig
 from .bone_paths import is_transform_channel, split_bone_path
 from .sources import Sources
 
-_COPY_CONSTRAINTS = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}
 _FOUR_COMPONENT_MODES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
 _VERBS = {ROTATION: "rotate", LOCATION: "move", SCALE: "scale"}
 
@@ -126,9 +126,9 @@ def _can_vary(bounds: tuple[float, float] | None) -> bool:
 def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, AxisRanges]]:
     """Yield kind, property and ranges of the channels that are free to move a bone."""
     if bone.rotation_mode in _FOUR_COMPONENT_MODES:
-        if not all(bone.lock_rotation) and not _is_overridden(bone, ROTATION):
+        if not all(bone.lock_rotation) and not is_overridden(bone, ROTATION):
             yield ROTATION, _FOUR_COMPONENT_MODES[bone.rotation_mode], dict.fromkeys(range(4))
-    elif not _is_overridden(bone, ROTATION):
+    elif not is_overridden(bone, ROTATION):
         yield (
             ROTATION,
             "rotation_euler",
@@ -138,19 +138,5 @@ def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, AxisRan
     if not (bone.parent and bone.bone.use_connect):
         other_channels.insert(0, (LOCATION, bone.lock_location, location_ranges(bone)))
     for kind, locks, ranges in other_channels:
-        if not _is_overridden(bone, kind):
+        if not is_overridden(bone, kind):
             yield kind, kind, {axis: ranges.get(axis) for axis in range(3) if not locks[axis]}
-
-
-def _is_overridden(bone: bpy.types.PoseBone, kind: str) -> bool:
-    """Return whether a constraint overrides the channels of `kind`: location, rotation or scale."""
-    return any(
-        constraint.type == "COPY_TRANSFORMS"
-        or (_COPY_CONSTRAINTS.get(constraint.type) == kind and _copies_all_axes(constraint))
-        for constraint in bone.constraints
-        if not constraint.mute and constraint.influence == 1 and getattr(constraint, "mix_mode", "REPLACE") == "REPLACE"
-    )
-
-
-def _copies_all_axes(constraint: bpy.types.Constraint) -> bool:
-    return all(getattr(constraint, f"use_{axis}") for axis in "xyz") and not getattr(constraint, "use_offset", False)

@@ -225,8 +225,6 @@ class SimulatedPoseSetter(PoseSetter):
 
     def _play_pre_roll(self, player: ClipPlayer, clip: Clip, first_frame: int) -> None:
         """Move from the rest pose at a frame towards the first pose of a clip, up to the frame before the clip."""
-        armature_object = self.target.scene_rig.armature_object
-        bones = armature_object.pose.bones
         player.show(clip, clip.frames[0])
         end_channels = player.current_clip_frame.channels
         player.stop()
@@ -234,9 +232,12 @@ class SimulatedPoseSetter(PoseSetter):
         self.target.restart_simulations()
         for frame in range(first_frame, clip.frames[0]):
             fraction = (frame - first_frame) / (clip.frames[0] - first_frame)
-            for channel, start, end in zip(POSE_CHANNELS, rest_channels, end_channels, strict=True):
-                write(bones, channel, _interpolate_channel(channel.name, start, end, np.float32(fraction)))
-            armature_object.update_tag(refresh={"DATA"})
+            for armature_object in player.armature_objects:
+                ends = rest_channels[armature_object], end_channels[armature_object]
+                for channel, start, end in zip(POSE_CHANNELS, *ends, strict=True):
+                    values = _interpolate_channel(channel.name, start, end, np.float32(fraction))
+                    write(armature_object.pose.bones, channel, values)
+                armature_object.update_tag(refresh={"DATA"})
             bpy.context.scene.frame_set(frame)
 
 

@@ -7,12 +7,10 @@ from contextlib import ExitStack, contextmanager
 from ..core.poses import CONTROL, Channel
 from ..core.rig import Rig
 from ..poses.clip import Clip
-from ..poses.clip_player import ClipPlayer, clip_actions, clip_player
-from ..scene.armature import clear_pose
+from ..poses.clip_player import ClipPlayer, clip_player
 from ..scene.comparison import hidden_comparison_objects
 from ..scene.controls import temporary_controls
 from ..scene.scene_rig import SceneRig
-from ..scene.temporary_state import temporary_pose
 from ..scene.time_stretching import unstretched_time
 from .modifier_stack import downstream_disabled
 
@@ -48,18 +46,15 @@ def temporary_rig_states(
     Raises:
         RigError: a clip is mirrored, and a rig is not symmetric.
     """
-    armature_object = rigs[0][0].armature_object
     controlled_rigs = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *other_rigs)]
     with ExitStack() as stack:
         player = stack.enter_context(clip_player(controlled_rigs, clips))
         stack.enter_context(hidden_comparison_objects())
         for scene_rig, _, _ in rigs:
             stack.enter_context(downstream_disabled(scene_rig.mesh_object))
-        stack.enter_context(temporary_pose(armature_object, clip_actions(armature_object, clips)))
         stack.enter_context(unstretched_time())
         for scene_rig, names in controlled_rigs:
             stack.enter_context(temporary_controls(scene_rig, names))
-        clear_pose(armature_object)
         yield player
 
 

@@ -2,13 +2,14 @@
 """Finds the keyframes, drivers and modifiers that change a surface with time, besides the pose and the controls."""
 
 import ast
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
+from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.animation import changes_value, curves_with_actions, value_range
 from ..scene.controls import canonical_path, fcurve_target, owner_of
 from ..scene.scene_rig import SceneRig
@@ -66,7 +67,8 @@ def check_time_inputs(
     ]
     sources = Sources(scene_rig, mesh_object, followed_modifiers)
     keys = control_keys(scene_rig, controls)
-    for time_input in (*_time_modifiers(sources), *time_inputs(sources, keys, actions)):
+    curves_by_action = curves_of_actions(actions, mesh_object, scene_rig.armature_object)
+    for time_input in (*_time_modifiers(sources), *time_inputs(sources, keys, curves_by_action)):
         raise RigError(
             f"The surface of '{mesh_object.name}' changes with time through {time_input.description}, so it does not "
             f"follow from the pose; {time_input.remedy}."
@@ -82,18 +84,20 @@ def control_keys(scene_rig: SceneRig, controls: Iterable[Control]) -> set[Proper
 
 
 def time_inputs(
-    sources: Sources, controls: Iterable[PropertyKey] = (), actions: Iterable[bpy.types.Action] = ()
+    sources: Sources,
+    controls: Iterable[PropertyKey] = (),
+    curves_by_action: Sequence[CurvesByDatablock] = (),
 ) -> Iterator[TimeInput]:
     """Find everything except modifiers that changes a surface with time.
 
     Args:
         sources: everything on which the surface depends.
         controls: numbers that are controls, so that they may change.
-        actions: further actions that may be played.
+        curves_by_action: F-curves of further actions that may be played (`curves_of_actions`).
     """
-    controls, actions = set(controls), tuple(actions)
+    controls = set(controls)
     for datablock in (*sources.objects, *sources.datablocks):
-        for curve in curves_with_actions(datablock, actions):
+        for curve in curves_with_actions(datablock, curves_by_action):
             property_key = (datablock, canonical_path(datablock, curve.data_path), curve.array_index)
             if (
                 property_key not in controls
@@ -103,7 +107,7 @@ def time_inputs(
                 yield _keyed_input(sources, datablock, curve)
     numbers = [*sources.numbers, *((scene, path) for _, scene, path in sources.scene_reads)]
     for property_key in dict.fromkeys(fcurve_target(*number) for number in numbers):
-        for curve in curves_with_actions(property_key[0], actions):
+        for curve in curves_with_actions(property_key[0], curves_by_action):
             if (
                 (canonical_path(property_key[0], curve.data_path), curve.array_index) == property_key[1:]
                 and property_key not in controls

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator
 import bpy
 import numpy as np
 
+from .action_slots import CurvesByDatablock
 from .arrays import KEYFRAME_ELEMENTS, read
-from .compatibility import curves_of, curves_of_slot
+from .compatibility import curves_of_slot
 
 MIN_VALUE_CHANGE = 1e-6
 """Keyframes whose values differ by no more than this count as equal."""
@@ -35,9 +36,11 @@ def _unmuted_strips(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.
             yield from _unmuted_strips(strip.strips)
 
 
-def curves_with_actions(datablock: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> list[bpy.types.FCurve]:
-    """Find the F-curves that animate a datablock, and those that would animate it if it had one of these actions."""
-    return [*active_curves(datablock), *(curve for action in actions for curve in curves_of(action, datablock))]
+def curves_with_actions(
+    datablock: bpy.types.ID, curves_by_action: Iterable[CurvesByDatablock]
+) -> list[bpy.types.FCurve]:
+    """Find the F-curves that animate a datablock, and those with which actions would animate it."""
+    return [*active_curves(datablock), *(curve for curves in curves_by_action for curve in curves.get(datablock, ()))]
 
 
 def changes_value(curve: bpy.types.FCurve) -> bool:

@@ -12,29 +12,9 @@ def animation_curves(action: bpy.types.Action) -> list[bpy.types.FCurve]:
     return list(getattr(action, "fcurves", ()))
 
 
-def slot_of(action: bpy.types.Action, datablock: bpy.types.ID) -> "bpy.types.ActionSlot | None":
-    """Choose the slot with which an action animates a datablock; None if there is none (4.4 and later have slots).
-
-    The slot is the one with the datablock's name, or else the only one. An armature object also accepts a slot with
-    another name that animates bones, so that it can play actions of other characters. The slot that the datablock used
-    last is ignored, because the choice must not depend on the action that was played before.
-    """
-    all_slots = getattr(action, "slots", ())
-    slots = [slot for slot in all_slots if slot.target_id_type in {datablock.id_type, "UNSPECIFIED"}]
-    candidates = [slot for slot in slots if slot.name_display == datablock.name]
-    if len(all_slots) == 1:
-        candidates += slots
-    if not candidates and getattr(datablock, "type", "") == "ARMATURE":
-        candidates = [s for s in slots if any(c.data_path.startswith("pose.bones[") for c in curves_of_slot(action, s))]
-    return candidates[0] if candidates else None
-
-
-def curves_of(action: bpy.types.Action, datablock: bpy.types.ID) -> list[bpy.types.FCurve]:
-    """Return the F-curves with which an action animates a datablock."""
-    if not hasattr(action, "slots"):
-        return list(action.fcurves) if action.id_root == datablock.id_type else []
-    slot = slot_of(action, datablock)
-    return [] if slot is None else curves_of_slot(action, slot)
+def accepts_slot(datablock: bpy.types.ID, slot: "bpy.types.ActionSlot") -> bool:
+    """Return whether a slot can animate a datablock of this type."""
+    return slot.target_id_type in {datablock.id_type, "UNSPECIFIED"}
 
 
 def curves_of_slot(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> list[bpy.types.FCurve]:

@@ -13,6 +13,7 @@ from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, OTHER_OBJECT
 from ..core.errors import RigError
 from .bone_transform import MATRIX_ELEMENT_RANGE, bone_transform
 from .scene_rig import SceneRig
+from .temporary_state import animation_state, restore_animation
 
 MAX_RANGE_WIDTH = 1e4
 """A property with a wider range is treated as a property without a range."""
@@ -295,18 +296,14 @@ def temporary_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[No
         (owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)
     ]
     owners = {fcurve_target(*owner_and_path)[0] for owner_and_path in owners_and_paths} - {scene_rig.armature_object}
-    animations = [a for a in (owner.animation_data for owner in owners) if a is not None]
-    previous_animations = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
+    states = [(owner, animation_state(owner)) for owner in owners if owner.animation_data is not None]
     values = {name: owner_of(scene_rig, name.partition("/")[0]).path_resolve(name.partition("/")[2]) for name in names}
-    for animation in animations:
-        animation.use_nla, animation.action = False, None
+    for owner, _ in states:
+        owner.animation_data.use_nla, owner.animation_data.action = False, None
     try:
         yield
     finally:
-        for animation, action, slot, use_nla in previous_animations:
-            animation.action = action
-            if action is not None and slot is not None:
-                animation.action_slot = slot
-            animation.use_nla = use_nla
+        for owner, state in states:
+            restore_animation(owner, state)
         for name, value in values.items():
             set_control(scene_rig, name, value)

@@ -8,7 +8,7 @@ import bpy
 
 from .animated_values import animated_values, driving_actions, read_scene_values, restore_values, set_value
 from .arrays import POSE_CHANNELS, read, write
-from .compatibility import animation_curves, slot_of
+from .compatibility import animation_curves
 from .unkeyed_changes import discard_requests, keep_unkeyed_changes
 
 
@@ -34,24 +34,13 @@ def temporary_pose(
     scene_values = read_scene_values(scene)
     animation = armature_object.animation_data
     animated_before = animated_values(armature_object, actions)
-    if animation is not None:
-        action, use_nla = animation.action, animation.use_nla
-        slot = getattr(animation, "action_slot", None)
-        if not keep_animation:
-            animation.use_nla = False
-            animation.action = None
+    state = animation_state(armature_object)
+    if animation is not None and not keep_animation:
+        animation.use_nla, animation.action = False, None
     try:
         yield
     finally:
-        if animation is None:
-            if armature_object.animation_data is not None:
-                armature_object.animation_data_clear()
-        else:
-            animation.action = action
-            if action is not None and hasattr(animation, "action_slot"):
-                # Blender chooses a slot when an action is assigned, even if there was none before.
-                animation.action_slot = slot
-            animation.use_nla = use_nla
+        restore_animation(armature_object, state)
         # Set the frame first: it sets animated channels, and the restored pose may differ from the keyframes.
         scene.frame_set(frame, subframe=subframe)
         restore_values(scene_values)
@@ -104,10 +93,34 @@ def temporary_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
         yield
 
 
-def assign_action(datablock: bpy.types.ID, action: bpy.types.Action) -> None:
-    """Assign an action and the slot of `compatibility.slot_of` to a datablock."""
+def assign_action(
+    datablock: bpy.types.ID, action: bpy.types.Action | None, slot: "bpy.types.ActionSlot | None"
+) -> None:
+    """Assign an action and one of its slots to a datablock."""
     animation = datablock.animation_data or datablock.animation_data_create()
     animation.action = action
-    slot = slot_of(action, datablock)
-    if slot is not None and animation.action_slot != slot:
+    if action is not None:
+        # Blender chooses a slot when an action is assigned.
         animation.action_slot = slot
+
+
+AnimationState = tuple[bpy.types.Action | None, "bpy.types.ActionSlot | None", bool] | None
+"""Action, slot, and whether the NLA is on; None without animation data."""
+
+
+def animation_state(datablock: bpy.types.ID) -> AnimationState:
+    """Return the state of a datablock's animation, for `restore_animation`."""
+    animation = datablock.animation_data
+    return None if animation is None else (animation.action, animation.action_slot, animation.use_nla)
+
+
+def restore_animation(datablock: bpy.types.ID, state: AnimationState) -> None:
+    """Restore the state that `animation_state` returned, if it has changed."""
+    if state == animation_state(datablock):
+        return
+    if state is None:
+        datablock.animation_data_clear()
+        return
+    action, slot, use_nla = state
+    assign_action(datablock, action, slot)
+    datablock.animation_data.use_nla = use_nla

@@ -39,7 +39,7 @@ def frames_covering(times: range) -> range:
 def unstretched_time() -> Iterator[None]:
     """Switch time stretching off in the block, so that frames are times. The scene stays at the same time.
 
-    Enter it after `temporary_pose`, which restores the frame.
+    Enter it inside of `temporary_pose`, which restores the frame.
     """
     scene, render = bpy.context.scene, bpy.context.scene.render
     if render.frame_map_old == render.frame_map_new:

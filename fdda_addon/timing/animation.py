@@ -7,13 +7,16 @@ from contextlib import contextmanager
 import bpy
 
 from ..core.poses import CONTROL, ROTATION, ROTATION_VECTOR, Channel, sample_pose
+from ..core.recording.index import ACTION
 from ..poses.action_range import action_frames
+from ..poses.clip import Clip
+from ..poses.clip_player import clip_player
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_rig
+from ..scene.action_slots import active_action
 from ..scene.armature import Poser, clear_pose
 from ..scene.comparison import hidden_comparison_objects
 from ..scene.scene_rig import SceneRig
-from ..scene.temporary_state import assign_action, temporary_pose
 from ..scene.time_stretching import unstretched_time
 
 RANDOM_POSE_COUNT, KEY_STEP_FRAMES = 20, 5
@@ -22,26 +25,25 @@ RANDOM_POSE_COUNT, KEY_STEP_FRAMES = 20, 5
 
 @contextmanager
 def temporary_animation(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator[range]:
-    """Assign the action of an armature, or `key_random_poses` if it has none; restore pose and animation afterwards.
+    """Play the active action of a rig, or `key_random_poses` if it has none; restore pose and animation afterwards.
 
     Yields:
         The frames of the action.
     """
-    animation = scene_rig.armature_object.animation_data
-    original_action = animation.action if animation else None
-    with (
-        hidden_comparison_objects(),
-        temporary_pose(scene_rig.armature_object, [original_action] if original_action else []),
-        unstretched_time(),
-    ):
-        action = original_action or key_random_poses(scene_rig, channels)
-        assign_action(scene_rig.armature_object, action)
+    armature_object, mesh_object = scene_rig.armature_object, scene_rig.mesh_object
+    action = active_action(armature_object, mesh_object)
+    clips = (Clip(ACTION, action.name, action_frames(action)),) if action else ()
+    with hidden_comparison_objects(), clip_player([(scene_rig, ())], clips) as player, unstretched_time():
+        if clips:
+            player.start(clips[0])
+            yield clips[0].frames
+            return
+        action = key_random_poses(scene_rig, channels)
         try:
             yield action_frames(action)
         finally:
-            scene_rig.armature_object.animation_data.action = None
-            if action != original_action:
-                bpy.data.actions.remove(action)
+            armature_object.animation_data.action = None
+            bpy.data.actions.remove(action)
 
 
 def key_random_poses(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bpy.types.Action:

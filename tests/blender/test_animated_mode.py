@@ -74,9 +74,9 @@ def test_renders_follow_a_keyed_mode(bound_elbow, elbow_files, tmp_path):
 
 
 def curves(mesh_object: bpy.types.Object) -> list[bpy.types.FCurve]:
-    from fdda_addon.scene.compatibility import curves_of
+    from fdda_addon.scene.compatibility import animation_curves
 
-    return curves_of(mesh_object.animation_data.action, mesh_object)
+    return animation_curves(mesh_object.animation_data.action)
 
 
 def remove_model(mesh_object: bpy.types.Object, path: Path) -> None:

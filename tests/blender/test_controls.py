@@ -110,8 +110,10 @@ def test_keys_and_drivers_are_found_by_numbers_as_by_names(rig, armature_object)
     for curve in (*animation_curves(action), *armature_object.animation_data.drivers):
         curve.data_path = curve.data_path.replace('["lower"]', f"[{index}]")
     path = 'pose.bones["lower"]'
-    assert curves_by_bone(armature_object, action)["lower"]["rotation_euler"].keys() == {0, 1, 2}
-    assert ("armature_object", f'{path}["fist"]') in keyed_numbers(rig, action)
+    assert curves_by_bone(armature_object, {armature_object: animation_curves(action)})["lower"][
+        "rotation_euler"
+    ].keys() == {0, 1, 2}
+    assert ("armature_object", f'{path}["fist"]') in keyed_numbers(rig, [action])[0]
     assert is_driven(armature_object, f"{path}.scale[1]") and not is_driven(armature_object, f"{path}.scale[0]")
     (control,) = parse_controls(rig, [f'armature_object/pose.bones[{index}]["fist"]'])
     assert control.path == f'{path}["fist"]'

@@ -104,9 +104,9 @@ def test_both_rigs_play_the_same_action_without_the_models_of_the_full_rig(folde
     bpy.ops.wm.save_mainfile()
     played, models = [], []
 
-    def assign(armature_object, action):
+    def assign(armature_object, action, slot):
         played.append(action.name)
-        assign_action(armature_object, action)
+        assign_action(armature_object, action, slot)
 
     def count_models(calls):
         bpy.context.view_layer.update()

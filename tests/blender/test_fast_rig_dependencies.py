@@ -90,6 +90,9 @@ def test_control_bones_are_visible_or_keyed_or_in_a_collection():
     assert control_bones(armature_object, [f"collection:{CONTROLS}"]) == {"control"}
     with pytest.raises(RigError, match=r"has no bone collection 'Faces'; its collections: 'Controls', 'Mechanism'\."):
         control_bones(armature_object, ["collection:Faces"])
+    armature_object.data.collections.new("Empty")
+    with pytest.raises(RigError, match=r"The bone collection 'Empty' of '.*' has no bones; assign bones to it"):
+        control_bones(armature_object, ["visible", "collection:Empty"])
 
 
 def test_a_driven_property_of_the_scene_is_followed():

@@ -16,7 +16,7 @@ from fdda_addon.panels.recording import cached_content
 from fdda_addon.panels.sampling import describe_channels
 from fdda_addon.properties.character import recording_folder
 from fdda_addon.properties.recording_options import recording_settings
-from fdda_addon.scene.compatibility import curves_of
+from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 DEFORMING = ("upper", "lower")
@@ -70,7 +70,7 @@ def wave(rig: SceneRig) -> bpy.types.Action:
         bone.rotation_euler[0], rig.armature_object["ik"] = angle, ik
         bone.keyframe_insert("rotation_euler", index=0, frame=frame)
         rig.armature_object.keyframe_insert('["ik"]', frame=frame)
-    assert len(curves_of(action, rig.armature_object)) == 2
+    assert len(animation_curves(action)) == 2
     action.fdda.record = True
     return action
 
@@ -136,7 +136,7 @@ class TestBones:
 
         assert turn() == pytest.approx((0.0, 0.8))
         assert turn() == pytest.approx((0.0, 0.8)), "measured once"
-        curve = next(c for c in curves_of(action, arm.armature_object) if c.data_path.endswith("rotation_euler"))
+        curve = next(c for c in animation_curves(action) if c.data_path.endswith("rotation_euler"))
         curve.keyframe_points[1].co[1] = 0.4
         curve.update()
         assert turn() == pytest.approx((0.0, 0.4))

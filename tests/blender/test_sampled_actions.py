@@ -8,17 +8,20 @@ import numpy as np
 import pytest
 from mathutils import Euler, Quaternion
 
+from fdda_addon.core.errors import RigError
 from fdda_addon.core.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
 from fdda_addon.panels.limits import _format_channels
 from fdda_addon.poses.action_range import measured_ranges
 from fdda_addon.poses.measured_limits import GIMBAL_LOCK_NOTE, describe_limits, set_limits_from_actions
 from fdda_addon.poses.sample_selection import select_bones
 from fdda_addon.poses.sampling import rig_allows_ranges, sampled_channels, selected_channels
+from fdda_addon.recording.plan import RecordingSettings, read_sampled_rig
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.armature import Poser
-from fdda_addon.scene.compatibility import curves_of
+from fdda_addon.scene.compatibility import animation_curves, select_bone
 from fdda_addon.scene.scene_rig import SceneRig
 
+from .conftest import run
 from .figure import WAVE, add_wave, build_figure, key_channel
 
 ARM = "arm.L"
@@ -72,7 +75,7 @@ def test_limits_narrow_the_keyed_ranges_and_add_no_channels(figure):
 
 def test_muted_curves_of_an_action_are_not_sampled(figure):
     action = add_wave(figure)
-    curves = {(c.data_path, c.array_index): c for c in curves_of(action, figure.armature_object)}
+    curves = {(c.data_path, c.array_index): c for c in animation_curves(action)}
     curves['pose.bones["spine"].rotation_euler', 1].mute = True
     curves['pose.bones["arm.L"]["fist"]', 0].mute = True
     assert ("rotation", 1) not in ranges(sampled(figure), "spine")
@@ -167,3 +170,40 @@ def test_euler_angles_of_several_actions_do_not_wrap(figure):
     # A bone with a limit is sampled about its axes, so that the limit narrows the range.
     limit(bone, "LIMIT_ROTATION", min_x=0.0, max_x=math.radians(180))
     assert ranges(sampled(figure), ARM)["rotation", 0] == pytest.approx((math.radians(165), math.pi), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"controls": ("collection:Empty", "bone:spine")}, "The bone collection 'Empty' of 'figure_rig' has no bones;"),
+        ({"sample": ("collection:Empty", "bone:spine")}, "The bone collection 'Empty' of 'figure_rig' has no bones;"),
+        ({"sample": ("selected", "bone:spine")}, "No bone of 'figure_rig' is selected; select bones in Pose Mode"),
+        (
+            {"sample": ("action:nothing", "bone:spine")},
+            "The action 'nothing' chooses nothing to sample: it keys no bone",
+        ),
+    ],
+)
+def test_selections_without_bones_are_refused(figure, settings, message):
+    figure.armature_object.data.collections.new("Empty")
+    bpy.data.actions.new("nothing")
+    for bone in figure.armature_object.pose.bones:
+        select_bone(bone, False)
+    with pytest.raises(RigError, match=message):
+        read_sampled_rig(figure, RecordingSettings(**settings))
+
+
+def test_shape_keys_and_actions_that_add_nothing_are_printed(figure, tmp_path, capsys):
+    add_wave(figure)
+    figure.mesh_object.data.shape_keys.key_blocks["Smile"].driver_add("value")
+    figure.mesh_object.animation_data_create().action = bpy.data.actions.new("slide")
+    figure.mesh_object.keyframe_insert("location", frame=1)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
+    options = ("--poses", 0, "--action", WAVE, "--control", "shape_keys")
+    assert run("record", tmp_path / "rig.blend", tmp_path / "recording", *options) == 0
+    assert "--control shape_keys adds no input: no recorded mesh has a shape key without a driver." in (
+        capsys.readouterr().out
+    )
+    options = ("--action", WAVE, "--action", "slide")
+    assert run("limits", tmp_path / "rig.blend", tmp_path / "limited.blend", *options) == 0
+    assert "The action 'slide' moves no bone of 'figure_rig'." in capsys.readouterr().out
