@@ -134,3 +134,19 @@ def test_joints_that_never_moved_get_small_factors(smooth_rig):
     assert np.abs(fit.factors).max() < 0.1
     bent_skin = skin_matrices(pose_chain(smooth_rig, np.full((1, JOINTS, 2), 0.5)), smooth_rig.rest_matrices)
     assert np.abs(fit.compute_offsets(bent_skin)).max() < 0.1
+
+
+def test_joints_that_move_alike_share_the_fit(smooth_rig):
+    """In the training poses all joints bend in proportion, as with twist bones. Then a constraint of one is muted."""
+    rig, proportions = with_heaviest_joints(smooth_rig), np.array([0, 1, 0.6, 0.3])
+    angles = np.random.default_rng(0).uniform(0, 1.9, (300, 1, 1)) * proportions[:, None] * [1, 0]
+    training_poses = pose_chain(smooth_rig, angles)
+    muted_poses = pose_chain(smooth_rig, np.array([[0, 0], [1.2, 0], [0, 0], [0.36, 0]])[None])
+    partition = make_partitions(rig, {1: (1, 2, 3)})[1]
+    skin = skin_matrices(training_poses, rig.rest_matrices)
+    # What smoothing does is not linear in the transforms.
+    residuals = np.sin(angles[:, 1:2, :1]) ** 2 * random_residuals(rig, partition, 1)
+    fit, remainder = joint_regression(rig, partition, skin).fit(residuals.astype(np.float32), TRAINING)
+    assert np.sqrt((remainder**2).mean()) < 0.4 * np.sqrt((residuals**2).mean())
+    offsets = fit.compute_offsets(skin_matrices(muted_poses, rig.rest_matrices))
+    assert np.abs(offsets).max() < 2 * np.abs(residuals).max()

@@ -17,8 +17,10 @@ from fdda_addon.core.rig import STATIC_JOINT, Rig
 from ..blocks import block_slices
 from .least_squares import add_ridge, solve_ridge
 
-RIDGE = 1e-6
-"""Ridge, as a part of the number of poses. It makes joints that move alike share the fit, and keeps factors small."""
+RIDGE = 1e-4
+"""Ridge, as a part of the number of poses. Joints that move alike share the fit, so that its factors are small.
+
+With large factors the model is far off as soon as one of these joints moves alone."""
 MAX_PRUNING_LOSS = 0.01
 """Joints are removed, the least useful first, as long as the error is at most this part larger than with all joints."""
 MIN_EQUATIONS_PER_UNKNOWN = 4
@@ -65,17 +67,17 @@ class JointRegression:
         center: (3,) float64, center of the partition at rest, mesh-object space, mesh units.
         design: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint. The last column of each joint is the motion of the
             center, which keeps the regression well conditioned far from the origin.
-        metres_per_unit: as in `Rig`; makes the ridge independent of the mesh unit.
+        size: as in `Rig`; makes the ridge independent of the mesh unit and of the size of the character.
     """
 
     joints: np.ndarray
     center: np.ndarray
     design: np.ndarray
-    metres_per_unit: float
+    size: float
 
     def main_joint_only(self) -> "JointRegression":
         """Return the regression on the main joint alone, which is constant in its own space."""
-        return JointRegression(self.joints[:1], self.center, self.design[:, :, :4], self.metres_per_unit)
+        return JointRegression(self.joints[:1], self.center, self.design[:, :, :4], self.size)
 
     def design_of(self, joints: np.ndarray) -> np.ndarray:
         """Return the (N, 3, 4 n) float64 columns of n of the joints, in the given order."""
@@ -115,8 +117,10 @@ class JointRegression:
             moments += rows.T @ values
             total += (values**2).sum()
         ridge = np.ones(width)
-        ridge[3::4] /= self.metres_per_unit**2
+        ridge[3::4] *= self.size**2
         ridge *= RIDGE * len(training)
+        # Hardly any for the main joint: its part is the mean of the residuals, which no other joint can share.
+        ridge[:4] *= 1e-2
         selected = _select_joints(add_ridge(gram, ridge), moments, total)
         columns = (4 * selected[:, None] + np.arange(4)).ravel()
         solution = solve_ridge(gram[np.ix_(columns, columns)], moments[columns], ridge[columns])
@@ -189,9 +193,7 @@ def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> Jo
     relative[:, :, :, 3] -= is_skin * matrices[:, main, None, :3, 3]
     local = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ relative
     local[:, :, :, 3] += is_skin * (local[:, :, :, :3] @ center - center)
-    return JointRegression(
-        joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), rig.metres_per_unit
-    )
+    return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), rig.size)
 
 
 def joints_on_path(parents: np.ndarray, first: int, second: int) -> set[int]:
