@@ -8,6 +8,7 @@ Playback compares the recorded deformation with the deformation of the rig. An e
 | `modifiers` | list of `{"name", "type", "settings"}` in stack order |
 | `shape_keys`, `b_bones` | settings of each shape key or B-Bone, by its name |
 | `attributes` | digest of the values of each attribute or vertex group that settings or nodes name, by its name |
+| `unread_bones` | settings of the bones whose effect the model learned from key joints, by their names |
 | `drivers` | hash of the drivers |
 
 A setting is a boolean, a number, a string or a list of these, and null where it is animated. An empty object means that
@@ -21,12 +22,17 @@ from difflib import SequenceMatcher
 
 from .controls import MESH_OBJECT, SHAPE_KEYS, Control
 
-MAX_ENTRIES = 10_000
+MAX_ENTRIES = 100_000
 MAX_SHOWN_DIFFERENCES = 3
 SETTING_TOLERANCE = 1e-4
 """Largest relative difference of two settings that count as equal; rounding to float32 is smaller."""
-_GROUP_LABELS = {"shape_keys": "shape key", "b_bones": "bone", "attributes": "attribute or vertex group"}
-_DIGESTS = {"shape", "values"}
+_GROUP_LABELS = {
+    "shape_keys": "shape key",
+    "b_bones": "bone",
+    "attributes": "attribute or vertex group",
+    "unread_bones": "bone",
+}
+_DIGESTS = {"shape", "values", "inheritance or IK", "drivers"}
 """Settings that are digests, so that a user is not told their values."""
 _ARRAY_INDEX = re.compile(r"\[\d+\]$")
 _NODE_INPUT_PATH = re.compile(r"\.properties\.inputs\.(\w+)\.value\b")
@@ -69,7 +75,9 @@ def deformation_differences(recorded: dict, current: dict, controls: Iterable[Co
     control_paths = {(control.owner, control.path) for control in controls}
     clauses = _modifier_differences(recorded.get("modifiers", []), current.get("modifiers", []), control_paths)
     for group, label in _GROUP_LABELS.items():
-        clauses += _group_differences(label, recorded.get(group, {}), current.get(group, {}), control_paths)
+        # Without the joints of a model, nobody knows which bones it does not read.
+        if group != "unread_bones" or group in current:
+            clauses += _group_differences(group, label, recorded.get(group, {}), current.get(group, {}), control_paths)
     if recorded.get("drivers", "") != current.get("drivers", ""):
         clauses.append("the drivers that deform the mesh differ")
     return clauses[:MAX_SHOWN_DIFFERENCES] + (
@@ -108,15 +116,17 @@ def _modifier_differences(recorded: list[dict], current: list[dict], control_pat
     return clauses
 
 
-def _group_differences(label: str, recorded: dict, current: dict, control_paths: set[tuple[str, str]]) -> list[str]:
-    lost = "is no B-Bone any more" if label == "bone" else "is gone"
+def _group_differences(
+    group: str, label: str, recorded: dict, current: dict, control_paths: set[tuple[str, str]]
+) -> list[str]:
+    lost = "is no B-Bone any more" if group == "b_bones" else "is gone"
     clauses = [f"the {label} '{name}' {lost}" for name in recorded if name not in current]
     for name, settings in current.items():
         if name in recorded:
             clauses += _setting_differences(label, name, recorded[name], settings, control_paths)
-        elif label == "bone":
+        elif group == "b_bones":
             clauses.append(f"the bone '{name}' was no B-Bone when it was recorded")
-        elif label != "shape key" or (settings.get("value", 0.0) != 0 and not settings.get("mute")):
+        elif group == "attributes" or (settings.get("value", 0.0) != 0 and not settings.get("mute")):
             clauses.append(f"it was recorded without the {label} '{name}'")
     return clauses
 
@@ -126,8 +136,9 @@ def _setting_differences(
 ) -> list[str]:
     clauses = []
     for setting, recorded_value in recorded.items():
+        tolerance = SETTING_TOLERANCE if setting == "rest pose" else SETTING_TOLERANCE * SETTING_TOLERANCE
         # A setting may exist in one version of Blender only.
-        if recorded_value is None or setting not in current or _are_equal(recorded_value, current[setting]):
+        if setting not in current or _are_equal(recorded_value, current[setting], tolerance):
             continue
         if _is_control(group_label, name, setting, control_paths):
             continue
@@ -155,9 +166,11 @@ def _is_control(group_label: str, name: str, setting: str, control_paths: set[tu
     )
 
 
-def _are_equal(value: object, current: object) -> bool:
+def _are_equal(value: object, current: object, abs_tolerance: float) -> bool:
+    """Return whether two settings are equal; an animated one, None, equals any."""
     if isinstance(value, list) and isinstance(current, list):
-        return len(value) == len(current) and all(map(_are_equal, value, current))
+        pairs = zip(value, current, strict=False)
+        return len(value) == len(current) and all(_are_equal(*pair, abs_tolerance) for pair in pairs)
     if isinstance(value, int | float) and isinstance(current, int | float):
-        return math.isclose(value, current, rel_tol=SETTING_TOLERANCE, abs_tol=SETTING_TOLERANCE * SETTING_TOLERANCE)
-    return value == current
+        return math.isclose(value, current, rel_tol=SETTING_TOLERANCE, abs_tol=abs_tolerance)
+    return value is None or value == current

@@ -69,7 +69,7 @@ def read_b_bones(armature: bpy.types.Armature) -> dict:
     """Read the settings of the deforming bones that have B-Bone segments, by name; animated settings are None."""
     return {
         bone_name: {
-            name.removeprefix("bbone_"): None if value is None else _json_value(None, value)
+            name.removeprefix("bbone_"): None if value is None else json_value(None, value)
             for name, value in zip(_B_BONE_SETTINGS, values, strict=True)
         }
         for bone_name, values in b_bone_values(armature, armature.bones).items()
@@ -117,16 +117,16 @@ def _read_modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
         setting_names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bind_property]
         path = modifier.path_from_id()
         settings = {
-            name: (f"{path}.{name}", getattr(modifier, name)) for name in setting_names if _is_setting(modifier, name)
+            name: (f"{path}.{name}", getattr(modifier, name)) for name in setting_names if is_setting(modifier, name)
         }
     animated = animated_paths(modifier.id_data)
     values = {
-        name: None if path in animated else _json_value(scene_rig, value) for name, (path, value) in settings.items()
+        name: None if path in animated else json_value(scene_rig, value) for name, (path, value) in settings.items()
     }
     return {"name": modifier.name, "type": modifier.type, "settings": values}
 
 
-def _is_setting(struct: bpy.types.bpy_struct, name: str) -> bool:
+def is_setting(struct: bpy.types.bpy_struct, name: str) -> bool:
     """Return whether a property holds a value or a datablock, not a nested struct or a collection."""
     prop = struct.bl_rna.properties[name]
     if prop.type == "POINTER":
@@ -150,7 +150,7 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
         if (positions == relative_positions[relative_key.name]).all():
             # The key moves no vertex.
             continue
-        settings = {name: _json_value(None, getattr(block, name)) for name in _SHAPE_KEY_PROPERTIES}
+        settings = {name: json_value(None, getattr(block, name)) for name in _SHAPE_KEY_PROPERTIES}
         for name in settings:
             if f"{block.path_from_id()}.{name}" in animated:
                 settings[name] = None
@@ -167,7 +167,7 @@ def _drivers_digest(scene_rig: SceneRig) -> str:
     for owner in (mesh_object, mesh_object.data, mesh_object.data.shape_keys):
         for curve in owner.animation_data.drivers if owner is not None and owner.animation_data else ():
             if owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path):
-                drivers.append(_read_driver(scene_rig, curve))
+                drivers.append(read_driver(scene_rig, curve))
     return Fingerprint.digest_text(json.dumps(sorted(drivers))) if drivers else ""
 
 
@@ -177,13 +177,13 @@ def _is_rig_modifier_path(mesh_object: bpy.types.Object, path: str) -> bool:
     return path.startswith("modifiers[") and not path.startswith(tuple(fdda_paths))
 
 
-def _read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
+def read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
     driver = curve.driver
     return [
         *(versionless_path(curve.data_path), curve.array_index, curve.mute, driver.type),
         driver.expression if driver.type == "SCRIPTED" else "",
-        [[_rounded(coordinate) for coordinate in point.co] for point in curve.keyframe_points],
-        [list(map(_rounded, modifier.coefficients)) for modifier in curve.modifiers if modifier.type == "GENERATOR"],
+        [[rounded(coordinate) for coordinate in point.co] for point in curve.keyframe_points],
+        [list(map(rounded, modifier.coefficients)) for modifier in curve.modifiers if modifier.type == "GENERATOR"],
         [
             [
                 variable.name,
@@ -207,14 +207,14 @@ def _read_target(
         yield from (target.bone_target, target.transform_type, target.transform_space, target.rotation_mode)
 
 
-def _json_value(scene_rig: SceneRig | None, value: object) -> object:
+def json_value(scene_rig: SceneRig | None, value: object) -> object:
     """Convert the value of a property to JSON; a datablock becomes its type alone, because its name may change."""
     if value is None:
         return ""
     if isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
-        return _rounded(value)
+        return rounded(value)
     if isinstance(value, bpy.types.Object):
         return "the rig's armature" if scene_rig and value == scene_rig.armature_object else value.type
     if isinstance(value, bpy.types.ID):
@@ -223,8 +223,8 @@ def _json_value(scene_rig: SceneRig | None, value: object) -> object:
         return getattr(value, "name", "")
     if isinstance(value, set):
         return sorted(value)
-    return [_json_value(None, item) for item in value]
+    return [json_value(None, item) for item in value]
 
 
-def _rounded(value: float) -> float:
+def rounded(value: float) -> float:
     return float(f"{value:.{_SIGNIFICANT_DIGITS}g}")

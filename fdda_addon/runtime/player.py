@@ -79,7 +79,7 @@ class Player:
         armature_object, self.mesh_uid = scene_rig.armature_object, mesh_object.data.session_uid
         self._armature_object_uid, self.armature_uid = armature_object.session_uid, armature_object.data.session_uid
         self._check_vertex_count(mesh_object)
-        self.signature = rig_signature.read_signature(scene_rig)
+        self.signature = self._read_signature(scene_rig, rig_signature.PARTS)
         rig_signature.check(scene_rig, self.network, self.signature)
         self._pose_reader = self._create_pose_reader(scene_rig)
         self._control_reader = ControlReader(scene_rig, info.controls)
@@ -132,10 +132,14 @@ class Player:
             FDDAError: as `rig_signature.check`, or the armature was removed.
         """
         scene_rig = self.scene_rig(mesh_object)
-        if not rig_signature.read_signature(scene_rig, parts).items() <= self.signature.items():
+        if not self._read_signature(scene_rig, parts).items() <= self.signature.items():
             return False
         rig_signature.check(scene_rig, self.network, self.signature)
         return True
+
+    def _read_signature(self, scene_rig: SceneRig, parts: Iterable[str]) -> dict[str, tuple]:
+        unread_bones = self.network.info.fingerprint.deformation.get("unread_bones", {})
+        return rig_signature.read_signature(scene_rig, unread_bones, parts)
 
     def update_mask(self, mesh_object: bpy.types.Object, weights_changed: bool) -> bool:
         """Read the mask of the object again if it may have changed.

@@ -15,6 +15,7 @@ from ..core.errors import ModelError
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
 from ..rig.deformation import b_bone_values, read_modifiers_and_drivers
 from ..rig.reading import read_model_rig
+from ..rig.unread_bones import read_unread_bones
 from ..scene.arrays import ElementProperty, read
 from ..scene.mesh import rest_positions
 from ..scene.scene_rig import SceneRig, armature_modifier
@@ -28,6 +29,9 @@ _BONE_PROPERTIES = (
     ElementProperty("bbone_segments", np.int32),
     ElementProperty("matrix_local", np.float32, (16,)),
     ElementProperty("use_deform", np.bool_),
+    ElementProperty("use_inherit_rotation", np.bool_),
+    ElementProperty("use_local_location", np.bool_),
+    ElementProperty("inherit_scale", np.int32),
 )
 _ENVELOPE_PROPERTIES = (
     ElementProperty("envelope_distance", np.float32),
@@ -41,22 +45,29 @@ BONES, PARENTS, OBJECT, MESH = PARTS = ("bones", "parents", "object", "mesh")
 """Parts of a rig that Blender reports separately. Posing by hand is reported as a change of the bones."""
 
 
-def read_signature(scene_rig: SceneRig, parts: Iterable[str] = PARTS) -> dict[str, tuple]:
+def read_signature(
+    scene_rig: SceneRig, unread_bones: Iterable[str] = (), parts: Iterable[str] = PARTS
+) -> dict[str, tuple]:
     """Read the signature of a rig: what is quick to read. If it and the mesh are unchanged, the whole rig is unchanged.
 
     Args:
         scene_rig: the rig.
+        unread_bones: names of the bones whose effect the model learned from others (`rig.unread_bones`).
         parts: which parts to read.
 
     Returns:
-        By part. Names, rest matrices and skinning properties of all bones; their parents; the vertex groups, modifiers
-        and drivers of the object (`rig.deformation`); a digest of the rest positions of the mesh.
+        By part. Names, rest matrices, inheritance and skinning properties of all bones; their parents, and how unread
+        bones follow the others; the vertex groups, modifiers and drivers of the object (`rig.deformation`); a digest of
+        the rest positions of the mesh.
     """
     mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
     modifier = armature_modifier(mesh_object)
     readers = {
         BONES: lambda: _read_bones_once(armature, modifier is not None and modifier.use_bone_envelopes),
-        PARENTS: lambda: tuple(bone.parent.name if bone.parent else "" for bone in armature.bones),
+        PARENTS: lambda: (
+            *(bone.parent.name if bone.parent else "" for bone in armature.bones),
+            str(read_unread_bones(scene_rig, unread_bones)),
+        ),
         OBJECT: lambda: (*mesh_object.vertex_groups.keys(), str(read_modifiers_and_drivers(scene_rig))),
         MESH: lambda: (rest_digest(mesh_object.data),),
     }
@@ -73,7 +84,7 @@ def _read_bones_once(armature: bpy.types.Armature, has_envelopes: bool) -> tuple
 
 
 def bone_signature(armature: bpy.types.Armature, has_envelopes: bool) -> tuple:
-    """Read names, rest matrices and skinning properties of all bones, their envelopes only where these have effect."""
+    """Read names, rest matrices, inheritance and skinning properties of all bones, and envelopes where used."""
     properties = (*_BONE_PROPERTIES, *(_ENVELOPE_PROPERTIES if has_envelopes else ()))
     names, (segments, *values) = armature.bones.keys(), [read(armature.bones, element) for element in properties]
     # Few bones are B-Bones, whose settings are slow to read.

@@ -13,6 +13,7 @@ import pytest
 from blend_fixtures.characters.bones import NewBone, add_bones, limit
 from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
+from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import ModelError, RigError
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.folder import FolderState, read_folder
@@ -23,14 +24,18 @@ from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.recording.weight_fitting import MIN_RANDOM_POSES, choose_fit_poses
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
+from fdda_addon.rig.unread_bones import find_unread_bones
 from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.session import session
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import assert_plays, run, train
 from .resuming import check_resuming
+from .rig_changes import change_in_edit_mode
 from .scene_state import assert_same_state, drain, scene_state
+from .test_changed_rigs import trigger_check
 from .waves import wave
 
 SETTINGS = RecordingSettings(poses=80, influence_poses=2, joints="auto")
@@ -126,6 +131,120 @@ def test_new_weights_on_another_bone_are_noticed(limb_files):
     rig.mesh_object.vertex_groups["half.1"].name = "other"
     with pytest.raises(ModelError, match="the skin weights differ"):
         bind(rig, limb_files.model)
+
+
+def edit_bone(rig: SceneRig, name: str, **settings: object) -> None:
+    def change() -> None:
+        edit_bones = rig.armature_object.data.edit_bones
+        for attribute, value in settings.items():
+            setattr(edit_bones[name], attribute, edit_bones[value] if attribute == "parent" else value)
+
+    change_in_edit_mode(rig.armature_object, change)
+
+
+def bone_of(rig: SceneRig) -> bpy.types.Bone:
+    return rig.armature_object.data.bones["half.1"]
+
+
+def constraint_of(rig: SceneRig, name: str = "half.1") -> bpy.types.Constraint:
+    return rig.armature_object.pose.bones[name].constraints[0]
+
+
+def copy_location(rig: SceneRig, name: str, **settings: object) -> bpy.types.Constraint:
+    constraint = rig.armature_object.pose.bones[name].constraints.new("COPY_LOCATION")
+    constraint.target, constraint.subtarget = rig.armature_object, "bone.0"
+    for attribute, value in settings.items():
+        setattr(constraint, attribute, value)
+    return constraint
+
+
+def mute_driver(rig: SceneRig) -> None:
+    rig.armature_object.animation_data.drivers.find('pose.bones["push.2"].location', index=2).mute = True
+    rig.armature_object.update_tag()
+
+
+HALF = "of the bone 'half.1'"
+UNREAD_CHANGES = {
+    "roll": (lambda r: edit_bone(r, "half.1", roll=1.2), f"'rest pose' {HALF} differs"),
+    "tail": (lambda r: edit_bone(r, "push.1", tail=(0.3, 0, 0.3)), "'rest pose' of the bone 'push.1' differs"),
+    "parent": (lambda r: edit_bone(r, "half.1", parent="bone.1"), f"'parent' {HALF} was bone.0 and is bone.1"),
+    "scale": (
+        lambda r: setattr(r.armature_object.data.bones["half.1"], "inherit_scale", "NONE"),
+        f"IK' {HALF} differs",
+    ),
+    "muted": (lambda r: setattr(constraint_of(r), "mute", True), f"'constraints' {HALF} differs"),
+    "influence": (lambda r: setattr(constraint_of(r), "influence", 0.1), f"'influences' {HALF} differs"),
+    "key": (lambda r: constraint_of(r).keyframe_insert("influence", frame=1), f"'influences' {HALF} differs"),
+    "target": (lambda r: setattr(constraint_of(r), "subtarget", "bone.0"), f"'constraints' {HALF} differs"),
+    "axis": (lambda r: setattr(constraint_of(r), "use_x", False), f"'constraints' {HALF} differs"),
+    "another": (lambda r: copy_location(r, "half.1"), f"'constraints' {HALF} differs"),
+    "driver": (mute_driver, "'drivers' of the bone 'push.2' differs"),
+}
+
+
+@pytest.mark.parametrize("what", UNREAD_CHANGES)
+def test_a_change_of_a_bone_that_is_not_read_shows_the_rig(limb_files, what):
+    rig = limb_files.open()
+    bind(rig, limb_files.model)
+    pose_limb(rig.armature_object)
+    assert_plays(rig.mesh_object, limb_files.model)
+    change, clause = UNREAD_CHANGES[what]
+    change(rig)
+    trigger_check("view layer")
+    assert rig.mesh_object.fdda.mode == "RIG" and clause in rig.mesh_object.fdda.status
+
+
+def key_influence(rig: SceneRig) -> None:
+    constraint = copy_location(rig, "bone.2", influence=0.2)
+    for frame in (1, 20):
+        constraint.keyframe_insert("influence", frame=frame)
+
+
+FOLLOWED_CHANGES = {
+    "a constraint of a joint": lambda r: copy_location(r, "bone.1", influence=0.3),
+    "a keyed influence of a joint": key_influence,
+    "a muted constraint": lambda r: copy_location(r, "half.1", mute=True),
+    "a constraint without influence": lambda r: copy_location(r, "half.1", influence=0),
+    "another name": lambda r: setattr(constraint_of(r), "name", "other"),
+    "IK settings without IK": lambda r: setattr(r.armature_object.pose.bones["half.1"], "ik_stiffness_x", 0.3),
+    "another place": lambda r: setattr(r.armature_object, "location", (100, 0, 3)),
+    "a still bone": lambda r: add_bones(r.armature_object, NewBone("new", (0, 0, 1), (0, 0, 2), "bone.0", False)),
+}
+
+
+@pytest.mark.parametrize("what", FOLLOWED_CHANGES)
+def test_a_change_that_the_model_follows_or_that_has_no_effect_keeps_it_playing(limb_files, what):
+    rig = limb_files.open()
+    bind(rig, limb_files.model)
+    pose_limb(rig.armature_object)
+    FOLLOWED_CHANGES[what](rig)
+    trigger_check("view layer")
+    pose_limb(rig.armature_object)
+    trigger_check("frame")
+    assert_plays(rig.mesh_object, limb_files.model)
+    # The whole rig is read again.
+    rig.mesh_object.data.update()
+    session.passed_checks.clear()
+    trigger_check("view layer")
+    assert_plays(rig.mesh_object, limb_files.model)
+
+
+def test_bones_that_move_only_bones_that_are_not_read_are_compared():
+    """`shared` moves a joint, too, so the model sees what it does; `control` is an input of the model."""
+    rig = build_limb()
+    places = {"mechanism": 0.1, "above": 0.2, "shared": 0.3, "control": 0.4, "pole": 0.5}
+    add_bones(rig.armature_object, *(NewBone(name, (x, 0, 1), (x, 0, 1.1), "", False) for name, x in places.items()))
+    edit_bone(rig, "mechanism", parent="above")
+    copy_location(rig, "half.1", subtarget="mechanism")
+    copy_location(rig, "half.2", subtarget="control")
+    copy_location(rig, "push.1", subtarget="shared")
+    copy_location(rig, "bone.2", subtarget="shared")
+    chain = rig.armature_object.pose.bones["push.2"].constraints.new("IK")
+    chain.target = chain.pole_target = rig.armature_object
+    chain.subtarget, chain.pole_subtarget, chain.chain_count = "bone.0", "pole", 1
+    controls = (Control("armature_object", 'pose.bones["control"].location[0]', -1, 1),)
+    bones = find_unread_bones(rig, dataclasses.replace(read_rig(rig), controls=controls), MAIN_BONES)
+    assert bones == {*HELPERS, "mechanism", "above", "pole"}
 
 
 def test_a_fast_rig_has_only_the_bones_that_the_model_reads(limb_files, tmp_path):

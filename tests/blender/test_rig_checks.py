@@ -102,7 +102,7 @@ def test_envelopes_are_compared_only_where_they_have_an_effect(bound_elbow):
     rig = SceneRig(bound_elbow, armature_object)
 
     def bones() -> tuple:
-        return rig_signature.read_signature(rig, ["bones"])["bones"]
+        return rig_signature.read_signature(rig, parts=["bones"])["bones"]
 
     for has_effect in (False, True):
         armature_modifier(bound_elbow).use_bone_envelopes = has_effect
@@ -140,7 +140,7 @@ def test_in_a_window_posing_reads_no_bones_until_it_pauses(bound_elbow, elbow_fi
     monkeypatch.setattr(
         rig_signature,
         "read_signature",
-        lambda rig, *parts: read_parts.append(set(*parts)) or read_signature(rig, *parts),
+        lambda *arguments: read_parts.append(set(arguments[-1])) or read_signature(*arguments),
     )
     monkeypatch.setattr(session_module, "CHECK_DELAY_S", 1e6)
     for angle in (0.2, 0.4, 0.6):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.controls import Control
+from fdda_addon.core.deformation import MAX_ENTRIES
 from fdda_addon.core.rig import REST_MATRIX_TOLERANCE, Fingerprint, Joint, Rig, rig_differences
 
 from .limb import JOINTS, make_rig
@@ -205,7 +206,7 @@ def test_an_input_of_nodes_that_is_a_control_may_differ(rig, path, index):
     [
         [], "x", {"other": 1}, {"modifiers": [3]}, {"modifiers": [{"name": "a"}]}, {"shape_keys": {"a": 3}},
         {"drivers": 3}, {"modifiers": [{"name": "a", "type": 4, "settings": {}}]},
-        {"b_bones": {str(number): {} for number in range(20_000)}},
+        {"b_bones": {str(number): {} for number in range(MAX_ENTRIES + 1)}},
     ],
 )  # fmt: skip
 def test_a_damaged_deformation_is_refused(value):

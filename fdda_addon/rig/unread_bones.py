@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads how bones follow the others that deform a mesh and are no inputs of its model.
+
+A model reads the poses of its joints, so whatever moves these may change: keys, constraints and their influences. If it
+reads key joints, it has learned how the other deforming bones follow them. Its inputs do not show a change of that, so
+it is compared (`core.deformation`).
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+
+import bpy
+import numpy as np
+
+from ..core.rig import STATIC_JOINT, Fingerprint, Rig
+from ..scene.bone_transform import controls_by_bone
+from ..scene.scene_rig import SceneRig
+from ..scene.temporary_state import animated_paths
+from .bone_paths import split_bone_path
+from .deformation import is_setting, json_value, read_driver, rounded
+from .sources import constraint_targets
+
+_INHERITANCE = ("use_inherit_rotation", "inherit_scale", "use_local_location", "use_relative_parent")
+_IK_PREFIXES = ("ik_", "lock_ik_", "use_ik_")
+_CONSTRAINT_LABELS = {"name", "type", "show_expanded", "is_override_data", "active", "enabled", "mute", "influence"}
+"""Properties of constraints that have no effect, or that are read on their own."""
+_IK_TYPES = {"IK", "SPLINE_IK"}
+
+
+def find_unread_bones(scene_rig: SceneRig, rig: Rig, joint_names: Iterable[str]) -> set[str]:
+    """Find the bones whose changes move the mesh without moving what a model reads.
+
+    These are the bones with skin weights that are no joints, and the bones that move these alone.
+
+    Args:
+        scene_rig, rig: the rig with its own skin weights and the controls of the model.
+        joint_names: names of the joints of the model.
+    """
+    weighted = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
+    joints, sources = set(joint_names), _sources_of_bones(scene_rig.armature_object)
+    followers = weighted - joints - {STATIC_JOINT}
+    visible = _with_sources(sources, joints | set(controls_by_bone(rig.controls)))
+    return followers | (_with_sources(sources, followers) - visible)
+
+
+def read_unread_bones(scene_rig: SceneRig, names: Iterable[str]) -> dict[str, dict]:
+    """Read rest pose, parent, constraints and drivers of bones, as JSON settings by name, without missing bones."""
+    armature_object = scene_rig.armature_object
+    animation, bones = armature_object.animation_data, armature_object.pose.bones
+    drivers: dict[str, list] = {}
+    for curve in animation.drivers if animation else ():
+        bone_name, subpath = split_bone_path(armature_object, curve.data_path)
+        if bone_name and not subpath.startswith('["'):
+            drivers.setdefault(bone_name, []).append(curve)
+    animated, solved = animated_paths(armature_object), {b for _, chain in _ik_chains(armature_object) for b in chain}
+    return {
+        name: _read_bone(scene_rig, bones[name], drivers.get(name, ()), animated, name in solved)
+        for name in names
+        if name in bones
+    }
+
+
+def _read_bone(
+    scene_rig: SceneRig,
+    pose_bone: bpy.types.PoseBone,
+    drivers: Iterable[bpy.types.FCurve],
+    animated: set[str],
+    is_solved: bool,
+) -> dict:
+    """Read the settings of a bone, given its drivers, the animated paths, and whether it is part of an IK chain."""
+    bone = pose_bone.bone
+    rest, length = np.array(bone.matrix_local, np.float64)[:3], bone.length
+    rest[:, 3] /= length or 1.0
+    constraints, influences = [], []
+    for constraint in pose_bone.constraints:
+        path = constraint.path_from_id()
+        is_animated = f"{path}.influence" in animated or f"{path}.mute" in animated
+        if is_animated or (not constraint.mute and constraint.influence > 0):
+            settings = list(_read_constraint(scene_rig, constraint, path, animated))
+            constraints.append(f"{constraint.type} {Fingerprint.digest_text(json.dumps(settings))}")
+            influences.append(None if is_animated else rounded(constraint.influence))
+    settings = [json_value(scene_rig, getattr(bone, name, None)) for name in _INHERITANCE]
+    if is_solved:
+        names = [prop.identifier for prop in pose_bone.bl_rna.properties if prop.identifier.startswith(_IK_PREFIXES)]
+        settings += [json_value(scene_rig, getattr(pose_bone, name)) for name in names]
+    digests = [json.dumps(read_driver(scene_rig, curve)) for curve in drivers]
+    return {
+        "rest pose": [rounded(float(value)) for value in rest.ravel()],
+        "length": rounded(length),
+        "parent": bone.parent.name if bone.parent else "",
+        "inheritance or IK": Fingerprint.digest_text(json.dumps(settings)),
+        "constraints": constraints,
+        "influences": influences,
+        "drivers": Fingerprint.digest_text("".join(sorted(digests))) if digests else "",
+    }
+
+
+def _read_constraint(
+    scene_rig: SceneRig, constraint: bpy.types.Constraint, path: str, animated: set[str]
+) -> Iterator[list]:
+    """Yield name and value of each setting of a constraint, and what its targets are."""
+    for prop in constraint.bl_rna.properties:
+        name = prop.identifier
+        if name not in _CONSTRAINT_LABELS and not prop.is_readonly and is_setting(constraint, name):
+            value = None if f"{path}.{name}" in animated else json_value(scene_rig, getattr(constraint, name))
+            yield [name, value]
+    for index, target in enumerate(getattr(constraint, "targets", ())):
+        weight = getattr(target, "weight", 1.0)
+        is_animated = f"{path}.targets[{index}].weight" in animated
+        yield [json_value(scene_rig, target.target), target.subtarget, None if is_animated else rounded(weight)]
+
+
+def _sources_of_bones(armature_object: bpy.types.Object) -> dict[str, set[str]]:
+    """Return the bones of the same armature that each bone reads: parent, targets, IK chains, drivers and handles."""
+    sources: dict[str, set[str]] = {}
+    for bone in armature_object.pose.bones:
+        read = sources[bone.name] = set()
+        handles = (bone.bone.bbone_custom_handle_start, bone.bone.bbone_custom_handle_end)
+        read |= {other.name for other in (bone.parent, *handles) if other is not None}
+        for constraint in (c for c in bone.constraints if not c.mute):
+            read |= {name for target, name in constraint_targets(constraint) if target == armature_object and name}
+    for owner, chain in _ik_chains(armature_object):
+        for name in chain:
+            sources[name].add(owner)
+    animation = armature_object.animation_data
+    for curve in animation.drivers if animation else ():
+        bone_name, _ = split_bone_path(armature_object, curve.data_path)
+        for variable in curve.driver.variables if bone_name in sources else ():
+            for target in (target for target in variable.targets if target.id == armature_object):
+                is_number = variable.type == "SINGLE_PROP"
+                read_name = split_bone_path(target.id, target.data_path)[0] if is_number else target.bone_target
+                sources[bone_name].add(read_name)
+    return sources
+
+
+def _ik_chains(armature_object: bpy.types.Object) -> Iterator[tuple[str, list[str]]]:
+    """Yield each bone that has an inverse kinematics constraint, and the bones that the constraint moves."""
+    for bone in armature_object.pose.bones:
+        for constraint in bone.constraints:
+            if constraint.type in _IK_TYPES and not constraint.mute:
+                chain = [bone, *bone.parent_recursive][not getattr(constraint, "use_tail", True) :]
+                yield bone.name, [member.name for member in chain[: constraint.chain_count or len(chain)]]
+
+
+def _with_sources(sources: dict[str, set[str]], names: Iterable[str]) -> set[str]:
+    """Return bones and all bones on which they depend."""
+    found, queue = set(), [name for name in names if name in sources]
+    while queue:
+        name = queue.pop()
+        if name not in found:
+            found.add(name)
+            queue += [source for source in sources[name] if source in sources]
+    return found
