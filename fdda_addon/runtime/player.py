@@ -215,9 +215,9 @@ class Player:
         controls = self._control_reader.values(owners)
         # In mode RIG the modifiers are about to be switched, so the strength does not matter.
         strength = 0.0 if (session.overriding_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
-        inputs = pose_matrices.tobytes(), controls.tobytes(), strength
+        inputs = pose_matrices.tobytes(), controls.tobytes(), strength, self._control_reader.warning
         if inputs != self._shown_inputs and not (session.skips_models and self._positions is not None):
-            self.warning = ""
+            self.warning = self._control_reader.warning
             if not np.isfinite(pose_matrices).all():
                 pose_matrices, first_name = repair_pose(pose_matrices, self.network.info)
                 self.warning = (

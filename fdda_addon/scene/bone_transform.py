@@ -29,12 +29,14 @@ class BoneTransform:
         bone_name: name of the bone.
         element: column and row of the number in `MATRIX`; None for a scale or a rotation channel.
         is_matrix: the path of the control is an element of `MATRIX`.
+        scale_axis: axis of a scale; None for any other number.
     """
 
     bone_path: str
     bone_name: str
     element: tuple[int, int] | None
     is_matrix: bool
+    scale_axis: int | None
 
 
 def bone_transform(path: str) -> BoneTransform | None:
@@ -46,7 +48,8 @@ def bone_transform(path: str) -> BoneTransform | None:
     element = (int(match["index"]), int(match["row"])) if is_matrix else None
     if match["property"] == "location":
         element = 3, int(match["index"])
-    return BoneTransform(match["bone"], bpy.utils.unescape_identifier(match["name"]), element, is_matrix)
+    scale_axis = int(match["index"]) if match["property"] == "scale" else None
+    return BoneTransform(match["bone"], bpy.utils.unescape_identifier(match["name"]), element, is_matrix, scale_axis)
 
 
 def controls_by_bone(controls: Iterable[Control]) -> dict[str, tuple[int, ...]]:

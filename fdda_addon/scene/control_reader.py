@@ -1,25 +1,34 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reads the values of controls of a rig in every frame, also on the threads of Blender's evaluation."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import bpy
 import numpy as np
 
 from ..core.controls import Control
 from ..core.errors import RigError
+from ..core.rig import STATIC_JOINT
+from .armature import PoseMatrixReader, rest_matrices
+from .arrays import POSE_CHANNELS, PropertyReader
 from .bone_transform import BoneTransform, bone_transform
-from .controls import number_at, owner_of
-from .scene_rig import SceneRig
+from .controls import canonical_path, number_at, owner_of
+from .scene_rig import MIN_VOLUME, SceneRig
+
+MAX_HIDDEN_MOTION = 1e-3
+"""Largest motion of a control bone along an axis that is no control, as a part of its length, without a warning."""
 
 
 class ControlReader:
     """Reads the values of controls of a rig.
 
-    The locations and rotations of one bone are read together, as one matrix, because a face has hundreds of them.
+    The locations, rotations and scales of one bone are read together, as one matrix, because a face has hundreds of
+    them. It includes the constraints of the bone, because what follows the bone sees them. Only drivers that read the
+    channels of a bone do not; then the channels are read.
 
     Attributes:
         sources: one control of each struct that is read. Whoever depends on them depends on all controls.
+        warning: names a bone that constraints have moved along an axis that is no control; empty for none.
     """
 
     def __init__(self, scene_rig: SceneRig, controls: tuple[Control, ...]):
@@ -32,27 +41,42 @@ class ControlReader:
         Raises:
             RigError: the rig lacks a control.
         """
-        self._controls, self._mesh_name = controls, scene_rig.mesh_object.name
+        self._controls, self._mesh_name, self.warning = controls, scene_rig.mesh_object.name, ""
+        channel_bones = set(_read_channel_bones())
+
+        def is_constrained(control: Control, transform: BoneTransform) -> bool:
+            owner = owner_of(scene_rig, control.owner)
+            bone = owner and owner.type == "ARMATURE" and owner.data.bones.get(transform.bone_name)
+            return bool(bone) and (owner.name, bone.name) not in channel_bones and _inherits_all(bone)
+
         bone_elements: dict[tuple[str, str], list[tuple[int, BoneTransform]]] = {}
         self._single_controls: list[int] = []
         for index, control in enumerate(controls):
             transform = bone_transform(control.path)
-            if transform is None or transform.element is None:
+            is_scale = transform is not None and transform.scale_axis is not None
+            if transform is None or (
+                transform.element is None and not (is_scale and is_constrained(control, transform))
+            ):
                 self._single_controls.append(index)
             else:
                 bone_elements.setdefault((control.owner, transform.bone_path), []).append((index, transform))
         groups = list(bone_elements.values())
         self._bone_names = [elements[0][1].bone_name for elements in groups]
         self._matrices = np.zeros((len(groups), 4, 4), np.float32)
-        self._matrix_controls = np.array([index for elements in groups for index, _ in elements], np.intp)
-        self._matrix_elements = np.array(
-            [
-                16 * bone_index + 4 * transform.element[1] + transform.element[0]
-                for bone_index, elements in enumerate(groups)
-                for _, transform in elements
-            ],
-            np.intp,
-        )
+        bones_by_owner: dict[str, list[int]] = {}
+        for bone_index, elements in enumerate(groups):
+            index, transform = elements[0]
+            if is_constrained(controls[index], transform):
+                bones_by_owner.setdefault(controls[index].owner, []).append(bone_index)
+        self._constrained_bones = [
+            (bone_indices, ConstrainedBones(owner_of(scene_rig, owner), [groups[i] for i in bone_indices]))
+            for owner, bone_indices in bones_by_owner.items()
+        ]
+        numbers = [(i, index, transform) for i, elements in enumerate(groups) for index, transform in elements]
+        elements = [(index, 16 * i + 4 * t.element[1] + t.element[0]) for i, index, t in numbers if t.element]
+        scales = [(index, 3 * i + t.scale_axis) for i, index, t in numbers if not t.element]
+        self._matrix_controls, self._matrix_elements = np.array(elements, np.intp).reshape(-1, 2).T
+        self._scale_controls, self._scale_elements = np.array(scales, np.intp).reshape(-1, 2).T
         first_controls = [elements[0][0] for elements in groups] + self._single_controls
         self.sources: tuple[Control, ...] = tuple(controls[index] for index in first_controls)
         self.values([owner_of(scene_rig, source.owner) for source in self.sources])
@@ -71,9 +95,17 @@ class ControlReader:
 
     def values(self, owners: Sequence[bpy.types.ID | None]) -> np.ndarray:
         """Read the values as `read` does, given the owner of each of `sources`, which may be an evaluated datablock."""
-        values = np.zeros(len(self._controls), np.float32)
+        values, self.warning = np.zeros(len(self._controls), np.float32), ""
         bone_count = len(self._bone_names)
-        for bone_index, (name, owner) in enumerate(zip(self._bone_names, owners[:bone_count], strict=True)):
+        remaining = set(range(bone_count))
+        for bone_indices, bones in self._constrained_bones:
+            owner = owners[bone_indices[0]]
+            if getattr(owner, "pose", None) and bones.fits(owner):
+                self._matrices[bone_indices], warning = bones.read(owner)
+                self.warning = self.warning or warning
+                remaining -= set(bone_indices)
+        for bone_index in sorted(remaining):
+            name, owner = self._bone_names[bone_index], owners[bone_index]
             pose = getattr(owner, "pose", None)
             bone = pose and pose.bones.get(name)
             if bone is None:
@@ -83,6 +115,9 @@ class ControlReader:
                 )
             self._matrices[bone_index] = bone.matrix_basis
         values[self._matrix_controls] = self._matrices.reshape(-1)[self._matrix_elements]
+        if len(self._scale_controls):
+            lengths = np.linalg.norm(self._matrices[:, :3, :3], axis=1)
+            values[self._scale_controls] = lengths.reshape(-1)[self._scale_elements]
         for index, owner in zip(self._single_controls, owners[bone_count:], strict=True):
             control = self._controls[index]
             value = None if owner is None else number_at(owner, control.path)
@@ -93,3 +128,84 @@ class ControlReader:
                 "a number; name it as before, or record and train this rig."
             )
         return values
+
+
+class ConstrainedBones:
+    """Reads the transforms of bones of one armature after their constraints, relative to rest pose and parent."""
+
+    def __init__(self, armature_object: bpy.types.Object, bones: Sequence[Sequence[tuple[int, BoneTransform]]]):
+        """Prepare to read bones.
+
+        Args:
+            armature_object: the armature object.
+            bones: the numbers of each bone that are controls, at least one.
+        """
+        self._names = [numbers[0][1].bone_name for numbers in bones]
+        rest_bones = [armature_object.data.bones[name] for name in self._names]
+        parent_names = [bone.parent.name if bone.parent else STATIC_JOINT for bone in rest_bones]
+        names = (*self._names, *parent_names)
+        self._reader = PoseMatrixReader(armature_object, names)
+        rest, parent_rest = np.split(rest_matrices(armature_object.data, names), 2)
+        self._offsets = np.linalg.inv(parent_rest) @ rest
+        self._locations = np.empty((len(armature_object.pose.bones), 3), np.float32)
+        self._location_reader = PropertyReader(POSE_CHANNELS[0], self._locations)
+        self._indices = [armature_object.pose.bones.find(name) for name in self._names]
+        elements = [{transform.element for _, transform in numbers} for numbers in bones]
+        # A connected bone ignores its location.
+        self._hidden_axes = np.array(
+            [
+                [(3, axis) not in read and not bone.use_connect for axis in range(3)]
+                for read, bone in zip(elements, rest_bones, strict=True)
+            ]
+        )
+        self._max_motion = MAX_HIDDEN_MOTION * np.array([bone.length for bone in rest_bones])
+
+    def fits(self, armature_object: bpy.types.Object) -> bool:
+        """Return whether the armature still has the same number of bones."""
+        return self._reader.fits(armature_object)
+
+    def read(self, armature_object: bpy.types.Object) -> tuple[np.ndarray, str]:
+        """Read an evaluated armature object.
+
+        Returns:
+            (n, 4, 4) float64 matrices, the identity for bones whose parents have no volume; and a warning for a bone
+            that moves along an axis that is no control, or an empty text.
+        """
+        matrices, parent_matrices = np.split(self._reader.read(armature_object).astype(np.float64), 2)
+        parent_spaces = parent_matrices @ self._offsets
+        is_flat = np.abs(np.linalg.det(parent_spaces)) < MIN_VOLUME
+        parent_spaces[is_flat] = np.eye(4)
+        local = np.linalg.inv(parent_spaces) @ matrices
+        local[is_flat] = np.eye(4)
+        self._location_reader.read(armature_object.pose.bones)
+        moved = (local[:, :3, 3] - self._locations[self._indices]) * self._hidden_axes
+        hidden = np.flatnonzero(np.linalg.norm(moved, axis=1) > self._max_motion)
+        if not len(hidden):
+            return local, ""
+        return local, (
+            f"A constraint moves the control bone '{self._names[hidden[0]]}' along an axis that is no extra input, so "
+            "the model does not follow it; mute it, or record and train this rig."
+        )
+
+
+def _inherits_all(bone: bpy.types.Bone) -> bool:
+    """Return whether a bone inherits the whole transform of its parent."""
+    return bone.use_inherit_rotation and bone.use_local_location and bone.inherit_scale == "FULL"
+
+
+def _read_channel_bones() -> Iterator[tuple[str, str]]:
+    """Yield the names of armature object and bone of each bone whose channels drivers read, without its constraints."""
+    for datablock in (*bpy.data.objects, *bpy.data.shape_keys, *bpy.data.armatures, *bpy.data.node_groups):
+        # The drivers that run models read all controls.
+        animation = None if datablock.is_runtime_data else datablock.animation_data
+        for curve in animation.drivers if animation else ():
+            for variable in curve.driver.variables:
+                for target in variable.targets:
+                    if not isinstance(target.id, bpy.types.Object):
+                        continue
+                    if variable.type == "SINGLE_PROP":
+                        transform = bone_transform(canonical_path(target.id, target.data_path))
+                        if transform is not None:
+                            yield target.id.name, transform.bone_name
+                    elif variable.type == "TRANSFORMS" and target.transform_space == "TRANSFORM_SPACE":
+                        yield target.id.name, target.bone_target

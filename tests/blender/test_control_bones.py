@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import control_face
+from blend_fixtures.characters.bones import limit
 from blend_fixtures.characters.targets import TARGET
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
@@ -213,6 +214,42 @@ def test_cosine_and_sine_are_read_from_the_matrix(face, axis):
     bpy.context.view_layer.update()
     values = reader.read(face, bpy.context.evaluated_depsgraph_get())
     assert values == pytest.approx([np.cos(0.7), np.sin(0.7)], abs=1e-6)
+
+
+def test_constraints_of_control_bones_are_read_unless_drivers_read_the_channels(face):
+    bones, controls = face.armature_object.pose.bones, listed_controls(face, RecordingSettings(controls=(FACE,)))
+    bones["brow"].location = (0.5, 0, 0)
+    bones["lid"].rotation_euler[1], bones["mouth"].scale[2] = 2.0, 3.0
+    bones["still"].rotation_euler = (0.3, 0.6, 0)
+    copy = bones["eye"].constraints.new("COPY_ROTATION")
+    copy.target, copy.subtarget, copy.owner_space, copy.target_space = face.armature_object, "still", "LOCAL", "LOCAL"
+    limit(bones["eye"], "LIMIT_SCALE", {0: (0.5, 0.8)})
+    controls += parse_controls(face, ['armature_object/pose.bones["eye"].scale[0]=0:1'])
+    reader = ControlReader(face, controls)
+    bpy.context.view_layer.update()
+    read = reader.read(face, bpy.context.evaluated_depsgraph_get())
+    values = {control.path.removeprefix("pose.bones"): value for control, value in zip(controls, read, strict=True)}
+    # A bone follows the brow, so it stays at the limit; drivers read the channels of the lid and the mouth.
+    assert values['["brow"].location[0]'] == pytest.approx(0.02)
+    assert values['["lid"].matrix_basis[2][2]'] == pytest.approx(np.cos(2), abs=1e-6)
+    assert values['["mouth"].scale[2]'] == pytest.approx(3)
+    assert values['["eye"].scale[0]'] == pytest.approx(0.8)
+    expected = np.array(bones["still"].matrix_basis)[:3, 1]
+    assert [values[f'["eye"].matrix_basis[1][{row}]'] for row in range(3)] == pytest.approx(expected, abs=1e-5)
+    assert not reader.warning
+
+
+def test_a_constraint_along_an_axis_that_is_no_input_warns(bound_face):
+    """The brow has inputs along x and z."""
+    armature_object = bpy.data.objects[control_face.ARMATURE]
+    armature_object.animation_data.action = None
+    lift = armature_object.pose.bones["brow"].constraints.new("LIMIT_LOCATION")
+    lift.use_min_z, lift.min_z = True, 0.1
+    bpy.context.view_layer.update()
+    assert bound_face.fdda.mode == "FDDA" and "moves the control bone 'brow' along an axis" in bound_face.fdda.status
+    lift.mute = True
+    bpy.context.view_layer.update()
+    assert bound_face.fdda.mode == "FDDA" and not bound_face.fdda.status
 
 
 def test_sixty_control_bones_are_read_through_sixty_dependencies():
