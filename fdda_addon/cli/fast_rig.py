@@ -91,7 +91,8 @@ def _summary(fast_rig: "FastRig") -> str:
     ]
     if fast_rig.moving_joints:
         lines.append(
-            f"  the joints move as in the full rig in {format_count(fast_rig.pose_count, 'pose')} (largest difference "
+            f"  the joints, the controls and {format_count(fast_rig.object_count, 'rendered object')} are as in the "
+            f"full rig in {format_count(fast_rig.pose_count, 'pose')} (largest difference "
             f"{fast_rig.largest_difference:.1e} of the size)"
         )
     else:
@@ -99,11 +100,13 @@ def _summary(fast_rig: "FastRig") -> str:
             f"  no joint moves in {format_count(fast_rig.pose_count, 'pose')} of these controls, so nothing shows that "
             "the joints move as in the full rig; choose the controls that move them with --controls"
         )
-    if counts := fast_rig.infinite_joints:
+    if counts := fast_rig.infinite_bones:
         lines.append(
             f"  in up to {max(counts.values())} of these, both rigs give no finite transform to "
             f"{_names(tuple(counts))}; there they were not compared"
         )
+    if fast_rig.unrepeated:
+        lines.append(f"  not compared, because the full rig does not repeat it: {', '.join(fast_rig.unrepeated)}")
     for action, counts in fast_rig.lost_channels.items():
         lines.append(
             f"  '{action}': {sum(counts.values()):,} keyed channels have no bone any more: {_names(tuple(counts))}"

@@ -65,19 +65,24 @@ def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> 
 
 
 def animating_actions(armature_object: bpy.types.Object) -> list[bpy.types.Action]:
-    """Return the actions of the file that key bones of an armature, except those that only Action constraints play."""
-    constraints = (constraint for bone in armature_object.pose.bones for constraint in bone.constraints)
-    constraint_actions = {c.action for c in constraints if c.type == "ACTION" and c.action is not None}
-    animation = armature_object.animation_data
-    if animation is not None:
-        strips = (strip for track in animation.nla_tracks for strip in track.strips)
-        constraint_actions -= {animation.action, *(strip.action for strip in strips)}
-    bones = armature_object.pose.bones
+    """Return the actions of the file that key bones of an armature, except `constraint_actions`."""
+    bones, excluded = armature_object.pose.bones, constraint_actions(armature_object)
     return [
         action
         for action in bpy.data.actions
-        if action not in constraint_actions and any(name in bones for name in keyed_bones(armature_object, action))
+        if action not in excluded and any(name in bones for name in keyed_bones(armature_object, action))
     ]
+
+
+def constraint_actions(armature_object: bpy.types.Object) -> set[bpy.types.Action]:
+    """Return the actions that only Action constraints of bones play."""
+    constraints = (constraint for bone in armature_object.pose.bones for constraint in bone.constraints)
+    actions = {c.action for c in constraints if c.type == "ACTION" and c.action is not None}
+    animation = armature_object.animation_data
+    if animation is not None:
+        strips = (strip for track in animation.nla_tracks for strip in track.strips)
+        actions -= {animation.action, *(strip.action for strip in strips)}
+    return actions
 
 
 def keyed_bones(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, int]:

@@ -20,8 +20,8 @@ from ..scene.scene_rig import find_rig
 from ..scene.temporary_state import assign_action
 from ..scene.time_stretching import unstretched_time
 from ..timing.benchmark import time_calls
+from .compared_poses import set_random_pose
 from .controls import animating_actions
-from .joint_poses import set_random_pose
 
 ROUNDS = 3
 WARM_UP_FRAMES = 3

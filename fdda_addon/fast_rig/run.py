@@ -19,10 +19,20 @@ from ..runtime.model_files import network_of
 from ..scene.blend_file import save_copy
 from ..scene.controls import owner_of
 from ..scene.scene_rig import SceneRig
-from .controls import animating_actions, control_bones, keyed_bones
+from .compared_poses import (
+    ComparedPoses,
+    differing_bones,
+    evaluate_poses,
+    infinite_bones,
+    moving_bones,
+    playable_actions,
+    rig_size,
+)
+from .controls import control_bones, keyed_bones
 from .dependency_graph import Node
 from .driver_reader import bone_of_path, driven_node
-from .joint_poses import JointPoses, differing_joints, evaluate_joints, infinite_joints, moving_joints, rig_size
+from .graph_reader import shown_objects
+from .object_values import differing_objects, driven_properties
 from .removal import Removed, remove_unneeded
 from .struct_reader import bone_node, datablock_node
 
@@ -30,7 +40,7 @@ TOLERANCE = 1e-5
 """Largest accepted difference of a joint between full rig and fast rig, as a ratio of the size of the rig."""
 REPEATED_POSES = 10
 """Number of random poses that are evaluated again, to find out whether the full rig repeats its result."""
-MAX_NAMED_BONES = 5
+MAX_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -45,10 +55,12 @@ class FastRig:
         controls: names of the chosen control bones.
         removed_objects, removed_modifiers, removed_drivers: names of objects and modifiers, and number of drivers.
         lost_channels: number of keyed channels that have lost their bones, by action and bone.
-        pose_count: number of poses in which the joints were compared.
-        largest_difference: largest difference of a joint in these, as a ratio of the size of the rig.
+        object_count: number of objects that were compared.
+        pose_count: number of poses in which bones and objects were compared.
+        largest_difference: largest difference in these, as a ratio of the size of the rig.
         moving_joints: number of joints that move in these.
-        infinite_joints: number of these poses in which both rigs give a joint no finite transform, by its name.
+        infinite_bones: number of these poses in which both rigs give a bone no finite transform, by its name.
+        unrepeated: names of objects that look different in the same pose, so that they were not compared.
     """
 
     armature_name: str
@@ -61,10 +73,12 @@ class FastRig:
     removed_modifiers: tuple[str, ...]
     removed_drivers: int
     lost_channels: dict[str, dict[str, int]] = field(default_factory=dict)
+    object_count: int = 0
     pose_count: int = 0
     largest_difference: float = 0.0
     moving_joints: int = 0
-    infinite_joints: dict[str, int] = field(default_factory=dict)
+    infinite_bones: dict[str, int] = field(default_factory=dict)
+    unrepeated: tuple[str, ...] = ()
 
 
 def make_fast_rig(
@@ -83,8 +97,8 @@ def make_fast_rig(
         Progress, and at the end the FastRig.
 
     Raises:
-        FDDAError: a rig or model is refused, a joint moves in another way without the removed bones, or the file cannot
-            be written. Nothing is written.
+        FDDAError: a rig or model is refused, a bone that is read or posed or an object that is rendered looks different
+            without what is removed, or the file cannot be written. Nothing is written.
     """
     scene_rigs = [scene_rig for scene_rig, _ in rigs_and_models]
     armature_object = _shared_armature(scene_rigs)
@@ -98,18 +112,32 @@ def make_fast_rig(
             f"'{armature_object.name}' has no bones for --controls {' '.join(choices)}, so the fast rig would have "
             "nothing to animate; choose other controls: visible, keyed or collection:NAME, a bone collection."
         )
-    actions = tuple(animating_actions(armature_object))
-    poses = JointPoses(armature_object, joint_names, controls, actions, rig_size(armature_object))
-    before = yield from _evaluate_full_rig(poses)
+    bone_names = tuple(dict.fromkeys((*joint_names, *controls)))
+    actions, shown = playable_actions(armature_object), tuple(shown_objects(scene_rigs))
+    driven, size = tuple(driven_properties(shown)), rig_size(armature_object)
+    poses = ComparedPoses(armature_object, bone_names, controls, actions, size, shown, driven)
+    before, unrepeated = yield from _evaluate_full_rig(poses)
     bones_before = len(armature_object.data.bones)
     keyed = {action.name: keyed_bones(armature_object, action) for action in actions}
     removed = _remove_unneeded(scene_rigs, joint_names, controls)
     after = yield from _evaluate(poses, "fast rig")
 
-    if differences := differing_joints(poses, before, after, TOLERANCE):
+    if differences := differing_bones(poses, before.matrices, after.matrices, TOLERANCE):
         raise RigError(
             f"Without the removed bones, {_named_bones(differences)} of '{armature_object.name}', which the model "
-            "reads, would move differently; keep more bones with --controls collection:NAME."
+            "reads or animators pose, would move differently; keep more bones with --controls collection:NAME."
+        )
+    differences = differing_objects(before.objects, after.objects, -1.0)
+    compared = {name: difference for name, difference in differences.items() if name not in unrepeated}
+    texts = [
+        f"another {name} (relative difference {difference:.1e})"
+        for name, difference in _largest_first(compared)
+        if difference > TOLERANCE
+    ]
+    if texts:
+        raise RigError(
+            f"Without the removed bones and objects, renders would show {_listed(texts)}; keep more bones with "
+            "--controls collection:NAME."
         )
     save_copy(out)
     yield FastRig(
@@ -123,10 +151,12 @@ def make_fast_rig(
         removed.modifiers,
         removed.drivers,
         _lost_channels(keyed, removed.bones),
-        len(before),
-        max(differing_joints(poses, before, after, -1.0).values(), default=0.0),
-        len(moving_joints(poses, before, TOLERANCE)),
-        infinite_joints(poses, before),
+        len(shown),
+        len(before.matrices),
+        max((*differing_bones(poses, before.matrices, after.matrices, -1.0).values(), *compared.values()), default=0.0),
+        len(moving_bones(poses, before.matrices, TOLERANCE) & set(joint_names)),
+        infinite_bones(poses, before.matrices),
+        tuple(unrepeated),
     )
 
 
@@ -189,21 +219,33 @@ def _model_nodes(scene_rigs: list[SceneRig]) -> list[Node]:
     return nodes
 
 
-def _evaluate_full_rig(poses: JointPoses) -> Iterator[Progress]:
-    """Yield progress, and return the matrices of the full rig; raise a RigError if its poses do not repeat."""
-    matrices = yield from _evaluate(poses, "full rig")
-    again = yield from _evaluate(replace(poses, actions=(), pose_count=REPEATED_POSES), "repeated poses")
-    if differences := differing_joints(poses, matrices[:REPEATED_POSES], again, TOLERANCE):
+def _evaluate_full_rig(poses: ComparedPoses) -> Iterator[Progress]:
+    """Yield progress, and return the full rig's Evaluation and the names of the objects that do not repeat.
+
+    Simulated objects may depend on the poses before.
+
+    Raises:
+        RigError: the bones do not repeat.
+    """
+    full = yield from _evaluate(poses, "full rig")
+    # Of an action, only objects, which may be simulated: its first frame may depend on the pose before.
+    again = yield from _evaluate(replace(poses, actions=poses.actions[:1], pose_count=REPEATED_POSES), "repeated poses")
+    indices = [
+        *range(REPEATED_POSES),
+        *range(poses.pose_count, poses.pose_count + len(again.matrices) - REPEATED_POSES),
+    ]
+    if differences := differing_bones(poses, *(e.matrices[:REPEATED_POSES] for e in (full, again)), TOLERANCE):
         raise RigError(
             f"Evaluating the same pose again moves {_named_bones(differences)} of '{poses.armature_object.name}' "
             "differently, so a fast rig cannot be compared; look for dependency cycles among constraints and drivers."
         )
-    return matrices
+    first = {name: [values[index] for index in indices] for name, values in full.objects.items()}
+    return full, list(differing_objects(first, again.objects, TOLERANCE))
 
 
-def _evaluate(poses: JointPoses, stage: str) -> Iterator[Progress]:
-    """Yield the progress of `evaluate_joints`, and return its matrices."""
-    for step in evaluate_joints(poses, stage):
+def _evaluate(poses: ComparedPoses, stage: str) -> Iterator[Progress]:
+    """Yield the progress of `evaluate_poses`, and return its Evaluation."""
+    for step in evaluate_poses(poses, stage):
         if isinstance(step, Progress):
             yield step
     return step
@@ -211,10 +253,18 @@ def _evaluate(poses: JointPoses, stage: str) -> Iterator[Progress]:
 
 def _named_bones(differences: dict[str, float]) -> str:
     """Return the number of bones that differ, with the names and differences of the largest."""
-    names = sorted(differences, key=differences.__getitem__, reverse=True)
-    shown = ", ".join(f"'{name}' by {differences[name]:.1e} of the size" for name in names[:MAX_NAMED_BONES])
-    more = f" and {len(names) - MAX_NAMED_BONES} more" if len(names) > MAX_NAMED_BONES else ""
-    return f"{format_count(len(names), 'bone')} ({shown}{more})"
+    texts = [f"'{name}' by {difference:.1e} of the size" for name, difference in _largest_first(differences)]
+    return f"{format_count(len(differences), 'bone')} ({_listed(texts)})"
+
+
+def _largest_first(differences: dict[str, float]) -> list[tuple[str, float]]:
+    return sorted(differences.items(), key=lambda item: item[1], reverse=True)
+
+
+def _listed(texts: list[str]) -> str:
+    """Return the first of some texts, and the number of others."""
+    more = f" and {len(texts) - MAX_NAMED} more" if len(texts) > MAX_NAMED else ""
+    return ", ".join(texts[:MAX_NAMED]) + more
 
 
 def _lost_channels(keyed: dict[str, dict[str, int]], removed_bones: set[str]) -> dict[str, dict[str, int]]:

@@ -19,9 +19,9 @@ from ..scene.scene_rig import SceneRig, armature_modifier, armature_of
 from ..scene.skin import read_skin
 from ..timing.durations import Duration
 from ..timing.fast_rig_saving import FastRigSaving
+from .compared_poses import rig_size
 from .controls import VISIBLE, control_bones
 from .frame_times import measure_frames
-from .joint_poses import rig_size
 from .removal import remove_unneeded
 
 ROUNDS, FRAMES_PER_ROUND = 5, 12

@@ -8,11 +8,11 @@ import bpy
 import numpy as np
 import pytest
 
-from blend_fixtures.characters.dependencies import DEPENDENCIES, SOURCE, UNUSED, studio_arm
+from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.fast_rig import frame_times
 from fdda_addon.fast_rig import removal as fast_rig_removal
+from fdda_addon.fast_rig.compared_poses import ComparedPoses, differing_bones, infinite_bones
 from fdda_addon.fast_rig.graph_reader import read_graph
-from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, infinite_joints
 from fdda_addon.fast_rig.struct_reader import bone_node
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
@@ -83,7 +83,7 @@ def test_a_fast_rig_has_the_same_names_and_plays(folder):
 
     assert f"has {full_count - 2} of {full_count} bones" in lines[0] and "animators pose 1" in lines[0]
     assert "1 object ('cage'), 2 modifiers ('Mush', 'Lattice')" in lines[1]
-    assert "in 240 poses (largest difference 0.0e+00 of the size)" in lines[2]
+    assert "the joints, the controls and 2 rendered objects are as in the full rig in 240 poses (largest" in lines[2]
     assert lines[3].strip() == f"'{ACTION} {UNUSED}': 3 keyed channels have no bone any more: '{UNUSED}'"
     assert "times as fast" in lines[4] and len(lines) == 5
 
@@ -120,22 +120,82 @@ def test_both_rigs_play_the_same_action_without_the_models_of_the_full_rig(folde
     assert sorted(set(models)) == [0, 2]
 
 
-def test_bones_that_differ_are_named_and_nothing_is_written(folder, monkeypatch, capsys):
-    """Without one dependency, the comparison refuses the fast rig."""
-    missing = f"{SOURCE}.distance"
+def drop_needs_of_bone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the dependency graph lack what needs a bone."""
 
     def read_incomplete_graph(*arguments):
         graph = read_graph(*arguments)
         for needed in graph.needs.values():
-            needed.discard(bone_node(arguments[0][0].armature_object, missing))
+            needed.discard(bone_node(arguments[0][0].armature_object, name))
         return graph
 
     monkeypatch.setattr(fast_rig_removal, "read_graph", read_incomplete_graph)
+
+
+def test_bones_that_differ_are_named_and_nothing_is_written(folder, monkeypatch, capsys):
+    """Without one dependency, the comparison refuses the fast rig."""
+    drop_needs_of_bone(f"{SOURCE}.distance", monkeypatch)
     assert run(*fast_rig_arguments(folder)) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert "Without the removed bones, 1 bone ('lower' by " in error
-    assert "which the model reads, would move differently" in error
+    assert "which the model reads or animators pose, would move differently" in error
     assert not (folder / "fast.blend").exists()
+
+
+@pytest.mark.parametrize("owner", ["prop", "control"])
+def test_what_would_differ_besides_joints_is_named(folder, monkeypatch, capsys, owner):
+    """Only one of the actions moves the removed bone."""
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    if owner == "prop":
+        prop = bpy.data.objects.new("prop", None)
+        bpy.context.scene.collection.objects.link(prop)
+        prop.parent, prop.parent_type, prop.parent_bone = armature_object, "BONE", UNUSED
+    else:
+        armature_object.data.collections[CONTROLS].assign(armature_object.data.bones[f"{UNUSED}_child"])
+    bpy.ops.wm.save_mainfile()
+    drop_needs_of_bone(UNUSED, monkeypatch)
+    assert run(*fast_rig_arguments(folder, "--controls", "visible")) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    if owner == "prop":
+        assert "renders would show another object 'prop' (relative difference " in error
+    else:
+        assert f"1 bone ('{UNUSED}_child' by " in error
+    assert not (folder / "fast.blend").exists()
+
+
+def test_objects_that_do_not_repeat_themselves_are_not_compared(folder):
+    """The driver adds to its own result in each evaluation, as simulations depend on the poses before."""
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
+    prop = bpy.data.objects.new("prop", None)
+    bpy.context.scene.collection.objects.link(prop)
+    driver = prop.driver_add("location", 0).driver
+    driver.type = "SUM"
+    for datablock, path in ((prop, "location[0]"), (bpy.data.objects[ELBOW_RIG], 'pose.bones["control"].scale[0]')):
+        target = driver.variables.new().targets[0]
+        target.id, target.data_path = datablock, path
+    bpy.ops.wm.save_mainfile()
+    lines = output_of(*fast_rig_arguments(folder, "--frames", 0)).out
+    assert lines[3] == "  not compared, because the full rig does not repeat it: object 'prop'"
+
+
+def test_the_comparison_leaves_the_file_as_it_was(folder):
+    """It links objects, shows them, and assigns actions, all for a while."""
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
+    prop = bpy.data.objects.new("prop", None)
+    bpy.context.scene.collection.objects.link(prop)
+    prop.keyframe_insert("hide_render", frame=1)
+    prop.animation_data.action.use_fake_user = True
+    prop.animation_data_clear()
+    prop.hide_viewport = prop.hide_render = True
+    prop.hide_set(True)
+    bpy.ops.wm.save_mainfile()
+    collections = len(bpy.data.collections)
+    assert run(*fast_rig_arguments(folder, "--frames", 0)) == 0
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "fast.blend"))
+    prop = bpy.data.objects["prop"]
+    assert len(bpy.data.collections) == collections and prop.animation_data is None
+    assert prop.hide_render and prop.hide_viewport and prop.hide_get()
 
 
 def test_a_rig_that_does_not_repeat_itself_is_refused(folder, capsys):
@@ -184,11 +244,11 @@ def test_a_joint_that_is_infinite_in_one_rig_differs():
     before = np.zeros((2, 2, 4, 4), np.float32)
     after = before.copy()
     before[0, 0, 0, 3] = after[0, 0, 0, 3] = np.nan
-    poses = JointPoses(None, ("first", "second"), (), (), 1.0)
-    assert differing_joints(poses, before, after, 1e-5) == {}
-    assert infinite_joints(poses, before) == {"first": 1}
+    poses = ComparedPoses(None, ("first", "second"), (), (), 1.0)
+    assert differing_bones(poses, before, after, 1e-5) == {}
+    assert infinite_bones(poses, before) == {"first": 1}
     after[1, 1, 2, 2] = np.nan
-    assert differing_joints(poses, before, after, 1e-5) == {"second": np.inf}
+    assert differing_bones(poses, before, after, 1e-5) == {"second": np.inf}
 
 
 def test_nothing_is_compared_with_what_is_left_of_the_rig(folder, capsys):

@@ -8,10 +8,10 @@ import pytest
 from blend_fixtures.characters.bones import NewBone, add_bones
 from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
+from fdda_addon.fast_rig.compared_poses import ComparedPoses, differing_bones, evaluate_poses
 from fdda_addon.fast_rig.controls import control_bones
 from fdda_addon.fast_rig.dependency_graph import Node
 from fdda_addon.fast_rig.graph_reader import read_graph
-from fdda_addon.fast_rig.joint_poses import JointPoses, differing_joints, evaluate_joints
 from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
 from fdda_addon.fast_rig.removal import remove_unneeded
 from fdda_addon.fast_rig.struct_reader import bone_node
@@ -34,11 +34,11 @@ def kept_for_joints(scene_rig: SceneRig) -> tuple[set[Node], set[Node]]:
     return graph.nodes, graph.kept([bone_node(scene_rig.armature_object, "lower")])
 
 
-def joint_matrices(scene_rig: SceneRig, *control_names: str) -> tuple[JointPoses, np.ndarray]:
+def joint_matrices(scene_rig: SceneRig, *control_names: str) -> tuple[ComparedPoses, np.ndarray]:
     """Evaluate `lower` in some random poses of control bones."""
-    poses = JointPoses(scene_rig.armature_object, ("lower",), control_names, (), SIZE, POSE_COUNT)
-    *_, matrices = evaluate_joints(poses, "poses")
-    return poses, matrices
+    poses = ComparedPoses(scene_rig.armature_object, ("lower",), control_names, (), SIZE, pose_count=POSE_COUNT)
+    *_, evaluation = evaluate_poses(poses, "poses")
+    return poses, evaluation.matrices
 
 
 @pytest.mark.parametrize("name", DEPENDENCIES)
@@ -51,14 +51,14 @@ def test_a_joint_keeps_the_bones_that_it_depends_on(name):
     remove_drivers([scene_rig], nodes, kept, frozenset())
     assert set(remove_bones(armature_object, kept)) == {UNUSED, f"{UNUSED}_child"}
     _, fast = joint_matrices(scene_rig, "control", source)
-    assert differing_joints(poses, full, fast, 0.0) == {}
+    assert differing_bones(poses, full, fast, 0.0) == {}
 
     # The same comparison finds the difference if the bone is missing.
     missing = kept - {bone_node(armature_object, source)}
     remove_drivers([scene_rig], nodes, missing, frozenset())
     assert remove_bones(armature_object, missing) == [source]
     _, broken = joint_matrices(scene_rig, "control")
-    assert differing_joints(poses, full, broken, 1e-3).keys() == {"lower"}
+    assert differing_bones(poses, full, broken, 1e-3).keys() == {"lower"}
 
 
 def test_a_bone_keeps_the_bone_at_which_its_custom_shape_is_drawn():

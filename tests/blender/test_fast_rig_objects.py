@@ -7,6 +7,9 @@ import pytest
 from blend_fixtures.characters.base import link
 from blend_fixtures.characters.dependencies import UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
+from fdda_addon.fast_rig.compared_poses import ComparedPoses, evaluate_poses
+from fdda_addon.fast_rig.graph_reader import shown_objects
+from fdda_addon.fast_rig.object_values import differing_objects, driven_properties
 from fdda_addon.fast_rig.removal import remove_unneeded
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.compatibility import animation_curves
@@ -105,9 +108,10 @@ def test_actions_that_only_removed_objects_use_are_saved(tmp_path):
 
 def drive(struct: bpy.types.bpy_struct, name: str, target_id: bpy.types.ID, path: str) -> None:
     """Set the first element of a property to the value at a path of a datablock."""
-    driver = struct.driver_add(name) if name.startswith("[") else struct.driver_add(name, 0)
-    driver.driver.type = "SUM"
-    target = driver.driver.variables.new().targets[0]
+    curves = struct.driver_add(name)
+    driver = (curves[0] if isinstance(curves, list) else curves).driver
+    driver.expression = "var > 0.1" if name == "hide_render" else "var"
+    target = driver.variables.new().targets[0]
     target.id, target.data_path = target_id, path
 
 
@@ -232,7 +236,7 @@ def test_paths_with_numbers_lead_to_the_same_elements_afterwards():
         curve.data_path = curve.data_path.replace(f'["{UNUSED}"]', f"[{number}]")
     add_mesh_object("another")
     removed = remove_unneeded([scene_rig], ["lower"], ["upper"])
-    assert removed.bones == {f"{UNUSED}_child"} and len(armature_object.animation_data.drivers) == 1
+    assert removed.bones == {f"{UNUSED}_child"} and len(armature_object.animation_data.drivers) == 3
     path = f'pose.bones["{UNUSED}"]'
     assert {curve.data_path for curve in animation_curves(action)} == {f"{path}.rotation_euler"}
     target = prop.animation_data.drivers[0].driver.variables[0].targets[0]
@@ -257,3 +261,76 @@ def test_a_driver_that_reads_if_a_replaced_modifier_is_on_is_refused():
     drive(add_mesh_object("prop"), "location", scene_rig.mesh_object, 'modifiers["Mush"].show_viewport')
     with pytest.raises(RigError, match="A driver reads if the modifier 'Mush' of 'elbow' is on, but a model turns it"):
         remove(scene_rig)
+
+
+def add_readers_of_unused(armature_object: bpy.types.Object) -> set[str]:
+    """Add what renders show differently in another pose of `unused`, and return what the comparison calls it."""
+    scene, path = bpy.context.scene, f'pose.bones["{UNUSED}"].rotation_euler[0]'
+    props = {
+        name: add_mesh_object(name)
+        for name in ("follower", "hidden", "pass", "skinned", "seen", "wet", "wet data", "painted", "shaded", "still")
+    }
+    for name in ("follower", "hidden", "pass"):
+        props[name].parent, props[name].parent_type, props[name].parent_bone = armature_object, "BONE", UNUSED
+    props["hidden"].hide_viewport = True
+    collection = bpy.data.collections.new("second pass")
+    scene.collection.children.link(collection)
+    scene.collection.objects.unlink(props["pass"])
+    collection.objects.link(props["pass"])
+    scene.view_layers.new("second")
+    bpy.context.view_layer.layer_collection.children["second pass"].exclude = True
+
+    armature_object.data.bones[UNUSED].use_deform = True
+    props["skinned"].vertex_groups.new(name=UNUSED).add([0], 1.0, "REPLACE")
+    props["skinned"].modifiers.new("Armature", "ARMATURE").object = armature_object
+    drive(props["seen"], "hide_render", armature_object, path)
+    for owner in (props["wet"], props["wet data"].data):
+        owner["wetness"] = 0.0
+        drive(owner, '["wetness"]', armature_object, path)
+    for name in ("painted", "shaded"):
+        props[name].data.materials.append(bpy.data.materials.new(name))
+    drive(props["painted"].data.materials[0], "roughness", armature_object, path)
+    shaded = props["shaded"].data.materials[0]
+    if shaded.node_tree is None:
+        # Before Blender 5.0, materials have no nodes at first.
+        shaded.use_nodes = True
+    drive(shaded.node_tree.nodes["Principled BSDF"].inputs["Roughness"], "default_value", armature_object, path)
+
+    curve = bpy.data.curves.new("tube", "CURVE")
+    curve.splines.new("POLY").points.add(1)
+    curve.splines[0].points[1].co = (0.1, 0.0, 0.0, 1.0)
+    curve.bevel_depth = 0.01
+    link(bpy.data.objects.new("tube", curve))
+    drive(curve, "extrude", armature_object, path)
+    light, scene.world = bpy.data.lights.new("lamp", "POINT"), bpy.data.worlds.new("sky")
+    link(bpy.data.objects.new("lamp", light))
+    drive(light, "energy", armature_object, path)
+    drive(scene.world, "color", armature_object, path)
+    instance, source = link(bpy.data.objects.new("instance", None)), bpy.data.objects.new("source", curve)
+    source.parent, source.parent_type, source.parent_bone = armature_object, "BONE", UNUSED
+    instance.instance_type, instance.instance_collection = "COLLECTION", bpy.data.collections.new("instances")
+    instance.instance_collection.objects.link(source)
+    objects = ("follower", "hidden", "pass", "skinned", "seen", "wet", "tube", "instance")
+    data = ("mesh 'wet data'", "material 'painted'", "material 'shaded'", "curve 'tube'", "light 'lamp'")
+    return {*(f"object '{name}'" for name in objects), *data, "world 'sky'"}
+
+
+def test_the_comparison_finds_all_that_renders_show_differently():
+    """An action that is not assigned moves the bone."""
+    scene_rig = SceneRig(*studio_arm())
+    armature_object = scene_rig.armature_object
+    action = wave(armature_object, UNUSED)
+    expected = add_readers_of_unused(armature_object)
+    bpy.context.view_layer.update()
+    shown = tuple(shown_objects([scene_rig]))
+    driven = tuple(driven_properties(shown))
+    poses = ComparedPoses(armature_object, ("lower",), ("control",), (action,), 0.5, shown, driven, pose_count=2)
+    *_, before = evaluate_poses(poses, "poses")
+    *_, again = evaluate_poses(poses, "poses")
+    assert differing_objects(before.objects, again.objects, 0.0) == {}
+    for curve in animation_curves(action):
+        curve.mute = True
+    # Blender leaves what it set where a driver is removed.
+    bpy.data.lights["lamp"].animation_data.drivers.remove(bpy.data.lights["lamp"].animation_data.drivers[0])
+    *_, after = evaluate_poses(poses, "poses")
+    assert differing_objects(before.objects, after.objects, 1e-5).keys() == expected

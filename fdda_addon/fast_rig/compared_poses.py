@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Evaluates the joints of a rig in the same random poses and actions before and after bones are removed."""
+"""Evaluates bones and shown objects in the same random poses and actions before and after bones are removed."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import bpy
 import numpy as np
@@ -11,10 +12,13 @@ from mathutils import Euler, Quaternion
 
 from ..core.progress import Progress
 from ..poses.action_range import action_frames
-from ..scene.action_slots import dependencies, slots_of_action
+from ..scene.action_slots import ActionSlots, dependencies, slots_of_action
+from ..scene.animated_values import animated_values, set_value
 from ..scene.armature import PoseMatrixReader, clear_pose
-from ..scene.temporary_state import assign_action, temporary_pose
+from ..scene.temporary_state import animation_state, assign_action, restore_animation, temporary_pose
 from ..scene.time_stretching import unstretched_time
+from .controls import animating_actions, constraint_actions
+from .object_values import DrivenProperty, ObjectReader, objects_evaluated
 
 RANDOM_POSE_COUNT = 200
 MAX_ACTION_FRAMES = 40
@@ -28,64 +32,85 @@ MAX_PROPERTY_WIDTH = 1000.0
 
 
 @dataclass(frozen=True)
-class JointPoses:
-    """What `evaluate_joints` evaluates.
+class ComparedPoses:
+    """What `evaluate_poses` evaluates.
 
     Attributes:
         armature_object: the armature object.
-        joint_names: names of the J joints to read.
+        bone_names: names of the B bones to read.
         control_names: names of the bones that random poses move.
         actions: the actions to play.
         size: size of the rig, armature units.
+        objects, driven: the objects and driven properties to read.
         pose_count: number of random poses.
     """
 
     armature_object: bpy.types.Object
-    joint_names: tuple[str, ...]
+    bone_names: tuple[str, ...]
     control_names: tuple[str, ...]
     actions: tuple[bpy.types.Action, ...]
     size: float
+    objects: tuple[bpy.types.Object, ...] = ()
+    driven: tuple[DrivenProperty, ...] = ()
     pose_count: int = RANDOM_POSE_COUNT
 
 
-def evaluate_joints(poses: JointPoses, stage: str) -> Iterator[Progress | np.ndarray]:
-    """Evaluate the joints in all poses, as a generator that restores the rig.
+class Evaluation(NamedTuple):
+    """What was read in P poses.
+
+    Attributes:
+        matrices: (P, B, 4, 4) float32 pose matrices of the bones, armature space, armature units.
+        objects: as `ObjectReader.values`.
+    """
+
+    matrices: np.ndarray
+    objects: dict[str, list[np.ndarray]]
+
+
+def evaluate_poses(poses: ComparedPoses, stage: str) -> Iterator[Progress | Evaluation]:
+    """Evaluate bones and objects in all poses, as a generator that restores the rig.
 
     Args:
         poses: the poses.
         stage: stage of the progress.
 
     Yields:
-        Progress, and at the end (P, J, 4, 4) float32 pose matrices, armature space, armature units.
+        Progress, and at the end the Evaluation.
     """
-    armature_object = poses.armature_object
-    reader = PoseMatrixReader(armature_object, poses.joint_names)
-    shown_poses = list(_pose_setters(poses))
-    matrices = np.empty((len(shown_poses), len(poses.joint_names), 4, 4), np.float32)
+    armature_object, shown_poses = poses.armature_object, list(_pose_setters(poses))
+    bone_reader = PoseMatrixReader(armature_object, poses.bone_names)
+    world_size = poses.size * max(armature_object.matrix_world.to_scale(), key=abs)
+    object_reader = ObjectReader(poses.objects, poses.driven, abs(world_size), len(shown_poses))
+    matrices = np.empty((len(shown_poses), len(poses.bone_names), 4, 4), np.float32)
     with (
         temporary_pose(armature_object, poses.actions),
         unstretched_time(),
-        _temporary_properties(armature_object, poses.control_names),
+        _temporary_properties(poses),
+        _temporary_actions(poses),
+        objects_evaluated({armature_object, *poses.objects}),
     ):
+        # Some drivers read the pose before. So the first pose follows itself in each evaluation.
+        shown_poses[0]()
         for index, show_pose in enumerate(shown_poses):
             show_pose()
             depsgraph = bpy.context.evaluated_depsgraph_get()
-            matrices[index] = reader.read(armature_object.evaluated_get(depsgraph))
+            matrices[index] = bone_reader.read(armature_object.evaluated_get(depsgraph))
+            object_reader.read(depsgraph)
             yield Progress(stage, index + 1, len(shown_poses))
-    yield matrices
+    yield Evaluation(matrices, object_reader.values)
 
 
-def differing_joints(poses: JointPoses, before: np.ndarray, after: np.ndarray, tolerance: float) -> dict[str, float]:
-    """Compare the joints of two evaluations.
+def differing_bones(poses: ComparedPoses, before: np.ndarray, after: np.ndarray, tolerance: float) -> dict[str, float]:
+    """Compare the matrices of two evaluations.
 
     Args:
         poses: the poses.
-        before, after: (P, J, 4, 4), as from `evaluate_joints`.
+        before, after: (P, B, 4, 4), as in `Evaluation`.
         tolerance: largest accepted difference, as a ratio of the size of the rig for translations, and absolute for
             rotations and scales.
 
     Returns:
-        The largest difference of each joint that differs, by name, in the unit of `tolerance`. It is infinite where
+        The largest difference of each bone that differs, by name, in the unit of `tolerance`. It is infinite where
         only one of the evaluations is finite. Elements that neither has finite count as equal.
     """
     with np.errstate(invalid="ignore"):
@@ -95,26 +120,26 @@ def differing_joints(poses: JointPoses, before: np.ndarray, after: np.ndarray, t
     differences[~np.isfinite(differences)] = np.inf
     differences[~np.isfinite(before) & ~np.isfinite(after)] = 0.0
     largest = differences.max(axis=(0, 2, 3), initial=0)
-    return {name: float(value) for name, value in zip(poses.joint_names, largest, strict=True) if value > tolerance}
+    return {name: float(value) for name, value in zip(poses.bone_names, largest, strict=True) if value > tolerance}
 
 
-def moving_joints(poses: JointPoses, matrices: np.ndarray, tolerance: float) -> set[str]:
-    """Return the names of the joints that move between poses; arguments as for `differing_joints`."""
-    return set(differing_joints(poses, matrices, matrices[:1], tolerance))
+def moving_bones(poses: ComparedPoses, matrices: np.ndarray, tolerance: float) -> set[str]:
+    """Return the names of the bones that move between poses; arguments as for `differing_bones`."""
+    return set(differing_bones(poses, matrices, matrices[:1], tolerance))
 
 
-def infinite_joints(poses: JointPoses, matrices: np.ndarray) -> dict[str, int]:
-    """Count the poses in which joints have an infinite or undefined place, rotation or scale.
+def infinite_bones(poses: ComparedPoses, matrices: np.ndarray) -> dict[str, int]:
+    """Count the poses in which bones have an infinite or undefined place, rotation or scale.
 
     Args:
         poses: the poses.
-        matrices: (P, J, 4, 4), as from `evaluate_joints`.
+        matrices: (P, B, 4, 4), as in `Evaluation`.
 
     Returns:
-        The number of poses of each joint that has any, by name.
+        The number of poses of each bone that has any, by name.
     """
     counts = (~np.isfinite(matrices)).any(axis=(2, 3)).sum(axis=0)
-    return {name: int(count) for name, count in zip(poses.joint_names, counts, strict=True) if count}
+    return {name: int(count) for name, count in zip(poses.bone_names, counts, strict=True) if count}
 
 
 def rig_size(armature_object: bpy.types.Object) -> float:
@@ -145,7 +170,15 @@ def set_random_pose(armature_object: bpy.types.Object, names: Iterable[str], siz
     armature_object.update_tag(refresh={"OBJECT", "DATA"})
 
 
-def _pose_setters(poses: JointPoses) -> Iterator[Callable[[], None]]:
+def playable_actions(armature_object: bpy.types.Object) -> tuple[bpy.types.Action, ...]:
+    """Return the actions of the file that animate an armature object or other datablocks, assigned now or not."""
+    animating = animating_actions(armature_object)
+    excluded = {*animating, *constraint_actions(armature_object)}
+    others = [action for action in bpy.data.actions if action not in excluded]
+    return (*animating, *(action for action in others if _animated_slots(armature_object, action)))
+
+
+def _pose_setters(poses: ComparedPoses) -> Iterator[Callable[[], None]]:
     """Yield functions that show the random poses, and then the frames of the actions."""
     armature_object = poses.armature_object
 
@@ -153,11 +186,16 @@ def _pose_setters(poses: JointPoses) -> Iterator[Callable[[], None]]:
         set_random_pose(armature_object, poses.control_names, poses.size, seed)
         bpy.context.view_layer.update()
 
+    properties = _property_values(poses)
+
     def show_first_frame(action: bpy.types.Action, frame: int) -> None:
         clear_pose(armature_object)
+        _restore_properties(properties)
+        # Otherwise, the evaluated rig may keep unkeyed bones in the pose before.
+        armature_object.update_tag(refresh={"OBJECT", "DATA"})
         # An action of removed bones alone has no slot any more.
         assign_action(armature_object, None, None)
-        for datablock, slot in slots_of_action(action, dependencies(armature_object)).items():
+        for datablock, slot in _animated_slots(armature_object, action).items():
             assign_action(datablock, action, slot)
         bpy.context.scene.frame_set(frame)
 
@@ -168,6 +206,28 @@ def _pose_setters(poses: JointPoses) -> Iterator[Callable[[], None]]:
         indices = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_ACTION_FRAMES)).round().astype(int))
         yield lambda action=action, frame=frames[0]: show_first_frame(action, frame)
         yield from (lambda frame=frames[index]: bpy.context.scene.frame_set(frame) for index in indices[1:])
+
+
+def _animated_slots(armature_object: bpy.types.Object, action: bpy.types.Action) -> ActionSlots:
+    """Return the slots with which an action animates the rig, and other datablocks whose names its slots have."""
+    named = {(slot.target_id_type, slot.name_display): slot for slot in action.slots}
+    datablocks = {(d.id_type, d.name): d for d in bpy.data.user_map() if d.library is None}
+    slots = {datablocks[key]: slot for key, slot in named.items() if key in datablocks}
+    return slots | slots_of_action(action, dependencies(armature_object))
+
+
+@contextmanager
+def _temporary_actions(poses: ComparedPoses) -> Iterator[None]:
+    """Restore the actions of the datablocks other than the armature object that the actions animate, and the values."""
+    animated = {d for action in poses.actions for d in _animated_slots(poses.armature_object, action)}
+    before = [(d, animation_state(d), animated_values(d, poses.actions)) for d in animated - {poses.armature_object}]
+    try:
+        yield
+    finally:
+        for datablock, state, values in before:
+            restore_animation(datablock, state)
+            for path, value in values.items():
+                set_value(datablock, path, value)
 
 
 def _set_rotation(bone: bpy.types.PoseBone, angles: np.ndarray) -> None:
@@ -201,14 +261,23 @@ def _ranged_properties(owner: bpy.types.PoseBone | bpy.types.Object) -> Iterator
 
 
 @contextmanager
-def _temporary_properties(armature_object: bpy.types.Object, names: Iterable[str]) -> Iterator[None]:
+def _temporary_properties(poses: ComparedPoses) -> Iterator[None]:
     """Restore the custom properties that random poses set."""
-    owners = [armature_object, *(armature_object.pose.bones[name] for name in names)]
-    values = [(owner, key, owner[key]) for owner in owners for key, _, _ in _ranged_properties(owner)]
+    values = _property_values(poses)
     try:
         yield
     finally:
-        for owner, key, value in values:
-            owner[key] = value
-        armature_object.update_tag(refresh={"OBJECT", "DATA"})
+        _restore_properties(values)
+        poses.armature_object.update_tag(refresh={"OBJECT", "DATA"})
         bpy.context.view_layer.update()
+
+
+def _property_values(poses: ComparedPoses) -> list[tuple[bpy.types.bpy_struct, str, object]]:
+    """Return the custom properties that random poses set: owner, key and value."""
+    owners = [poses.armature_object, *(poses.armature_object.pose.bones[name] for name in poses.control_names)]
+    return [(owner, key, owner[key]) for owner in owners for key, _, _ in _ranged_properties(owner)]
+
+
+def _restore_properties(values: list[tuple[bpy.types.bpy_struct, str, object]]) -> None:
+    for owner, key, value in values:
+        owner[key] = value
