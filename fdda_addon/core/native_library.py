@@ -45,14 +45,13 @@ _CAUSES = (
         r"needs msvcp140\.dll",
         (127, 998, 1114),
         "install Microsoft's Visual C++ runtime from {runtime}",
-        "another extension may have brought an ONNX Runtime that needs a newer Blender: remove that extension, or use "
-        "Blender 5.1 or later",
+        "another extension may have brought a newer ONNX Runtime: remove that extension, or use a newer Blender",
     ),
     _Cause(r"", (182,), _OTHER_PROGRAM + _REINSTALL_TRAINER, _OTHER_PROGRAM + _REINSTALL_EXTENSION),
     _Cause(r"shared object.*: Cannot allocate memory", (8, 14, 1455), _MEMORY, _MEMORY),
     _Cause(r"code signature|disallowed by system policy", (225, 577, 1260, 4551), _ALLOW, _ALLOW),
     _Cause(
-        r"(?i)wrong ELF class|invalid ELF header|file too short|incompatible architecture|not a mach-o|valid mach-o",
+        r"ELF (?:class|header|load)|file too short|cannot read file data|/[^\s:]+: cannot open shared object|mach-o",
         (193, 216),
         f"{_OTHER_FILE}{_REINSTALL_TRAINER}, with a Python for this processor",
         _OTHER_FILE + _REINSTALL_EXTENSION,
@@ -82,13 +81,13 @@ _CAUSES = (
         "update macOS to version 14 or later",
     ),
     _Cause(
-        r"([^\s:('\"]+): cannot open shared object file",
+        r"([^\s:('\"/]+): cannot open shared object file",
         (),
         f"install the package of this Linux that has '{{0}}', or {_REINSTALL_TRAINER}",
         f"install the package of this Linux that has '{{0}}', or {_REINSTALL_EXTENSION}",
     ),
     _Cause(r"failed to map segment from shared object", (), _NO_PROGRAMS, _NO_PROGRAMS),
-    _Cause(r'Error loading "|DLL load failed|dlopen\(|shared object', (), _REINSTALL_TRAINER, ""),
+    _Cause(r'Error loading "|DLL load failed|dlopen\(|shared object|undefined symbol', (), _REINSTALL_TRAINER, ""),
 )
 _ENGLISH_TEXTS = {
     8: "Not enough memory resources",

@@ -53,7 +53,7 @@ class Network:
             check_cpp_library("onnxruntime")
             # Imported here so that Blender starts without ONNX Runtime.
             import onnxruntime
-        except ImportError as error:
+        except (ImportError, OSError) as error:
             version = ".".join(map(str, sys.version_info[:2]))
             advice = runtime_advice(str(error), in_blender=True) or (
                 f"install the extension's zip for this platform and for Python {version}: 3.11 and 3.13 are in one, "
