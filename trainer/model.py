@@ -34,7 +34,7 @@ class TrainedModel:
     def half_rotation_joints(self) -> np.ndarray:
         """Return (H,) int64, ascending, the joints whose half-rotation matrices some partition is fitted to."""
         fitted = np.unique(np.concatenate([prepared.fit.joints for prepared in self.prepared]))
-        return fitted[fitted >= len(self.rig.parents)] - len(self.rig.parents)
+        return fitted[fitted >= len(self.rig.joints)] - len(self.rig.joints)
 
     def checkpoint(self, holdout: str, config: TrainingConfig, history: list[dict]) -> Checkpoint:
         """Return the state from which the training can be continued; other arguments as in `Checkpoint`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Joint features: transforms of joints relative to their parents and the rest pose. They are inputs of the networks."""
+"""Joint features: transforms of joints relative to their reference joints and to the rest pose, inputs of networks."""
 
 import numpy as np
 
@@ -14,32 +14,32 @@ character's size for a length. Features that vary less express rounding in impor
 amplifies it."""
 
 
-def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """Compute the transform of each joint relative to its parent and to the rest pose.
+def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, references: np.ndarray) -> np.ndarray:
+    """Compute the transform of each joint relative to its reference joint (`core.references`) and to the rest pose.
 
-    F_j = (B_p^-1 B_j)^-1 P_p^-1 P_j for joint j with parent p, rest matrices B and pose matrices P.
+    F_j = (B_r^-1 B_j)^-1 P_r^-1 P_j for joint j with reference joint r, rest matrices B and pose matrices P.
 
-    F_j is the identity in the rest pose. The parent space of a root is mesh-object space.
+    F_j is the identity in the rest pose. Joints without a reference joint are relative to mesh-object space.
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
         rest_matrices: (J, 4, 4), mesh-object space, mesh units.
-        parents: (J,) parent index, -1 for a root joint; every parent before its children.
+        references: (J,) index of each reference joint; -1 for mesh-object space.
 
     Returns:
         (N, J, 12) float32: the upper three rows of F_j, row by row; rotations without unit, translations in mesh units.
     """
     pose = pose_matrices.astype(np.float64)
     rest = rest_matrices.astype(np.float64)
-    relative = np.linalg.inv(relative_to_parent(rest[None], parents)) @ relative_to_parent(pose, parents)
+    relative = np.linalg.inv(_relative_to(references, rest[None])) @ _relative_to(references, pose)
     return relative[:, :, :3, :].reshape(*relative.shape[:2], FEATURES_PER_JOINT).astype(np.float32)
 
 
-def relative_to_parent(matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """Convert (N, J, 4, 4) matrices from mesh-object space to the space of the parent joint; roots stay unchanged."""
+def _relative_to(references: np.ndarray, matrices: np.ndarray) -> np.ndarray:
+    """Convert (N, J, 4, 4) matrices from mesh-object space to the spaces of reference joints."""
     relative = matrices.copy()
-    children = np.flatnonzero(parents >= 0)
-    relative[:, children] = np.linalg.inv(matrices[:, parents[children]]) @ matrices[:, children]
+    joints = np.flatnonzero(references >= 0)
+    relative[:, joints] = np.linalg.inv(matrices[:, references[joints]]) @ matrices[:, joints]
     return relative
 
 
@@ -56,7 +56,7 @@ def joint_features_in_metres(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
     Returns:
         (N, J, 12) float32.
     """
-    features = joint_features(pose_matrices, rig.rest_matrices, rig.parents)
+    features = joint_features(pose_matrices, rig.rest_matrices, rig.references)
     translations = features[:, :, 3::4]
     is_constant = np.ptp(translations, axis=0) <= float32_rounding(pose_matrices)
     features[:, :, 3::4] = rig.metres_per_unit * np.where(is_constant, translations.mean(axis=0), translations)

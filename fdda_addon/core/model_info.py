@@ -110,7 +110,7 @@ class ModelInfo:
         """Return the text of the metadata property."""
         value = {
             "version": VERSION,
-            "joints": [asdict(joint) for joint in self.joints],
+            "joints": [joint.to_json() for joint in self.joints],
             "rest_matrices": self.rest_matrices.reshape(-1, 16).tolist(),
             "vertices": self.vertex_count,
             "fingerprint": asdict(self.fingerprint),

@@ -168,8 +168,8 @@ def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tup
     """Set the influences of partitions to those that are likely, where influences cannot be detected by moving joints.
 
     These are the main joint, the joints with a weight on a vertex of the partition or on a vertex that shares a face
-    with it, their parents, and every control. A surface that sags depends on the direction of gravity, so all
-    ancestors of the main joint are included.
+    with it, their reference joints, and every control. A surface that sags depends on the direction of gravity, so all
+    joints from the main joint up to mesh-object space are included.
 
     Args:
         rig: the rig.
@@ -179,18 +179,18 @@ def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tup
     face_of_corner = np.repeat(
         np.arange(len(rig.face_starts)), np.diff(np.append(rig.face_starts, len(rig.face_vertices)))
     )
-    joints = {}
+    joints, references = {}, rig.references
     for partition in partitions:
         is_near = np.zeros(rig.vertex_count, bool)
         is_near[partition.vertices] = True
         near_faces = np.unique(face_of_corner[is_near[rig.face_vertices]])
         is_near[rig.face_vertices[np.isin(face_of_corner, near_faces)]] = True
         influences = {partition.joint, *np.flatnonzero(has_weight[is_near].any(axis=0)).tolist()}
-        influences |= {rig.joints[joint].parent for joint in influences if rig.joints[joint].parent >= 0}
-        ancestor = rig.joints[partition.joint].parent
-        while ancestor >= 0:
-            influences.add(ancestor)
-            ancestor = rig.joints[ancestor].parent
+        influences |= {int(references[joint]) for joint in influences if references[joint] >= 0}
+        reference = int(references[partition.joint])
+        while reference >= 0:
+            influences.add(reference)
+            reference = int(references[reference])
         joints[partition.joint] = tuple(sorted(influences))
     controls = {partition.joint: tuple(range(len(rig.controls))) for partition in partitions}
     merged = {joint: partition.joint for partition in partitions for joint in partition.merged}

@@ -39,10 +39,23 @@ def read_name(value: object) -> str:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint: the name of its bone, and the index of its parent joint; -1 for a root joint."""
+    """A joint.
+
+    Attributes:
+        name: name of its bone.
+        parent: index of its parent joint; -1 for a root joint.
+        reference: index of its reference joint, if that is not the parent (`core.references`). Rigs with different
+            reference joints are equal.
+    """
 
     name: str
     parent: int
+    reference: int | None = field(default=None, compare=False)
+
+    def to_json(self) -> dict:
+        """Return the JSON for recordings and models."""
+        value = {"name": self.name, "parent": self.parent}
+        return value if self.reference is None else value | {"reference": self.reference}
 
 
 def read_joints(values: list) -> tuple[Joint, ...]:
@@ -54,13 +67,36 @@ def read_joints(values: list) -> tuple[Joint, ...]:
     """
     if not isinstance(values, list):
         raise TypeError("its joints are not a list")
-    joints = tuple(Joint(read_name(value["name"]), value["parent"]) for value in values)
+    joints = tuple(Joint(read_name(value["name"]), value["parent"], value.get("reference")) for value in values)
     if not joints or len({joint.name for joint in joints}) != len(joints):
         raise ValueError("it has no joints, or two of one name")
     for index, joint in enumerate(joints):
         if type(joint.parent) is not int or not -1 <= joint.parent < index:
             raise ValueError(f"a joint comes before its parent: the parent of joint {joint.name!r} is {joint.parent!r}")
+        if joint.reference is not None and not (type(joint.reference) is int and 0 <= joint.reference < len(joints)):
+            raise ValueError(f"the reference joint of joint {joint.name!r} is {joint.reference!r}")
+    reference_order(joints)
     return joints
+
+
+def reference_order(joints: tuple[Joint, ...]) -> list[int]:
+    """Return the indices of joints in an order in which each joint comes after its reference joint.
+
+    Raises:
+        ValueError: reference joints form a cycle.
+    """
+    if all(joint.reference is None for joint in joints):
+        return list(range(len(joints)))
+    references = [joint.parent if joint.reference is None else joint.reference for joint in joints]
+    depths = []
+    for index in range(len(joints)):
+        depth = 0
+        while (index := references[index]) >= 0:
+            depth += 1
+            if depth > len(joints):
+                raise ValueError("its reference joints form a cycle")
+        depths.append(depth)
+    return sorted(range(len(joints)), key=depths.__getitem__)
 
 
 @dataclass(frozen=True)
@@ -142,6 +178,11 @@ class Rig:
     def parents(self) -> np.ndarray:
         """(J,) int32, index of the parent of each joint; -1 for a root joint."""
         return np.array([joint.parent for joint in self.joints], np.int32)
+
+    @property
+    def references(self) -> np.ndarray:
+        """(J,) int32, index of the reference joint of each joint, usually its parent; -1 for mesh-object space."""
+        return np.array([j.parent if j.reference is None else j.reference for j in self.joints], np.int32)
 
     @property
     def vertex_count(self) -> int:

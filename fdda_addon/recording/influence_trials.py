@@ -87,14 +87,15 @@ class Trials(Protocol):
 @contextmanager
 def prepared_trials(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch) -> Iterator[Trials]:
     """Prepare the trials of a rig; clear the pose of the armature afterwards."""
-    if not follows_control_bones(scene_rig, rig, search.channels):
+    # Channels do not move the other joints that have a joint as their reference joint.
+    has_references = any(joint.reference is not None for joint in rig.joints)
+    if not has_references and not follows_control_bones(scene_rig, rig, search.channels):
         yield _ChannelTrials(scene_rig, rig, search)
     else:
         states = _sample_states(scene_rig, rig, search, search.drawn_poses)
         clear_pose(scene_rig.armature_object)
         with override_joints(scene_rig, rig.joints, search.has_other_bones) as override:
-            leaders = _find_leading_roots(rig, states, override.rest) if search.has_other_bones else {}
-            yield _OverrideTrials(scene_rig, rig, states, override, leaders, search.poses)
+            yield _OverrideTrials(scene_rig, rig, states, override, search.poses)
     clear_pose(scene_rig.armature_object)
 
 
@@ -160,12 +161,8 @@ class _OverrideTrials:
         rig: Rig,
         states: "list[_PoseState]",
         override: JointOverride,
-        leading_roots: dict[int, int],
         trial_count: int,
     ):
-        self._followers: dict[int, list[int]] = {}
-        for follower, leader in leading_roots.items():
-            self._followers.setdefault(leader, []).append(follower)
         self._scene_rig, self._rig, self._override = scene_rig, rig, override
         joint_transforms = np.stack([state.joints for state in states])
         changes = np.abs(joint_transforms - joint_transforms[0])
@@ -185,7 +182,7 @@ class _OverrideTrials:
         self._bone_of_control = {indices[0]: name for name, indices in self._movable_bones.items()}
         self.undetectable_controls = frozenset(range(len(rig.controls))) - movable_bone_controls
         self.undetectable_controls -= frozenset(self._movable_controls)
-        self.inputs = [(JOINT, index) for index in moving_joints if index not in leading_roots]
+        self.inputs = [(JOINT, index) for index in moving_joints]
         self.inputs += [(CONTROL, index) for index in sorted([*self._movable_controls, *self._bone_of_control])]
         rest_state = _PoseState(override.rest, states[0].controls, dict.fromkeys(bones, Matrix()))
         self._base_states = [rest_state, *states][:trial_count]
@@ -214,8 +211,7 @@ class _OverrideTrials:
             kind, index = self.inputs[moved]
             moved_state = self._moved_states[trial][moved]
             if kind == JOINT:
-                joints = [index, *self._followers.get(index, ())]
-                state.joints[joints] = moved_state.joints[joints]
+                state.joints[index] = moved_state.joints[index]
             elif index in self._bone_of_control:
                 bone = self._bone_of_control[index]
                 state.bones[bone] = moved_state.bones[bone]
@@ -233,7 +229,7 @@ class _PoseState:
     """State of joints and controls in a pose.
 
     Attributes:
-        joints: (J, 4, 4) matrices relative to parent joints.
+        joints: (J, 4, 4) matrices relative to reference joints.
         controls: (C,) control values.
         bones: the transform of each control bone relative to its rest pose, by name.
     """
@@ -244,28 +240,6 @@ class _PoseState:
 
     def copy(self) -> "_PoseState":
         return _PoseState(self.joints.copy(), self.controls.copy(), dict(self.bones))
-
-
-def _find_leading_roots(rig: Rig, states: list[_PoseState], rest: np.ndarray) -> dict[int, int]:
-    """Find the roots that move exactly as an earlier root in all states, and return that root's index by theirs.
-
-    In Rigify, constraints attach several roots to the bone "root". Bones between them would be torn if one moved alone.
-
-    Args:
-        rig: the rig.
-        states: poses of its joints.
-        rest: (J, 4, 4) rest matrices relative to parent joints.
-    """
-    roots = [index for index, parent in enumerate(rig.parents.tolist()) if parent < 0]
-    motions = np.stack([state.joints[roots] for state in states]) @ np.linalg.inv(rest[roots])
-    motions[..., :3, 3] *= rig.metres_per_unit
-    leaders: dict[int, int] = {}
-    for number, root in enumerate(roots):
-        differences = np.abs(motions[:, :number] - motions[:, number, None]).max(axis=(0, 2, 3))
-        same = np.flatnonzero(differences < MIN_TRANSFORM_CHANGE)
-        if len(same):
-            leaders[root] = roots[same[0]]
-    return leaders
 
 
 def _sample_states(scene_rig: SceneRig, rig: Rig, search: InfluenceSearch, count: int) -> list[_PoseState]:

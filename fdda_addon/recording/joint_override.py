@@ -9,20 +9,22 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import RigError
-from ..core.rig import STATIC_JOINT, Joint
+from ..core.rig import STATIC_JOINT, Joint, reference_order
 from ..rig.bone_paths import is_transform_channel, split_bone_path
 from ..scene.armature import PoseMatrixReader, rest_matrices
 from ..scene.scene_rig import MIN_VOLUME, SceneRig, is_flat
 
 _CHAIN_CONSTRAINTS = {"IK", "SPLINE_IK"}
 """Constraints that also move ancestors of their bone."""
+_PARENT_CONSTRAINTS = {"CHILD_OF", "ARMATURE"}
+"""Constraints that move a bone as a parent does."""
 
 
 class JointOverride:
     """Reads joints of evaluated poses, and sets each joint alone.
 
     Attributes:
-        rest: (J, 4, 4) float64, rest matrix of each joint relative to its parent joint, mesh units.
+        rest: (J, 4, 4) float64, rest matrix of each joint relative to its reference joint, mesh units.
     """
 
     def __init__(self, scene_rig: SceneRig, joints: tuple[Joint, ...]):
@@ -33,13 +35,18 @@ class JointOverride:
             joints: J joints, every parent before its children.
         """
         self._armature_object = scene_rig.armature_object
-        self._joints = joints
+        self._joints, self._order = joints, reference_order(joints)
+        self._carried_bones = {
+            bone.name
+            for bone in scene_rig.armature_object.pose.bones
+            if not bone.parent and not any(constraint.type in _PARENT_CONSTRAINTS for constraint in bone.constraints)
+        }
         names = tuple(joint.name for joint in joints)
         self._matrix_reader = PoseMatrixReader(scene_rig.armature_object, names)
         self.rest = self._to_relative_matrices(rest_matrices(scene_rig.armature_object.data, names))
 
     def read(self) -> np.ndarray:
-        """Read the evaluated matrix of each joint relative to its parent joint; (J, 4, 4) float64, mesh units.
+        """Read the evaluated matrix of each joint relative to its reference joint; (J, 4, 4) float64, mesh units.
 
         Raises:
             RigError: the armature, or a bone, has a scale of zero.
@@ -55,18 +62,24 @@ class JointOverride:
         return self._to_relative_matrices(matrices)
 
     def _to_relative_matrices(self, matrices: np.ndarray) -> np.ndarray:
-        parents = [joint.parent for joint in self._joints]
+        references = [joint.parent if joint.reference is None else joint.reference for joint in self._joints]
         return np.array(
-            [np.linalg.solve(matrices[p], m) if p >= 0 else m for p, m in zip(parents, matrices, strict=True)]
+            [np.linalg.solve(matrices[r], m) if r >= 0 else m for r, m in zip(references, matrices, strict=True)]
         )
 
     def set(self, relative_matrices: np.ndarray) -> None:
         """Set the joints to (J, 4, 4) matrices as `read` returns them, in `override_joints`, without an evaluation."""
         target_matrices: dict[str, Matrix] = {}
-        for joint, matrix in zip(self._joints, relative_matrices, strict=True):
-            parent_matrix = target_matrices[self._joints[joint.parent].name] if joint.parent >= 0 else Matrix()
-            target_matrices[joint.name] = parent_matrix @ Matrix(matrix)
+        for index in self._order:
+            joint, matrix = self._joints[index], Matrix(relative_matrices[index])
+            reference = joint.parent if joint.reference is None else joint.reference
+            target_matrices[joint.name] = (
+                target_matrices[self._joints[reference].name] @ matrix if reference >= 0 else matrix
+            )
         target_matrices.pop(STATIC_JOINT, None)
+        # The joint without a reference joint carries the whole rig, so bones that nothing else moves follow it.
+        root = self._joints[self._order[0]].name
+        root_motion = target_matrices[root] @ self._armature_object.data.bones[root].matrix_local.inverted()
         pose_matrices: dict[str, Matrix] = {}
         for bone in self._armature_object.pose.bones:
             bone_data = bone.bone
@@ -81,6 +94,9 @@ class JointOverride:
                 bone.matrix_basis = bone_data.convert_local_to_pose(
                     target_matrices[bone_data.name], bone_data.matrix_local, invert=True, **parent_matrices
                 )
+            elif bone_data.name in self._carried_bones:
+                pose_matrices[bone_data.name] = root_motion @ bone_data.matrix_local
+                bone.matrix_basis = bone_data.matrix_local.inverted() @ pose_matrices[bone_data.name]
             else:
                 pose_matrices[bone_data.name] = bone_data.convert_local_to_pose(
                     Matrix(), bone_data.matrix_local, **parent_matrices

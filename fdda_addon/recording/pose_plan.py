@@ -27,7 +27,7 @@ class PosePlan:
     """Poses that the meshes on one armature share. Channels of a mesh object apply to that mesh alone.
 
     Attributes:
-        total: number of poses.
+        total, random_count: number of all poses, and of random poses, which come first.
         in_range_count: number of random poses inside the range of motion; the poses of the margin follow them.
     """
 
@@ -49,6 +49,7 @@ class PosePlan:
         self._rigs = [scene_rig for scene_rig, _ in meshes]
         self._settings, self._clips = settings, clips
         self.pose_setter = pose_setter
+        self.random_count = settings.poses
         self.total = settings.poses + sum(len(clip.frames) for clip in clips)
         # A channel that several meshes share has the owner -1, and the first mesh sets it.
         unique_channels: dict[tuple, tuple[int, Channel]] = {}
@@ -74,7 +75,7 @@ class PosePlan:
 
         Limit constraints are disabled while a pose of the margin is set.
         """
-        random_count, margin = self._settings.poses, self._margin
+        random_count, margin = self.random_count, self._margin
         with self.pose_setter.prepared():
             set_pose = self._make_setter(self._channels)
             for index in range(self.in_range_count):

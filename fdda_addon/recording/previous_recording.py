@@ -52,8 +52,10 @@ def _describe_weights(fit: SkinFit | None) -> str:
     return " ".join(filter(None, (joints, kind)))
 
 
-def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Partition, ...] | None:
-    """Return the partitions of a rig with the influences of a recording; None if the recording is of another rig.
+def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Rig, tuple[Partition, ...]]:
+    """Return a rig with the reference joints of a recording, and its partitions with the influences of the recording.
+
+    If the recording is of another rig, returns the rig unchanged, and no partitions.
 
     Args:
         path: folder of the recording.
@@ -67,12 +69,12 @@ def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) 
     joints = read_joints(index["joints"])
     controls = [control.to_json() for control in rig.controls]
     if joints != rig.joints or index["controls"] != controls or index["vertices"] != rig.vertex_count:
-        return None
+        return rig, ()
     current_partitions = make_merged_partitions(rig, min_partition_vertices)
     current_partition_joints = [(partition.joint, list(partition.merged)) for partition in current_partitions]
     if current_partition_joints != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
-        return None
-    return read_partitions(rig, index["partitions"])
+        return rig, ()
+    return replace(rig, joints=joints), read_partitions(rig, index["partitions"])
 
 
 def check_influences_match(path: Path, rig: Rig, info: RecordingInfo) -> None:

@@ -44,7 +44,8 @@ class RecordedMesh:
 
     Attributes:
         scene_rig: the rig as scene objects.
-        rig: the rig as arrays; `fit_weights` replaces its skin weights, and may remove joints.
+        rig: the rig as arrays; `fit_weights` replaces its skin weights, and may remove joints. `find_influences` sets
+            reference joints.
         note: a sentence for the user about the rig; may be empty.
         original_rig: the rig with its own skin weights and all joints.
         path: folder of the recording.

@@ -207,7 +207,7 @@ def _distances_to_recording(recording: Recording, recorded_count: int, pose_matr
     """
     rig = recording.rig
     probe_features, recorded_features = (
-        joint_features(matrices, rig.rest_matrices, rig.parents)
+        joint_features(matrices, rig.rest_matrices, rig.references)
         for matrices in (pose_matrices, np.array(recording.pose_matrices[:recorded_count]))
     )
     return np.stack(

@@ -34,6 +34,7 @@ from .plan import RecordingSettings, find_actions, make_pose_sampler, make_sampl
 from .pose_plan import PosePlan
 from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
 from .recorded_mesh import RecordedMesh, TimedEvaluator
+from .reference_joints import find_references
 from .repeatability import measure_repeatability
 from .seam_check import check_seams
 from .target_check import check_target_moves
@@ -183,11 +184,11 @@ class RecordingSession:
         mesh.rig, mesh.fit, mesh.needed_inputs = weights.rig, weights.fit, weights.needed_inputs
 
     def find_influences(self, mesh: RecordedMesh, player: ClipPlayer) -> Iterator[Progress]:
-        """Read previous influences on the partitions of a mesh, or detect them with the channels of this mesh alone."""
+        """Read the reference joints and influences of a previous recording, or find them with this mesh's channels."""
         mesh.evaluator = TimedEvaluator(mesh.make_evaluator())
         min_vertices = self.settings.min_partition_vertices
         if mesh.previous_path:
-            mesh.partitions = read_previous_partitions(mesh.previous_path, mesh.rig, min_vertices) or ()
+            mesh.rig, mesh.partitions = read_previous_partitions(mesh.previous_path, mesh.rig, min_vertices)
             if not mesh.partitions and mesh.previous_path != mesh.path:
                 raise RecordingError(
                     f"The influences in '{mesh.previous_path}' are of other partitions than those of '{mesh.name}'; "
@@ -197,6 +198,7 @@ class RecordingSession:
             return
         for note in filter(None, (mesh.note, check_seams(mesh, self.poses, player))):
             yield Progress("influences", 0, 1, note)
+        mesh.rig = find_references(mesh, self.poses, player)
         partitions = make_merged_partitions(mesh.rig, min_vertices)
         if mesh.target and mesh.target.follows != POSE:
             # A target that depends on time does not follow a moved joint immediately: influences cannot be detected.

@@ -2,8 +2,8 @@
 """Graph nodes that compute the features of a pose, clamp them to the training range, and compute the confidence.
 
 The graph computes features of joints as vectors R^-1 (d - t) of three elements, where R and t are the axes and the
-translation of a space. A vector is a column of a joint's matrix, in the space of the joint as its parent carries it
-along. All vectors together take one gather of spaces, two gathers of points, and one product.
+translation of a space. A vector is a column of a joint's matrix, in the space of the joint as its reference joint
+carries it along. All vectors together take one gather of spaces, two gathers of points, and one product.
 
 Half-rotation matrices and the features of rotations are computed from the same vectors.
 """
@@ -92,9 +92,10 @@ def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
 
 
 def _add_joint_vectors(graph: GraphBuilder, rig: Rig, joints: np.ndarray) -> tuple[str, str]:
-    """Add the columns of (B,) joints in the space Q_j of the joint as its parent carries it along, and a zero vector.
+    """Add the columns of (B,) joints in the space Q_j, and a zero vector.
 
-    Q_j = P_p B_p^-1 B_j with the parent p. The axes of a joint have no origin. Its translation is relative to Q_j.
+    Q_j = P_r B_r^-1 B_j is the joint as its reference joint r carries it along. The axes of a joint have no origin. Its
+    translation is relative to Q_j.
 
     Returns:
         Names of the (N, 4 B + 1, 3) vectors, and of the (N, ., 12) table: B spaces Q_j, then the J joints.
@@ -130,10 +131,12 @@ def _needed_features(trained_model: TrainedModel) -> np.ndarray:
 
 def _add_spaces(graph: GraphBuilder, rig: Rig, joints: np.ndarray) -> str:
     """Add the (N, B + J, 4, 4) matrices of all spaces."""
-    parents, rest_matrices = rig.parents[joints], rig.rest_matrices.astype(np.float64)
-    is_fixed, parents = (parents < 0)[:, None, None], np.maximum(parents, 0)
-    to_child = np.linalg.inv(rest_matrices[parents]) @ rest_matrices[joints]
-    space_matrices = graph.add("Gather", [POSE_INPUT, graph.integers("space_joints", parents)], "space_poses", axis=1)
+    references, rest_matrices = rig.references[joints], rig.rest_matrices.astype(np.float64)
+    is_fixed, references = (references < 0)[:, None, None], np.maximum(references, 0)
+    to_child = np.linalg.inv(rest_matrices[references]) @ rest_matrices[joints]
+    space_matrices = graph.add(
+        "Gather", [POSE_INPUT, graph.integers("space_joints", references)], "space_poses", axis=1
+    )
     offsets = graph.floats("space_offsets", np.where(is_fixed, 0, to_child))
     space_matrices = graph.add("MatMul", [space_matrices, offsets], "moved")
     if is_fixed.any():

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Half-rotation features: regressors for rigs that preserve volume, in addition to the skin matrices.
 
-Such a rig blends rotations: a point halfway between a joint and its parent rotates by half the angle. No linear
-combination of the two matrices does that. A half-rotation matrix is approximately proportional to the sine of half the
-angle, and needs no square root. Blending of rotations: Kavan and others, Geometric Skinning with Approximate Dual
-Quaternion Blending, 2008.
+Such a rig blends rotations: a point halfway between a joint and its reference joint rotates by half the angle. No
+linear combination of the two matrices does that. A half-rotation matrix is approximately proportional to the sine of
+half the angle, and needs no square root. Blending of rotations: Kavan and others, Geometric Skinning with Approximate
+Dual Quaternion Blending, 2008.
 """
 
 import numpy as np
@@ -27,25 +27,25 @@ MAX_ERROR_RATIO = 0.7
 def half_rotation_matrices(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
     """Compute the half-rotation matrices V_j = Q_j A_j B_j^-1, with A_j = (R_j - R_j^T) / (3 + tr R_j).
 
-    Q_j = P_p B_p^-1 B_j is the joint as its parent carries it along. R_j is the rotation and scale of the joint
-    relative to Q_j, the upper left of F_j in `core.features`. Where R_j rotates by an angle a, A_j is
+    Q_j = P_r B_r^-1 B_j is the joint as its reference joint r carries it along. R_j is the rotation and scale of the
+    joint relative to Q_j, the upper left of F_j in `core.features`. Where R_j rotates by an angle a, A_j is
     sin a / (2 + cos a) [axis]x: within three hundredths of 0.687 sin (a/2) up to 120 degrees, and 0 at 0 and at 180.
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
 
     Returns:
-        (N, J, 3, 3) float64, no unit; zero for roots.
+        (N, J, 3, 3) float64, no unit; zero for joints without a reference joint.
     """
-    joint_count = len(rig.parents)
-    rotations = joint_features(pose_matrices, rig.rest_matrices, rig.parents).reshape(-1, joint_count, 3, 4)[..., :3]
+    references, joint_count = rig.references, len(rig.joints)
+    rotations = joint_features(pose_matrices, rig.rest_matrices, references).reshape(-1, joint_count, 3, 4)[..., :3]
     rotations = rotations.astype(np.float64)
     divisors = np.maximum(3 + np.trace(rotations, axis1=2, axis2=3), MIN_DIVISOR)
     rotations = (rotations - rotations.swapaxes(2, 3)) / divisors[..., None, None]
     rest_rotations = rig.rest_matrices[:, :3, :3].astype(np.float64)
-    parent_skin = skin_matrices(pose_matrices, rig.rest_matrices)[:, np.maximum(rig.parents, 0), :3, :3]
-    matrices = parent_skin @ (rest_rotations @ rotations @ np.linalg.inv(rest_rotations))
-    return np.where((rig.parents < 0)[:, None, None], 0, matrices)
+    reference_skin = skin_matrices(pose_matrices, rig.rest_matrices)[:, np.maximum(references, 0), :3, :3]
+    matrices = reference_skin @ (rest_rotations @ rotations @ np.linalg.inv(rest_rotations))
+    return np.where((references < 0)[:, None, None], 0, matrices)
 
 
 def regression_matrices(pose_matrices: np.ndarray, rig: Rig, use_half_rotations: bool) -> np.ndarray:

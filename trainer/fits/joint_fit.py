@@ -179,13 +179,13 @@ def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> Jo
         matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) followed by half-rotation
             matrices (`half_rotations.regression_matrices`). The rest pose may be any fixed pose.
     """
-    parents, center = rig.parents, rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
+    references, center = rig.references, rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
     # The static joint never moves, so it influences nothing.
     static = {index for index, name in enumerate(rig.joint_names) if name == STATIC_JOINT}
-    influencing, main, count = set(partition.influencing), partition.joint, len(parents)
-    paths = [joints_on_path(parents, main, joint) for joint in range(count)]
-    # A half rotation is in the space of the joint's parent, and depends on the joint.
-    paths += [{joint} | (paths[parent] if parent >= 0 else {-1}) for joint, parent in enumerate(parents.tolist())]
+    influencing, main, count = set(partition.influencing), partition.joint, len(references)
+    paths = [joints_on_path(references, main, joint) for joint in range(count)]
+    # A half rotation is in the space of the reference joint, and depends on the joint.
+    paths += [{joint} | (paths[reference] if reference >= 0 else {-1}) for joint, reference in enumerate(references)]
     others = [index for index in range(matrices.shape[1]) if index != main and paths[index] - static <= influencing]
     joints = np.array([main, *others], np.int64)
     is_skin = (joints < count)[:, None]
@@ -196,14 +196,14 @@ def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> Jo
     return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), rig.size)
 
 
-def joints_on_path(parents: np.ndarray, first: int, second: int) -> set[int]:
-    """Return the joints whose parent-relative transforms compose the transform of one joint relative to another.
+def joints_on_path(references: np.ndarray, first: int, second: int) -> set[int]:
+    """Return the joints whose transforms relative to their reference joints compose that of one joint in another's.
 
-    Without a common ancestor, these are all joints from either one up to its root.
+    Without a common reference joint, these are all joints from either one up to mesh-object space.
     """
     chains: tuple[set[int], set[int]] = set(), set()
     for chain, joint in zip(chains, (first, second), strict=True):
         while joint >= 0:
             chain.add(joint)
-            joint = int(parents[joint])
+            joint = int(references[joint])
     return chains[0] ^ chains[1]

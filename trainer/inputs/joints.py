@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The transforms of joints relative to their parents and to the rest pose, as inputs."""
+"""The transforms of joints relative to their reference joints and to the rest pose, as inputs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,28 +20,28 @@ class JointFeatures(FeatureBlock):
     """Twelve features for each of J joints (`core.features`). Every fourth feature is a length in mesh units.
 
     Attributes:
-        parents: (J,) parent of each joint, -1 for a root.
+        references: (J,) reference joint of each joint, -1 for mesh-object space.
         rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
     """
 
     name, is_direct = "joints", True
-    parents: np.ndarray
+    references: np.ndarray
     rest_matrices: np.ndarray
 
     @classmethod
     def make(cls, rig: Rig, partitions: Sequence[Partition], state: State) -> Self:
-        return cls(rig.parents, rig.rest_matrices)
+        return cls(rig.references, rig.rest_matrices)
 
     @property
     def length_mask(self) -> np.ndarray:
-        return np.arange(FEATURES_PER_JOINT * len(self.parents)) % MATRIX_COLUMNS == MATRIX_COLUMNS - 1
+        return np.arange(FEATURES_PER_JOINT * len(self.references)) % MATRIX_COLUMNS == MATRIX_COLUMNS - 1
 
     def offered(self, partition: Partition) -> np.ndarray:
         joints = np.array(partition.influencing, np.int64)
         return (FEATURES_PER_JOINT * joints[:, None] + np.arange(FEATURES_PER_JOINT)).ravel()
 
     def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        return joint_features(pose_matrices, self.rest_matrices, self.parents).reshape(len(pose_matrices), -1)
+        return joint_features(pose_matrices, self.rest_matrices, self.references).reshape(len(pose_matrices), -1)
 
     def add_nodes(
         self, graph: GraphBuilder, is_needed: np.ndarray, joint_vectors: JointVectors

@@ -41,26 +41,26 @@ def _differences() -> np.ndarray:
 
 @dataclass(frozen=True)
 class RotationFeatures(FeatureBlock):
-    """Three features for each of R joints: the axis times 2 sin(a / 2), a the angle, relative to the parent; no unit.
+    """Three features for each of R joints: the axis of its rotation times 2 sin(a / 2), a the angle; no unit.
 
-    A network needs fewer weights for them, and joints without scale rotate by nothing else. The elements of the
-    rotations remain what the confidence depends on.
+    The rotation is relative to the reference joint and the rest pose. A network needs fewer weights for them, and
+    joints without scale rotate by nothing else. The elements of the rotations remain what the confidence depends on.
 
     Attributes:
-        parents: (J,) parent of each joint, -1 for a root.
+        references: (J,) reference joint of each joint, -1 for mesh-object space.
         rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
         joints: (R,) int64, ascending, joints that influence a partition.
     """
 
     name = "rotations"
-    parents: np.ndarray
+    references: np.ndarray
     rest_matrices: np.ndarray
     joints: np.ndarray
 
     @classmethod
     def fit(cls, recording: Recording, split: Split, config: TrainingConfig) -> State:
         rig, matrices = recording.rig, np.array(recording.pose_matrices[split.training])
-        features = joint_features(matrices, rig.rest_matrices, rig.parents)
+        features = joint_features(matrices, rig.rest_matrices, rig.references)
         rotations = features.reshape(*features.shape[:2], VECTOR_SIZE, MATRIX_COLUMNS)[..., :VECTOR_SIZE]
         errors = np.abs(rotations.swapaxes(2, 3) @ rotations - np.eye(VECTOR_SIZE, dtype=np.float32))
         is_rotation = (errors.max(axis=(0, 2, 3)) <= MAX_SCALE_OR_SHEAR) & (
@@ -82,7 +82,7 @@ class RotationFeatures(FeatureBlock):
 
     @classmethod
     def make(cls, rig: Rig, partitions: Sequence[Partition], state: State) -> Self:
-        return cls(rig.parents, rig.rest_matrices, state.get("joints", np.zeros(0, np.int64)))
+        return cls(rig.references, rig.rest_matrices, state.get("joints", np.zeros(0, np.int64)))
 
     @property
     def length_mask(self) -> np.ndarray:
@@ -97,7 +97,7 @@ class RotationFeatures(FeatureBlock):
         return (VECTOR_SIZE * indices[:, None] + np.arange(VECTOR_SIZE)).ravel()
 
     def evaluate(self, pose_matrices: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        features = joint_features(pose_matrices, self.rest_matrices, self.parents)[:, self.joints]
+        features = joint_features(pose_matrices, self.rest_matrices, self.references)[:, self.joints]
         differences = features.astype(np.float64) @ _differences()
         squares = np.maximum(1 + differences[..., VECTOR_SIZE:], 1 + MIN_TRACE)
         return (differences[..., :VECTOR_SIZE] / np.sqrt(squares)).reshape(len(features), -1).astype(np.float32)

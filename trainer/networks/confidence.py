@@ -14,7 +14,7 @@ import numpy as np
 from fdda_addon.core.controls import Control
 from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.partition import Partition
-from fdda_addon.core.rig import Rig
+from fdda_addon.core.rig import STATIC_JOINT, Rig
 from fdda_addon.core.skinning import SkinBlock
 
 MARGIN_RATIO = 0.1
@@ -92,14 +92,17 @@ def measure_training_range(
 
 def _counting_joints(spread: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarray:
     """Return (P, 12 J) bool, the features of joints that count for each partition."""
-    counts = np.zeros((len(partitions), len(rig.joints)), bool)
+    counts, references = np.zeros((len(partitions), len(rig.joints)), bool), rig.references
     by_joint = spread[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT)
     is_translation = np.arange(FEATURES_PER_JOINT) % 4 == 3
     min_spread = np.where(is_translation, MIN_LOCKED_SPREAD / rig.metres_per_unit, MIN_LOCKED_SPREAD)
     is_locked = (by_joint < min_spread).all(axis=1)
+    if STATIC_JOINT not in rig.joint_names:
+        # A joint without a reference joint carries the whole mesh.
+        is_locked &= references >= 0
     for index, partition in enumerate(partitions):
-        adjacent = {partition.joint, rig.joints[partition.joint].parent, *SkinBlock(rig, partition).joints.tolist()}
-        adjacent |= {child for child, joint in enumerate(rig.joints) if joint.parent == partition.joint}
+        adjacent = {partition.joint, references[partition.joint], *SkinBlock(rig, partition).joints.tolist()}
+        adjacent |= set(np.flatnonzero(references == partition.joint).tolist())
         counts[index, [joint for joint in adjacent if joint >= 0 and is_locked[joint]]] = True
         counts[index, list(partition.influencing)] = True
     return np.repeat(counts, FEATURES_PER_JOINT, axis=1)

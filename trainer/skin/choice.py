@@ -10,6 +10,7 @@ from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
 from fdda_addon.core.partition import joints_with_weight, make_partitions
 from fdda_addon.core.recording.fit_folder import FitPoses
+from fdda_addon.core.references import choose_references, has_reference_choice
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import are_invertible, skin_matrices
 
@@ -19,6 +20,8 @@ from .solver import fit_skin
 
 MAX_PATCH_VERTICES = 16
 """Largest number of vertices that one fitted vertex represents."""
+MAX_REFERENCE_POSES = 48
+"""Number of poses by which reference joints are chosen."""
 
 
 def choose_key_joints(
@@ -44,6 +47,12 @@ def choose_key_joints(
     Raises:
         RecordingError: a joint has a scale of zero in some random pose.
     """
+    rig, pose_count = all_poses.rig, len(all_poses.pose_matrices)
+    # Drivers may read joints without skin weights.
+    is_fixed = ~joints_with_weight(rig.skin_joints, rig.skin_weights, len(rig.joints)).any(axis=0)
+    if has_reference_choice(rig, is_fixed):
+        compared = np.linspace(0, pose_count - 1, MAX_REFERENCE_POSES).round().astype(int)
+        all_poses = replace(all_poses, rig=choose_references(rig, is_fixed, all_poses.pose_matrices[compared]))
     poses = all_poses.subset(slice(0, random_count))
     if not are_invertible(poses.pose_matrices).all():
         raise RecordingError(
@@ -108,7 +117,7 @@ def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndarray) -> np.ndarray:
-    """Measure how far frames of actions move joints relative to their parents from where random poses have them.
+    """Measure how far frames of actions move joints from where random poses have them, relative to reference joints.
 
     Args:
         poses: poses of J joints, the random ones first.
@@ -123,8 +132,8 @@ def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndar
     variances, axes = np.linalg.eigh(moments)
     moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
     distances = np.zeros(len(moments))
-    for joint, parent in enumerate(poses.rig.parents.tolist()):
-        relative = np.linalg.solve(skin[:, parent], skin[:, joint]) if parent >= 0 else skin[:, joint]
+    for joint, reference in enumerate(poses.rig.references.tolist()):
+        relative = np.linalg.solve(skin[:, reference], skin[:, joint]) if reference >= 0 else skin[:, joint]
         motion = (relative @ moment_roots[joint])[:, :3]
         motion -= motion[:random_count].mean(axis=0)
         distances[joint] = np.sqrt((motion**2).sum(axis=(1, 2))).max()

@@ -28,12 +28,13 @@ class InputBlocks:
     Attributes:
         count: J + C; the block of control c is J + c.
         widths: (J + C,) number of columns of each block; 0 if the input does not change.
-        parents: (J,) nearest ancestor of each joint that was not removed; -1 if there is none.
+        parents: (J,) nearest ancestor of each joint that was not removed; -1 if there is none. In this module and in
+            `key_joints`, the parent of a joint is its reference joint.
     """
 
     def __init__(self, poses: FitPoses):
         """Compute the features of poses."""
-        self._size, self.parents = max(poses.rig.size, 1e-9), poses.rig.parents
+        self._size, self.parents = max(poses.rig.size, 1e-9), poses.rig.references
         self._poses, self._rest = (
             matrices.astype(np.float64) for matrices in (poses.pose_matrices, poses.rig.rest_matrices)
         )

@@ -20,6 +20,7 @@ import numpy as np
 
 from fdda_addon.core.key_joints import KeyJointReport
 from fdda_addon.core.recording.fit_folder import FitPoses
+from fdda_addon.core.rig import reference_order
 from fdda_addon.core.skinning import skin_matrices
 
 from .input_blocks import MIN_SPREAD, InputBlocks, predict
@@ -119,12 +120,14 @@ class KeyJointSearch:
         variances, axes = np.linalg.eigh(moments)
         self._moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
         self._is_sampled, self._is_still = poses.is_sampled, blocks.widths[: len(moments)] == 0
-        self._ancestors: list[list[int]] = []
-        for parent in poses.rig.parents.tolist():
-            self._ancestors.append([parent, *self._ancestors[parent]] if parent >= 0 else [])
+        parents = poses.rig.references
+        self._ancestors: list[list[int]] = [[] for _ in parents]
+        for joint in reference_order(poses.rig.joints):
+            if (parent := int(parents[joint])) >= 0:
+                self._ancestors[joint] = [parent, *self._ancestors[parent]]
         has_weights = np.zeros(len(moments), bool)
         has_weights[poses.rig.skin_joints[poses.rig.skin_weights > 0]] = True
-        is_root = poses.rig.parents < 0
+        is_root = parents < 0
         self._has_own_weights = has_weights | is_root | self._is_required
         self._is_weightless_root = is_root & ~has_weights & ~is_static
         self._is_anchor_of_descendants = self._is_still & ~is_static

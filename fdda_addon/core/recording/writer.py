@@ -193,7 +193,7 @@ class RecordingWriter:
                 "object": info.object_name,
                 "fingerprint": asdict(self.rig.fingerprint),
             },
-            "joints": [asdict(joint) for joint in self.rig.joints],
+            "joints": [joint.to_json() for joint in self.rig.joints],
             "controls": [control.to_json() for control in self.rig.controls],
             "partitions": partitions_to_json(self.partitions),
             **({"fit": info.fit.to_json()} if info.fit else {}),

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Finds the reference joints of a rig in poses of its recording."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from copy import copy
+
+import bpy
+import numpy as np
+
+from ..core.references import choose_references, has_reference_choice
+from ..core.rig import Rig
+from ..poses.clip_player import ClipPlayer
+from ..rig.bone_paths import split_bone_path
+from ..rig.pose_setter import DIRECT_POSE_SETTER
+from ..rig.reading import PoseReader
+from ..rig.sources import Sources
+from ..scene.armature import clear_pose
+from ..scene.scene_rig import SceneRig
+from .pose_plan import PosePlan
+from .recorded_mesh import RecordedMesh
+
+MAX_POSES = 24
+"""Largest number of random poses, and of frames of actions, in which the motions of joints are compared."""
+
+
+def find_references(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> Rig:
+    """Return the rig of a mesh with its reference joints (`core.references`).
+
+    Args:
+        mesh: the mesh, prepared by `temporary_rig_states`, with the skin weights of linear skinning.
+        plan: plan of the poses.
+        player: player of the clips of the plan.
+    """
+    rig, scene_rig = mesh.rig, mesh.scene_rig
+    # What a driver reads of a bone without a parent is relative to the armature.
+    read_bones = {bone.name for bone in _bones_read_by_drivers(scene_rig) if not bone.parent}
+    is_fixed = np.array([name in read_bones for name in rig.joint_names])
+    if not has_reference_choice(rig, is_fixed):
+        return rig
+    # The joints follow a pose at once; only a simulated target does not.
+    plan = copy(plan)
+    plan.pose_setter = DIRECT_POSE_SETTER
+    parts = (0, plan.random_count), (plan.random_count, plan.total)
+    indices = {
+        index
+        for start, end in parts
+        for index in np.linspace(start, end - 1, min(MAX_POSES, end - start)).round().astype(int).tolist()
+    }
+    reader, pose_matrices = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices), []
+    with closing(plan.show_poses(player, indices)) as poses:
+        for _ in poses:
+            depsgraph = bpy.context.evaluated_depsgraph_get()
+            objects = (o.evaluated_get(depsgraph) for o in (scene_rig.mesh_object, scene_rig.armature_object))
+            pose_matrices.append(reader.read(*objects))
+    player.stop()
+    clear_pose(scene_rig.armature_object)
+    player.restore_numbers()
+    return choose_references(rig, is_fixed, np.stack(pose_matrices))
+
+
+def _bones_read_by_drivers(scene_rig: SceneRig) -> Iterator[bpy.types.PoseBone]:
+    """Yield the bones of the rig whose channels or transforms the drivers of its mesh read."""
+    armature_object = scene_rig.armature_object
+    for _, curve in Sources(scene_rig, scene_rig.mesh_object).drivers.values():
+        for variable in curve.driver.variables:
+            for target in variable.targets:
+                name = target.bone_target if variable.type == "TRANSFORMS" else ""
+                if variable.type == "SINGLE_PROP":
+                    name = split_bone_path(armature_object, target.data_path)[0]
+                if target.id == armature_object and name in armature_object.pose.bones:
+                    yield armature_object.pose.bones[name]
