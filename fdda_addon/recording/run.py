@@ -36,6 +36,7 @@ from .previous_recording import check_influences_match, read_previous_partitions
 from .recorded_mesh import RecordedMesh, TimedEvaluator
 from .reference_joints import find_references
 from .repeatability import measure_repeatability
+from .saturation_check import check_saturation
 from .seam_check import check_seams
 from .target_check import check_target_moves
 from .time_check import check_follows_pose
@@ -196,7 +197,7 @@ class RecordingSession:
                 )
         if mesh.partitions:
             return
-        for note in filter(None, (mesh.note, check_seams(mesh, self.poses, player))):
+        for note in filter(None, (mesh.note, check_seams(mesh, self.poses, player), check_saturation(mesh))):
             yield Progress("influences", 0, 1, note)
         mesh.rig = find_references(mesh, self.poses, player)
         partitions = make_merged_partitions(mesh.rig, min_vertices)

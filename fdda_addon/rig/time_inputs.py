@@ -14,6 +14,7 @@ from ..scene.animation import changes_value, curves_with_actions, value_range
 from ..scene.controls import canonical_path, fcurve_target, owner_of
 from ..scene.scene_rig import SceneRig
 from .independent_objects import describe_independent_objects
+from .missing_ranges import describe_missing_ranges
 from .modifier_effects import time_dependence
 from .modifier_stack import ModifierStack, is_fdda_modifier
 from .other_armatures import check_other_armatures
@@ -56,7 +57,8 @@ def check_time_inputs(
         actions: the actions whose frames are recorded.
 
     Returns:
-        A sentence for the user about objects that do not move with the rig (`describe_independent_objects`), or "".
+        Sentences for the user about objects that do not move with the rig (`describe_independent_objects`), and about
+        numbers without a range (`describe_missing_ranges`); may be empty.
 
     Raises:
         RigError: the surface depends on time, or on a bone of another armature; the message names the cause.
@@ -74,7 +76,8 @@ def check_time_inputs(
             f"follow from the pose; {time_input.remedy}."
         )
     check_other_armatures(scene_rig, sources, keys)
-    return describe_independent_objects(scene_rig, sources, keys)
+    notes = describe_independent_objects(scene_rig, sources, keys), describe_missing_ranges(scene_rig, sources, keys)
+    return " ".join(filter(None, notes))
 
 
 def control_keys(scene_rig: SceneRig, controls: Iterable[Control]) -> set[PropertyKey]:
