@@ -7,7 +7,6 @@ Windows refuses all three while a virus scanner, an indexer or another Blender h
 import errno
 import os
 import random
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,6 @@ OPEN_RETRY_SECONDS = 1.0
 """How long an operation is retried before a file counts as in use. The time for opening is shorter, because the cause
 may be missing permission."""
 MAX_PAUSE_SECONDS = 0.1
-IN_USE_TEXT = "another program has it open"
 SHARING_WINERRORS = {5, 32, 33, 1224}
 """Windows error numbers: access denied, sharing violation, lock violation, and user-mapped file."""
 
@@ -49,35 +47,31 @@ def open_with_retry(open_file: Callable[[], Result]) -> Result:
     Raises:
         OSError: `open_file` raised it.
     """
-    deadline = time.monotonic() + OPEN_RETRY_SECONDS
-    while True:
-        try:
-            return open_file()
-        except PermissionError:
-            # The exception of `open` lacks the error number of Windows.
-            if sys.platform != "win32" or time.monotonic() > deadline:
-                raise
-        _pause()
+    # The exception of `open` lacks the error number of Windows.
+    return _retry(open_file, OPEN_RETRY_SECONDS, lambda _: os.name == "nt")
 
 
 def _retry_while_in_use(action: Callable[[], None], path: Path) -> None:
-    deadline = time.monotonic() + RETRY_SECONDS
+    def is_in_use(error: PermissionError) -> bool:
+        # Windows refuses a folder and a write-protected file permanently.
+        is_permanent = os.path.isdir(path) or (os.path.lexists(path) and not os.access(path, os.W_OK))
+        return getattr(error, "winerror", None) in SHARING_WINERRORS and not is_permanent
+
+    try:
+        _retry(action, RETRY_SECONDS, is_in_use)
+    except PermissionError as error:
+        if not is_in_use(error):
+            raise
+        raise OSError(errno.EBUSY, "another program has it open", str(path)) from error
+
+
+def _retry(action: Callable[[], Result], seconds: float, is_in_use: Callable[[PermissionError], bool]) -> Result:
+    deadline = time.monotonic() + seconds
     while True:
         try:
             return action()
         except PermissionError as error:
-            if getattr(error, "winerror", None) not in SHARING_WINERRORS or _is_permanently_refused(path):
+            if not is_in_use(error) or time.monotonic() > deadline:
                 raise
-            if time.monotonic() > deadline:
-                raise OSError(errno.EBUSY, IN_USE_TEXT, str(path)) from error
-        _pause()
-
-
-def _is_permanently_refused(path: Path) -> bool:
-    """Return whether Windows refuses a path permanently, because it is a folder or write-protected."""
-    return os.path.isdir(path) or (os.path.lexists(path) and not os.access(path, os.W_OK))
-
-
-def _pause() -> None:
-    # With a constant pause, each attempt might coincide with a program that opens the file at regular intervals.
-    time.sleep(random.uniform(0.1, 1) * MAX_PAUSE_SECONDS)
+        # With a constant pause, each attempt might coincide with a program that opens the file at regular intervals.
+        time.sleep(random.uniform(0.1, 1) * MAX_PAUSE_SECONDS)

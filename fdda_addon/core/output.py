@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Atomic writing of files: a reader finds the old file, the new file or no file, but never an incomplete file."""
 
-import errno
 import json
 import os
 import re
@@ -19,8 +18,6 @@ from .open_files import remove_file, replace_file
 from .path_limits import check_path, comparable_path, is_windows
 
 TEMPORARY_PREFIX = ".fdda-"
-KEPT_FILE_PREFIX = "new-"
-"""Prefix of the name of a new file that could not replace the old file."""
 _TEMPORARY_NAME_PATTERN = r"\.fdda-[0-9a-f]{12}(\..*)?"
 """Pattern of the temporary names of `atomic_write`."""
 
@@ -55,20 +52,17 @@ def check_outputs(
             continue
         if any(os.path.exists(input_path) and os.path.samefile(path, input_path) for input_path in inputs):
             raise OutputError(f"Cannot write '{path}': it is read for this; give another name, or --overwrite.")
-        if not _has_kind(path, kind):
+        try:
+            has_kind = kind.matches(path)
+        except OSError as error:
+            raise OutputError(
+                f"Cannot write '{path}': another file is there, {os_error_text(error)}; give another name."
+            ) from error
+        if not has_kind:
             raise OutputError(
                 f"Cannot write '{path}': another file is there, which is not {kind.name}; give another name, or "
                 "--overwrite."
             )
-
-
-def _has_kind(path: Path, kind: FileKind) -> bool:
-    try:
-        return kind.matches(path)
-    except OSError as error:
-        raise OutputError(
-            f"Cannot write '{path}': another file is there, {os_error_text(error)}; give another name."
-        ) from error
 
 
 def check_writable(path: Path) -> None:
@@ -200,12 +194,10 @@ def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failur
             raise
         text = f"{_format_names(changed_paths)} was replaced, and no other" if changed_paths else "nothing was changed"
         if keep_on_failure and not changed_paths and (kept_paths := _keep_beside(temporaries, paths)):
-            rename_text = f"rename {'it' if len(kept_paths) == 1 else 'them'}"
-            advice = (
-                f"close the program that has '{failed_path.name}' open, and" if error.errno == errno.EBUSY else "then"
+            text += (
+                f", and the new content is in {_format_names(kept_paths)}; rename it when no program has "
+                f"'{failed_path.name}' open"
             )
-            new_files_text = "the new file is" if len(kept_paths) == 1 else "the new files are"
-            text += f", and {new_files_text} kept as {_format_names(kept_paths)}; {advice} {rename_text}"
         raise OutputError(f"Cannot write '{failed_path}': {os_error_text(error)}; {text}.") from error
     finally:
         for path, backup in backups.items():
@@ -240,11 +232,9 @@ def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
 
 def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
     """Rename temporary files that could not replace `paths` to new names beside these paths; return the new paths."""
-    for attempt in count(1):
-        prefix = KEPT_FILE_PREFIX if attempt == 1 else f"{KEPT_FILE_PREFIX}{attempt}-"
-        new_paths = [path.with_name(f"{prefix}{path.name}") for path in paths]
-        if not any(os.path.lexists(new_path) for new_path in new_paths):
-            break
+    prefixes = (f"new-{'' if attempt == 1 else f'{attempt}-'}" for attempt in count(1))
+    all_new_paths = ([path.with_name(prefix + path.name) for path in paths] for prefix in prefixes)
+    new_paths = next(new_paths for new_paths in all_new_paths if not any(map(os.path.lexists, new_paths)))
     kept_paths = []
     for temporary, new_path in zip(temporaries, new_paths, strict=True):
         with suppress(OSError):

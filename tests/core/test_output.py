@@ -109,7 +109,7 @@ def test_a_failed_rename_changes_no_file_and_keeps_the_new_files(tmp_path, old):
         paths[0].write_text(old)
     (tmp_path / "new-a").write_text("somebody's")
     with (
-        pytest.raises(OutputError, match=r"(directory|denied); nothing .* kept as 'new-2-a', 'new-2-b'; then"),
+        pytest.raises(OutputError, match=r"(directory|denied); nothing .* in 'new-2-a', 'new-2-b'; rename it"),
         atomic_write_all(*paths) as temporaries,
     ):
         for temporary in temporaries:
@@ -157,15 +157,11 @@ def test_a_new_file_has_the_usual_permissions(tmp_path):
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
-def test_writing_into_a_removed_folder_is_refused(tmp_path):
-    with pytest.raises(OutputError, match=r"Cannot write '.*': No such file or directory; nothing was changed\."):
-        write_text(tmp_path / "gone" / "a.txt", "")
-
-
-def test_writing_below_a_file_is_refused(tmp_path):
+def test_writing_below_what_is_no_folder_is_refused(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match=f"{systems.BELOW_A_FILE}; nothing was changed"):
-        write_text(tmp_path / "file" / "a.txt", "")
+    for name, reason in (("gone", systems.NOT_FOUND), ("file", systems.BELOW_A_FILE)):
+        with pytest.raises(OutputError, match=rf"Cannot write '.*': {reason}; nothing was changed\."):
+            write_text(tmp_path / name / "a.txt", "")
 
 
 def test_a_name_that_is_too_long_is_refused(tmp_path):
@@ -187,25 +183,23 @@ def test_checking_a_valid_path_changes_nothing(tmp_path):
     assert file_names(tmp_path) == ["old.txt"]
 
 
-def test_a_folder_in_place_of_a_file_is_refused(tmp_path):
-    with pytest.raises(OutputError, match="it is a folder; give the name of a file"):
-        check_writable(tmp_path)
-
-
-def test_a_device_in_place_of_a_file_is_refused():
-    with pytest.raises(OutputError, match=f"'{os.devnull}': (it is not a regular file|'nul' is the name of a device)"):
-        check_writable(Path(os.devnull))
-
-
-def test_a_file_in_a_missing_folder_is_refused(tmp_path):
-    with pytest.raises(OutputError, match=r"the folder '.*none' does not exist; create it first"):
-        check_writable(tmp_path / "none" / "a.txt")
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        (".", "it is a folder; give the name of a file"),
+        (os.devnull, f"'{os.devnull}': (it is not a regular file|'nul' is the name of a device)"),
+        ("none/a.txt", r"the folder '.*none' does not exist; create it first"),
+        ("file/below/deep", r"the folder .* does not exist"),
+    ],
+)
+def test_a_path_that_cannot_be_a_file_is_refused(tmp_path, path, words):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=words):
+        check_writable(tmp_path / path)
 
 
 def test_a_folder_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match=r"the folder .* does not exist"):
-        check_writable(tmp_path / "file" / "a.txt")
     with pytest.raises(OutputError, match=r"Cannot write into '.*below.deep': '.*file' is a file; choose another"):
         check_folder_writable(tmp_path / "file" / "below" / "deep")
 
