@@ -119,6 +119,14 @@ def test_settings_of_pip_and_of_a_launcher_do_not_change_where_and_what_is_insta
     assert "secret" not in log.read_text() and not (tmp_path / "root").exists()
 
 
+def test_settings_of_pip_that_cannot_be_read_are_named(user: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "pip.conf").write_text("user = true\n")
+    monkeypatch.setenv("PIP_CONFIG_FILE", str(tmp_path / "pip.conf"))
+    with pytest.raises(TrainerEnvironmentError, match=r"The settings of pip cannot be read \(.*pip\.conf.*\); correct"):
+        list(EnvironmentCreation(tmp_path / "trainer", tmp_path / "log", base=sys.executable).steps())
+    assert not (tmp_path / "trainer").exists()
+
+
 def test_preferences_and_variable_come_before_the_own_environment(
     own: Path, preferences, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

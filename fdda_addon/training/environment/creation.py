@@ -31,6 +31,8 @@ from .interpreters import Interpreter, find_interpreters, query_interpreter
 from .source_checks import TEMPORARY_FOLDER_NAME, check_source, check_wheels
 
 RUN_PIP = Path(__file__).with_name("run_pip.py")
+UNREADABLE_SETTINGS_STATUS = 78
+"""Exit status of `RUN_PIP` if pip's settings cannot be read: EX_CONFIG of sysexits.h."""
 
 
 class EnvironmentCreation:
@@ -157,7 +159,12 @@ class EnvironmentCreation:
         command += ["--only-binary=:all:", "--constraint", str(requirements_file(interpreter.version)), *PACKAGES]
         if self.wheels is not None:
             command += ["--no-index", "--find-links", str(self.wheels)]
-        if (yield from self._run(command, log, dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)))) != 0:
+        status = yield from self._run(command, log, dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)))
+        if status == UNREADABLE_SETTINGS_STATUS:
+            raise TrainerEnvironmentError(
+                f"The settings of pip cannot be read ({self._error_line()}); correct or remove that file."
+            )
+        if status != 0:
             source = f"of '{self.wheels}'" if self.wheels else "of the package index"
             advice = (
                 "add what is missing"

@@ -12,20 +12,25 @@ import sys
 
 USED_SETTINGS = {
     *("index-url", "extra-index-url", "find-links", "no-index"),
-    *("proxy", "cert", "client-cert", "trusted-host", "keyring-provider", "use-feature", "use-deprecated"),
+    *("proxy", "cert", "client-cert", "trusted-host", "keyring-provider", "use-deprecated"),
     *("timeout", "default-timeout", "retries", "resume-retries"),
 }
-CERTIFICATE_FEATURES = {"truststore", "legacy-certs"}
-"""The values of `use-feature` and `use-deprecated` that matter for a download."""
+LEGACY_CERTIFICATES = "legacy-certs"
+"""The only value of `use-deprecated` that matters for a download."""
 MIN_VERSION_WITH_RAW_PROGRESS = (24, 1)
 
 
 def _settings() -> dict[str, str]:
     """Return pip's settings by name, from its files and from environment variables."""
     from pip._internal.configuration import Configuration
+    from pip._internal.exceptions import PipError
 
     configuration = Configuration(isolated=False)
-    configuration.load()
+    try:
+        configuration.load()
+    except PipError as error:
+        print("ERROR:", " ".join(str(error).split()))
+        sys.exit(78)  # `creation.UNREADABLE_SETTINGS_STATUS`
     # Since pip 25 the values are grouped by file.
     groups = [value if isinstance(value, dict) else {key: value} for key, value in configuration.items()]
     items = [(*key.rpartition(".")[::2], str(value)) for group in groups for key, value in group.items()]
@@ -38,8 +43,8 @@ def _main() -> None:
 
     settings = {} if "--no-index" in sys.argv else _settings()
     used = {name: value for name, value in settings.items() if name in USED_SETTINGS}
-    for name in {"use-feature", "use-deprecated"} & set(used):
-        used[name] = " ".join(feature for feature in used[name].split() if feature in CERTIFICATE_FEATURES)
+    if LEGACY_CERTIFICATES in used.pop("use-deprecated", "").split():
+        used["use-deprecated"] = LEGACY_CERTIFICATES
     print("Settings of pip that are used:", ", ".join(used) or "none", flush=True)
     for name in [name for name in os.environ if name.upper().startswith("PIP_")]:
         del os.environ[name]
