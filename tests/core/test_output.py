@@ -187,7 +187,7 @@ def test_checking_a_valid_path_changes_nothing(tmp_path):
     ("path", "words"),
     [
         (".", "it is a folder; give the name of a file"),
-        (os.devnull, f"'{os.devnull}': (it is not a regular file|'nul' is the name of a device)"),
+        (os.devnull, f"{os.devnull}': (it is not a regular file|'nul' is the name of a device)"),
         ("none/a.txt", r"the folder '.*none' does not exist; create it first"),
         ("file/below/deep", r"the folder .* does not exist"),
     ],
