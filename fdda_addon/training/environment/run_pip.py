@@ -56,4 +56,5 @@ def _main() -> None:
     runpy.run_module("pip", run_name="__main__")
 
 
-_main()
+if __name__ == "__main__":
+    _main()
