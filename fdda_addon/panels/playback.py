@@ -7,7 +7,7 @@ import bpy
 
 from ..jobs import job
 from ..models.entries import active_entry, bound_model_name
-from ..rig.modifier_stack import is_fdda_modifier
+from ..rig.modifier_stack import is_playback_modifier
 from ..runtime.confidence import partition_confidence
 from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
@@ -108,7 +108,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             draw_wrapped(box, context, binding.status)
             row = layout.row(align=True)
             row.operator("fdda.relink", text="Find Model…", icon="FILEBROWSER")
-            if any(map(is_fdda_modifier, mesh_object.modifiers)):
+            if any(map(is_playback_modifier, mesh_object.modifiers)):
                 row.operator("fdda.set_mode", text="Try Again", icon="FILE_REFRESH").mode = "FDDA"
             else:
                 row.operator("fdda.bind", text="Bind Again", icon="LINKED").object = mesh_object.name

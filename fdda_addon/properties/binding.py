@@ -136,6 +136,9 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         override=OVERRIDABLE,
     )
     modifiers: CollectionProperty(type=FDDA_PG_modifier, override=INSERTABLE)
+    adds_rest_position: BoolProperty(
+        description="Add Rest Position was on before the model replaced the modifiers", override=OVERRIDABLE
+    )
 
     models: CollectionProperty(type=FDDA_PG_model, override=INSERTABLE)
     model_index: IntProperty(name="Model", description="Active model of the list", override=OVERRIDABLE)

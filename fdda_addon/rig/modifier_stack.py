@@ -19,6 +19,9 @@ from .modifier_effects import INDIRECT_TYPES, ModifierEffect, effect_of, is_unbo
 PLAYBACK_GROUP_KEY = "fdda_playback_group"
 """Custom property of the node group of FDDA modifiers."""
 
+UNDEFORMED_MODIFIER_NAME = f"{MODIFIER_NAME} Undeformed"
+"""Name of the modifier after the FDDA modifier that makes Blender compute undeformed coordinates."""
+
 ORIGINAL_MESH_TYPES = {"MULTIRES", "SOFT_BODY"}
 """Modifiers that need the original mesh: Blender allows no Geometry Nodes modifier, such as FDDA's, before them."""
 
@@ -42,7 +45,17 @@ class ModifierStack:
 
 
 def is_fdda_modifier(modifier: bpy.types.Modifier) -> bool:
-    """Return whether a modifier is an FDDA modifier, which is never part of the rig."""
+    """Return whether a modifier was added with a model, so that it is never part of the rig."""
+    return is_playback_modifier(modifier) or is_undeformed_modifier(modifier)
+
+
+def is_undeformed_modifier(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier is the one that makes Blender compute undeformed coordinates."""
+    return modifier.type == "SMOOTH" and modifier.name.startswith(UNDEFORMED_MODIFIER_NAME)
+
+
+def is_playback_modifier(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier is an FDDA modifier, with or without its node group."""
     if modifier.type != "NODES":
         return False
     return modifier.name == MODIFIER_NAME if modifier.node_group is None else PLAYBACK_GROUP_KEY in modifier.node_group
@@ -139,14 +152,15 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
 
 def _fdda_modifier_index(mesh_object: bpy.types.Object) -> int | None:
     """Return the index of the FDDA modifier; None if there is none."""
-    return next((index for index, modifier in enumerate(mesh_object.modifiers) if is_fdda_modifier(modifier)), None)
+    return next((index for index, modifier in enumerate(mesh_object.modifiers) if is_playback_modifier(modifier)), None)
 
 
 def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     """Sort the modifiers of a mesh object, and check that a model can replace those that are on.
 
     Raises:
-        RigError: a modifier depends on time, is not bound, or changes the topology before another one deforms.
+        RigError: a modifier depends on time or is not bound, or one that changes the topology or depends on the shape
+            of the mesh stands before another one that deforms.
     """
     stack = read_stack(mesh_object)
     for name in (m.name for m in mesh_object.modifiers if m.show_viewport):

@@ -15,7 +15,7 @@ from ..poses.clip import Clip
 from ..scene import mesh as mesh_io
 from ..scene.scene_rig import SceneRig, is_flat
 from ..scene.temporary_state import temporary_attributes
-from .modifier_stack import downstream_disabled_unchecked, is_fdda_modifier
+from .modifier_stack import downstream_disabled_unchecked, is_playback_modifier
 from .target_caches import Cache, read_caches
 
 
@@ -137,7 +137,7 @@ def find_target(scene_rig: SceneRig, name: str, controls: Iterable[Control] = ()
             f"'{name}' cannot be its own target: a target is another object, which shows what '{name}' is to learn; "
             "leave the target out to record the rig itself."
         )
-    if any(is_fdda_modifier(modifier) and modifier.show_viewport for modifier in target_object.modifiers):
+    if any(is_playback_modifier(modifier) and modifier.show_viewport for modifier in target_object.modifiers):
         raise RigError(
             f"The target '{name}' plays a model, so there is nothing to learn from it but that model; let it show its "
             "rig, or choose another object."

@@ -53,7 +53,7 @@ def bind(
     if packed_text is None:
         model_files.allow_path(model_path)
     # Modifiers after the last deforming modifier stay on and change the positions of the model.
-    playback_modifier.add_modifier(mesh_object, stack.insert_index)
+    playback_modifier.add_modifiers(mesh_object, stack.insert_index)
     binding = mesh_object.fdda
     binding.model = stored_path_for(mesh_object, model_path)
     binding.packed = packed_text
@@ -77,9 +77,7 @@ def unbind(mesh_object: bpy.types.Object) -> None:
     character = session.character_of(mesh_object)
     binding.mode = "RIG"
     session.dispatch(Event.UNBIND, character)
-    modifier = playback_modifier.find_modifier(mesh_object)
-    if modifier is not None and not playback_modifier.is_from_library(modifier):
-        mesh_object.modifiers.remove(modifier)
+    playback_modifier.remove_modifiers(mesh_object)
     effects.remove_unused_objects()
     for property_name in ("is_bound", "model", "packed", "use_in_render", "status"):
         binding.property_unset(property_name)

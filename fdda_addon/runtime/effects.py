@@ -99,6 +99,7 @@ def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.t
         buffer = position_buffer.create_buffer(mesh_object)
     if playback_modifier.buffer_of(modifier) != buffer:
         playback_modifier.set_buffer(modifier, buffer)
+    playback_modifier.add_rest_position(mesh_object, modifier, keep=mesh_object.fdda.adds_rest_position)
     return buffer
 
 

@@ -48,6 +48,11 @@ def apply_visibility(mesh_object: bpy.types.Object, animated: frozenset[str]) ->
     binding, modifier = mesh_object.fdda, playback_modifier.find_modifier(mesh_object)
     if modifier is None or session.overriding_mode(mesh_object.session_uid):
         return
+    if binding.is_playing and not mesh_object.add_rest_position_attribute:
+        # The user may have switched off what the FDDA modifier needs.
+        if binding.adds_rest_position:
+            binding.adds_rest_position = False
+        playback_modifier.add_rest_position(mesh_object, modifier, keep=False)
     if modifier.show_viewport != binding.is_playing:
         if "show_viewport" in animated:
             return
@@ -81,9 +86,9 @@ def switch_modifiers(mesh_object: bpy.types.Object, show_model: bool) -> None:
         _store_visibility(mesh_object)
     elif not show_model and binding.is_playing:
         _restore_visibility(mesh_object)
-    if modifier is not None:
-        modifier.show_viewport = show_model
-        modifier.show_render = show_model and binding.use_in_render
+    for added_modifier in playback_modifier.added_modifiers(mesh_object):
+        added_modifier.show_viewport = show_model
+        added_modifier.show_render = show_model and binding.use_in_render
     if show_model:
         binding.status = ""
         for stored, rig_modifier in _stored_modifiers(mesh_object):
@@ -98,6 +103,7 @@ def _store_visibility(mesh_object: bpy.types.Object) -> None:
         stored = binding.modifiers.add()
         stored.uid = modifier.persistent_uid
         stored.show_viewport, stored.show_render = modifier.show_viewport, modifier.show_render
+    binding.adds_rest_position = mesh_object.add_rest_position_attribute
     binding.is_playing = True
 
 
@@ -106,6 +112,7 @@ def _restore_visibility(mesh_object: bpy.types.Object) -> None:
         modifier.show_viewport, modifier.show_render = stored.show_viewport, stored.show_render
     mesh_object.fdda.modifiers.clear()
     mesh_object.fdda.is_playing = False
+    mesh_object.add_rest_position_attribute = mesh_object.fdda.adds_rest_position
     if mesh_object.data.shape_keys is not None:
         # The player has muted the evaluated shape keys, and Blender has to copy them again.
         mesh_object.data.shape_keys.update_tag()

@@ -20,6 +20,7 @@ from ..scene.arrays import ElementProperty, read
 from ..scene.mesh import rest_positions
 from ..scene.scene_rig import SceneRig, armature_modifier
 from .network import Network
+from .playback_modifier import REST_POSITION
 from .session import session
 
 STABLE_MODES = ("OBJECT", "POSE")
@@ -57,8 +58,8 @@ def read_signature(
 
     Returns:
         By part. Names, rest matrices, inheritance and skinning properties of all bones; their parents, and how unread
-        bones follow the others; the vertex groups, modifiers and drivers of the object (`rig.deformation`); a digest of
-        the rest positions of the mesh.
+        bones follow the others; the vertex groups, modifiers and drivers of the object (`rig.deformation`); a digest
+        of the rest positions of the mesh, and whether it has the attribute `REST_POSITION`.
     """
     mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
     modifier = armature_modifier(mesh_object)
@@ -68,8 +69,11 @@ def read_signature(
             *(bone.parent.name if bone.parent else "" for bone in armature.bones),
             str(read_unread_bones(scene_rig, unread_bones)),
         ),
-        OBJECT: lambda: (*mesh_object.vertex_groups.keys(), str(read_modifiers_and_drivers(scene_rig))),
-        MESH: lambda: (rest_digest(mesh_object.data),),
+        OBJECT: lambda: (
+            *mesh_object.vertex_groups.keys(),
+            str(read_modifiers_and_drivers(scene_rig)),
+        ),
+        MESH: lambda: (rest_digest(mesh_object.data), REST_POSITION in mesh_object.data.attributes),
     }
     return {part: readers[part]() for part in parts}
 

@@ -37,6 +37,10 @@ class ElbowFiles:
     bound: Path
 
 
+ADDED = {"FDDA": (False, False), "FDDA Undeformed": (False, False)}
+"""The modifiers that a binding adds, with their visibility in viewport and render while the rig is shown."""
+
+
 def run(*arguments: object) -> int:
     """Run a verb of the command line, and return its exit status."""
     return main([str(argument) for argument in arguments], "fdda")

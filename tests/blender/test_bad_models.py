@@ -268,7 +268,7 @@ def test_a_refused_model_does_not_change_a_bound_object(bound_elbow, elbow_files
     with pytest.raises(FDDAError, match="the operator set"):
         bind(find_rig(), path)
     assert bound_elbow.fdda.is_bound and bound_elbow.fdda.mode == "FDDA"
-    assert [m.show_viewport for m in bound_elbow.modifiers] == [False, False, True]
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [False, False, True, True]
 
 
 def test_the_unchanged_model_is_accepted(verb, elbow_files):

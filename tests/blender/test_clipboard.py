@@ -11,7 +11,7 @@ import fdda_addon
 from fdda_addon.operators import clipboard
 from fdda_addon.runtime import playback
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
+from .conftest import ADDED, ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def test_a_copied_character_shows_its_rig_without_the_add_on(bound_elbow, elbow_
         bpy.context.scene.collection.objects.link(pasted)
     bpy.context.view_layer.update()
     shown = {m.name: (m.show_viewport, m.show_render) for m in bpy.data.objects[ELBOW].modifiers}
-    assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+    assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), **ADDED}
     assert np.array_equal(evaluated_positions(bpy.data.objects[ELBOW]), rig_shape)
 
 
@@ -79,7 +79,7 @@ def test_a_character_copied_by_blender_s_operator_plays(bound_elbow, elbow_files
     pasted = bpy.data.objects[f"{ELBOW}.001"]
     assert_plays(pasted, elbow_files.model)
     pasted.fdda.mode = "RIG"
-    assert [m.show_viewport for m in pasted.modifiers] == [True, True, False]
+    assert [m.show_viewport for m in pasted.modifiers] == [True, True, False, False]
 
 
 def test_copying_in_edit_mode_shows_an_error(bound_elbow):

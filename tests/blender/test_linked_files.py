@@ -10,7 +10,7 @@ import fdda_addon
 from fdda_addon.models import model_list
 from fdda_addon.runtime.session import session
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions
+from .conftest import ADDED, ELBOW, ELBOW_RIG, assert_plays, evaluated_positions
 from .linked import (
     ANGLES,
     COLLECTION,
@@ -63,7 +63,7 @@ def test_saved_overrides_show_their_rig_without_the_add_on(pair, library, tmp_pa
     for mesh_object, positions in zip(overridden_meshes(), rig_shapes, strict=True):
         assert not hasattr(mesh_object, "fdda")
         shown = {m.name: (m.show_viewport, m.show_render) for m in mesh_object.modifiers}
-        assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+        assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), **ADDED}
         assert np.abs(evaluated_positions(mesh_object) - positions).max() < 1e-6
 
 
@@ -105,7 +105,7 @@ def test_an_auto_saved_shot_plays(library, tmp_path):
     mesh_object = overridden_meshes()[0]
     assert np.array_equal(assert_plays(mesh_object, library.model), expected)
     mesh_object.fdda.mode = "RIG"
-    assert [m.show_viewport for m in mesh_object.modifiers] == [True, True, False]
+    assert [m.show_viewport for m in mesh_object.modifiers] == [True, True, False, False]
 
 
 def test_a_packed_model_is_found_in_the_library(library, tmp_path):
@@ -163,7 +163,7 @@ def test_a_resynchronized_override_plays(pair, library, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
     assert sum("hat" in o.name and o.library is None for o in bpy.data.objects) == 2
     pair = [o for o in overridden_meshes() if o.fdda.is_bound]
-    assert [[m.name for m in o.modifiers][2:] for o in pair] == [["FDDA", "Cast", "Subdivision"]] * 2
+    assert [[m.name for m in o.modifiers][2:] for o in pair] == [["FDDA", "FDDA Undeformed", "Cast", "Subdivision"]] * 2
     for mesh_object in pair:
         assert_plays(mesh_object, library.model)
         bend_elbow(mesh_object, 0.5)

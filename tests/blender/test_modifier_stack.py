@@ -82,7 +82,7 @@ def test_modifiers_that_add_vertices_after_the_rig_use_the_output_of_the_model(l
     # The smoothing of this character differs slightly from the smoothing that the model has learned.
     assert np.linalg.norm(playing - true, axis=1).mean() < 0.002
     assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == [
-        "FDDA", "Subdivision", "Thickness", "Detail",
+        "FDDA", "FDDA Undeformed", "Subdivision", "Thickness", "Detail",
     ]  # fmt: skip
 
 
@@ -108,7 +108,9 @@ def test_frame_times_include_downstream_modifiers(rig, elbow_files, monkeypatch)
     monkeypatch.setattr(rig_cost, "time_frames", watch)
     drain(benchmark.benchmark(rig, elbow_files.model, 5))
     drain(rig_cost.measure(rig))
-    true, linear, model = ([*own, "Subdivision"] for own in (["Armature", "CorrectiveSmooth"], ["Armature"], ["FDDA"]))
+    true, linear, model = (
+        [*own, "Subdivision"] for own in (["Armature", "CorrectiveSmooth"], ["Armature"], ["FDDA", "FDDA Undeformed"])
+    )
     # More rounds follow while the times vary.
     rounds = next(index for index in range(0, len(seen), 4) if seen[index + 2 : index + 3] != [model]) // 4
     rig_rounds = (len(seen) - 4 * rounds) // 2
@@ -149,7 +151,7 @@ def test_a_render_only_modifier_between_replaced_ones_is_disabled_while_a_model_
     bind(rig, loose_model, use_in_render=True)
     assert not rig.mesh_object.modifiers["Subdivision"].show_render
     rig.mesh_object.fdda.mode = "RIG"
-    assert [state for state in shown(rig) if state[0] != "FDDA"] == before
+    assert [state for state in shown(rig) if not state[0].startswith("FDDA")] == before
 
 
 def test_a_disabled_modifier_does_not_move_the_playback_modifier(loose_model):
@@ -164,7 +166,7 @@ def test_the_playback_modifier_is_inserted_before_a_modifier_pinned_to_last(loos
     last = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     last.use_pin_to_last = True
     bind(rig, loose_model)
-    assert [m.name for m in rig.mesh_object.modifiers] == ["Armature", "Mush", "FDDA", "Subdivision"]
+    assert [m.name for m in rig.mesh_object.modifiers] == ["Armature", "Mush", "FDDA", "FDDA Undeformed", "Subdivision"]
 
 
 @pytest.mark.parametrize("kind", ["BUILD", "EXPLODE", "PARTICLE_INSTANCE"])
@@ -227,7 +229,12 @@ def test_shading_nodes_after_a_subdivision_are_accepted(loose_model, tmp_path):
     rig.mesh_object.modifiers["It"].use_pin_to_last = True
     assert len(residuals(rig, tmp_path)) == FEW_POSES.poses
     bind(rig, loose_model)
-    assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == ["FDDA", "Subdivision", "It"]
+    assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == [
+        "FDDA",
+        "FDDA Undeformed",
+        "Subdivision",
+        "It",
+    ]
 
 
 def test_a_simulation_after_the_rig_uses_the_output_of_the_model(loose_model):

@@ -74,10 +74,10 @@ def test_playing_differs_from_the_rig(bound_elbow, elbow_files):
 def test_rig_mode_shows_the_rig_again(bound_elbow, elbow_files):
     pose(angle=1.2)
     bound_elbow.fdda.mode = "RIG"
-    assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True, False]
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True, False, False]
     true = evaluated_positions(bound_elbow)
     bound_elbow.fdda.mode = "FDDA"
-    assert [m.show_viewport for m in bound_elbow.modifiers] == [False, False, True]
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [False, False, True, True]
     assert_plays(bound_elbow, elbow_files.model)
     bound_elbow.fdda.mode = "RIG"
     assert np.array_equal(evaluated_positions(bound_elbow), true)

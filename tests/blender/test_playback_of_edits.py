@@ -53,7 +53,7 @@ def test_deleting_the_armature(bound_elbow, capsys):
     assert bound_elbow.fdda.mode == "RIG"
     assert "'elbow' has no Armature modifier with an armature any more" in bound_elbow.fdda.status
     assert capsys.readouterr().out.count("switched off") == 1
-    assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True, False]
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True, False, False]
 
 
 def test_deleting_the_armature_comes_back_with_undo(bound_elbow, elbow_files):

@@ -63,7 +63,7 @@ def test_removing_the_playback_modifier_shows_the_rig_immediately(bound_elbow, i
         bound_elbow.modifiers.remove(playback_modifier.find_modifier(bound_elbow))
     bpy.context.view_layer.update()
     assert bound_elbow.fdda.mode == "RIG" and "was removed; bind the model again" in bound_elbow.fdda.status
-    assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True]
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True, False]
     first = evaluated_positions(bound_elbow)
     pose(angle=0.3)
     assert np.abs(evaluated_positions(bound_elbow) - first).max() > 1e-2
@@ -216,7 +216,7 @@ def test_the_others_play_on_when_one_character_raises_any_error(bound_elbow, elb
     bpy.context.view_layer.update()
     assert [o.fdda.mode for o in crowd] == ["FDDA", "RIG", "FDDA"]
     assert "cannot be played (SystemExit('out'))" in crowd[1].fdda.status
-    assert [m.show_viewport for m in crowd[1].modifiers] == [True, True, False]
+    assert [m.show_viewport for m in crowd[1].modifiers] == [True, True, False, False]
     for mesh_object in (crowd[0], crowd[2]):
         assert_plays(mesh_object, elbow_files.model)
     assert capsys.readouterr().out.count("switched off") == 1

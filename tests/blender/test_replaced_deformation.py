@@ -164,7 +164,13 @@ def test_binding_again_keeps_modifiers_after_the_playback_modifier(bound_elbow, 
     add("SMOOTH", None, iterations=5)(bound_elbow)
     bind(find_rig(), elbow_files.model)
     bpy.context.view_layer.update()
-    assert [m.name for m in bound_elbow.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA", "Smooth"]
+    assert [m.name for m in bound_elbow.modifiers] == [
+        "Armature",
+        "CorrectiveSmooth",
+        "FDDA",
+        "FDDA Undeformed",
+        "Smooth",
+    ]
     assert not bound_elbow.fdda.status
 
 

@@ -10,7 +10,7 @@ from fdda_addon.runtime import model_files
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
-from .conftest import ELBOW, assert_plays, evaluated_positions, pose, without_deformation
+from .conftest import ADDED, ELBOW, assert_plays, evaluated_positions, pose, without_deformation
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_without_the_addon_the_file_shows_and_renders_the_rig(keyed, tmp_path, u
     mesh_object = bpy.data.objects[ELBOW]
     assert not hasattr(mesh_object, "fdda")
     shown, pinned, index = state(mesh_object)
-    assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+    assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), **ADDED}
     assert (pinned, index) == (False, 1)
     pose(angle=1.3)
     assert np.abs(evaluated_positions(mesh_object) - true).max() < 1e-6
@@ -65,7 +65,7 @@ def test_saving_does_not_stop_the_playback(keyed, elbow_files):
     assert state(keyed) == before
     assert np.array_equal(assert_plays(keyed, elbow_files.model), first)
     keyed.fdda.mode = "RIG"
-    assert [m.show_viewport for m in keyed.modifiers] == [True, True, False]
+    assert [m.show_viewport for m in keyed.modifiers] == [True, True, False, False]
 
 
 def test_a_handler_that_saves_a_backup_during_a_save(bound_elbow, elbow_files, tmp_path):
@@ -87,7 +87,7 @@ def test_a_handler_that_saves_a_backup_during_a_save(bound_elbow, elbow_files, t
     for name in ("backup", "saved", "next"):
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / f"{name}.blend"))
         shown = state(bpy.data.objects[ELBOW])[0]
-        assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}, name
+        assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), **ADDED}, name
 
 
 def test_a_save_that_fails_does_not_stop_the_playback(bound_elbow, elbow_files, tmp_path):
@@ -117,7 +117,7 @@ def test_the_mode_is_restored_with_the_file(bound_elbow, elbow_files, mode):
 def test_disabling_the_addon_shows_the_rig_and_enabling_it_resumes_playback(bound_elbow, elbow_files):
     pose(angle=1.0)
     fdda_addon.unregister()
-    assert state(bound_elbow)[0] == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+    assert state(bound_elbow)[0] == {"Armature": (True, True), "CorrectiveSmooth": (True, True), **ADDED}
     fdda_addon.register()
     bpy.context.view_layer.update()
     assert_plays(bpy.data.objects[ELBOW], elbow_files.model)

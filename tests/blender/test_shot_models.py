@@ -43,7 +43,7 @@ def test_binding_to_an_override(elbow_files, tmp_path):
     for _ in range(2):
         mesh_object = overridden_meshes()[0]
         assert_plays(mesh_object, model)
-        assert [m.name for m in mesh_object.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA"]
+        assert [m.name for m in mesh_object.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA", "FDDA Undeformed"]
         assert [entry.path for entry in mesh_object.fdda.models] == [mesh_object.fdda.model] == ["//elbow.onnx"]
         save_and_reopen_shot(tmp_path)
     unbind(overridden_meshes()[0])
@@ -72,7 +72,7 @@ def test_an_override_that_was_saved_without_the_addon_is_bound_again(elbow_files
     assert not mesh_object.fdda.is_bound
     bind(rig_of(mesh_object), model)
     assert_plays(mesh_object, model)
-    assert [m.name for m in mesh_object.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA"]
+    assert [m.name for m in mesh_object.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA", "FDDA Undeformed"]
     assert sum("positions" in o.name for o in bpy.data.objects) == 1
 
 
@@ -81,7 +81,7 @@ def test_another_model_in_the_shot(pair, library, elbow_files, tmp_path):
     model = tmp_path / "shots" / "elbow.onnx"
     shutil.copy(elbow_files.model, model)
     unbind(pair[0])
-    assert [m.show_viewport for m in pair[0].modifiers] == [True, True, False]
+    assert [m.show_viewport for m in pair[0].modifiers] == [True, True, False, False]
     save_and_reopen_shot(tmp_path)
     first, second = overridden_meshes()
     assert not first.fdda.is_bound and second.fdda.is_bound
