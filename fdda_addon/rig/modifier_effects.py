@@ -5,7 +5,15 @@ from enum import Enum, auto
 
 import bpy
 
-from ..scene.node_groups import GeometryEffect, find_time_node, geometry_effect
+from ..scene.compatibility import node_input_settings
+from ..scene.node_groups import (
+    GeometryEffect,
+    depends_on_shape,
+    find_time_node,
+    geometry_effect,
+    named_attributes,
+    stored_attributes,
+)
 
 DEFORMING_TYPES = {
     "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
@@ -86,3 +94,68 @@ def is_unbound(modifier: bpy.types.Modifier) -> bool:
     ):
         return False
     return not getattr(modifier, BIND_PROPERTIES[modifier.type])
+
+
+def reads_shape(modifier: bpy.types.Modifier) -> bool:
+    """Return whether the result of a neutral modifier depends on the positions of the vertices.
+
+    This is assumed of each type that is not known to depend on nothing but weights, UV maps and transforms.
+    """
+    if modifier.type == "NODES":
+        tree = modifier.node_group
+        return tree is not None and (depends_on_shape(tree) or "position" in _node_input_texts(modifier))
+    if modifier.type in {"VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY"}:
+        if modifier.mask_texture is not None and modifier.mask_tex_mapping != "UV":
+            return True
+        return modifier.type == "VERTEX_WEIGHT_PROXIMITY" and modifier.proximity_mode == "GEOMETRY"
+    if modifier.type == "DATA_TRANSFER":
+        mappings = {
+            getattr(modifier, f"{kind}_mapping")
+            for kind in ("vert", "edge", "loop", "poly")
+            if getattr(modifier, f"use_{kind}_data")
+        }
+        return modifier.object is not None and not mappings <= {"TOPOLOGY"}
+    return not {
+        "COLLISION": lambda: not modifier.settings.use,
+        "DYNAMIC_PAINT": lambda: not (modifier.canvas_settings or modifier.brush_settings),
+        "FLUID": lambda: modifier.fluid_type == "NONE",
+        "TRIANGULATE": lambda: True,
+        "UV_PROJECT": lambda: not any(projector.object for projector in modifier.projectors),
+        "UV_WARP": lambda: True,
+    }.get(modifier.type, lambda: False)()
+
+
+def written_names(modifier: bpy.types.Modifier) -> set[str] | None:
+    """Return the names of the vertex groups and attributes that a neutral modifier writes; None if it writes more."""
+    if modifier.type == "NODES":
+        return stored_attributes(modifier.node_group)
+    if modifier.type == "DATA_TRANSFER":
+        writes_weights = modifier.use_vert_data and modifier.data_types_verts == {"VGROUP_WEIGHTS"}
+        writes_more = modifier.use_edge_data or modifier.use_loop_data or modifier.use_poly_data
+        return set(modifier.id_data.vertex_groups.keys()) if writes_weights and not writes_more else None
+    if modifier.type == "VERTEX_WEIGHT_MIX":
+        return {modifier.vertex_group_a}
+    return {modifier.vertex_group} if modifier.type in {"VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_PROXIMITY"} else None
+
+
+def read_names(modifier: bpy.types.Modifier) -> set[str]:
+    """Return the names of the vertex groups and attributes that a modifier may read."""
+    structs = [modifier, modifier.particle_system] if modifier.type == "PARTICLE_SYSTEM" else [modifier]
+    names = {
+        getattr(struct, prop.identifier)
+        for struct in structs
+        for prop in struct.bl_rna.properties
+        if prop.type == "STRING" and prop.identifier != "name"
+    }
+    if modifier.type == "ARMATURE" and modifier.use_vertex_groups:
+        names |= set(modifier.id_data.vertex_groups.keys())
+    if modifier.type == "NODES" and modifier.node_group is not None:
+        names |= named_attributes(modifier.node_group) | _node_input_texts(modifier)
+    return names - {""}
+
+
+def _node_input_texts(modifier: bpy.types.NodesModifier) -> set[str]:
+    """Return the texts in the inputs of Geometry Nodes, among them the names of the attributes that inputs read."""
+    sockets = [s for s in modifier.node_group.interface.items_tree if s.item_type == "SOCKET" and s.in_out == "INPUT"]
+    settings = [node_input_settings(modifier, socket.identifier).values() for socket in sockets]
+    return {value for values in settings for _, value in values if isinstance(value, str)}

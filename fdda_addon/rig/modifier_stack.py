@@ -12,9 +12,19 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.errors import RigError
+from ..scene.material_attributes import material_attributes
 from ..scene.mesh import topology
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
-from .modifier_effects import INDIRECT_TYPES, ModifierEffect, effect_of, is_unbound, time_dependence
+from .modifier_effects import (
+    INDIRECT_TYPES,
+    ModifierEffect,
+    effect_of,
+    is_unbound,
+    read_names,
+    reads_shape,
+    time_dependence,
+    written_names,
+)
 
 PLAYBACK_GROUP_KEY = "fdda_playback_group"
 """Custom property of the node group of FDDA modifiers."""
@@ -150,6 +160,67 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
     return modifiers
 
 
+def replaced_range(mesh_object: bpy.types.Object) -> tuple[list[bpy.types.Modifier], int]:
+    """Return the last two arguments of `find_shape_readers` for a bound object."""
+    deforming = [m for m in recorded_modifiers(mesh_object) if effect_of(m) is not ModifierEffect.NEUTRAL]
+    return deforming, _fdda_modifier_index(mesh_object) or 0
+
+
+def find_shape_readers(
+    mesh_object: bpy.types.Object, deforming: Iterable[bpy.types.Modifier], end: int
+) -> list[bpy.types.Modifier]:
+    """Return the neutral modifiers before the last deforming one whose result depends on the positions of the vertices.
+
+    They stay on while a model plays, and then see the rest pose. Those are left out whose result only deforming
+    modifiers read, such as weights.
+
+    Args:
+        mesh_object: the object.
+        deforming: the modifiers that a model replaces and that are on while the rig is shown.
+        end: index after the last modifier that a model replaces.
+    """
+    binding, deforming_names = getattr(mesh_object, "fdda", None), {modifier.name for modifier in deforming}
+    in_render = binding is not None and binding.is_bound and binding.use_in_render
+    enabled = [
+        (index, modifier)
+        for index, modifier in enumerate(mesh_object.modifiers)
+        if modifier.name not in deforming_names
+        and not is_fdda_modifier(modifier)
+        and (modifier.show_viewport or (in_render and modifier.show_render))
+    ]
+    readers = []
+    for index, modifier in enabled:
+        if index >= end or effect_of(modifier) is not ModifierEffect.NEUTRAL or not reads_shape(modifier):
+            continue
+        names = written_names(modifier)
+        later_names = {m.name for m in mesh_object.modifiers[index + 1 :]} & deforming_names
+        rig_reads = {name for each in later_names for name in read_names(mesh_object.modifiers[each])}
+        others_read = {name for _, other in enabled if other != modifier for name in read_names(other)}
+        if names is None or not names <= rig_reads - others_read - material_attributes(mesh_object):
+            readers.append(modifier)
+    return readers
+
+
+def check_shape_readers(mesh_object: bpy.types.Object, deforming: Iterable[bpy.types.Modifier], end: int) -> None:
+    """Check that no neutral modifier sees the rest pose only while a model plays.
+
+    Args:
+        mesh_object, deforming, end: as for `find_shape_readers`.
+
+    Raises:
+        RigError: a modifier does.
+    """
+    first_index = min((mesh_object.modifiers.find(modifier.name) for modifier in deforming), default=end)
+    last = next((m for m in mesh_object.modifiers[end:] if is_playback_modifier(m)), mesh_object.modifiers[end - 1])
+    for modifier in find_shape_readers(mesh_object, deforming, end):
+        if mesh_object.modifiers.find(modifier.name) > first_index:
+            raise RigError(
+                f"Modifier '{modifier.name}' of '{mesh_object.name}' depends on the shape of the mesh, and stands "
+                f"between modifiers that a model replaces, so it would see the rest pose; move it behind "
+                f"'{last.name}', or switch it off in the viewport."
+            )
+
+
 def _fdda_modifier_index(mesh_object: bpy.types.Object) -> int | None:
     """Return the index of the FDDA modifier; None if there is none."""
     return next((index for index, modifier in enumerate(mesh_object.modifiers) if is_playback_modifier(modifier)), None)
@@ -186,6 +257,8 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
             f"{subject} before '{stack.replaced[-1]}', which a model replaces, so its vertices cannot be followed; "
             "move it to the end of the modifiers, switch it off in the viewport, or apply it."
         )
+    deforming = [mesh_object.modifiers[name] for name in stack.replaced if mesh_object.modifiers[name].show_viewport]
+    check_shape_readers(mesh_object, deforming, stack.insert_index)
     return stack
 
 

@@ -14,6 +14,7 @@ from ..core.errors import FDDAError, ModelError, RigError
 from ..core.mask import SkinningBlend
 from ..core.pose_repair import repair_pose
 from ..core.rig import STATIC_JOINT
+from ..rig.modifier_stack import check_shape_readers, find_shape_readers, replaced_range
 from ..rig.reading import PoseReader, read_model_rig
 from ..scene.control_reader import ControlReader
 from ..scene.mask import mask_key, read_mask
@@ -79,6 +80,12 @@ class Player:
         armature_object, self.mesh_uid = scene_rig.armature_object, mesh_object.data.session_uid
         self._armature_object_uid, self.armature_uid = armature_object.session_uid, armature_object.data.session_uid
         self._check_vertex_count(mesh_object)
+        replaced = replaced_range(mesh_object)
+        check_shape_readers(mesh_object, *replaced)
+        # What stands before the rig and reads the shape gets it with shape keys.
+        self._mutes_shape_keys = not find_shape_readers(mesh_object, *replaced)
+        if mesh_object.data.shape_keys is not None and not self._mutes_shape_keys:
+            mesh_object.data.shape_keys.update_tag()
         self.signature = self._read_signature(scene_rig, rig_signature.PARTS)
         rig_signature.check(scene_rig, self.network, self.signature)
         self._pose_reader = self._create_pose_reader(scene_rig)
@@ -256,7 +263,8 @@ class Player:
         set_mesh_positions(buffer.data, self._positions)
         if mesh_object.data.shape_keys is not None:
             self.has_new_copy |= not seen_mode(mesh_object)
-            evaluated_copies.mute_shape_keys(mesh_object)
+            if self._mutes_shape_keys:
+                evaluated_copies.mute_shape_keys(mesh_object)
 
     def _create_blend(self, scene_rig: SceneRig) -> SkinningBlend:
         """Create the blend of the model with linear skinning."""

@@ -14,6 +14,7 @@ import numpy as np
 from ..core.errors import ModelError
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
 from ..rig.deformation import b_bone_values, read_modifiers_and_drivers
+from ..rig.modifier_stack import find_shape_readers, replaced_range
 from ..rig.reading import read_model_rig
 from ..rig.unread_bones import read_unread_bones
 from ..scene.arrays import ElementProperty, read
@@ -72,6 +73,7 @@ def read_signature(
         OBJECT: lambda: (
             *mesh_object.vertex_groups.keys(),
             str(read_modifiers_and_drivers(scene_rig)),
+            tuple(modifier.name for modifier in find_shape_readers(mesh_object, *replaced_range(mesh_object))),
         ),
         MESH: lambda: (rest_digest(mesh_object.data), REST_POSITION in mesh_object.data.attributes),
     }

@@ -13,6 +13,18 @@ ATTRIBUTE_NODES = {
     "GeometryNodeViewer", "NodeGroupInput", "NodeReroute",
 }  # fmt: skip
 """Nodes that keep the vertices and their positions."""
+SHAPE_INDEPENDENT_NODES = (ATTRIBUTE_NODES - {"GeometryNodeSetMeshNormal"}) | {
+    "GeometryNodeAccumulateField", "GeometryNodeAttributeDomainSize", "GeometryNodeAttributeStatistic",
+    "GeometryNodeBlurAttribute", "GeometryNodeCollectionInfo", "GeometryNodeEvaluateAtIndex",
+    "GeometryNodeEvaluateOnDomain", "GeometryNodeFieldAtIndex", "GeometryNodeFieldOnDomain", "GeometryNodeGroup",
+    "GeometryNodeIndexSwitch", "GeometryNodeInputActiveCamera", "GeometryNodeInputID", "GeometryNodeInputIndex",
+    "GeometryNodeInputMaterial", "GeometryNodeInputMaterialIndex", "GeometryNodeInputMeshEdgeNeighbors",
+    "GeometryNodeInputMeshFaceNeighbors", "GeometryNodeInputMeshIsland", "GeometryNodeInputMeshVertexNeighbors",
+    "GeometryNodeInputSceneTime", "GeometryNodeInputShadeSmooth", "GeometryNodeIsViewport",
+    "GeometryNodeMaterialSelection", "GeometryNodeMenuSwitch", "GeometryNodeObjectInfo", "GeometryNodeSampleIndex",
+    "GeometryNodeSelfObject", "GeometryNodeSwitch", "NodeFrame",
+}  # fmt: skip
+"""Nodes whose results do not depend on the positions of the vertices, beside those of functions and shaders."""
 POSITION_NODE = "GeometryNodeSetPosition"
 SIMULATION_NODES = {"GeometryNodeSimulationInput", "GeometryNodeSimulationOutput"}
 TIME_NODES = {"GeometryNodeInputSceneTime", *SIMULATION_NODES}
@@ -102,12 +114,61 @@ def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:
 def _node_types(node: bpy.types.Node) -> Iterator[str]:
     if node.type == "GROUP" and node.node_tree is not None:
         yield from _geometry_node_types(node.node_tree)
-    elif node.bl_idname == "GeometryNodeStoreNamedAttribute" and _may_store_positions(node):
+    elif node.bl_idname == "GeometryNodeStoreNamedAttribute" and _may_name_positions(node):
         yield POSITION_NODE
     else:
         yield node.bl_idname
 
 
-def _may_store_positions(node: bpy.types.Node) -> bool:
+def _may_name_positions(node: bpy.types.Node) -> bool:
     name = node.inputs["Name"]
     return name.is_linked or name.default_value == "position"
+
+
+def depends_on_shape(tree: bpy.types.NodeTree) -> bool:
+    """Return whether the result of a node group may depend on the positions of the vertices."""
+    return any(_depends_on_shape(node) for node in tree_nodes(tree))
+
+
+def named_attributes(tree: bpy.types.NodeTree) -> set[str]:
+    """Return the texts in the sockets of a node group and of nested groups: the attributes that it names."""
+    return {
+        socket.default_value
+        for node in tree_nodes(tree)
+        for socket in node.inputs
+        if socket.type == "STRING" and not socket.is_linked
+    }
+
+
+def stored_attributes(tree: bpy.types.NodeTree) -> set[str] | None:
+    """Return the names of the attributes that a node group stores; None if it may change anything else of the mesh."""
+    outputs = [item for item in tree.interface.items_tree if item.item_type == "SOCKET" and item.in_out == "OUTPUT"]
+    if len(outputs) > 1 or not set(_geometry_node_types(tree)) <= {
+        "GeometryNodeStoreNamedAttribute",
+        "NodeGroupInput",
+        "NodeReroute",
+    }:
+        return None
+    sockets = [n.inputs["Name"] for n in tree_nodes(tree) if n.bl_idname == "GeometryNodeStoreNamedAttribute"]
+    return None if any(socket.is_linked for socket in sockets) else {socket.default_value for socket in sockets}
+
+
+def tree_nodes(tree: bpy.types.NodeTree | None) -> Iterator[bpy.types.Node]:
+    """Yield the nodes of a group and of nested groups."""
+    for node in tree.nodes if tree is not None else ():
+        yield node
+        if node.type == "GROUP":
+            yield from tree_nodes(node.node_tree)
+
+
+def _depends_on_shape(node: bpy.types.Node) -> bool:
+    if node.bl_idname == "GeometryNodeInputNamedAttribute":
+        return _may_name_positions(node)
+    if node.bl_idname.startswith("ShaderNodeTex"):
+        # Without a link, the vector is the position.
+        return not all(socket.is_linked for socket in node.inputs if socket.name == "Vector" and socket.enabled)
+    return not (
+        node.mute
+        or node.bl_idname in SHAPE_INDEPENDENT_NODES
+        or node.bl_idname.startswith(("FunctionNode", "NodeGroup", "ShaderNode"))
+    )

@@ -40,6 +40,38 @@ def painted(mesh_object: bpy.types.Object) -> None:
     mesh_object.modifiers["It"].canvas_settings.canvas_surfaces[0].surface_type = "DISPLACE"
 
 
+def near(mesh_object: bpy.types.Object, vertex_group: str = "near") -> None:
+    """Add weights by the distance from a point, before the smoothing."""
+    point = bpy.data.objects.new("point", bpy.data.meshes.new("point"))
+    point.data.from_pydata([(0, 0, 0)], [], [])
+    bpy.context.scene.collection.objects.link(point)
+    mesh_object.vertex_groups.new(name="near").add(range(len(mesh_object.data.vertices)), 1.0, "REPLACE")
+    add_modifier_at(1, "VERTEX_WEIGHT_PROXIMITY", vertex_group="near", target=point, max_dist=0.4)(mesh_object)
+    mesh_object.modifiers["It"].proximity_mode = "GEOMETRY"
+    mesh_object.modifiers["It"].proximity_geometry = {"VERTEX"}
+
+
+def projected(mesh_object: bpy.types.Object) -> None:
+    mesh_object.data.uv_layers.new(name="UVMap")
+    add_modifier_at(1, "UV_PROJECT", uv_layer="UVMap")(mesh_object)
+    mesh_object.modifiers["It"].projectors[0].object = bpy.data.objects[ELBOW_RIG]
+
+
+def transferred(mesh_object: bpy.types.Object) -> None:
+    settings = {"use_vert_data": True, "data_types_verts": {"VGROUP_WEIGHTS"}, "vert_mapping": "NEAREST"}
+    source = bpy.data.objects.new("source", mesh_object.data.copy())
+    add_modifier_at(1, "DATA_TRANSFER", object=source, use_loop_data=True, **settings)(mesh_object)
+
+
+def storing(mesh_object: bpy.types.Object, node: str = "GeometryNodeInputPosition") -> None:
+    """Add nodes that store the output of a node as the attribute *seen*, before the smoothing."""
+    add_nodes_at(1, "GeometryNodeStoreNamedAttribute")(mesh_object)
+    group = mesh_object.modifiers["It"].node_group
+    store = group.nodes["Store Named Attribute"]
+    store.data_type, store.inputs["Name"].default_value = "FLOAT", "seen"
+    group.links.new(group.nodes.new(node).outputs[0], store.inputs["Value"])
+
+
 POSE = "so its result does not follow from the pose; switch it off in the viewport, or remove it."
 MIDDLE = (
     "changes the topology of the mesh before 'Mush', which a model replaces, so its vertices cannot be followed; move "
@@ -50,7 +82,16 @@ ORIGINAL = (
     "the viewport, or apply it."
 )
 UNBOUND = "is not bound, so it does nothing; bind it first, or switch it off in the viewport."
+SHAPE = (
+    "depends on the shape of the mesh, and stands between modifiers that a model replaces, so it would see the rest "
+    "pose; move it behind 'Mush', or switch it off in the viewport."
+)
 REFUSED = {
+    **{
+        kind: (add_modifier_at(1, kind), SHAPE)
+        for kind in ("PARTICLE_SYSTEM", "COLLISION", "WEIGHTED_NORMAL", "NORMAL_EDIT")
+    },
+    **{build.__name__: (build, SHAPE) for build in (near, projected, transferred, storing)},
     **{kind: (add_modifier_at(2, kind), f"is a simulation, {POSE}") for kind in ("CLOTH", "SOFT_BODY")},
     **{kind: (add_modifier_at(2, kind), f"plays a cache, {POSE}") for kind in ("MESH_CACHE", "MESH_SEQUENCE_CACHE")},
     **{kind: (add_modifier_at(0, kind), f"changes with time, {POSE}") for kind in ("WAVE", "BUILD")},
@@ -82,6 +123,55 @@ def test_an_unsupported_modifier_is_named_in_the_message(name, loose_model, tmp_
     rig.mesh_object.modifiers["It"].show_viewport = False
     assert check_recordable_rig(rig).problems == ()
     bind(rig, loose_model)
+    assert_plays(rig.mesh_object, loose_model)
+
+
+def smooth_near(mesh_object: bpy.types.Object) -> None:
+    near(mesh_object)
+    mesh_object.modifiers["Mush"].vertex_group = "near"
+
+
+def displace_seen(mesh_object: bpy.types.Object) -> None:
+    """Only later nodes, which deform, read the attribute."""
+    storing(mesh_object)
+    group = stacks.build_node_chain("Displace", "GeometryNodeSetPosition")
+    attribute, vector = group.nodes.new("GeometryNodeInputNamedAttribute"), group.nodes.new("ShaderNodeCombineXYZ")
+    attribute.inputs["Name"].default_value = "seen"
+    group.links.new(attribute.outputs[0], vector.inputs["Z"])
+    group.links.new(vector.outputs[0], group.nodes["Set Position"].inputs["Offset"])
+    mesh_object.modifiers.new("Displace", "NODES").node_group = group
+
+
+ACCEPTED = {
+    "hair before the rig": add_modifier_at(0, "PARTICLE_SYSTEM"),
+    "hair after the rig": add_modifier_at(2, "PARTICLE_SYSTEM"),
+    "constant weights": add_modifier_at(1, "VERTEX_WEIGHT_EDIT", vertex_group="lower"),
+    "weights of the rig": smooth_near,
+    "attribute of the rig": displace_seen,
+    "constant attribute": lambda mesh_object: storing(mesh_object, "GeometryNodeInputIndex"),
+}
+
+
+@pytest.mark.parametrize("name", ACCEPTED)
+def test_modifiers_without_effect_of_the_shape_are_accepted(name, loose_model):
+    rig = build_rig(stacks.corrective_smooth)
+    ACCEPTED[name](rig.mesh_object)
+    assert check_recordable_rig(rig).problems == ()
+    bind(rig, loose_model)
+    assert_plays(rig.mesh_object, loose_model)
+
+
+@pytest.mark.parametrize("in_render", [False, True], ids=["viewport", "render"])
+def test_a_modifier_added_while_a_model_plays_is_named(in_render, loose_model):
+    rig = build_rig(stacks.corrective_smooth)
+    bind(rig, loose_model, use_in_render=in_render)
+    assert_plays(rig.mesh_object, loose_model)
+    add_modifier_at(1, "PARTICLE_SYSTEM", show_viewport=not in_render)(rig.mesh_object)
+    bpy.context.view_layer.update()
+    assert rig.mesh_object.fdda.mode == "RIG"
+    assert rig.mesh_object.fdda.status == f"Modifier 'It' of 'elbow' {SHAPE.replace('Mush', 'FDDA')}"
+    rig.mesh_object.modifiers.move(1, 4)
+    rig.mesh_object.fdda.mode = "FDDA"
     assert_plays(rig.mesh_object, loose_model)
 
 
