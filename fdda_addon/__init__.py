@@ -35,6 +35,20 @@ def unregister() -> None:
     registration.unregister()
 
 
+def glTF2_pre_export_callback(export_settings: dict) -> None:  # noqa: N802
+    """Show the rigs to the glTF exporter of Blender, which calls this function of all enabled add-ons."""
+    from .runtime import gltf_export
+
+    gltf_export.glTF2_pre_export_callback(export_settings)
+
+
+def glTF2_post_export_callback(export_settings: dict) -> None:  # noqa: N802
+    """Play the models again."""
+    from .runtime import gltf_export
+
+    gltf_export.glTF2_post_export_callback(export_settings)
+
+
 def _run_command(arguments: list[str]) -> int:
     from .cli.main import main
 

@@ -18,7 +18,7 @@ def register() -> None:
     if is_registered():
         return
     from . import operators, panels, properties
-    from .runtime import handlers
+    from .runtime import gltf_export, handlers
 
     for package in (properties, operators, panels):
         _register_package(package)
@@ -30,6 +30,9 @@ def register() -> None:
     if not bpy.app.binary_path:
         # Blender disables its add-ons before it quits, but the `bpy` module does not.
         atexit.register(unregister)
+        # Blender has its enabled add-ons in the preferences, where the glTF exporter looks for callbacks.
+        if gltf_export.__name__ not in bpy.context.preferences.addons:
+            bpy.context.preferences.addons.new().module = gltf_export.__name__
 
 
 def is_registered() -> bool:
@@ -44,9 +47,12 @@ def unregister() -> None:
     if not is_registered():
         return
     from . import operators, panels, properties
-    from .runtime import handlers
+    from .runtime import gltf_export, handlers
 
     atexit.unregister(unregister)
+    addons = bpy.context.preferences.addons
+    if gltf_export.__name__ in addons:
+        addons.remove(addons[gltf_export.__name__])
     # The `bpy` module of 4.5 hangs at its exit if handlers stay registered.
     for name, handler in handler_table():
         blender_handlers = getattr(bpy.app.handlers, name)

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Changes the evaluated copies of characters in the dependency graphs of windows."""
+"""Changes the evaluated copies of characters in dependency graphs."""
 
 import bpy
 import numpy as np
 
-from ..scene.arrays import MUTE_ELEMENT, write
+from ..scene.arrays import MUTE_ELEMENT, ElementProperty, write
 from .depsgraph_changes import seen_mode
+
+SHOW_VIEWPORT_ELEMENT = ElementProperty("show_viewport", np.bool_)
 
 
 def mute_shape_keys(mesh_object: bpy.types.Object) -> None:
@@ -22,3 +24,16 @@ def mute_shape_keys(mesh_object: bpy.types.Object) -> None:
     # If the first key is muted, all keys were muted since Blender copied them, or the user muted it.
     if not shape_keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
         write(shape_keys.key_blocks, MUTE_ELEMENT, np.ones(len(shape_keys.key_blocks), bool))
+
+
+def show_rig_to_exporters(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
+    """Mark the modifiers of the rig as on in the viewport, in the evaluated copy of an object of a render graph.
+
+    The USD exporter evaluates such a graph, but looks there for an Armature modifier that is on in the viewport: only
+    then it writes skeleton, weights and rest pose. For the graph itself this setting means nothing.
+    """
+    evaluated = mesh_object.evaluated_get(depsgraph)
+    if evaluated.is_evaluated:
+        visibility = {stored.uid: stored.show_viewport for stored in mesh_object.fdda.modifiers}
+        shown = [visibility.get(m.persistent_uid, m.show_viewport) for m in evaluated.modifiers]
+        write(evaluated.modifiers, SHOW_VIEWPORT_ELEMENT, np.array(shown, bool))

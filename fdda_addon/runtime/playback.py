@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import bpy
 
-from . import effects, playback_modifier, player_batch
+from . import effects, evaluated_copies, playback_modifier, player_batch
 from .depsgraph_changes import DepsgraphChanges, changed_meshes, has_copied_armature
 from .model_files import network_of
 from .modifier_switch import animated_settings, evaluated_uses_model
@@ -118,6 +118,10 @@ def _update(depsgraph: bpy.types.Depsgraph) -> None:
     scan()
     # A graph has no id, and Blender reuses the address of a graph for another one.
     depsgraph_key = depsgraph.mode, depsgraph.scene.session_uid, depsgraph.view_layer.name
+    if depsgraph.mode == "RENDER":
+        for character in [c for c in session.characters.values() if c.player is not None]:
+            if mesh_object := character.find_object():
+                evaluated_copies.show_rig_to_exporters(mesh_object, depsgraph)
     for character in [c for c in session.characters.values() if c.player is not None]:
         player = character.player
         if depsgraph_key not in player.depsgraph_keys:
