@@ -59,8 +59,9 @@ def read_signature(
 
     Returns:
         By part. Names, rest matrices, inheritance and skinning properties of all bones; their parents, and how unread
-        bones follow the others; the vertex groups, modifiers and drivers of the object (`rig.deformation`); a digest
-        of the rest positions of the mesh, and whether it has the attribute `REST_POSITION`.
+        bones follow the others; the vertex groups, modifiers and drivers of the object (`rig.deformation`) and its
+        shape readers (`rig.modifier_stack`); a digest of the rest positions of the mesh, and whether it has the
+        attribute `REST_POSITION`.
     """
     mesh_object, armature = scene_rig.mesh_object, scene_rig.armature_object.data
     modifier = armature_modifier(mesh_object)
