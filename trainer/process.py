@@ -3,6 +3,7 @@
 
 import errno
 import os
+import select
 import sys
 import threading
 import traceback
@@ -62,7 +63,7 @@ class StopRequest:
                     # The stop file is deleted here, because the process that created it may have ended.
                     with suppress(OSError):
                         os.unlink(self._stop_file)
-                if self._is_requested:
+                if self._is_requested or _is_reader_gone():
                     # The lock is not released, so that no message follows the last one.
                     OUTPUT_LOCK.acquire()
                     os._exit(_send_last_message(self._sink, INTERRUPTED, MessageType.CANCELLED))
@@ -74,6 +75,15 @@ class StopRequest:
         finally:
             is_done.set()
             watcher.join()
+
+
+def _is_reader_gone() -> bool:
+    """Return whether the process that read the messages has ended; on Windows, only the next message fails."""
+    if not hasattr(select, "poll"):
+        return False
+    poll = select.poll()
+    poll.register(1, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 def run_with_messages(run_job: Callable[[], None], sink: MessageSink) -> int:

@@ -195,6 +195,17 @@ def test_a_stopped_training_writes_nothing(recording, tmp_path, monkeypatch, sto
     assert list(folder.iterdir()) == []
 
 
+@ONLY_POSIX
+def test_a_training_whose_reader_was_killed_writes_nothing(recording, tmp_path):
+    """The export sends no more messages, so the trainer has to notice by itself."""
+    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages")
+    while "Exporting the model" not in process.stdout.readline():
+        pass
+    process.stdout.close()
+    assert process.wait(timeout=30) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_stop_request_before_the_start_cancels_the_training(recording, tmp_path, monkeypatch):
     monkeypatch.setenv(STOP_FILE_VARIABLE, str(recording))
     process = start_trainer(recording, tmp_path / "m.onnx", "--messages")
