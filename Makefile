@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # Every target runs one or two commands that a person could type. `setup/environment` makes the virtual environments:
 # .venv has all packages, on the newer Python of this machine; .venv-4.5 and .venv-5.2 have one Blender LTS line each,
-# without the trainer's packages; .venv-farm has the packages of the farm.
+# without the trainer's packages; .venv-farm has Snakemake.
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
@@ -43,13 +43,13 @@ test-slow: .venv  ## run the tests that make test leaves out: whole trainings, s
 test-examples: .venv  ## run the tests of the examples in docs/formats.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
 	.venv/bin/python -m pytest tests/examples
 
-farm: .venv-farm  ## record, train and bind the characters of a plan, on this machine or a cluster (PLAN=characters.toml, OPTIONS="--workers 2")
-	.venv-farm/bin/python -m fdda_addon farm $(or $(PLAN),$(error PLAN=characters.toml names the characters, see docs/farm.md)) $(OPTIONS)
+farm: .venv .venv-farm  ## record, train, evaluate and bind the characters of a plan, see docs/farm.md (PLAN=characters.yaml, OPTIONS="--cores 2")
+	.venv-farm/bin/snakemake --snakefile farm/Snakefile --configfile $(or $(PLAN),$(error PLAN=characters.yaml names the characters, see docs/farm.md)) $(or $(OPTIONS),--cores all)
 
 .venv-farm:
 	@setup/environment .venv-farm farm
 
-test-farm: .venv-farm  ## run the tests of the farm: on a local cluster, and its jobs for OpenJD and Flamenco
+test-farm: .venv .venv-farm  ## run the tests of the farm: on this machine, on a stand-in for a cluster, and as jobs of OpenJD and Flamenco
 	.venv-farm/bin/python -m pytest tests/farm
 
 test-gui: package  ## press the buttons of the sidebar in a Blender with a window, and update the add-on, into out/gui (BLENDER=/path/to/blender)

@@ -11,8 +11,4 @@ if __name__ == "__main__":
     from .core.terminal import restart_in_utf8_mode
 
     restart_in_utf8_mode()
-    if sys.argv[1:2] == ["farm"]:
-        from .cli.farm import replace_process_with_farm
-
-        replace_process_with_farm(sys.argv[2:])
     sys.exit(main(sys.argv[1:], "python -m fdda_addon"))

@@ -27,7 +27,7 @@ SYSTEM_LIBRARIES = ROOT / "setup" / "system-libraries.txt"
 # By name of the contents: dependency groups of pyproject.toml to install, and modules whose import checks the result.
 CONTENTS = {
     "everything": (("setup", "blender", "trainer", "test", "lint"), ("bpy", "onnxruntime", "torch")),
-    "farm": (("setup", "blender", "trainer", "test", "farm"), ("bpy", "onnxruntime", "torch", "distributed")),
+    "farm": (("setup", "test", "farm"), ("snakemake",)),
     "blender": (("setup", "blender", "test"), ("bpy", "onnxruntime")),
 }
 

@@ -21,7 +21,7 @@ PACKAGES_OF_TIERS = {
     "contract": ("numpy",),
     "trainer": ("torch", "onnx", "onnxruntime", "scipy"),
     "blender": ("bpy", "onnxruntime", "onnx"),
-    "farm": ("distributed", "openjd", "bpy", "torch", "onnxruntime"),
+    "farm": ("snakemake", "openjd"),
     "examples": ("bpy", "torch", "onnx", "onnxruntime", "matplotlib"),
 }
 """Packages that the tests of a tier import, by the name of its folder."""

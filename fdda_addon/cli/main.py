@@ -22,7 +22,6 @@ VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
     "limits": ("limits", "set the rotation limits of a rig to the motion in actions"),
     "record": ("record", "record how a rig deforms its mesh in random poses and actions"),
-    "merge-recordings": ("merge_recordings", "join the shards of a recording"),
     "check-recording": ("check_recording", "check a recording for problems before training"),
     "check-trainer": ("check_trainer", "check the Python that trains, and show its device"),
     "train": ("train", "train a model on a recording"),
@@ -30,13 +29,10 @@ VERBS = {
     "fast-rig": ("fast_rig", "save a fast rig: the character without what its model and controls do not need"),
     "evaluate": ("evaluate", "compare a model with its rig on poses that are in no recording"),
     "benchmark": ("benchmark", "measure the time per frame of rig, linear skinning and model"),
-    "farm": ("farm", "record, train and bind many characters on many machines"),
     "bake": ("bake", "write the deformed mesh of an action to a file that plays without the add-on"),
 }
-SUBPROCESS_VERBS = {"train", "farm"}
-"""Verbs that start another process, which parses their options."""
-VERBS_WITHOUT_BLENDER = {"merge-recordings"}
-"""Verbs that need no Blender."""
+TRAIN = "train"
+"""The verb that starts another process, which parses its options."""
 
 
 def main(arguments: list[str], program: str) -> int:
@@ -64,17 +60,14 @@ def _run(arguments: list[str], program: str) -> int:
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     for name, (module_name, summary) in VERBS.items():
         subparser = verbs.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
-        if name == verb and verb not in SUBPROCESS_VERBS:
+        if name == verb and verb != TRAIN:
             # The modules of other verbs are not imported, so that the verb starts fast.
             import_module(f".{module_name}", __package__).add_options(subparser)
     try:
-        if verb in SUBPROCESS_VERBS:
+        if verb == TRAIN:
             return import_module(f".{verb}", __package__).run(arguments[1:])
         options = parser.parse_args(arguments)
         module = import_module(f".{VERBS[verb][0]}", __package__)
-        if verb in VERBS_WITHOUT_BLENDER:
-            module.run(options)
-            return 0
         from .registered import registered
 
         with registered():

@@ -330,5 +330,5 @@ def test_retired_words_are_found_in_prose_only():
 def test_retired_words_are_searched_in_scripts_and_settings():
     names = {path.relative_to(ROOT).as_posix() for path in retired_words.list_files()}
     assert names >= {"Makefile", "pyproject.toml", ".ci/run", "setup/environment", "setup/windows/launcher.c"}
-    assert names >= {"examples/web/src/main.js", "farm/flamenco_job/fdda_characters.js", "README.md"}
+    assert names >= {"examples/web/src/main.js", "farm/fdda_character.js", "README.md"}
     assert not any("__pycache__" in name or "node_modules" in name for name in names)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tests of the farm: its graph on a cluster of real workers, and what render farms take."""
+"""Tests of the Snakemake workflow: real verbs, on this machine and on a stand-in for a cluster."""
