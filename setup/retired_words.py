@@ -26,7 +26,6 @@ REPLACEMENTS = {
     r"trust in (this|the) pose|trusted range": "confidence, trained range",
     r"least[ -]vertices": "min-partition-vertices",
     r"still[-_]mm": "rest-threshold-mm",
-    r"influences[-_]only": "detect-influences",
     r"look_again|make_anew|take_news|give_back_rigs": "a verb of programming: request_rescan, recreate_player, …",
     r"what is none|so many of": "the noun that is meant",
     r"colour|\bgrey|centre|neighbour|normalis|standardis|recognis|minimis|licence\b|labelled": "the US spelling",

@@ -39,9 +39,8 @@ def print_unused_shape_keys(rigs: Iterable[SceneRig], options: argparse.Namespac
 
 def print_remix_hint(scene_rig: SceneRig, options: argparse.Namespace) -> None:
     """Print a hint to remix the actions if they move bones, unless the poses are chosen already."""
-    is_chosen = options.sample or options.resume or options.shard or options.detect_influences or options.influences
     actions = [bpy.data.actions[name] for name in options.action if name in bpy.data.actions]
-    if is_chosen or not actions or requested_poses(scene_rig, options) == 0:
+    if options.sample or options.resume or not actions or requested_poses(scene_rig, options) == 0:
         return
     if measured_ranges(scene_rig.armature_object, actions):
         print(REMIX_HINT)

@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
         if not options.refine:
             _print_notes(recording, options.min_partition_vertices)
         poses_text = f"{format_count(step.total, 'pose')}{' added' if options.refine else ''}"
-        print(f"{recording}: {'influences' if options.detect_influences else poses_text} in {seconds:.1f} s")
+        print(f"{recording}: {poses_text} in {seconds:.1f} s")
 
 
 def _print_notes(recording: Path, min_partition_vertices: int) -> None:
@@ -112,9 +112,6 @@ def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) 
         min_partition_vertices=options.min_partition_vertices,
         strips=tuple(options.strip),
         mirror=options.mirror,
-        shard=options.shard,
-        detect_influences=options.detect_influences,
-        influences=options.influences,
         target=target_settings(options),
         **pose_options,
     )

@@ -8,7 +8,6 @@ from ..core.defaults import MARGIN, MIN_PARTITION_VERTICES, POSES, REFINEMENT_PO
 from ..core.errors import WrongUsageError
 from ..core.joint_option import ALL, parse_joints
 from ..core.poses import MAX_MARGIN
-from ..core.recording.shard import MAX_SHARDS
 from .files import add_rig_argument
 from .target import add_repeatability_option, add_target_options, target_settings
 
@@ -21,7 +20,6 @@ def add_record_options(parser: argparse.ArgumentParser) -> None:
     _add_model_options(parser)
     parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
-    _add_shard_options(parser)
     add_target_options(parser)
     add_repeatability_option(parser)
     parser.add_argument(
@@ -128,38 +126,6 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_shard_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--shard",
-        type=_parse_shard,
-        metavar="K/N",
-        help="record only part K of N of the poses; merge-recordings joins all parts to one recording",
-    )
-    parser.add_argument(
-        "--detect-influences",
-        action="store_true",
-        help="only detect which joints influence which partitions, once for all shards",
-    )
-    parser.add_argument(
-        "--influences",
-        metavar="FOLDER",
-        type=Path,
-        help="use the influences in this folder, which --detect-influences has written for the same rig",
-    )
-
-
-def _parse_shard(text: str) -> tuple[int, int]:
-    """Parse index and count of a shard, such as "2/8".
-
-    Raises:
-        argparse.ArgumentTypeError: the text is invalid.
-    """
-    number, _, count = text.partition("/")
-    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count) <= MAX_SHARDS):
-        raise argparse.ArgumentTypeError(f"a shard is K/N, part K of N, with K from 1 to N and not {text!r}")
-    return int(number), int(count)
-
-
 def _parse_joints(text: str) -> str:
     """Check the option `--joints`; raise argparse.ArgumentTypeError if it is invalid."""
     try:
@@ -190,19 +156,12 @@ def check_options(options: argparse.Namespace) -> None:
         options.control,
         options.fit_linear,
         options.joints != ALL,
-        options.shard,
-        options.detect_influences,
-        options.influences,
         options.target,
     )
     if options.refine and (any(new_recording_options) or options.poses == 0):
         raise WrongUsageError(
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
-            "--control, --fit-linear, --joints, --shard, --influences and --target out."
-        )
-    if options.detect_influences and (options.shard or options.influences):
-        raise WrongUsageError(
-            "--detect-influences finds influences for all shards; leave --shard and --influences out."
+            "--control, --fit-linear, --joints, and --target out."
         )
     if options.refine and (options.all or len(options.object) > 1):
         raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")

@@ -3,7 +3,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import bpy
 
@@ -57,10 +56,6 @@ class RecordingSettings:
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.FIT_KINDS`); empty for those of the rig.
         controls: inputs besides the automatic controls, in the syntax of `split_control_bones` and `parse_controls`.
         min_partition_vertices: partitions with fewer vertices are merged into others; 0 to merge no partitions.
-        shard: number of the shard to record, from 1, and count of all shards; None to record all poses.
-        detect_influences: detect the influences of all shards, and record no poses.
-        influences: folder of a recording that was made with `detect_influences` and the same settings; None to detect
-            the influences. For several meshes it has a subfolder for each mesh.
         target: settings of the target whose surface is recorded.
         joints: the joints that the model reads: "all", "auto" for the fewest from which the others follow, or their
             number.
@@ -80,9 +75,6 @@ class RecordingSettings:
     min_partition_vertices: int = MIN_PARTITION_VERTICES
     strips: tuple[str, ...] = ()
     mirror: bool = False
-    shard: tuple[int, int] | None = None
-    detect_influences: bool = False
-    influences: Path | None = None
     target: TargetSettings = NO_TARGET
     overwrite: bool = False
     joints: str = ALL

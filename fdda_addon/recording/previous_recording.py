@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads weights and influences of a previous recording, which a resumed recording or a shard reuses."""
+"""Reads weights and influences of a recording, which it reuses when it is resumed."""
 
 from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import RecordingError
 from ..core.partition import Partition, make_merged_partitions
-from ..core.recording.index import RecordingInfo, find_different_keys, read_index, read_info
+from ..core.recording.index import read_index, read_info
 from ..core.recording.reader import read_partitions, read_recorded_skin
-from ..core.rig import Fingerprint, Rig, read_joints, rig_differences
+from ..core.rig import Rig, read_joints
 from ..core.skin_fit import DEFAULT_KIND, SkinFit, weights_match
 from ..rig.reading import read_key_joints_rig
 from ..scene.scene_rig import SceneRig
@@ -75,34 +75,3 @@ def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) 
     if current_partition_joints != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
         return rig, ()
     return replace(rig, joints=joints), read_partitions(rig, index["partitions"])
-
-
-def check_influences_match(path: Path, rig: Rig, info: RecordingInfo) -> None:
-    """Check that the influences of a recording were detected for this rig and these poses.
-
-    Args:
-        path: folder of the recording with the influences.
-        rig: the rig to compare.
-        info: info of the recording that reuses the influences.
-
-    Raises:
-        RecordingError: the rig, the settings or the version of Blender differ.
-    """
-    index = read_index(path)
-    previous_info = read_info(index)
-    joints = read_joints(index["joints"])
-    differences = rig_differences(
-        joints, rig.rest_matrices, index["vertices"], Fingerprint.from_json(index["rig"]["fingerprint"]), rig
-    )
-    if previous_info.blender != info.blender:
-        differences.append(f"Blender {previous_info.blender} found them, and this is {info.blender}")
-    different_settings = find_different_keys(previous_info.sampling.to_json(), info.sampling.to_json())
-    if previous_info.shard is None or info.shard is None or previous_info.shard.total != info.shard.total:
-        different_settings.append("poses")
-    if different_settings:
-        differences.append(f"they were found with other settings ({', '.join(different_settings)})")
-    if differences:
-        raise RecordingError(
-            f"The influences in '{path}' are not those of this recording: {'; '.join(differences)}. Find them with the "
-            "same rig and options (record --detect-influences)."
-        )

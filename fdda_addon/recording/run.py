@@ -15,7 +15,6 @@ from ..core.progress import Progress
 from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
 from ..core.recording.folder_check import check_recordable
 from ..core.recording.index import INDEX_NAME, RecordingInfo
-from ..core.recording.shard import Shard, shard_poses
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearSkinning
@@ -32,7 +31,7 @@ from .influences import detect_influences
 from .mesh_group import check_common_armature, group_into_passes, split_controls
 from .plan import RecordingSettings, find_actions, make_pose_sampler, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
-from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
+from .previous_recording import read_previous_partitions, read_previous_weights
 from .recorded_mesh import RecordedMesh, TimedEvaluator
 from .reference_joints import find_references
 from .repeatability import measure_repeatability
@@ -92,7 +91,6 @@ class RecordingSession:
         clips: the clips whose frames follow the random poses.
         meshes: the meshes.
         poses: the poses, which the meshes share, and the target whose surface they have.
-        pose_indices: indices of the poses to record.
     """
 
     def __init__(self, rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings):
@@ -120,27 +118,14 @@ class RecordingSession:
         self.poses = PosePlan(list(zip(scene_rigs, channels, strict=True)), settings, self.clips, pose_setter)
         if self.poses.total < 1:
             raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
-        self.pose_indices = range(self.poses.total)
-        if settings.detect_influences:
-            self.pose_indices = range(0)
-        elif settings.shard:
-            self.pose_indices = shard_poses(*settings.shard, self.poses.total)
         self.meshes = [
             RecordedMesh(
                 *(scene_rig, rig, path, mesh_channels, self.poses.channels_of_mesh(index)),
-                *(self._previous_path(path, len(rigs) > 1), pose_setter.target, notes[index]),
+                *(path if settings.resume and (path / INDEX_NAME).exists() else None, pose_setter.target, notes[index]),
             )
             for index, ((scene_rig, path), (rig, mesh_channels)) in enumerate(zip(rigs, sampled_rigs, strict=True))
         ]
-        check_disk_space([(mesh.path, recording_bytes(mesh.rig, len(self.pose_indices))) for mesh in self.meshes])
-
-    def _previous_path(self, path: Path, is_one_of_several: bool) -> Path | None:
-        """Return the recording whose weights and influences the recording at `path` reuses; None if there is none."""
-        if self.settings.resume and (path / INDEX_NAME).exists():
-            return path
-        if self.settings.influences is None:
-            return None
-        return self.settings.influences / path.name if is_one_of_several else self.settings.influences
+        check_disk_space([(mesh.path, recording_bytes(mesh.rig, self.poses.total)) for mesh in self.meshes])
 
     def record(self) -> Iterator[Progress]:
         """Run all phases; the meshes of a pass are evaluated together (`group_into_passes`)."""
@@ -190,11 +175,6 @@ class RecordingSession:
         min_vertices = self.settings.min_partition_vertices
         if mesh.previous_path:
             mesh.rig, mesh.partitions = read_previous_partitions(mesh.previous_path, mesh.rig, min_vertices)
-            if not mesh.partitions and mesh.previous_path != mesh.path:
-                raise RecordingError(
-                    f"The influences in '{mesh.previous_path}' are of other partitions than those of '{mesh.name}'; "
-                    "find them with the same rig and options (record --detect-influences)."
-                )
         if mesh.partitions:
             return
         for note in filter(None, (mesh.note, check_seams(mesh, self.poses, player), check_saturation(mesh))):
@@ -229,7 +209,7 @@ class RecordingSession:
 
     def record_poses(self, meshes: list[RecordedMesh], player: ClipPlayer) -> Iterator[Progress]:
         """Evaluate the poses that are missing, and write them; then measure the repeatability of a target."""
-        pose_setter, pose_count = self.poses.pose_setter, len(self.pose_indices)
+        pose_setter, pose_count = self.poses.pose_setter, self.poses.total
         with ExitStack() as stack:
             appenders = []
             for mesh in meshes:
@@ -242,13 +222,13 @@ class RecordingSession:
                     yield Progress("poses", 0, pose_count, writer.note)
             done = min(appender.pose_count for appender in appenders)
             yield Progress("poses", done, pose_count, self._describe_estimate(meshes, pose_count - done))
-            remaining_poses = self.poses.show_poses(player, self.pose_indices[done:])
+            remaining_poses = self.poses.show_poses(player, range(done, pose_count))
             # Close the generators before the writers, so that an interrupted recording keeps the evaluated poses.
             with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as pose_counts:
                 for done in pose_counts:
                     yield Progress("poses", done, pose_count, detail=pose_setter.rest_description)
             repeated_count = self.settings.target.repeatability_poses
-            if self.poses.repeatable_poses and repeated_count and pose_count == self.poses.total:
+            if self.poses.repeatable_poses and repeated_count:
                 yield from measure_repeatability(meshes[0], self.poses, player, writer, repeated_count)
                 yield Progress("poses", pose_count, pose_count)
 
@@ -261,17 +241,12 @@ class RecordingSession:
         seconds = [settle_seconds or mesh.evaluator.seconds_per_pose for mesh in meshes]
         remaining_seconds = None if None in seconds else max(seconds) * remaining_count
         vertex_count = sum(mesh.rig.vertex_count for mesh in meshes)
-        total_bytes = sum(recording_bytes(mesh.rig, len(self.pose_indices)) for mesh in meshes)
+        total_bytes = sum(recording_bytes(mesh.rig, self.poses.total) for mesh in meshes)
         return Estimate(remaining_count, vertex_count, total_bytes, remaining_seconds).sentence()
 
     def _make_info(self, mesh: RecordedMesh) -> RecordingInfo:
         """Make the info of the recording of a mesh."""
-        settings, pose_count = self.settings, len(self.pose_indices)
-        sampling = make_sampling(mesh.scene_rig, settings, mesh.limits)
+        sampling = make_sampling(mesh.scene_rig, self.settings, mesh.limits)
         file_name, blender_version = Path(bpy.data.filepath).name, bpy.app.version_string
-        is_shard = settings.shard is not None or settings.detect_influences
-        shard = Shard(self.pose_indices.start, self.poses.total) if is_shard else None
-        info = RecordingInfo(pose_count, 0, file_name, mesh.name, blender_version, sampling, mesh.fit, shard)
-        if mesh.previous_path and mesh.previous_path != mesh.path:
-            check_influences_match(mesh.previous_path, mesh.rig, info)
-        return replace(info, target=self.poses.pose_setter.recorded_target)
+        origin = file_name, mesh.name, blender_version, sampling, mesh.fit
+        return RecordingInfo(self.poses.total, 0, *origin, self.poses.pose_setter.recorded_target)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recordings with key joints: choice, training, playback, fast rigs, resuming, shards, the sidebar, and errors."""
+"""Recordings with key joints: choice, training, playback, fast rigs, resuming, the sidebar, and errors."""
 
 import dataclasses
 import json
@@ -373,18 +373,6 @@ def test_the_search_shows_its_progress(tmp_path):
 def test_a_resumed_recording_keeps_its_joints(tmp_path, monkeypatch):
     others = [dataclasses.replace(SETTINGS, joints=joints) for joints in ("all", "3")]
     check_resuming(build_limb(), tmp_path, SETTINGS, others, "--joints auto", monkeypatch)
-
-
-def test_shards_have_the_joints_of_their_influences(tmp_path):
-    rig = build_limb()
-    drain(record(rig, tmp_path / "whole", SETTINGS))
-    drain(record(rig, tmp_path / "influences", dataclasses.replace(SETTINGS, detect_influences=True)))
-    for number in (1, 2):
-        shard = dataclasses.replace(SETTINGS, influences=tmp_path / "influences", shard=(number, 2))
-        drain(record(rig, tmp_path / f"shard{number}", shard))
-    assert run("merge-recordings", tmp_path / "shard1", tmp_path / "shard2", tmp_path / "merged") == 0
-    for file in (tmp_path / "whole").iterdir():
-        assert file.read_bytes() == (tmp_path / "merged" / file.name).read_bytes(), file.name
 
 
 def test_the_sidebar_records_with_key_joints(tmp_path):

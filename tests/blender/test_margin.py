@@ -12,7 +12,6 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.poses import Channel
-from fdda_addon.core.recording.merge import merge_recordings
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.skinning import skin_matrices
 from fdda_addon.poses.suspended_limits import SuspendedLimits
@@ -110,15 +109,6 @@ def test_a_resumed_recording_equals_an_uninterrupted_one_bit_for_bit(rig, tmp_pa
     steps.close()
     drain(record(opened(rig), tmp_path / "broken", replace(SETTINGS, resume=True)))
     assert file_contents(tmp_path / "broken") == file_contents(tmp_path / "whole")
-
-
-def test_merged_shards_equal_the_whole_recording(rig, tmp_path):
-    drain(record(opened(rig), tmp_path / "whole", SETTINGS))
-    shards = [tmp_path / str(number) for number in range(1, 4)]
-    for number, shard in enumerate(shards, 1):
-        drain(record(opened(rig), shard, replace(SETTINGS, shard=(number, 3))))
-    drain(merge_recordings(shards, tmp_path / "merged"))
-    assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
 
 
 def test_a_recording_cannot_be_resumed_with_another_margin(rig, tmp_path):

@@ -143,7 +143,7 @@ def test_poses_that_were_not_chosen_for_the_model_are_not_resumed(elbow_files, r
         list(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2, resume=True)))
 
 
-@pytest.mark.parametrize("option", [["--shard", "1/2"], ["--action", "elbow_wave"], ["--poses", 0]])
+@pytest.mark.parametrize("option", [["--action", "elbow_wave"], ["--poses", 0]])
 def test_contradicting_options_of_record_are_refused(elbow_files, recording, capfd, option):
     assert run("record", elbow_files.rig, recording, "--refine", elbow_files.model, *option) == 2
     assert "--refine adds random poses to a complete recording" in capfd.readouterr().err

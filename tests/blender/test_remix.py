@@ -160,7 +160,6 @@ def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
         (["--action", TURN], False),
         # Poses that are chosen already cannot change.
         (["--action", WAVE, "--resume"], False),
-        (["--action", WAVE, "--shard", "1/2"], False),
     ],
 )
 def test_recording_actions_with_random_poses_suggests_to_remix(waving, tmp_path, capsys, options, has_hint):

@@ -13,7 +13,7 @@ import pytest
 
 from blend_fixtures.characters import targets
 from blend_fixtures.elbow import ACTION, FRAMES
-from fdda_addon.core.recording.reader import open_recording, read_recording
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.rig.pose_setter import TargetSettings
@@ -140,11 +140,6 @@ def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
         "max_settle_frames": 80,
         "rest_threshold_mm": 0.1,
     }
-    # A shard has fewer poses before each pose.
-    assert run("record", rig, tmp_path / "half", "--object", "elbow", *SETTLED, "--poses", 6, "--shard", "2/2") == 0
-    half = open_recording(tmp_path / "half")
-    assert np.array_equal(half.pose_matrices, recording.pose_matrices[3:])
-    assert np.array_equal(half.residuals, recording.residuals[3:])
 
 
 @pytest.mark.slow
@@ -177,12 +172,6 @@ def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
     recording = recorded(rig, tmp_path / "recording", *hasty)
     assert recording.info.unsettled == (0, 1, 2, 3, 4)
     assert "5 of 5 poses did not come to rest in 12 frames: 0, 1, 2 and 2 more" in capfd.readouterr().out
-    shards = [tmp_path / f"shard{number}" for number in (1, 2)]
-    for number, shard in enumerate(shards, 1):
-        assert run("record", rig, shard, "--object", "elbow", *hasty, "--shard", f"{number}/2") == 0
-    assert run("merge-recordings", *shards, tmp_path / "merged") == 0
-    for name in ("pose_matrices.npy", "residuals.npy", "recording.json"):
-        assert (tmp_path / "merged" / name).read_bytes() == (tmp_path / "recording" / name).read_bytes(), name
 
 
 @pytest.mark.slow

@@ -36,7 +36,6 @@ OUTCOME_BY_TAG = {"error": "failed", "failure": "failed", "skipped": "skipped"}
 BLENDER = (
     "recording",
     "overwriting",
-    "shards",
     "baked_files",
     "encodings",
     "documents",

@@ -15,7 +15,6 @@ from ..rig import Fingerprint, read_joints, read_name
 from ..skin_fit import SkinFit
 from ..surface import MIN_CORNERS
 from ..unit import read_unit
-from .shard import Shard
 from .target import RecordedTarget, Repeatability
 
 FORMAT = "fdda-recording"
@@ -81,9 +80,8 @@ class RecordingInfo:
         poses, complete: number of all poses, and of complete poses.
         rig_file, object_name: names of the .blend file and of the mesh object.
         blender: version of Blender.
-        sampling: sampling of the poses; for a shard, the sampling of all shards together.
+        sampling: sampling of the poses.
         fit: fit of the skin weights; None where they are the rig's own.
-        shard: range of poses of a shard; None for a recording of all poses.
         target: target whose surface was recorded; None where the rig itself was recorded.
         unsettled: ascending indices of the poses in which the target did not come to rest.
         repeatability: repeatability of the target; None where it was not measured.
@@ -96,7 +94,6 @@ class RecordingInfo:
     blender: str
     sampling: Sampling
     fit: SkinFit | None = None
-    shard: Shard | None = None
     target: RecordedTarget | None = None
     unsettled: tuple[int, ...] = ()
     repeatability: Repeatability | None = None
@@ -167,8 +164,6 @@ def _check_index(index: dict) -> None:
     read_unit(index)
     if "fit" in index:
         SkinFit.from_json(index["fit"])
-    if "shard" in index:
-        Shard.from_json(index["shard"], index["poses"])
     if "target" in index:
         RecordedTarget.from_json(index["target"])
     if "repeatability" in index:
@@ -226,7 +221,6 @@ def read_info(index: dict) -> RecordingInfo:
         index["blender"],
         _read_sampling(index["sampling"]),
         SkinFit.from_json(index["fit"]) if "fit" in index else None,
-        Shard.from_json(index["shard"], index["poses"]) if "shard" in index else None,
         RecordedTarget.from_json(index["target"]) if "target" in index else None,
         tuple(index.get("unsettled", ())),
         Repeatability.from_json(index["repeatability"], index["complete"]) if "repeatability" in index else None,

@@ -55,12 +55,7 @@ def read_recording(path: Path) -> Recording:
             or its files contradict each other.
     """
     recording = open_recording(path)
-    poses, shard = recording.info.poses, recording.info.shard
-    if shard:
-        raise RecordingError(
-            f"'{path}' is a shard of a recording ({shard.format_range(poses)}); give all shards to merge-recordings, "
-            "and go on with the recording that it makes."
-        )
+    poses = recording.info.poses
     if not poses:
         raise _incomplete_error(path, 0, 0)
     for name in STREAMED_ARRAY_NAMES:
@@ -73,7 +68,7 @@ def read_recording(path: Path) -> Recording:
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a recording or shard, possibly without poses, without reading its large arrays.
+    """Open a recording, possibly without poses, without reading its large arrays.
 
     Raises:
         RecordingError: as for `read_recording`, but the values of poses are not checked.

@@ -181,7 +181,6 @@ class RecordingWriter:
             "version": VERSION,
             "poses": info.poses,
             "complete": self.complete,
-            **({"shard": info.shard.to_json()} if info.shard else {}),
             "vertices": self.rig.vertex_count,
             "influences": int(self.rig.skin_joints.shape[1]),
             **self._face_counts(),
