@@ -9,7 +9,7 @@ Playback compares the recorded deformation with the deformation of the rig. An e
 | `shape_keys`, `b_bones` | settings of each shape key or B-Bone, by its name |
 | `attributes` | digest of the values of each attribute or vertex group that settings or nodes name, by its name |
 | `unread_bones` | settings of the bones whose effect the model learned from key joints, by their names |
-| `drivers` | hash of the drivers |
+| `drivers` | hash of each driver that is not muted, by OWNER/PATH[INDEX] |
 
 A setting is a boolean, a number, a string or a list of these, and null where it is animated. An empty object means that
 the deformation is unknown.
@@ -47,10 +47,16 @@ def check_deformation(value: object) -> dict:
     """Check a deformation from a file and return it; raise TypeError, KeyError or ValueError where it is damaged."""
     if not isinstance(value, dict) or not value.keys() <= {"modifiers", "drivers", *_GROUP_LABELS}:
         raise TypeError("its deformation is invalid")
+    if not isinstance(value.get("drivers", {}), dict):
+        raise TypeError("its drivers are invalid")
     named_settings = [(modifier["name"], modifier["settings"]) for modifier in value.get("modifiers", [])]
     named_settings += [entry for group in _GROUP_LABELS for entry in value.get(group, {}).items()]
-    texts = [value.get("drivers", ""), *(modifier["type"] for modifier in value.get("modifiers", []))]
-    if len(named_settings) > MAX_ENTRIES or sum(len(settings) for _, settings in named_settings) > MAX_ENTRIES:
+    drivers = value.get("drivers", {})
+    texts = [*drivers, *drivers.values(), *(modifier["type"] for modifier in value.get("modifiers", []))]
+    if (
+        len(named_settings) + len(drivers) > MAX_ENTRIES
+        or sum(len(settings) for _, settings in named_settings) > MAX_ENTRIES
+    ):
         raise ValueError("its deformation has too many settings")
     if not all(isinstance(text, str) for text in texts) or not all(
         isinstance(name, str) and isinstance(settings, dict) for name, settings in named_settings
@@ -78,10 +84,51 @@ def deformation_differences(recorded: dict, current: dict, controls: Iterable[Co
         # Without the joints of a model, nobody knows which bones it does not read.
         if group != "unread_bones" or group in current:
             clauses += _group_differences(group, label, recorded.get(group, {}), current.get(group, {}), control_paths)
-    if recorded.get("drivers", "") != current.get("drivers", ""):
-        clauses.append("the drivers that deform the mesh differ")
+    clauses += _driver_differences(recorded.get("drivers", {}), current.get("drivers", {}), control_paths)
     return clauses[:MAX_SHOWN_DIFFERENCES] + (
         [f"{len(clauses) - MAX_SHOWN_DIFFERENCES} more"] if len(clauses) > MAX_SHOWN_DIFFERENCES else []
+    )
+
+
+def _driver_differences(recorded: dict, current: dict, control_paths: set[tuple[str, str]]) -> list[str]:
+    """List other drivers, except those of controls, which the model reads, and those that only shape keys have lost."""
+    clauses = []
+    for name in sorted({*recorded, *current}):
+        owner, _, path = name.rpartition("[")[0].partition("/")
+        is_control = any(
+            owner == control_owner and path == _ARRAY_INDEX.sub("", versionless_path(control_path))
+            for control_owner, control_path in control_paths
+        )
+        if is_control or recorded.get(name) == current.get(name):
+            continue
+        if name not in recorded:
+            clauses.append(f"it was recorded without the driver of '{path}'")
+        elif name in current:
+            clauses.append(f"the driver of '{path}' differs")
+        elif owner != SHAPE_KEYS:
+            clauses.append(f"the driver of '{path}' is muted or gone")
+    return clauses
+
+
+def lost_driver_note(recorded: dict, current: dict, controls: Iterable[Control], object_name: str) -> str:
+    """Say that drivers of shape keys are muted or gone; empty if none is.
+
+    A model reads what these drivers read, so it does what they did.
+
+    Args:
+        recorded, current, controls: as for `deformation_differences`.
+        object_name: name of the mesh object.
+    """
+    control_paths = {control.path for control in controls if control.owner == SHAPE_KEYS}
+    names = sorted(recorded.get("drivers", {}).keys() - current.get("drivers", {}).keys())
+    paths = [name.rpartition("[")[0].removeprefix(f"{SHAPE_KEYS}/") for name in names if name.startswith(SHAPE_KEYS)]
+    paths = [path for path in paths if path not in control_paths]
+    if not paths:
+        return ""
+    others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+    return (
+        f"The driver of '{paths[0]}' of '{object_name}'{others} is muted or gone, but the model does what it did; "
+        "restore it, or record and train this rig."
     )
 
 

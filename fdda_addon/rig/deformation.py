@@ -56,13 +56,13 @@ def read_deformation(scene_rig: SceneRig) -> dict:
 
 
 def read_modifiers_and_drivers(scene_rig: SceneRig) -> dict:
-    """Read the modifiers that deform the mesh of a rig, and a digest of the drivers, as JSON values.
+    """Read the modifiers that deform the mesh of a rig, and digests of the drivers, as JSON values.
 
     Raises:
         RigError: as `recorded_modifiers`.
     """
     modifiers = [_read_modifier(scene_rig, modifier) for modifier in recorded_modifiers(scene_rig.mesh_object)]
-    return {"modifiers": modifiers, "drivers": _drivers_digest(scene_rig)}
+    return {"modifiers": modifiers, "drivers": read_drivers(scene_rig)}
 
 
 def read_b_bones(armature: bpy.types.Armature) -> dict:
@@ -160,15 +160,18 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
     return shape_keys
 
 
-def _drivers_digest(scene_rig: SceneRig) -> str:
-    """Compute a digest of the drivers of the mesh, its shape keys and its modifiers; empty if there are none."""
-    mesh_object = scene_rig.mesh_object
-    drivers = []
+def read_drivers(scene_rig: SceneRig) -> dict[str, str]:
+    """Read digests of the drivers of the mesh, its shape keys and its modifiers that are not muted, by OWNER/PATH."""
+    mesh_object, drivers = scene_rig.mesh_object, {}
     for owner in (mesh_object, mesh_object.data, mesh_object.data.shape_keys):
         for curve in owner.animation_data.drivers if owner is not None and owner.animation_data else ():
-            if owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path):
-                drivers.append(read_driver(scene_rig, curve))
-    return Fingerprint.digest_text(json.dumps(sorted(drivers))) if drivers else ""
+            is_rig = owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path)
+            if is_rig and not curve.mute:
+                name = (
+                    f"{owner_name(scene_rig, owner) or 'mesh'}/{versionless_path(curve.data_path)}[{curve.array_index}]"
+                )
+                drivers[name] = Fingerprint.digest_text(json.dumps(read_driver(scene_rig, curve)))
+    return drivers
 
 
 def _is_rig_modifier_path(mesh_object: bpy.types.Object, path: str) -> bool:
