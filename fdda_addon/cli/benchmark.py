@@ -68,13 +68,20 @@ def run(options: argparse.Namespace) -> None:
         write_json(options.json, saving.to_json() | {"unit": "ms"})
         print(saving.sentence)
         return
-    benchmarks = {}
+    benchmarks, errors = {}, []
     for name, (scene_rig, model) in open_rigs(options).items():
-        with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
-            benchmarks[name] = _last_step(benchmark(scene_rig, model, options.frames), progress)
-    write_json(options.json, to_json_by_object({name: result.to_json() for name, result in benchmarks.items()}))
+        try:
+            with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
+                benchmarks[name] = _last_step(benchmark(scene_rig, model, options.frames), progress)
+        except FDDAError as error:
+            # The times of the other meshes took minutes.
+            errors.append(error)
+    if benchmarks:
+        write_json(options.json, to_json_by_object({name: result.to_json() for name, result in benchmarks.items()}))
     for name, result in benchmarks.items():
         print(with_heading(name, result.table()))
+    if errors:
+        raise errors[0]
 
 
 def _profile(options: argparse.Namespace) -> None:

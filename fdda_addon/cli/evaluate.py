@@ -143,7 +143,7 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
                 times = step.frame_times("")
         settings = FilmSettings(
             fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base * time_ratio(),
-            times_ms={RIG: times.rig, LINEAR: times.linear, FDDA: times.fdda},
+            times_ms={RIG: times.rig, FDDA: times.fdda} | ({LINEAR: times.linear} if times.linear else {}),
             reference_label=f"Target {options.target}" if options.target else LABELS[RIG],
         )
         with model_disabled(scene_rig.mesh_object):

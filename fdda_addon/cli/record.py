@@ -76,12 +76,15 @@ def _print_notes(recording: Path, min_partition_vertices: int) -> None:
 
 def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
     """Return the rigs to record, each with the folder of its recording."""
-    from ..scene.scene_rig import find_rig, find_rigs
+    from ..scene.scene_rig import describe_left_out_meshes, find_rig, find_rigs
     from .folders import mesh_folders
 
     names = list(dict.fromkeys(options.object))
     if options.all:
-        return mesh_folders(find_rigs(), options.recording)
+        rigs = find_rigs()
+        if note := describe_left_out_meshes(rigs):
+            print(note)
+        return mesh_folders(rigs, options.recording)
     if len(names) > 1:
         return mesh_folders([find_rig(name) for name in names], options.recording)
     return [(find_rig(*names), options.recording)]

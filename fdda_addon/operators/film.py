@@ -84,7 +84,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
             settings = FilmSettings(
                 view=View.from_direction(self.direction) if any(self.direction) else View(),
                 fps=scene.render.fps / scene.render.fps_base * time_ratio(),
-                times_ms={RIG: times.rig, LINEAR: times.linear, FDDA: times.fdda},
+                times_ms={RIG: times.rig, FDDA: times.fdda} | ({LINEAR: times.linear} if times.linear else {}),
             )
             evaluation = yield from _result(evaluate_action(scene_rig, network, name))
             first_frame = action_frames(find_action(name)).start

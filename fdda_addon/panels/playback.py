@@ -145,7 +145,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
         for label, value in (
             ("Rig", f"{times.rig:.2f} ms"),
-            ("Armature Only", f"{times.linear:.2f} ms"),
+            *((("Armature Only", f"{times.linear:.2f} ms"),) if times.linear else ()),
             ("Model", f"{times.fdda:.2f} ms"),
             ("   Blender", f"{times.floor:.2f} ms"),
             ("   Network", f"{times.inference:.2f} ms"),

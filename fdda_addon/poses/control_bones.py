@@ -121,17 +121,15 @@ def _is_driven(armature_object: bpy.types.Object, channel: Channel) -> bool:
 def bones_without_location_range(
     armature_object: bpy.types.Object, names: Iterable[str], controls: Iterable[Control]
 ) -> list[str]:
-    """Return the control bones whose location may be moved but is no control, because it has no range, sorted."""
+    """Return the control bones whose location may be moved, but is no control on any axis, sorted."""
     paths = {control.path for control in controls}
     return [
         name
         for name in sorted(names)
         for bone in [armature_object.pose.bones[name]]
         if not bone.bone.use_connect
-        and any(
-            not is_locked and f"{bone.path_from_id()}.location[{axis}]" not in paths
-            for axis, is_locked in enumerate(bone.lock_location)
-        )
+        and not all(bone.lock_location)
+        and paths.isdisjoint(f"{bone.path_from_id()}.location[{axis}]" for axis in range(3))
     ]
 
 
@@ -171,8 +169,8 @@ def describe_control_bones(
     if unlimited := bones_without_location_range(armature_object, names, controls):
         others = f" and of {len(unlimited) - 1} more" if len(unlimited) > 1 else ""
         sentence += (
-            f" The location of '{unlimited[0]}'{others} has no range and is no input; lock it, give it a Limit "
-            "Location, or record an action that moves it."
+            f" The location of '{unlimited[0]}'{others} has no range, so random poses do not move it; lock it, give it "
+            "a Limit Location, or record an action that moves it."
         )
     if properties := properties_without_range(armature_object, names, controls):
         bone_name, property_name = properties[0]

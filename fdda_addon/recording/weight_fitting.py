@@ -20,7 +20,7 @@ from ..core.skin_fit import DEFAULT_KIND, SkinFit
 from ..core.temporary import temporary_folder
 from ..rig.dependencies import read_dependencies
 from ..rig.reading import PoseEvaluator, read_key_joints_rig
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, armature_modifier
 from ..training.process import TrainerProcess
 from .plan import RecordingSettings
 
@@ -228,12 +228,18 @@ def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:
     """Check that vertices of the rig have weights on deforming bones.
 
     Raises:
-        RigError: no vertex follows a bone.
+        RigError: there is no Armature modifier, or no vertex follows a bone.
     """
+    mesh_object = scene_rig.mesh_object
+    remedy = "have one fitted (--fit-linear smooth, or Base Skinning in the sidebar)"
+    if armature_modifier(mesh_object) is None:
+        raise RigError(
+            f"'{mesh_object.name}' has no Armature modifier, so there is no linear skinning to learn from; {remedy}."
+        )
     weighted_joints = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
     if weighted_joints <= {STATIC_JOINT}:
         raise RigError(
-            f"The vertices of '{scene_rig.mesh_object.name}' have no weights on deforming bones of "
-            f"'{scene_rig.armature_object.name}', so there is no linear skinning to learn from; have one fitted "
-            "(--fit-linear smooth, or Base Skinning in the sidebar), or paint weights."
+            f"The vertices of '{mesh_object.name}' have no weights on deforming bones of "
+            f"'{scene_rig.armature_object.name}', so there is no linear skinning to learn from; {remedy}, or paint "
+            "weights."
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import bpy
 
+from ..core.checks.warning import format_with_noun
 from ..core.errors import RigError
 from .comparison import is_comparison
 from .temporary_state import animated_paths
@@ -66,6 +67,21 @@ def find_rigs() -> list[SceneRig]:
     meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
     rigged_objects = [o for o in meshes if armature_modifier(o) is not None]
     return [SceneRig(o, armature_of(o)) for o in rigged_objects] or [find_rig()]
+
+
+def describe_left_out_meshes(rigs: list[SceneRig]) -> str:
+    """Describe the other meshes that follow the armatures of rigs from `find_rigs`; empty if there are none."""
+    armature_objects = {rig.armature_object for rig in rigs}
+    mesh_objects = {rig.mesh_object for rig in rigs}
+    candidates = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
+    names = [o.name for o in candidates if o not in mesh_objects and armature_of(o) in armature_objects]
+    if not names:
+        return ""
+    return (
+        f"Left out: {format_with_noun(names, 'mesh', 'meshes')}, because no Armature modifier deforms "
+        f"{'it' if len(names) == 1 else 'them'}. Other modifiers follow the armature; record such a mesh by itself "
+        f"(--object '{names[0]}' --fit-linear smooth)."
+    )
 
 
 def check_full_rig(mesh_object: bpy.types.Object) -> None:

@@ -44,7 +44,7 @@ class Benchmark:
         vertices: number of vertices of the mesh.
         frames: number of timed frames of each variant.
         rig: times with all modifiers of the rig.
-        linear: times with the Armature modifier alone.
+        linear: times with the Armature modifier alone; empty for a mesh without one.
         fdda: times with the model.
         floor: times as for `fdda`, without running the model.
         inference: times of one run of the model for one pose, outside of Blender's evaluation.
@@ -69,7 +69,8 @@ class Benchmark:
             model: path of the model, as its binding stores it.
         """
         return FrameTimes(
-            **{variant: float(np.median(times)) for variant, times in self._times_by_variant().items()},
+            **{"linear": 0.0}
+            | {variant: float(np.median(times)) for variant, times in self._times_by_variant().items()},
             constant_bytes=self.constant_bytes,
             model=model,
             ratio_low=self.ratio_range[0],
@@ -105,7 +106,8 @@ class Benchmark:
         }
 
     def _times_by_variant(self) -> dict[str, list[float]]:
-        return {variant: getattr(self, variant) for variant in ("rig", "linear", "fdda", "floor", "inference")}
+        variants = ("rig", "linear", "fdda", "floor", "inference")
+        return {variant: times for variant in variants if (times := getattr(self, variant))}
 
     def table(self) -> str:
         """Format the times as a table, followed by a sentence that compares rig and model."""
@@ -159,6 +161,8 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
             "fdda": partial(temporary_mode, mode="FDDA"),
             "floor": _playback_without_model_runs,
         }
+        if armature_modifier(mesh_object) is None:
+            del show_variant["linear"]
         times: dict[str, list[float]] = {variant: [] for variant in show_variant}
         frames_per_round = max(1, -(-frames // ROUNDS))
         ratios: list[float] = []
@@ -181,7 +185,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     yield Benchmark(
         len(mesh_object.data.vertices),
         frames_per_round * len(ratios),
-        **times,
+        **{"linear": [], **times},
         inference=inference,
         constant_bytes=network.info.constant_bytes,
         ratios=ratios,

@@ -20,7 +20,7 @@ class FrameTimes:
 
     Attributes:
         rig: time with all modifiers of the rig.
-        linear: time with the Armature modifier alone.
+        linear: time with the Armature modifier alone; 0 for a mesh without one.
         fdda: time with the model.
         floor: time as for `fdda`, without running the model.
         inference: time of one run of the model for one pose, outside of Blender's evaluation.

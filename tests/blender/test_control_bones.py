@@ -11,6 +11,7 @@ import pytest
 from blend_fixtures.characters import control_face
 from blend_fixtures.characters.bones import limit
 from blend_fixtures.characters.targets import TARGET
+from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from fdda_addon.core.recording.reader import read_recording
@@ -296,6 +297,19 @@ def test_custom_properties_without_a_range_are_named(face, capfd):
     listed = ("bone:mouth", """armature_object/pose.bones["mouth"]["pu\\"ff"]=0:1""")
     controls = listed_controls(face, RecordingSettings(controls=listed))
     assert describe_control_bones(armature_object, ["mouth"], controls) == "1 control bone with 4 inputs."
+
+
+def test_locations_without_a_range_are_named_unless_an_axis_has_one(face):
+    """The axes that no limit and no action moves are seldom those that deform the mesh."""
+    armature_object = face.armature_object
+    mouth = armature_object.pose.bones["mouth"]
+    mouth.lock_location = (False, False, True)
+    controls = (Control("armature_object", 'pose.bones["mouth"].location[0]', 0.0, 1.0),)
+    assert "location" not in describe_control_bones(armature_object, ["mouth"], controls)
+    assert (
+        "The location of 'mouth' has no range, so random poses do not move it; lock it, give it a Limit Location, or "
+        "record an action that moves it."
+    ) in describe_control_bones(armature_object, ["mouth"], ())
 
 
 def test_control_bones_with_brackets_in_their_names_are_counted_one_by_one(face):

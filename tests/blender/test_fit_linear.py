@@ -156,9 +156,37 @@ def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_p
     build_cloth()
     save_copy(tmp_path / "cloth.blend")
     assert refusal("record", tmp_path / "cloth.blend", tmp_path / "recording", "--object", ELBOW) == (
+        "'elbow' has no Armature modifier, so there is no linear skinning to learn from; have one fitted (--fit-linear "
+        "smooth, or Base Skinning in the sidebar)."
+    )
+    mesh_object, armature_object = bpy.data.objects[ELBOW], bpy.data.objects["elbow_rig"]
+    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    save_copy(tmp_path / "without_weights.blend")
+    assert refusal("record", tmp_path / "without_weights.blend", tmp_path / "recording", "--object", ELBOW) == (
         "The vertices of 'elbow' have no weights on deforming bones of 'elbow_rig', so there is no linear skinning to "
         "learn from; have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint weights."
     )
+
+
+def test_all_meshes_are_those_with_an_armature_modifier_and_others_are_named(tmp_path, capfd):
+    build_cloth()
+    bpy.ops.mesh.primitive_cube_add()
+    save_copy(tmp_path / "cloth.blend")
+    assert run("record", tmp_path / "cloth.blend", tmp_path / "recordings", "--all", "--poses", 4) == 0
+    assert [path.name for path in (tmp_path / "recordings").iterdir()] == ["body"]
+    assert (
+        "Left out: the mesh 'elbow', because no Armature modifier deforms it. Other modifiers follow the armature; "
+        "record such a mesh by itself (--object 'elbow' --fit-linear smooth)."
+    ) in capfd.readouterr().out
+
+
+def test_the_times_of_a_mesh_without_armature_modifier_lack_linear_skinning(make_fitted_character, capfd, tmp_path):
+    files = make_fitted_character(*KINDS_AND_BUILDERS[0], capfd)
+    times = tmp_path / "times.json"
+    assert run("benchmark", files.rig, files.model, "--object", ELBOW, "--json", times, "--frames", 2) == 0
+    assert "linear" not in json.loads(times.read_text())
+    printed = capfd.readouterr().out
+    assert "Armature modifier alone" not in printed and "FDDA" in printed
 
 
 def test_fitting_to_too_few_poses_is_refused(refusal, tmp_path):

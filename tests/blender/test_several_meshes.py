@@ -219,6 +219,18 @@ def changed(two: Files, path: Path, change) -> Path:
     return path
 
 
+def test_a_mesh_that_fails_loses_no_times_of_others(two, tmp_path, capfd):
+    def move_vertex() -> None:
+        bpy.data.objects[SLEEVE].data.vertices[0].co.x += 0.1
+
+    times = tmp_path / "times.json"
+    moved = changed(two, tmp_path / "moved.blend", move_vertex)
+    assert run("benchmark", moved, two.models, "--json", times, "--frames", 2) == 1
+    output = capfd.readouterr()
+    assert "was trained for another rig" in output.err and "'elbow':" in output.out
+    assert list(json.loads(times.read_text())["objects"]) == [BODY]
+
+
 def test_two_names_with_the_same_folder_are_refused(two, tmp_path, capfd):
     def rename() -> None:
         bpy.data.objects[BODY].name, bpy.data.objects[SLEEVE].name = "left arm", "Left_arm"

@@ -113,7 +113,7 @@ def test_joints_that_move_no_vertex_are_reported(clean_recording):
     local_transforms = axis_rotations(np.random.default_rng(9).uniform(-1, 1, 200))
     with_helper = with_additional_joint(clean_recording, Joint("helper", 2), local_transforms)
     assert single_warning_text(with_helper, "dead-joints").startswith(
-        "The joint 'helper' is sampled but moves no vertex: lock all axes"
+        "The joint 'helper' is sampled but moves no vertex: lock the axes that have a range, or leave"
     )
     # No warning: a joint that is not sampled, one that influences a partition, and one whose child has weights.
     assert (
@@ -121,6 +121,12 @@ def test_joints_that_move_no_vertex_are_reported(clean_recording):
         == {}
     )
     assert warning_texts(with_partitions(with_helper, influencing=(1, 2, 3, 4))) == {}
+    # The channels of a control bone are inputs in place of the joint.
+    controls = (Control("armature_object", 'pose.bones["helper"].location[1]', 0, 1),)
+    with_control = with_rig(with_helper, controls=controls)
+    partitions = tuple(replace(partition, controls=(0,)) for partition in with_control.partitions)
+    values = np.random.default_rng(1).uniform(0, 1, (200, 1)).astype(np.float32)
+    assert "dead-joints" not in warning_texts(replace(with_control, partitions=partitions, controls=values))
     without_root_weights = with_rig(clean_recording, skin_joints=np.maximum(clean_recording.rig.skin_joints, 1))
     partitions = tuple(p for p in clean_recording.partitions if p.joint)
     assert "dead-joints" not in warning_texts(replace(without_root_weights, partitions=partitions))

@@ -166,8 +166,13 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
 
 
 def _check_joints(recording: Recording) -> list[RecordingWarning]:
-    """Warn about sampled joints that change no residual, and neither skin a vertex nor have a descendant that does."""
+    """Warn about sampled joints that change no residual, and neither skin a vertex nor have a descendant that does.
+
+    The channels of a joint may be controls, whose effect is then that of the controls.
+    """
     rig = recording.rig
+    used_controls = {control for partition in recording.partitions for control in partition.controls}
+    used_paths = [rig.controls[control].path for control in used_controls]
     sampled_names = {channel.name for channel in recording.info.sampling.channels}
     is_skinning = np.zeros(len(rig.joints), bool)
     is_skinning[rig.skin_joints[rig.skin_weights > 0]] = True
@@ -178,17 +183,25 @@ def _check_joints(recording: Recording) -> list[RecordingWarning]:
     idle_joints = [
         index
         for index, joint in enumerate(rig.joints)
-        if joint.name in sampled_names and not is_skinning[index] and index not in influencing
+        if joint.name in sampled_names
+        and not is_skinning[index]
+        and index not in influencing
+        and not any(path.startswith(_bone_path(joint.name)) for path in used_paths)
     ]
     dead_names = [rig.joints[index].name for index in idle_joints if not _moves_others(recording, index, sampled_names)]
     if not dead_names:
         return []
     text = (
         f"{format_with_noun(dead_names, 'joint')} "
-        f"{'is sampled but moves' if len(dead_names) == 1 else 'are sampled but move'} no vertex: lock all "
-        "axes, or switch Deform off, so that poses are spent on what deforms the mesh."
+        f"{'is sampled but moves' if len(dead_names) == 1 else 'are sampled but move'} no vertex: lock the axes that "
+        "have a range, or leave the bones out, so that poses are spent on what deforms the mesh."
     )
     return [RecordingWarning("dead-joints", text[0].upper() + text[1:])]
+
+
+def _bone_path(name: str) -> str:
+    """Return the start of the paths of the controls of a bone."""
+    return 'pose.bones["{}"]'.format(name.replace("\\", "\\\\").replace('"', '\\"'))
 
 
 def _moves_others(recording: Recording, joint: int, sampled_names: set[str]) -> bool:
