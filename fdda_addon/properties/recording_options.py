@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Converts the properties of a character to the settings of a recording."""
 
-from contextlib import suppress
-
 import bpy
 
 from ..core.errors import RigError
 from ..poses.action_range import action_frames
 from ..recording.plan import RecordingSettings
 from ..rig.pose_setter import TargetSettings
-from ..scene.action_slots import dependencies, slots_of_action
+from ..scene.action_slots import dependencies, may_animate
 from ..scene.active_rig import cached_active_rig
 from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
@@ -146,13 +144,6 @@ def actions_of_active_rig(context: bpy.types.Context) -> list[str]:
 
 @draw_cached
 def actions_of_rig(scene_rig: SceneRig) -> tuple[bpy.types.Action, ...]:
-    """Return the actions that animate a rig or something on which it depends."""
+    """Return the actions that may animate a rig or something on which it depends."""
     datablocks = dependencies(scene_rig.armature_object, scene_rig.mesh_object)
-    actions = []
-    for action in bpy.data.actions:
-        # If several datablocks fit, the recording asks for one.
-        with suppress(RigError):
-            if not slots_of_action(action, datablocks):
-                continue
-        actions.append(action)
-    return tuple(actions)
+    return tuple(action for action in bpy.data.actions if may_animate(action, datablocks))

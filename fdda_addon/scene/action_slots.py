@@ -17,6 +17,8 @@ _COPY_CONSTRAINTS = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY
 _IGNORED_PREFIXES = ("fdda.", "hide_")
 """Starts of paths that change what is shown, not its shape."""
 
+_BONE_PREFIX = 'pose.bones["'
+
 ActionSlots = dict[bpy.types.ID, "bpy.types.ActionSlot"]
 """Slots of an action, by the datablock that each animates."""
 CurvesByDatablock = dict[bpy.types.ID, list[bpy.types.FCurve]]
@@ -86,6 +88,27 @@ def slots_of_action(action: bpy.types.Action, datablocks: Sequence[bpy.types.ID]
     of_others = [slot for slot in remaining_slots if users[slot] or _named_object(slot) not in {None, *datablocks}]
     slots |= _fitting_slots(action, [s for s in remaining_slots if s not in of_others], curves, datablocks, slots)
     return slots or _fitting_slots(action, of_others, curves, datablocks, slots)
+
+
+def may_animate(action: bpy.types.Action, datablocks: Sequence[bpy.types.ID]) -> bool:
+    """Return whether an action may animate the datablocks of a rig, which takes less time than `slots_of_action`.
+
+    It also returns True if drivers or constraints override all of its F-curves.
+    """
+    for slot in action.slots:
+        users, accepted = set(slot.users()), [d for d in datablocks if accepts_slot(d, slot)]
+        claimed = [d for d in accepted if d in users or d.name == slot.name_display]
+        armature_objects = [d for d in accepted if not _is_not_armature(d)]
+        others = [d for d in accepted if not isinstance(d, bpy.types.Object)]
+        for curve in curves_of_slot(action, slot):
+            path = curve.data_path
+            if path.startswith(_BONE_PREFIX):
+                candidates = armature_objects
+            else:
+                candidates = [*claimed, *armature_objects, *others] if "[" in path else claimed
+            if any(_property_owner(d, path) is not None for d in candidates) and not path.startswith(_IGNORED_PREFIXES):
+                return True
+    return False
 
 
 def unmuted_curves(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> list[bpy.types.FCurve]:
@@ -164,11 +187,10 @@ def _fitting_slots(
     """Choose for each slot the datablock, besides those in `chosen`, where most of its F-curves have an effect."""
     slots: ActionSlots = {}
     for slot in candidates:
-        named_curves = [curve for curve in curves[slot] if "[" in curve.data_path]
         counts = {
             datablock: len(list(_curves_with_effect(datablock, named_curves)))
-            for datablock in datablocks
-            if named_curves and datablock not in chosen and accepts_slot(datablock, slot)
+            for datablock, named_curves in _named_curves(curves[slot], datablocks)
+            if datablock not in chosen and accepts_slot(datablock, slot)
         }
         largest_count = max(counts.values(), default=0)
         fitting = sorted((d for d, count in counts.items() if count == largest_count > 0), key=lambda d: d.name)
@@ -188,6 +210,16 @@ def _fitting_slots(
     return slots
 
 
+def _named_curves(
+    curves: Iterable[bpy.types.FCurve], datablocks: Iterable[bpy.types.ID]
+) -> list[tuple[bpy.types.ID, list[bpy.types.FCurve]]]:
+    """Return the F-curves for bones, shape keys and other named items, with each datablock that may have such items."""
+    named_curves = [curve for curve in curves if "[" in curve.data_path]
+    other_curves = [curve for curve in named_curves if not curve.data_path.startswith("pose.")]
+    pairs = [(d, other_curves if _is_not_armature(d) else named_curves) for d in datablocks]
+    return [(datablock, datablock_curves) for datablock, datablock_curves in pairs if datablock_curves]
+
+
 def _curves_with_effect(datablock: bpy.types.ID, curves: Iterable[bpy.types.FCurve]) -> Iterator[bpy.types.FCurve]:
     """Yield the F-curves whose property a datablock has, unless a driver or a constraint overrides it."""
     animation = datablock.animation_data
@@ -197,14 +229,23 @@ def _curves_with_effect(datablock: bpy.types.ID, curves: Iterable[bpy.types.FCur
         path = curve.data_path
         if path.startswith(_IGNORED_PREFIXES) or (path, curve.array_index) in driven:
             continue
-        try:
-            owner = datablock.path_resolve(path, False).data
-        except (ValueError, AttributeError):
-            continue
-        kind = path.rpartition(".")[2].partition("_")[0]
+        owner, kind = _property_owner(datablock, path), path.rpartition(".")[2].partition("_")[0]
         is_transform = kind in {LOCATION, ROTATION, SCALE} and isinstance(owner, bpy.types.PoseBone | bpy.types.Object)
-        if not (is_transform and is_overridden(owner, kind)):
+        if owner is not None and not (is_transform and is_overridden(owner, kind)):
             yield curve
+
+
+def _property_owner(datablock: bpy.types.ID, path: str) -> bpy.types.bpy_struct | None:
+    """Return the struct that has the property at a path of a datablock; None if there is no such property."""
+    # Looking a name up takes a fraction of the time of a path that cannot be resolved.
+    if path.startswith(_BONE_PREFIX) and "\\" not in path:
+        bones = () if _is_not_armature(datablock) else datablock.pose.bones
+        if path[len(_BONE_PREFIX) : path.find('"]')] not in bones:
+            return None
+    try:
+        return datablock.path_resolve(path, False).data
+    except (ValueError, AttributeError):
+        return None
 
 
 def _is_not_armature(datablock: bpy.types.ID) -> bool:
