@@ -102,8 +102,7 @@ films: demo  ## render the films of the demo: rig beside model, and their errors
 	.venv/bin/python docs/pictures/make_films.py out/demo out/films
 
 map: .venv  ## draw the diagrams of the code's layers and of a character's states for docs/development.md again
-	.venv/bin/python docs/pictures/make_map.py docs/pictures/map.svg
-	.venv/bin/python docs/pictures/make_states.py docs/development.md
+	.venv/bin/python docs/pictures/make_diagrams.py docs/development.md
 
 third-party: .venv  ## take characters that others made through the whole path, into out/third_party (FOLDER=/path/to/characters; half an hour)
 	.venv/bin/python benchmarks/third_party.py out/third_party $(FOLDER)

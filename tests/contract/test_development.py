@@ -14,7 +14,6 @@ from .layers import LAYERS, ROOT
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 DEVELOPMENT = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
-MAP = (ROOT / "docs" / "pictures" / "map.svg").read_text(encoding="utf-8")
 PATH_PATTERN = r"(?:fdda_addon|trainer|tests|benchmarks|blend_fixtures|examples|setup|docs)/[\w./-]*"
 TIMER_PATTERN = r"timers\.register\(|event_timer_add\("
 HANDLER_PATTERN = r"draw_handler_add\(|draw_handler_add$|bpy\.app\.handlers\b|atexit\.register\(|signal\.signal\("
@@ -64,16 +63,12 @@ def test_names_in_the_documentation_are_defined_in_their_files(page: Path):
     assert undefined_names == []
 
 
-def test_every_package_is_in_the_text_and_in_the_map():
+def test_every_package_is_in_the_text():
     packages = [package for layer in LAYERS for package in layer]
     assert [package for package in packages if f"`{package}`" not in chapter_text("Layers")] == []
-    drawn_packages = re.findall(r"<!-- (.+?) -->", MAP)
-    assert [package for package in packages if package not in drawn_packages] == [], (
-        "The map is outdated; draw it with `make map`."
-    )
 
 
-def test_the_state_diagram_is_drawn_from_the_table():
-    command = [sys.executable, str(ROOT / "docs" / "pictures" / "make_states.py")]
+def test_the_diagrams_are_drawn_from_the_layers_and_the_table_of_transitions():
+    command = [sys.executable, str(ROOT / "docs" / "pictures" / "make_diagrams.py")]
     drawn = subprocess.run([*command, "-"], input=DEVELOPMENT, capture_output=True, text=True, check=True).stdout
-    assert drawn == DEVELOPMENT, "The state diagram is outdated; draw it with `make map`."
+    assert drawn == DEVELOPMENT, "The diagrams are outdated; draw them with `make map`."

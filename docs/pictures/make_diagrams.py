@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draw the states of a character for docs/development.md again, from the table of transitions: `make map`.
+"""Draw the layers of the code and the states of a character for docs/development.md again: `make map`.
 
-    python docs/pictures/make_states.py docs/development.md
+    python docs/pictures/make_diagrams.py docs/development.md
 
-With - as the page, it reads the standard input and writes to the standard output. The diagram is text that GitHub and
+With - as the page, it reads the standard input and writes to the standard output. The diagrams are text that GitHub and
 GitLab draw (Mermaid).
 """
 
@@ -14,8 +14,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from fdda_addon.runtime.transitions import SHOWS_MODEL, TABLE, Event, State
+from tests.contract.layers import LAYERS
 
-DIAGRAM = re.compile(r"```mermaid\nstateDiagram-v2\n.*?```\n", re.DOTALL)
 GROUP = "MODEL_SHOWN"
 """Name of the box around the states that show the model."""
 
@@ -46,20 +46,33 @@ def state_diagram() -> str:
     return "\n".join([*lines, "```"]) + "\n"
 
 
-def with_diagram(page: str) -> str:
-    """Return a page with the current diagram.
+def layer_diagram() -> str:
+    """Return the diagram: a box for each layer, and the trainer beside them."""
+    lines = ["```mermaid", "flowchart TD"]
+    lines += [f'    layer{index}["{"<br>".join(layer)}"]' for index, layer in enumerate(LAYERS)]
+    lines.append(f"    {' --> '.join(f'layer{index}' for index in range(len(LAYERS)))}")
+    (training,) = (index for index, layer in enumerate(LAYERS) if "training" in layer)
+    lines += [f"    layer{training} -. starts .-> trainer --> layer{LAYERS.index(('core',))}", "```"]
+    return "\n".join(lines) + "\n"
+
+
+def with_diagrams(page: str) -> str:
+    """Return a page with the current diagrams.
 
     Raises:
-        ValueError: the page has no diagram.
+        ValueError: the page lacks a diagram.
     """
-    if not DIAGRAM.search(page):
-        raise ValueError("the page has no state diagram")
-    return DIAGRAM.sub(lambda _: state_diagram(), page, count=1)
+    for diagram in (layer_diagram(), state_diagram()):
+        start = "\n".join(diagram.splitlines()[:2])
+        page, count = re.subn(rf"{start}\n.*?```\n", lambda _, text=diagram: text, page, count=1, flags=re.DOTALL)
+        if not count:
+            raise ValueError(f"the page lacks a diagram that begins with {start!r}")
+    return page
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "-":
-        sys.stdout.write(with_diagram(sys.stdin.read()))
+        sys.stdout.write(with_diagrams(sys.stdin.read()))
     else:
         path = Path(sys.argv[1])
-        path.write_text(with_diagram(path.read_text(encoding="utf-8")), encoding="utf-8")
+        path.write_text(with_diagrams(path.read_text(encoding="utf-8")), encoding="utf-8")
