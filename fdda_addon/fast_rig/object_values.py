@@ -107,7 +107,7 @@ class ObjectReader:
 def differing_objects(
     before: dict[str, list[np.ndarray]], after: dict[str, list[np.ndarray]], tolerance: float
 ) -> dict[str, float]:
-    """Compare the values of two evaluations; arguments and result as for `differing_joints`, by the names of `before`.
+    """Compare the values of two evaluations; arguments and result as for `differing_bones`, by the names of `before`.
 
     A difference is infinite where the numbers of values differ.
     """
