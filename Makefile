@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # Every target runs one or two commands that a person could type. `setup/environment` makes the virtual environments:
 # .venv has all packages, on the newer Python of this machine; .venv-4.5 and .venv-5.2 have one Blender LTS line each,
-# without the trainer's packages; .venv-farm has Snakemake.
+# without the trainer's packages; .venv-core has what the core needs; .venv-farm has Snakemake.
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
@@ -23,13 +23,19 @@ help:  ## show this list
 .venv:
 	@setup/environment .venv everything
 
+# The core and its checks need neither Blender nor torch.
+CORE = $(if $(wildcard .venv/bin),.venv,.venv-core)
+
+.venv-core:
+	@setup/environment .venv-core core
+
 demo: .venv  ## record, train, bind and play the arm, into out/demo
 	.venv/bin/python benchmarks/demo.py out/demo
 
 test: test-core test-trainer test-blender  ## run the core, trainer and Blender tests on one Blender LTS line, without the slow ones
 
-test-core: .venv  ## run the tests that need no Blender and take seconds
-	.venv/bin/python -m pytest $(IN_PARALLEL) tests/core tests/contract
+test-core: $(CORE)  ## run the tests that need no Blender and take seconds
+	$(CORE)/bin/python -m pytest $(IN_PARALLEL) tests/core tests/contract
 
 test-trainer: .venv  ## run the tests of the training, export and report
 	.venv/bin/python -m pytest $(IN_PARALLEL) tests/trainer $(NOT_SLOW)
@@ -111,10 +117,10 @@ fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender un
 	@$(MAKE) .venv-line LINE=4.5
 	.venv-4.5/bin/python blend_fixtures/make_fixtures.py
 
-lint: .venv  ## check the code with ruff, and code and documents for retired words
-	.venv/bin/ruff check
-	.venv/bin/ruff format --check
-	.venv/bin/python setup/retired_words.py
+lint: $(CORE)  ## check the code with ruff, and code and documents for retired words
+	$(CORE)/bin/ruff check
+	$(CORE)/bin/ruff format --check
+	$(CORE)/bin/python setup/retired_words.py
 
 package: .venv  ## build dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: all platforms)
 	.venv/bin/python setup/package.py $(PLATFORM)
@@ -125,10 +131,10 @@ release: .venv  ## build the zips of VERSION for all platforms, and a repository
 requirements: .venv  ## pin the packages that pyproject.toml names, and their dependencies, in requirements/
 	for version in 3.11 3.13 3.14; do .venv/bin/uv pip compile --quiet --no-annotate \
 		--python-version $$version --python-platform x86_64-manylinux_2_28 --custom-compile-command 'make requirements' \
-		--group blender --group trainer --group test --group farm --group lint --group setup \
+		--group blender --group trainer --group core --group test --group farm --group lint --group setup \
 		--output-file requirements/python-$$version.txt || exit; done
 
 clean:  ## remove all built files and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench soak faults study simulation characters pictures films map fixtures lint package release requirements clean
+.PHONY: help .venv .venv-core .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench soak faults study simulation characters pictures films map fixtures lint package release requirements clean

@@ -27,6 +27,7 @@ SYSTEM_LIBRARIES = ROOT / "setup" / "system-libraries.txt"
 # By name of the contents: dependency groups of pyproject.toml to install, and modules whose import checks the result.
 CONTENTS = {
     "everything": (("setup", "blender", "trainer", "test", "lint"), ("bpy", "onnxruntime", "torch")),
+    "core": (("setup", "core", "test", "lint"), ("numpy", "onnx")),
     "farm": (("setup", "test", "farm"), ("snakemake",)),
     "blender": (("setup", "blender", "test"), ("bpy", "onnxruntime")),
 }
