@@ -27,6 +27,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import split_poses
+from trainer.device import choose_device
 from trainer.fits.joint_fit import joint_regression
 from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs
@@ -168,7 +169,7 @@ def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bo
     split = split_poses(trained_on, config.validation_fraction, config.seed)
     prepared = [prepare_partition(partition.data, split, config.tolerance_mm, config.seed) for partition in partitions]
     rows = []
-    for partition, trained in zip(partitions, train(prepared, split, config), strict=True):
+    for partition, trained in zip(partitions, train(prepared, split, config, choose_device().device), strict=True):
         mean, largest, linear = measure(partition, trained, measured)
         published = PUBLISHED_ERRORS_CM[partition.name]
         rows.append(
