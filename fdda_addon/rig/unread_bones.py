@@ -8,6 +8,8 @@ it is compared (`core.deformation`).
 
 import json
 from collections.abc import Iterable, Iterator
+from functools import cache
+from operator import attrgetter
 
 import bpy
 import numpy as np
@@ -72,8 +74,9 @@ def _read_bone(
     rest, length = np.array(bone.matrix_local, np.float64)[:3], bone.length
     rest[:, 3] /= length or 1.0
     constraints, influences = [], []
+    bone_path = f'pose.bones["{bpy.utils.escape_identifier(bone.name)}"].'
     for constraint in pose_bone.constraints:
-        path = constraint.path_from_id()
+        path = f'{bone_path}constraints["{bpy.utils.escape_identifier(constraint.name)}"]'
         is_animated = f"{path}.influence" in animated or f"{path}.mute" in animated
         if is_animated or (not constraint.mute and constraint.influence > 0):
             settings = list(_read_constraint(scene_rig, constraint, path, animated))
@@ -99,15 +102,23 @@ def _read_constraint(
     scene_rig: SceneRig, constraint: bpy.types.Constraint, path: str, animated: set[str]
 ) -> Iterator[list]:
     """Yield name and value of each setting of a constraint, and what its targets are."""
-    for prop in constraint.bl_rna.properties:
-        name = prop.identifier
-        if name not in _CONSTRAINT_LABELS and not prop.is_readonly and is_setting(constraint, name):
-            value = None if f"{path}.{name}" in animated else json_value(scene_rig, getattr(constraint, name))
-            yield [name, value]
+    names = _setting_names(constraint.bl_rna.identifier)
+    for name, value in zip(names, attrgetter(*names)(constraint), strict=True):
+        yield [name, None if f"{path}.{name}" in animated else json_value(scene_rig, value)]
     for index, target in enumerate(getattr(constraint, "targets", ())):
         weight = getattr(target, "weight", 1.0)
         is_animated = f"{path}.targets[{index}].weight" in animated
         yield [json_value(scene_rig, target.target), target.subtarget, None if is_animated else rounded(weight)]
+
+
+@cache
+def _setting_names(type_name: str) -> tuple[str, ...]:
+    """Return the names of the settings of a type of constraint that have an effect."""
+    rna_type = getattr(bpy.types, type_name)
+    properties = [prop for prop in rna_type.bl_rna.properties if prop.identifier not in _CONSTRAINT_LABELS]
+    return tuple(
+        prop.identifier for prop in properties if not prop.is_readonly and is_setting(rna_type, prop.identifier)
+    )
 
 
 def _sources_of_bones(armature_object: bpy.types.Object) -> dict[str, set[str]]:
