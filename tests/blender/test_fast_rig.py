@@ -75,7 +75,7 @@ def test_a_fast_rig_has_the_same_names_and_plays(folder):
     assert find_rig(ELBOW).armature_object == armature_object
     assert not {UNUSED, f"{UNUSED}_child"} & set(armature_object.data.bones.keys())
     assert {"cage"} & set(bpy.data.objects.keys()) == set()
-    assert {m.type for m in mesh_object.modifiers} == {"ARMATURE", "NODES"}
+    assert {m.type for m in mesh_object.modifiers} == {"ARMATURE", "NODES", "SMOOTH"}
     assert {f"{ACTION} control", f"{ACTION} {UNUSED}"} <= set(bpy.data.actions.keys())
     armature_object.pose.bones["control"].rotation_euler = (0.5, 0.2, 0.0)
     bpy.context.view_layer.update()
