@@ -24,7 +24,7 @@ import torch
 from benchmarks.ablation_mechanisms import ALL, MECHANISMS
 from benchmarks.ablation_trainings import ACTION, BEYOND, WITHIN, Character
 from fdda_addon.core.errors import FDDAError, RecordingError
-from fdda_addon.core.output import check_folder_writable, write_text
+from fdda_addon.core.files.output import check_folder_writable, write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 CHARACTERS = ("arm-1", "arm-2", "rigify")

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from blend_fixtures.characters.rigify import PERFORMANCE, REHEARSAL
 from fdda_addon import register, unregister
 from fdda_addon.cli.main import main as run_verb
-from fdda_addon.core.output import write_json
+from fdda_addon.core.files.output import write_json
 
 POSES, HELD_OUT_POSES = 600, 160
 HELD_OUT_SEED, HELD_OUT_MARGIN = 1, 2.0

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.ablation_mechanisms import ALL, MECHANISMS
-from fdda_addon.core.messages import MessageType
-from fdda_addon.core.metrics import distances, error_statistics
-from fdda_addon.core.output import write_json
+from fdda_addon.core.files.output import write_json
+from fdda_addon.core.formats.messages import MessageType
+from fdda_addon.core.mathematics.metrics import distances, error_statistics
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import RANDOM
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer import train
 from trainer.config import TrainingConfig

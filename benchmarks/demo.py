@@ -15,7 +15,7 @@ from fdda_addon.arm.joints import ACTION_NAME, ELBOW_FLEXION, FINGERS
 from fdda_addon.cli.evaluate import run_evaluation, table
 from fdda_addon.cli.files import open_file
 from fdda_addon.cli.main import main as run_verb
-from fdda_addon.core.output import write_json
+from fdda_addon.core.files.output import write_json
 from fdda_addon.evaluation.picture import View
 from fdda_addon.evaluation.pictures import draw_comparison, draw_partitions, make_pictured_pose
 from fdda_addon.evaluation.results import Evaluation

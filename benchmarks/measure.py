@@ -18,7 +18,7 @@ import bpy
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import fdda_addon
-from fdda_addon.core.poses import sample_pose
+from fdda_addon.core.mathematics.poses import sample_pose
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record

@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import split_poses

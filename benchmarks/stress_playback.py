@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import fdda_addon  # noqa: E402
-from fdda_addon.core.skinning import LinearSkinning  # noqa: E402
+from fdda_addon.core.mathematics.skinning import LinearSkinning  # noqa: E402
 from fdda_addon.rig.reading import PoseReader, read_model_rig  # noqa: E402
 from fdda_addon.runtime.network import Network  # noqa: E402
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier  # noqa: E402

@@ -24,10 +24,10 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(PROJECT))
 
-from fdda_addon.core.child_process import child_options  # noqa: E402
 from fdda_addon.core.errors import TRY_AGAIN  # noqa: E402
-from fdda_addon.core.file_lock import wait_for_lock  # noqa: E402
-from fdda_addon.core.output import write_text  # noqa: E402
+from fdda_addon.core.files.child_process import child_options  # noqa: E402
+from fdda_addon.core.files.file_lock import wait_for_lock  # noqa: E402
+from fdda_addon.core.files.output import write_text  # noqa: E402
 
 PAUSE_SECONDS = 10
 """Time before a verb is tried again that failed because of its machine."""

@@ -3,12 +3,12 @@
 
 import sys
 
-from .core.stop_signals import exit_on_stop_signal
+from .core.files.stop_signals import exit_on_stop_signal
 
 if __name__ == "__main__":
     exit_on_stop_signal()
     from .cli.main import main
-    from .core.terminal import restart_in_utf8_mode
+    from .core.files.terminal import restart_in_utf8_mode
 
     restart_in_utf8_mode()
     sys.exit(main(sys.argv[1:], "python -m fdda_addon"))

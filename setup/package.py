@@ -23,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT))
-from fdda_addon.core.windows_library import needed_cpp_library_version, read_imports  # noqa: E402
+from fdda_addon.core.files.windows_library import needed_cpp_library_version, read_imports  # noqa: E402
 
 DIST_FOLDER = ROOT / "dist"
 STAGE_FOLDER = DIST_FOLDER / "stage"

@@ -13,9 +13,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from fdda_addon.core.stop_signals import exit_on_stop_signal
-from fdda_addon.core.temporary import check_temporary_folder
-from fdda_addon.core.terminal import escape_unencodable_output
+from fdda_addon.core.files.stop_signals import exit_on_stop_signal
+from fdda_addon.core.files.temporary import check_temporary_folder
+from fdda_addon.core.files.terminal import escape_unencodable_output
 
 if __name__ == "__main__":
     # Before the other imports: a signal during an import would otherwise end in a traceback.

@@ -7,8 +7,8 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.messages import MessageType
-from fdda_addon.core.output import check_folder_writable
+from fdda_addon.core.files.output import check_folder_writable
+from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.recording.reader import open_recording
 
 from .config import TrainingConfig

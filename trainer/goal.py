@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from fdda_addon.core.report import Verdict
+from fdda_addon.core.formats.report import Verdict
 
 MAX_IMPROVED_RATIO = 0.97
 """More poses help when the error is below this part of the lowest earlier error."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 

@@ -3,9 +3,9 @@
 
 from pathlib import Path
 
-from fdda_addon.core.file_kind import CHECKPOINT, MODEL, PAGE, REPORT
-from fdda_addon.core.output import check_outputs
-from fdda_addon.core.report import checkpoint_path, page_path, report_path
+from fdda_addon.core.files.file_kind import CHECKPOINT, MODEL, PAGE, REPORT
+from fdda_addon.core.files.output import check_outputs
+from fdda_addon.core.formats.report import checkpoint_path, page_path, report_path
 
 
 def training_outputs(model: Path) -> tuple[Path, Path, Path, Path]:
@@ -18,7 +18,7 @@ def check_training_outputs(model: Path, overwrite: bool) -> None:
 
     Args:
         model: path of the model file.
-        overwrite: as in `core.output.check_outputs`.
+        overwrite: as in `core.files.output.check_outputs`.
 
     Raises:
         OutputError: a file cannot be written.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdda_addon.core.features import MIN_FEATURE_SPREAD, float32_rounding
+from fdda_addon.core.mathematics.features import MIN_FEATURE_SPREAD, float32_rounding
 from fdda_addon.core.recording.reader import Recording
 
 from .blocks import block_slices

@@ -20,9 +20,9 @@ from fdda_addon.core.errors import (
     machine_fault_sentence,
     to_single_line,
 )
-from fdda_addon.core.messages import STOP_FILE_VARIABLE, MessageType
-from fdda_addon.core.native_library import loader_winerror, runtime_advice
-from fdda_addon.core.stop_signals import INTERRUPTED, handle_stop_signals
+from fdda_addon.core.files.native_library import loader_winerror, runtime_advice
+from fdda_addon.core.files.stop_signals import INTERRUPTED, handle_stop_signals
+from fdda_addon.core.formats.messages import STOP_FILE_VARIABLE, MessageType
 
 from .progress import OUTPUT_LOCK, MessageSink
 

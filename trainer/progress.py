@@ -5,7 +5,7 @@ import sys
 import threading
 from typing import Protocol
 
-from fdda_addon.core.messages import WARNING_LINE, Message, MessageType
+from fdda_addon.core.formats.messages import WARNING_LINE, Message, MessageType
 
 FINISHED_LINE = "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s."
 LINE_FORMATS = {
@@ -29,7 +29,7 @@ class MessageSink(Protocol):
     """Receives the messages of one training, in order."""
 
     def send(self, message_type: MessageType, **values) -> None:
-        """Send a message; `core.messages` has the keys of each type."""
+        """Send a message; `core.formats.messages` has the keys of each type."""
 
 
 class JsonMessageSink:

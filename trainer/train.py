@@ -12,11 +12,11 @@ import torch
 
 from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.checks.warning import RecordingWarning, raise_first_warning
-from fdda_addon.core.messages import MessageType
-from fdda_addon.core.output import atomic_write_all
+from fdda_addon.core.files.output import atomic_write_all
+from fdda_addon.core.formats.messages import MessageType
+from fdda_addon.core.formats.report import report_text
 from fdda_addon.core.recording.estimate import training_size_sentence
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.report import report_text
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
 from .compression import drop_components, dropped_components_sentence, factorize_partition

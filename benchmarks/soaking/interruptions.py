@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdda_addon.core.model import read_model
+from fdda_addon.core.formats.model import read_model
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 

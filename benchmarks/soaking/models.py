@@ -12,7 +12,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 import fdda_addon
-from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY
+from fdda_addon.core.formats.model import CHECKSUM_KEY, METADATA_KEY
 from fdda_addon.rig.reading import PoseEvaluator, read_model_rig
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.model_files import network_of

@@ -8,8 +8,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from fdda_addon.core.metrics import distances
-from fdda_addon.core.poses import Channel
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.evaluation.run import evaluate, set_held_out_pose
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.poses.sampling import model_channels

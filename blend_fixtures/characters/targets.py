@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from blend_fixtures.elbow import ACTION, FRAMES
-from fdda_addon.core.point_cache import PointCacheWriter
+from fdda_addon.core.formats.point_cache import PointCacheWriter
 from fdda_addon.scene.mesh import evaluated_positions
 
 from .base import bulge, tube

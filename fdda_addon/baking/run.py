@@ -10,11 +10,11 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..core import file_kind
 from ..core.errors import FDDAError, OutputError, WrongUsageError, os_error_text
-from ..core.mask import SkinningBlend
-from ..core.output import atomic_write, atomic_write_all, check_outputs
-from ..core.point_cache import PointCacheWriter, read_point_cache
+from ..core.files import file_kind
+from ..core.files.output import atomic_write, atomic_write_all, check_outputs
+from ..core.formats.point_cache import PointCacheWriter, read_point_cache
+from ..core.mathematics.mask import SkinningBlend
 from ..core.progress import Progress
 from ..poses.clip import Clip, find_clips
 from ..poses.clip_player import clip_player
@@ -48,7 +48,7 @@ class BakeSettings:
         action: name of the action; empty for the animation of the scene.
         frames: first and last frame; None for the frames of the action, or of the scene if there is no action.
         shape_keys: whether to write the positions as shape keys into the .blend file, instead of into a point cache.
-        overwrite: whether to replace existing files (`core.output.check_outputs`).
+        overwrite: whether to replace existing files (`core.files.output.check_outputs`).
         strength: 0 for linear skinning alone, 1 for the model; None for the strength of the object in each frame.
     """
 

@@ -5,8 +5,8 @@ import argparse
 from pathlib import Path
 
 from ..baking.run import BakeSettings, bake, output_files
-from ..core.counts import format_count
 from ..core.progress import Progress
+from ..core.sentences.counts import format_count
 from .files import add_rig_options, open_rig
 from .outputs import add_overwrite_option
 from .progress import ProgressPrinter

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
-from ..core.file_kind import BENCHMARK
-from ..core.output import check_outputs, write_json
+from ..core.files.file_kind import BENCHMARK
+from ..core.files.output import check_outputs, write_json
+from ..core.files.temporary import check_temporary_folder
 from ..core.progress import Progress
-from ..core.temporary import check_temporary_folder
 from ..fast_rig.saving import measure_saving
 from ..runtime.binding import model_disabled
 from ..timing.benchmark import benchmark

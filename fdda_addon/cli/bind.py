@@ -25,9 +25,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.file_kind import BLEND
-    from ..core.open_files import remove_file
-    from ..core.output import check_outputs
+    from ..core.files.file_kind import BLEND
+    from ..core.files.open_files import remove_file
+    from ..core.files.output import check_outputs
     from ..scene.blend_file import save_copy
     from .folders import open_rigs
 
@@ -69,7 +69,7 @@ def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
 
 def _copy_model_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     """Copy the model next to the bound file if needed, store its path in the file, and return the path."""
-    from ..core.output import atomic_write
+    from ..core.files.output import atomic_write
     from ..models.entries import bound_entry
     from ..models.model_list import add_bound_model
     from ..scene.stored_paths import stored_path

@@ -19,8 +19,8 @@ def run(options: argparse.Namespace) -> None:
     import bpy
 
     from ..arm.rig import build_arm
-    from ..core.file_kind import BLEND
-    from ..core.output import check_outputs
+    from ..core.files.file_kind import BLEND
+    from ..core.files.output import check_outputs
     from ..scene.blend_file import save_copy
     from ..scene.viewport import frame_objects
 

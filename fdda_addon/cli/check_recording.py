@@ -23,8 +23,8 @@ def run(options: argparse.Namespace) -> None:
     """
     from ..core.checks.recording import check_recording
     from ..core.checks.warning import raise_first_warning
-    from ..core.file_kind import WARNINGS
-    from ..core.output import check_outputs, write_json
+    from ..core.files.file_kind import WARNINGS
+    from ..core.files.output import check_outputs, write_json
     from ..core.recording.reader import read_recording
 
     if options.json:

@@ -4,13 +4,13 @@
 import argparse
 from pathlib import Path
 
-from ..core.assessment import farther_than_skinning_sentence
-from ..core.counts import format_count
 from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED, FILM_TIMED_FRAMES
 from ..core.errors import WrongUsageError
-from ..core.file_kind import EVALUATION, PICTURE, VIDEO
-from ..core.output import atomic_write_all, check_outputs, to_json_text
+from ..core.files.file_kind import EVALUATION, PICTURE, VIDEO
+from ..core.files.output import atomic_write_all, check_outputs, to_json_text
 from ..core.progress import Progress
+from ..core.sentences.assessment import farther_than_skinning_sentence
+from ..core.sentences.counts import format_count
 from ..evaluation.results import Evaluation
 from ..evaluation.run import evaluate
 from ..evaluation.settings import EvaluationSettings

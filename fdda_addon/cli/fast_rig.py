@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.counts import format_count
+from ..core.sentences.counts import format_count
 
 if TYPE_CHECKING:
     from ..fast_rig.run import FastRig
@@ -40,8 +40,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
-    from ..core.file_kind import BLEND
-    from ..core.output import check_outputs
+    from ..core.files.file_kind import BLEND
+    from ..core.files.output import check_outputs
     from ..core.progress import Progress
     from ..fast_rig.controls import check_choices
     from ..fast_rig.frame_times import measure_frames

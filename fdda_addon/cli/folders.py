@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, ModelError, OutputError
-from ..core.model import read_model_info
+from ..core.formats.model import read_model_info
 from ..scene.scene_rig import SceneRig, find_rig
 from .files import open_file
 

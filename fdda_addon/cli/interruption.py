@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from ..core.stop_signals import handle_stop_signals, restore_handlers
+from ..core.files.stop_signals import handle_stop_signals, restore_handlers
 
 RETRY_SECONDS = 0.01
 _ADDON_PACKAGE = __name__.rsplit(".", 2)[0]

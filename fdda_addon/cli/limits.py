@@ -5,7 +5,7 @@ import argparse
 import math
 from pathlib import Path
 
-from ..core.counts import format_count
+from ..core.sentences.counts import format_count
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -33,8 +33,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
-    from ..core.file_kind import BLEND
-    from ..core.output import check_outputs
+    from ..core.files.file_kind import BLEND
+    from ..core.files.output import check_outputs
     from ..poses.action_range import measured_ranges
     from ..poses.clip import find_action
     from ..poses.measured_limits import describe_limits, set_limits_from_actions

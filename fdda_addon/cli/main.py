@@ -14,8 +14,8 @@ import sys
 from importlib import import_module
 
 from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_fault_sentence
-from ..core.stop_signals import INTERRUPTED
-from ..core.terminal import escape_unencodable_output
+from ..core.files.stop_signals import INTERRUPTED
+from ..core.files.terminal import escape_unencodable_output
 from .interruption import interruptible
 
 VERBS = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Adds the option `--overwrite`, for outputs that `core.output.check_outputs` refuses to overwrite."""
+"""Adds the option `--overwrite`, for outputs that `core.files.output.check_outputs` refuses to overwrite."""
 
 import argparse
 

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.counts import format_count
+from ..core.sentences.counts import format_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..core.defaults import MARGIN, MIN_PARTITION_VERTICES, POSES, REFINEMENT_POSES, SPREAD
 from ..core.errors import WrongUsageError
 from ..core.joint_option import ALL, parse_joints
-from ..core.poses import MAX_MARGIN
+from ..core.mathematics.poses import MAX_MARGIN
 from .files import add_rig_argument
 from .target import add_repeatability_option, add_target_options, target_settings
 

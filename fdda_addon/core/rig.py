@@ -44,7 +44,7 @@ class Joint:
     Attributes:
         name: name of its bone.
         parent: index of its parent joint; -1 for a root joint.
-        reference: index of its reference joint, if that is not the parent (`core.references`). Rigs with different
+        reference: index of its reference joint, if that is not the parent (`references`). Rigs with different
             reference joints are equal.
     """
 

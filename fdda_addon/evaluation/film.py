@@ -11,10 +11,10 @@ import bpy
 import numpy as np
 
 from ..core.errors import OutputError, os_error_text
-from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, NO_ERROR_METRES, distances, heat_colors
-from ..core.output import TEMPORARY_PREFIX
+from ..core.files.output import TEMPORARY_PREFIX
+from ..core.mathematics.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, NO_ERROR_METRES, distances, heat_colors
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
-from ..core.skinning import LinearSkinning
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.mask import read_mask

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.counts import format_count
 from ..core.defaults import MIN_PARTITION_VERTICES
 from ..core.errors import ModelError
-from ..core.metrics import viewport_colors
-from ..core.partition import make_merged_partitions, partition_colors
+from ..core.mathematics.metrics import viewport_colors
+from ..core.mathematics.partition import make_merged_partitions, partition_colors
+from ..core.sentences.counts import format_count
 from ..rig.reading import read_rig
 from ..runtime.model_files import network_of
 from ..runtime.opened_model import open_model

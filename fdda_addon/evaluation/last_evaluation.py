@@ -8,8 +8,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.metrics import ErrorStatistics, error_statistics, worst_poses
-from ..core.poses import Channel
+from ..core.mathematics.metrics import ErrorStatistics, error_statistics, worst_poses
+from ..core.mathematics.poses import Channel
 from ..scene.time_stretching import time_ratio, time_to_frame
 from .results import Evaluation
 

@@ -10,7 +10,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..core.metrics import viewport_colors
+from ..core.mathematics.metrics import viewport_colors
 from ..scene.arrays import TRIANGLE_ELEMENT, VECTOR_ELEMENT, read
 from ..scene.mesh import mesh_positions
 

@@ -15,8 +15,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import OutputError
-from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
-from ..core.output import atomic_write
+from ..core.files.output import atomic_write
+from ..core.mathematics.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
 from ..scene.blend_file import blender_path, silenced_stdout
 from ..scene.mesh import mesh_positions
 from .colored_mesh import MeshFactory, set_colors, srgb_to_linear

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.metrics import distances, heat_colors
-from ..core.partition import make_merged_partitions, partition_colors
-from ..core.skinning import LinearSkinning
+from ..core.mathematics.metrics import distances, heat_colors
+from ..core.mathematics.partition import make_merged_partitions, partition_colors
+from ..core.mathematics.skinning import LinearSkinning
 from ..rig.reading import read_rig
 from ..runtime.opened_model import open_model
 from ..scene.mask import read_mask

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..core.metrics import ErrorStatistics, error_statistics
-from ..core.partition import Partition
-from ..core.poses import Channel
-from ..core.surface import SurfaceErrors, surface_json
+from ..core.mathematics.metrics import ErrorStatistics, error_statistics
+from ..core.mathematics.partition import Partition
+from ..core.mathematics.poses import Channel
+from ..core.mathematics.surface import SurfaceErrors, surface_json
 
 
 @dataclass

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import FDDAError, RigError
-from ..core.mask import Mask
-from ..core.metrics import distances
-from ..core.poses import Channel, sample_pose, widen_ranges
+from ..core.mathematics.mask import Mask
+from ..core.mathematics.metrics import distances
+from ..core.mathematics.poses import Channel, sample_pose, widen_ranges
+from ..core.mathematics.skinning import LinearSkinning
+from ..core.mathematics.surface import Surface, SurfaceComparison, surface_errors
 from ..core.progress import Progress
-from ..core.skinning import LinearSkinning
-from ..core.surface import Surface, SurfaceComparison, surface_errors
 from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable

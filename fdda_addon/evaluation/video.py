@@ -11,9 +11,9 @@ from pathlib import Path
 
 import bpy
 
-from ..core.child_process import OutputLines, child_options, end_process
 from ..core.errors import OutputError, WrongUsageError
-from ..core.output import atomic_write
+from ..core.files.child_process import OutputLines, child_options, end_process
+from ..core.files.output import atomic_write
 from ..scene.blend_file import blender_path
 
 ENCODINGS = {".mp4": ("MPEG4", "H264", "H.264"), ".webm": ("WEBM", "WEBM", "VP9")}

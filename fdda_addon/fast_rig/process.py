@@ -10,10 +10,10 @@ from typing import Self
 
 import bpy
 
-from ..core.child_process import OutputLines, child_options, end_process
 from ..core.errors import FDDAError, os_error_text
+from ..core.files.child_process import OutputLines, child_options, end_process
+from ..core.files.temporary import new_temporary_file
 from ..core.progress import Progress
-from ..core.temporary import new_temporary_file
 
 ROOT = Path(__file__).resolve().parents[2]
 KILL_AFTER_SECONDS = 5.0

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import bpy
 
-from ..core.counts import format_count
 from ..core.errors import ModelError, RigError
-from ..core.model import read_model
+from ..core.formats.model import read_model
 from ..core.progress import Progress
 from ..core.rig import STATIC_JOINT
+from ..core.sentences.counts import format_count
 from ..rig.modifier_stack import check_evaluable
 from ..runtime import packed_model
 from ..runtime.binding import bind, unbind

@@ -8,9 +8,9 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
+from ..core.files.temporary import temporary_folder
 from ..core.progress import Progress
 from ..core.rig import STATIC_JOINT
-from ..core.temporary import temporary_folder
 from ..rig.dependencies import read_dependencies
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import unbind

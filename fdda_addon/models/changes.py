@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import bpy
 
-from ..core.model_info import ModelInfo
-from ..core.poses import ROTATION_VECTOR, Channel, bones_with_changed_range
+from ..core.formats.model_info import ModelInfo
+from ..core.mathematics.poses import ROTATION_VECTOR, Channel, bones_with_changed_range
 from ..core.rig import Rig, rig_differences
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_model_rig

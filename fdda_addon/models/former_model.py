@@ -6,9 +6,9 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, OutputError, os_error_text
-from ..core.model import read_model_info
-from ..core.output import atomic_write
-from ..core.report import page_path, report_path
+from ..core.files.output import atomic_write
+from ..core.formats.model import read_model_info
+from ..core.formats.report import page_path, report_path
 from .model_list import add_model
 
 FORMER_FOLDER = "previous"

@@ -7,9 +7,9 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import ModelError, OutputError, os_error_text
-from ..core.model import MAX_BYTES, check_model, read_model, read_model_info
-from ..core.model_info import ModelInfo
-from ..core.output import atomic_write, check_writable
+from ..core.files.output import atomic_write, check_writable
+from ..core.formats.model import MAX_BYTES, check_model, read_model, read_model_info
+from ..core.formats.model_info import ModelInfo
 from ..evaluation import last_evaluation
 from ..runtime import model_files, packed_model, playback
 from ..runtime.binding import bind, unbind

@@ -7,8 +7,8 @@ from pathlib import Path
 import bpy
 
 from ..baking.run import BakeSettings, bake
-from ..core.counts import format_count
 from ..core.errors import OutputError
+from ..core.sentences.counts import format_count
 from ..runtime.model_files import network_of
 from .confirm import ChooseFileFirst
 from .model_operator import ModelOperator

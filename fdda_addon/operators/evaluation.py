@@ -9,8 +9,8 @@ import bpy
 
 from ..core.defaults import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..core.errors import ModelError, RigError
+from ..core.formats.report import REPORT_HTML, page_path
 from ..core.progress import Progress
-from ..core.report import REPORT_HTML, page_path
 from ..evaluation import heat_map, last_evaluation, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..evaluation.run import evaluate, evaluate_action

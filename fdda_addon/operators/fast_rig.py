@@ -8,8 +8,8 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import OutputError, RigError
-from ..core.model import read_model
-from ..core.temporary import temporary_folder
+from ..core.files.temporary import temporary_folder
+from ..core.formats.model import read_model
 from ..fast_rig.process import VerbProcess
 from ..runtime import packed_model
 from ..runtime.model_files import model_path

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import bpy
 
-from ..core.counts import format_count
 from ..core.defaults import FILM_TIMED_FRAMES
 from ..core.errors import RigError
-from ..core.file_kind import VIDEO
-from ..core.output import check_outputs
+from ..core.files.file_kind import VIDEO
+from ..core.files.output import check_outputs
 from ..core.progress import Progress
+from ..core.sentences.counts import format_count
 from ..evaluation.film import FDDA, LINEAR, RIG, FilmSettings, film
 from ..evaluation.picture import View
 from ..evaluation.run import evaluate_action

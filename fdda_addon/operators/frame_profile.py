@@ -8,7 +8,7 @@ from dataclasses import replace
 import bpy
 
 from ..core.errors import FDDAError
-from ..core.temporary import temporary_folder
+from ..core.files.temporary import temporary_folder
 from ..fast_rig.process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements

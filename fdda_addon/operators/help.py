@@ -6,9 +6,9 @@ from pathlib import Path
 
 import bpy
 
-from ..core import manual_page
 from ..core.errors import OutputError
-from ..core.output import write_text
+from ..core.files.output import write_text
+from ..core.sentences import manual_page
 
 MANUAL = Path(__file__).resolve().parents[2] / "docs" / "manual.md"
 

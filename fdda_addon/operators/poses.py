@@ -5,8 +5,8 @@ import math
 
 import bpy
 
-from ..core.counts import format_count
 from ..core.errors import RigError
+from ..core.sentences.counts import format_count
 from ..poses.measured_limits import set_limits_from_actions
 from ..poses.motion_range import clear_rotation_range, set_rotation_range
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings

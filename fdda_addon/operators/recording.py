@@ -7,11 +7,11 @@ from pathlib import Path
 
 import bpy
 
-from ..core.counts import format_count
 from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import FDDAError
 from ..core.recording.folder import remove_recording
 from ..core.recording.index import read_index
+from ..core.sentences.counts import format_count
 from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size

@@ -10,7 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
-from ..core.messages import WARNING_LINE, MessageType
+from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.progress import Progress
 from ..core.recording.index import read_index
 from ..jobs.job import current

@@ -3,8 +3,8 @@
 
 import bpy
 
-from ..core.assessment import assess_evaluation
-from ..core.counts import format_count
+from ..core.sentences.assessment import assess_evaluation
+from ..core.sentences.counts import format_count
 from ..evaluation import last_evaluation, markers, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..jobs import job

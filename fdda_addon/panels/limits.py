@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import bpy
 
-from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
+from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from ..operators.poses import FDDA_OT_set_limit
 from ..poses.bone_channels import is_moved_by_constraints
 from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, find_local_limit, location_ranges, rotation_ranges

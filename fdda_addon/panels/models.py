@@ -4,8 +4,8 @@
 import bpy
 
 from ..core.errors import FDDAError
-from ..core.model_info import ModelInfo
-from ..core.poses import CONTROL, Channel
+from ..core.formats.model_info import ModelInfo
+from ..core.mathematics.poses import CONTROL, Channel
 from ..models.changes import compare_with_model
 from ..models.entries import active_entry, format_file_size, is_bound
 from ..models.model_list import entry_info

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import bpy
 
-from ..core.counts import format_count
 from ..core.errors import FDDAError
 from ..core.recording.folder import FolderContent, FolderState, read_folder
 from ..core.recording.index import INDEX_NAME
+from ..core.sentences.counts import format_count
 from ..jobs import job
 from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder

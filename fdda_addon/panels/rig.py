@@ -3,7 +3,7 @@
 
 import bpy
 
-from ..core.counts import format_count
+from ..core.sentences.counts import format_count
 from ..jobs import job
 from ..operators.rig import measured_cost
 from ..properties.character import file_problem

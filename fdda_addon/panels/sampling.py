@@ -5,7 +5,7 @@ import math
 
 import bpy
 
-from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
+from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from ..properties.recording_options import ALL_SHAPE_KEYS, recorded_actions
 from ..recording.rig_check import RigCheck
 from ..scene.scene_rig import SceneRig

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core.errors import FDDAError
-from ..core.model import read_model_info
+from ..core.formats.model import read_model_info
 from ..core.rig import rig_differences
 from ..properties.character import trained_file
 from ..scene.draw_cache import computed_once, draw_cached

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import bpy
 
-from ..core.assessment import Assessment, assess_training
 from ..core.errors import TrainingError
+from ..core.formats.report import Verdict, checkpoint_path, read_report, report_path
 from ..core.recording.folder import FolderState
-from ..core.report import Verdict, checkpoint_path, read_report, report_path
+from ..core.sentences.assessment import Assessment, assess_training
 from ..jobs import job
 from ..jobs.state import JobState
 from ..properties.character import default_model

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Quaternion, Vector
 
-from ..core.poses import LOCATION, ROTATION, SCALE
+from ..core.mathematics.poses import LOCATION, ROTATION, SCALE
 from ..scene.action_slots import CurvesByDatablock
 from ..scene.controls import canonical_path
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, Control
 from ..core.errors import RigError
-from ..core.poses import CONTROL, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, Channel
-from ..core.rotations import euler_angles, rotation_vectors, total_range_width
+from ..core.mathematics.poses import CONTROL, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, Channel
+from ..core.mathematics.rotations import euler_angles, rotation_vectors, total_range_width
 from ..scene.action_slots import curves_of_actions
 from ..scene.arrays import KEYFRAME_ELEMENTS, read
 from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_of

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import bpy
 
 from ..core.controls import ARMATURE_OBJECT
-from ..core.poses import LOCATION, ROTATION, SCALE, Channel
+from ..core.mathematics.poses import LOCATION, ROTATION, SCALE, Channel
 
 LIMIT_CONSTRAINTS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
 _PROPERTY_NAMES = {ROTATION: "rotation_euler", LOCATION: "location", SCALE: "scale"}

@@ -13,7 +13,7 @@ import bpy
 
 from ..core.controls import ARMATURE_OBJECT, Control
 from ..core.errors import RigError
-from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
+from ..core.mathematics.poses import LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..scene.bone_transform import MATRIX, MATRIX_ELEMENT_RANGE
 from ..scene.controls import canonical_path, custom_properties, is_driven, make_control
 from ..scene.scene_rig import SceneRig

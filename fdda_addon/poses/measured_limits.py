@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import bpy
 
 from ..core.errors import RigError
-from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
+from ..core.mathematics.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
 from ..scene.action_slots import curves_of_actions
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.errors import RigError
-from ..core.poses import DEFAULT_RANGE, LOCATION, ROTATION, SCALE
+from ..core.mathematics.poses import DEFAULT_RANGE, LOCATION, ROTATION, SCALE
 
 AXES = "xyz"
 RANGE_NAME = "FDDA Range"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads the frames of actions from which random poses combine limbs (`core.remix`)."""
+"""Reads the frames of actions from which random poses combine limbs (`core.mathematics.remix`)."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,9 +8,9 @@ import numpy as np
 from mathutils import Euler
 
 from ..core.errors import RigError
-from ..core.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION_VECTOR, SCALE, Channel
-from ..core.remix import Remix, find_limbs
-from ..core.rotations import rotation_vectors
+from ..core.mathematics.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION_VECTOR, SCALE, Channel
+from ..core.mathematics.remix import Remix, find_limbs
+from ..core.mathematics.rotations import rotation_vectors
 from ..scene.action_slots import curves_of_actions
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig

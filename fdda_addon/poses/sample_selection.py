@@ -8,8 +8,8 @@ import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
-from ..core.poses import Channel
-from ..core.remix import Remix
+from ..core.mathematics.poses import Channel
+from ..core.mathematics.remix import Remix
 from ..scene.compatibility import is_selected
 from ..scene.scene_rig import SceneRig
 from .action_range import constant_controls, keyed_controls, keyed_ranges, measured_controls
@@ -17,7 +17,7 @@ from .clip import find_action
 from .remix import read_remix
 
 REMIX = "remix"
-"""Entry for the bones of the recorded actions, whose limbs are combined from different frames (`core.remix`)."""
+"""Entry for the bones of the recorded actions, whose limbs are combined from different frames (`mathematics.remix`)."""
 SELECTED_BONES, COLLECTION_PREFIX, ACTION_PREFIX, BONE_PREFIX = "selected", "collection:", "action:", "bone:"
 """Forms of an entry: the selected bones, and the prefixes of a bone collection, an action and a single bone."""
 

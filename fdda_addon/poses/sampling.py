@@ -8,9 +8,18 @@ import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
-from ..core.model_info import ModelInfo
-from ..core.poses import CHANNEL_KINDS, CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
-from ..core.remix import replace_bone_channels
+from ..core.formats.model_info import ModelInfo
+from ..core.mathematics.poses import (
+    CHANNEL_KINDS,
+    CONTROL,
+    LOCATION,
+    RANGE_TOLERANCE,
+    ROTATION,
+    ROTATION_VECTOR,
+    SCALE,
+    Channel,
+)
+from ..core.mathematics.remix import replace_bone_channels
 from ..core.rig import Rig
 from ..scene.controls import can_be_set, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig

@@ -6,7 +6,7 @@ from typing import Self
 import bpy
 import numpy as np
 
-from ..core.poses import Channel
+from ..core.mathematics.poses import Channel
 from .motion_range import AXES, LIMIT_CONSTRAINT_TYPES
 
 

@@ -44,7 +44,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
 
 
 def _fit_kind(settings: FDDA_PG_character) -> str:
-    """Return the kind of fitted skin weights (`core.skin_fit.FIT_KINDS`); empty for the weights of the rig."""
+    """Return the kind of fitted skin weights (`mathematics.skin_fit.FIT_KINDS`); empty for the weights of the rig."""
     return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
 
 

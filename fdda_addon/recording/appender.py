@@ -8,9 +8,9 @@ from typing import Self
 
 import numpy as np
 
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.recording.extension import RecordingExtension
 from ..core.recording.writer import RecordingWriter
-from ..core.skinning import LinearSkinning
 from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter
 from ..rig.reading import PoseEvaluator
 

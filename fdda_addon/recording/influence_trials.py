@@ -16,8 +16,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.defaults import INFLUENCE_POSES
-from ..core.partition import INFLUENCE_TOLERANCE
-from ..core.poses import CONTROL, Channel
+from ..core.mathematics.partition import INFLUENCE_TOLERANCE
+from ..core.mathematics.poses import CONTROL, Channel
 from ..core.rig import STATIC_JOINT, Rig
 from ..poses.bone_channels import is_moved_by_constraints
 from ..rig.bone_paths import split_bone_path

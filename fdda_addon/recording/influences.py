@@ -9,12 +9,12 @@ from collections.abc import Generator
 import numpy as np
 
 from ..core.checks.warning import joint_name
-from ..core.features import FLOAT32_ROUNDING_RATIO
-from ..core.partition import Partition, make_partitions
-from ..core.poses import CONTROL
+from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
+from ..core.mathematics.partition import Partition, make_partitions
+from ..core.mathematics.poses import CONTROL
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.rig import Rig
-from ..core.skinning import LinearSkinning
 from ..rig.reading import PoseEvaluator
 from ..scene.bone_transform import controls_by_bone
 from ..scene.scene_rig import SceneRig

@@ -9,11 +9,11 @@ import bpy
 from ..core.controls import Control
 from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD
 from ..core.joint_option import ALL
-from ..core.partition import INFLUENCE_TOLERANCE
-from ..core.poses import Channel, Margin, make_margin
+from ..core.mathematics.partition import INFLUENCE_TOLERANCE
+from ..core.mathematics.poses import Channel, Margin, make_margin
+from ..core.mathematics.remix import PoseSampler
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
-from ..core.remix import PoseSampler
 from ..core.rig import Rig
 from ..poses.clip import find_clips
 from ..poses.control_bones import split_control_bones
@@ -43,7 +43,7 @@ class RecordingSettings:
         poses: number of random poses.
         seed: seed of the random poses.
         spread: standard deviation of the random poses as a ratio of half the range of motion.
-        margin: factor that widens the range of motion for some random poses (`core.poses.make_margin`); 1 for no
+        margin: factor that widens the range of motion for some random poses (`mathematics.poses.make_margin`); 1 for no
             margin.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
@@ -53,7 +53,7 @@ class RecordingSettings:
         overwrite: replace a recording in the folder.
         sample: control bones that the random poses move, in the syntax of `sampling.parse_sample_selection`; empty for
             the default bones.
-        fit_linear: kind of the skin weights that are fitted (`core.skin_fit.FIT_KINDS`); empty for those of the rig.
+        fit_linear: kind of the skin weights that are fitted (`skin_fit.FIT_KINDS`); empty for those of the rig.
         controls: inputs besides the automatic controls, in the syntax of `split_control_bones` and `parse_controls`.
         min_partition_vertices: partitions with fewer vertices are merged into others; 0 to merge no partitions.
         target: settings of the target whose surface is recorded.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..core.controls import MESH_OBJECT, SHAPE_KEYS
-from ..core.poses import CONTROL, Channel
+from ..core.mathematics.poses import CONTROL, Channel
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits

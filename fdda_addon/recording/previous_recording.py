@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import RecordingError
-from ..core.partition import Partition, make_merged_partitions
+from ..core.mathematics.partition import Partition, make_merged_partitions
+from ..core.mathematics.skin_fit import DEFAULT_KIND, SkinFit, weights_match
 from ..core.recording.index import read_index, read_info
 from ..core.recording.reader import read_partitions, read_recorded_skin
 from ..core.rig import Rig, read_joints
-from ..core.skin_fit import DEFAULT_KIND, SkinFit, weights_match
 from ..rig.reading import read_key_joints_rig
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings

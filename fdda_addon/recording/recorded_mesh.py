@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.partition import Partition
-from ..core.poses import Channel
+from ..core.mathematics.partition import Partition
+from ..core.mathematics.poses import Channel
+from ..core.mathematics.skin_fit import SkinFit
 from ..core.rig import Rig
-from ..core.skin_fit import SkinFit
 from ..rig.reading import PoseEvaluator
 from ..rig.target import Target
 from ..rig.temporary_rig_state import PosedRig

@@ -8,7 +8,7 @@ from copy import copy
 import bpy
 import numpy as np
 
-from ..core.references import choose_references, has_reference_choice
+from ..core.mathematics.references import choose_references, has_reference_choice
 from ..core.rig import Rig
 from ..poses.clip_player import ClipPlayer
 from ..rig.bone_paths import split_bone_path
@@ -25,7 +25,7 @@ MAX_POSES = 24
 
 
 def find_references(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> Rig:
-    """Return the rig of a mesh with its reference joints (`core.references`).
+    """Return the rig of a mesh with its reference joints (`core.mathematics.references`).
 
     Args:
         mesh: the mesh, prepared by `temporary_rig_states`, with the skin weights of linear skinning.

@@ -10,18 +10,18 @@ import numpy as np
 
 from ..core.defaults import REFINEMENT_POSES, SPREAD
 from ..core.errors import RecordingError
-from ..core.features import joint_features
-from ..core.metrics import distances
-from ..core.model_info import ModelInfo
-from ..core.partition import Partition
-from ..core.poses import Channel, sample_pose
+from ..core.formats.model_info import ModelInfo
+from ..core.mathematics.features import joint_features
+from ..core.mathematics.metrics import distances
+from ..core.mathematics.partition import Partition
+from ..core.mathematics.poses import Channel, sample_pose
+from ..core.mathematics.refinement import Probes, choose_poses, nearest_recorded_distances
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.recording.extension import RecordingExtension
 from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
-from ..core.refinement import Probes, choose_poses, nearest_recorded_distances
 from ..core.rig import Rig, rig_differences
-from ..core.skinning import LinearSkinning
 from ..poses.sampling import model_channels, rig_allows_ranges
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator

@@ -6,13 +6,13 @@ from contextlib import closing
 
 import numpy as np
 
-from ..core.metrics import distances, error_statistics
-from ..core.partition import GOLDEN_RATIO
+from ..core.mathematics.metrics import distances, error_statistics
+from ..core.mathematics.partition import GOLDEN_RATIO
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.recording.arrays import open_array
 from ..core.recording.target import Repeatability
 from ..core.recording.writer import RecordingWriter
-from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
 from .pose_plan import PosePlan
 from .recorded_mesh import RecordedMesh

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from ..core.controls import Control
 from ..core.errors import RigError
-from ..core.poses import Channel
+from ..core.mathematics.poses import Channel
 from ..core.rig import Rig
 from ..poses.sampling import default_channels, sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers

@@ -9,15 +9,15 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import RecordingError
-from ..core.key_joints import add_influences
-from ..core.partition import GOLDEN_RATIO, Partition, assume_nearby_influences, make_merged_partitions
+from ..core.mathematics.key_joints import add_influences
+from ..core.mathematics.partition import GOLDEN_RATIO, Partition, assume_nearby_influences, make_merged_partitions
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
 from ..core.recording.folder_check import check_recordable
 from ..core.recording.index import INDEX_NAME, RecordingInfo
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
-from ..core.skinning import LinearSkinning
 from ..poses.clip import find_clips
 from ..poses.clip_player import ClipPlayer
 from ..rig.modifier_stack import check_evaluable

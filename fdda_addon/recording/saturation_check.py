@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from ..core.partition import INFLUENCE_TOLERANCE
+from ..core.mathematics.partition import INFLUENCE_TOLERANCE
 from ..core.recording.target import POSE
 from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control
 from .recorded_mesh import RecordedMesh

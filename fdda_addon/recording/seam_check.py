@@ -7,8 +7,8 @@ from contextlib import closing
 import numpy as np
 
 from ..core.checks.seams import find_open_seams
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.recording.target import POSE
-from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
 from ..rig.reading import PoseEvaluator
 from ..scene.armature import clear_pose

@@ -7,10 +7,10 @@ from contextlib import closing
 import numpy as np
 
 from ..core.errors import RigError
-from ..core.partition import GOLDEN_RATIO
+from ..core.mathematics.partition import GOLDEN_RATIO
+from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.recording.target import SIMULATION
-from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
 from .pose_plan import PosePlan
 from .recorded_mesh import RecordedMesh

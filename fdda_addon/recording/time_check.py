@@ -8,8 +8,8 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from ..core.features import FLOAT32_ROUNDING_RATIO
-from ..core.partition import INFLUENCE_TOLERANCE
+from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
+from ..core.mathematics.partition import INFLUENCE_TOLERANCE
 from ..core.recording.target import POSE
 from ..poses.clip_player import ClipPlayer
 from .pose_plan import PosePlan

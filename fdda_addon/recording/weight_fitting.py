@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import RecordingError, RigError, TrainingError
+from ..core.files.temporary import temporary_folder
+from ..core.formats.messages import MessageType
 from ..core.joint_option import ALL, KEY_JOINTS_STAGE
-from ..core.key_joints import KeyJointReport
-from ..core.messages import MessageType
-from ..core.poses import CONTROL, Channel
+from ..core.mathematics.key_joints import KeyJointReport
+from ..core.mathematics.poses import CONTROL, Channel
+from ..core.mathematics.skin_fit import DEFAULT_KIND, SkinFit
 from ..core.progress import Progress
 from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted_weights, read_key_joints
 from ..core.rig import STATIC_JOINT, Rig
-from ..core.skin_fit import DEFAULT_KIND, SkinFit
-from ..core.temporary import temporary_folder
 from ..rig.dependencies import read_dependencies
 from ..rig.reading import PoseEvaluator, read_key_joints_rig
 from ..scene.scene_rig import SceneRig, armature_modifier
@@ -75,7 +75,7 @@ class FitRequest:
     """What is fitted.
 
     Attributes:
-        kind: one of `core.skin_fit.FIT_KINDS`; empty to fit weights only if joints are removed.
+        kind: one of `core.mathematics.skin_fit.FIT_KINDS`; empty to fit weights only if joints are removed.
         joints: the option `joints`.
         poses: indices of the poses of the fit in the recording, ascending.
         random_count: number of these poses that are random; key joints are chosen by these.

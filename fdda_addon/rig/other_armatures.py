@@ -7,7 +7,7 @@ import bpy
 
 from ..core.controls import OTHER_OBJECT, Control
 from ..core.errors import RigError
-from ..core.poses import LOCATION, ROTATION, SCALE
+from ..core.mathematics.poses import LOCATION, ROTATION, SCALE
 from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
 from ..scene.action_slots import is_overridden
 from ..scene.controls import fcurve_target, make_control

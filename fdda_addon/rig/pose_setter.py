@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.defaults import REPEATABILITY_POSES, REST_THRESHOLD_MM
-from ..core.poses import Channel
+from ..core.mathematics.poses import Channel
 from ..core.recording.target import RecordedTarget
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer

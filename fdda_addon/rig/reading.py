@@ -9,9 +9,9 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import RigError
-from ..core.features import FLOAT32_ROUNDING_RATIO
-from ..core.key_joints import select_joints
-from ..core.model_info import ModelInfo
+from ..core.formats.model_info import ModelInfo
+from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
+from ..core.mathematics.key_joints import select_joints
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig
 from ..poses.sampling import model_channels, sampled_channels
 from ..scene import armature as armature_io
@@ -119,7 +119,7 @@ def _check_rest_matrices(names: tuple[str, ...], rest_matrices: np.ndarray) -> N
 
 
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
-    """Read a rig with the joints, controls and unit of a model, so that `core.model.check_rig` can compare them.
+    """Read a rig with the joints, controls and unit of a model, so that `formats.model.check_rig` can compare them.
 
     A fast rig lacks modifiers and bones of the rig that the model was trained for, so skin weights and deformation
     count as those of the model. If the model reads key joints, the rig has these alone.
@@ -140,7 +140,7 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
 def read_key_joints_rig(
     scene_rig: SceneRig, rig: Rig, names: Iterable[str], unread_bones: Iterable[str] | None = None
 ) -> Rig:
-    """Read a rig with some of its joints (`core.key_joints.select_joints`), and how other bones follow them.
+    """Read a rig with some of its joints (`mathematics.key_joints.select_joints`), and how other bones follow them.
 
     Args:
         scene_rig, rig: the rig with its own skin weights.

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import bpy
 
-from ..core.alembic import read_time_range
 from ..core.controls import Control
 from ..core.errors import PointCacheError, RigError, os_error_text
-from ..core.mesh_cache import read_frame_count
+from ..core.formats.alembic import read_time_range
+from ..core.formats.mesh_cache import read_frame_count
 from ..scene.node_groups import SIMULATION_NODES, find_time_node
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import resolve_path

@@ -4,7 +4,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
-from ..core.poses import CONTROL, Channel
+from ..core.mathematics.poses import CONTROL, Channel
 from ..core.rig import Rig
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer, clip_player

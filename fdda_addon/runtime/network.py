@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import MACHINE_WINERRORS, TRY_AGAIN, ModelError
-from ..core.model import (
+from ..core.files.native_library import loader_winerror, runtime_advice
+from ..core.files.windows_library import check_cpp_library
+from ..core.formats.model import (
     CONFIDENCE_OUTPUT,
     CONTROLS_INPUT,
     POSE_INPUT,
@@ -18,9 +20,7 @@ from ..core.model import (
     read_model,
     read_skin,
 )
-from ..core.native_library import loader_winerror, runtime_advice
 from ..core.rig import Rig
-from ..core.windows_library import check_cpp_library
 
 MIN_MULTITHREADED_VERTICES = 100_000
 """Smallest number of vertices for which several threads run the model; starting them takes time too."""

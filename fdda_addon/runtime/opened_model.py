@@ -4,8 +4,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.model import check_rig
-from ..core.model_info import ModelInfo
+from ..core.formats.model import check_rig
+from ..core.formats.model_info import ModelInfo
 from ..core.rig import Rig
 from ..rig.reading import read_model_rig
 from ..scene.scene_rig import SceneRig

@@ -9,7 +9,7 @@ point to the text, so Blender appends and links it with them, and removes it wit
 import bpy
 
 from ..core.errors import ModelError
-from ..core.model import check_model
+from ..core.formats.model import check_model
 from .session import session
 
 PACKED_MODEL_KEY = "fdda_model"

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..core.deformation import lost_driver_note
 from ..core.errors import FDDAError, ModelError, RigError
-from ..core.mask import SkinningBlend
-from ..core.pose_repair import repair_pose
+from ..core.formats.pose_repair import repair_pose
+from ..core.mathematics.mask import SkinningBlend
 from ..core.rig import STATIC_JOINT
 from ..rig.deformation import read_drivers
 from ..rig.modifier_stack import check_shape_readers, find_shape_readers, replaced_range

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import bpy
 
 from ..core.errors import RigError
-from ..core.poses import LOCATION, ROTATION, SCALE
+from ..core.mathematics.poses import LOCATION, ROTATION, SCALE
 from .compatibility import accepts_slot, curves_of_slot
 
 _COPY_CONSTRAINTS = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}

@@ -5,7 +5,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Quaternion
 
-from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
+from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import STATIC_JOINT
 from .arrays import POSE_CHANNELS, POSE_MATRIX_ELEMENT, PropertyReader, read, write
 from .controls import set_control

@@ -10,9 +10,9 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
-from ..core.open_files import remove_file
-from ..core.output import atomic_write, check_writable
-from ..core.path_limits import path_length_problem
+from ..core.files.open_files import remove_file
+from ..core.files.output import atomic_write, check_writable
+from ..core.files.path_limits import path_length_problem
 
 SEEK_TABLE_END = bytes.fromhex("b1ea928f")
 """Last bytes of a compressed .blend file, which is in Zstandard's seekable format."""

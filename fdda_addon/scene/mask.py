@@ -4,7 +4,7 @@
 import bpy
 import numpy as np
 
-from ..core.mask import Mask
+from ..core.mathematics.mask import Mask
 
 
 def mask_key(mesh_object: bpy.types.Object) -> tuple[int, bool]:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import bpy
 
-from ..core.poses import CONTROL, ROTATION, ROTATION_VECTOR, Channel, sample_pose
+from ..core.mathematics.poses import CONTROL, ROTATION, ROTATION_VECTOR, Channel, sample_pose
 from ..core.recording.index import ACTION
 from ..poses.action_range import action_frames
 from ..poses.clip import Clip

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import BinaryIO, TextIO
 
 from ..core.errors import OutputError, os_error_text
-from ..core.file_lock import NoLocksError, has_ended, try_lock
-from ..core.output import write_json
+from ..core.files.file_lock import NoLocksError, has_ended, try_lock
+from ..core.files.output import write_json
 from .environment.folder import user_folder
 from .process import Training
 

@@ -15,12 +15,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Self, TextIO
 
-from ..core.child_process import OutputLines, child_environment, child_options, end_process
 from ..core.errors import TRY_AGAIN, TrainingDiedError, TrainingError, WrongUsageError, os_error_text
-from ..core.messages import STOP_FILE_VARIABLE, Message, MessageType
-from ..core.native_library import runtime_advice
-from ..core.stop_signals import INTERRUPTED
-from ..core.temporary import check_temporary_folder, new_temporary_file
+from ..core.files.child_process import OutputLines, child_environment, child_options, end_process
+from ..core.files.native_library import runtime_advice
+from ..core.files.stop_signals import INTERRUPTED
+from ..core.files.temporary import check_temporary_folder, new_temporary_file
+from ..core.formats.messages import STOP_FILE_VARIABLE, Message, MessageType
 from .environment.choice import select_python
 from .environment.folder import ROOT
 from .process_exit import explain_exit_status

@@ -5,7 +5,7 @@ import os
 from typing import NamedTuple
 
 from ..core.errors import TRY_AGAIN
-from ..core.native_library import runtime_url
+from ..core.files.native_library import runtime_url
 
 _WINDOWS_CRASHES = {
     0x80000003: "a breakpoint",

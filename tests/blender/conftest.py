@@ -17,7 +17,7 @@ from filelock import FileLock
 import fdda_addon
 from blend_fixtures.characters.training import Trainings
 from fdda_addon.cli.main import main
-from fdda_addon.core.model import METADATA_KEY
+from fdda_addon.core.formats.model import METADATA_KEY
 from fdda_addon.rig.reading import PoseReader
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.control_reader import ControlReader
@@ -131,7 +131,7 @@ def write_edited(model: Path, path: Path, edit: Callable) -> Path:
     """Write a copy of a model that `edit` changes, with a matching checksum, and return its path."""
     import onnx
 
-    from fdda_addon.core.model import CHECKSUM_KEY
+    from fdda_addon.core.formats.model import CHECKSUM_KEY
 
     proto = onnx.load(model)
     edit(proto)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.formats.messages import Message, MessageType
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
 _SITE_CUSTOMIZE = """

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RecordingError, RigError
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings

@@ -9,8 +9,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import FDDAError
-from fdda_addon.core.model import METADATA_KEY
-from fdda_addon.core.onnx_file import read_onnx
+from fdda_addon.core.formats.model import METADATA_KEY
+from fdda_addon.core.formats.onnx_file import read_onnx
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 

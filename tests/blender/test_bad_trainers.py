@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import pytest
 
 from fdda_addon.core.errors import TRY_AGAIN
-from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.formats.messages import Message, MessageType
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 from fdda_addon.training.process import trainer_command
 

@@ -12,7 +12,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from fdda_addon.core.model import CONTROLS_INPUT, METADATA_KEY
+from fdda_addon.core.formats.model import CONTROLS_INPUT, METADATA_KEY
 from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.player import Player
 from fdda_addon.runtime.session import session

@@ -11,7 +11,7 @@ import bpy
 import pytest
 
 from blend_fixtures.elbow import ACTION, FRAMES, build_elbow
-from fdda_addon.core.point_cache import PointCacheWriter
+from fdda_addon.core.formats.point_cache import PointCacheWriter
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import evaluated_positions
 

@@ -92,7 +92,7 @@ def test_train_passes_its_options_to_the_trainer(elbow_files, tmp_path, capfd):
     model = tmp_path / "m.onnx"
     options = ["--epochs", 3, "--hidden", 8, 16, "--activation", "tanh", "--seed", 9, "--learning-rate", "0.002"]
     assert run("train", elbow_files.recording, model, *options) == 0
-    from fdda_addon.core.model import read_model_info
+    from fdda_addon.core.formats.model import read_model_info
 
     training = read_model_info(model).training
     assert (training["epochs"], training["hidden"], training["activation"], training["seed"]) == (3, [8, 16], "tanh", 9)

@@ -13,7 +13,7 @@ from blend_fixtures.characters.bones import limit
 from blend_fixtures.characters.targets import TARGET
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RigError
-from fdda_addon.core.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
+from fdda_addon.core.mathematics.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.poses.control_bones import (
     bones_without_location_range,

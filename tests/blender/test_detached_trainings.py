@@ -10,8 +10,8 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.messages import MessageType
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.messages import MessageType
+from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.training import detached_process
 
 from .. import systems

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.messages import MessageType
+from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.recording.arrays import array_shapes
 from fdda_addon.training.process import trainer_python
 
@@ -65,9 +65,9 @@ def folder(elbow_files, tmp_path_factory) -> Path:
 
 def test_code_of_the_recording_chapter_runs(folder):
     """The code prints the same mean residual of the first pose as `fdda_addon.core`."""
-    from fdda_addon.core.metrics import distances
+    from fdda_addon.core.mathematics.metrics import distances
+    from fdda_addon.core.mathematics.skinning import LinearSkinning
     from fdda_addon.core.recording.reader import read_recording
-    from fdda_addon.core.skinning import LinearSkinning
 
     recording = read_recording(folder / "recording")
     skinning, pose = LinearSkinning(recording.rig), recording.pose_matrices[:1]
@@ -132,7 +132,7 @@ def test_recording_chapter_names_every_key_and_array(folder):
 
 
 def test_model_chapter_names_every_key(folder):
-    from fdda_addon.core.model import read_model_info
+    from fdda_addon.core.formats.model import read_model_info
 
     value = json.loads(read_model_info(folder / "model.onnx").to_json())
     keys = set(value) | {key for name in ("joints", "partitions") for key in value[name][0]}
@@ -141,7 +141,7 @@ def test_model_chapter_names_every_key(folder):
 
 
 def test_metadata_table_names_every_key_of_a_partition():
-    from fdda_addon.core.model_info import ModelPartition
+    from fdda_addon.core.formats.model_info import ModelPartition
 
     section = chapter("Model").partition("#### Partitions of a model\n")[2].partition("\n#")[0]
     keys = [field.name for field in fields(ModelPartition)]

@@ -9,11 +9,11 @@ import pytest
 
 from fdda_addon.cli.evaluate import table
 from fdda_addon.core.errors import RigError
-from fdda_addon.core.metrics import error_statistics
-from fdda_addon.core.model import read_model_info
-from fdda_addon.core.poses import sample_pose, widen_ranges
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.metrics import error_statistics
+from fdda_addon.core.mathematics.poses import sample_pose, widen_ranges
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation.results import Evaluation, PoseErrors
 from fdda_addon.evaluation.run import FIRST_HELD_OUT_INDEX, evaluate, evaluate_action
 from fdda_addon.evaluation.settings import EvaluationSettings, NamedPose

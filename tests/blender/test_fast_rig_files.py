@@ -7,8 +7,8 @@ from pathlib import Path
 import bpy
 
 from blend_fixtures.characters.bones import NewBone, add_bones
-from fdda_addon.core.model import METADATA_KEY
-from fdda_addon.core.model_info import OBJECT_KEY
+from fdda_addon.core.formats.model import METADATA_KEY
+from fdda_addon.core.formats.model_info import OBJECT_KEY
 from fdda_addon.scene.blend_file import save_copy
 
 from .command_output import output_of

@@ -13,11 +13,11 @@ import pytest
 from blend_fixtures.characters.base import cage, skin, tube
 from blend_fixtures.elbow import build_elbow, lower_weights
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation import heat_map
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings

@@ -15,7 +15,7 @@ from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import ModelError, RigError
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation.run import evaluate

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.poses import Channel
+from fdda_addon.core.mathematics.poses import Channel
+from fdda_addon.core.mathematics.skinning import skin_matrices
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.skinning import skin_matrices
 from fdda_addon.poses.suspended_limits import SuspendedLimits
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record

@@ -7,8 +7,8 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import error_statistics, viewport_colors
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.metrics import error_statistics, viewport_colors
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.evaluation import heat_map, last_evaluation, markers, overlay
 from fdda_addon.evaluation.run import evaluate, evaluate_action
 from fdda_addon.evaluation.settings import EvaluationSettings

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import sample_pose
+from fdda_addon.core.mathematics.poses import sample_pose
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.plan import RecordingSettings, make_recording_margin
 from fdda_addon.rig.reading import read_rig

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.file_lock import try_lock as lock_file
+from fdda_addon.core.files.file_lock import try_lock as lock_file
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.reader import read_recording

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import control_rigs, controls
-from fdda_addon.core.poses import CONTROL, LOCATION, ROTATION
+from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.panels import checks
 from fdda_addon.panels.limits import sampled_channels_by_bone

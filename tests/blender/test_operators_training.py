@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 import pytest
 
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job

@@ -9,7 +9,7 @@ import pytest
 from mathutils import Euler, Matrix
 
 from fdda_addon.core.errors import RigError
-from fdda_addon.core.poses import DEFAULT_RANGE, Channel, sample_pose
+from fdda_addon.core.mathematics.poses import DEFAULT_RANGE, Channel, sample_pose
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.plan import RecordingSettings

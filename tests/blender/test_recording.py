@@ -10,11 +10,11 @@ import pytest
 from mathutils import Matrix
 
 from fdda_addon.core.errors import RecordingError, RigError
-from fdda_addon.core.poses import ROTATION, Channel, sample_pose
+from fdda_addon.core.mathematics.poses import ROTATION, Channel, sample_pose
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.progress import Progress
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.appender import BATCH_POSES
 from fdda_addon.recording.influence_trials import follows_control_bones

@@ -19,7 +19,7 @@ from blend_fixtures.characters.bones import (
     remove_constraints,
 )
 from blend_fixtures.characters.training import SMALL
-from fdda_addon.core.metrics import distances
+from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record

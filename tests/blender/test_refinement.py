@@ -9,12 +9,12 @@ import pytest
 from mathutils import Matrix
 
 from fdda_addon.core.errors import FDDAError
-from fdda_addon.core.features import joint_features
-from fdda_addon.core.metrics import distances
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.features import joint_features
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import REFINED
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.recording.refinement import RefinementSettings, refine
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.runtime.network import Network

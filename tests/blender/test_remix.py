@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RigError
-from fdda_addon.core.poses import CONTROL, LOCATION, ROTATION_VECTOR
+from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION_VECTOR
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.panels import checks
 from fdda_addon.poses.remix import read_remix

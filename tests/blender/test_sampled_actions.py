@@ -9,7 +9,7 @@ import pytest
 from mathutils import Euler, Quaternion
 
 from fdda_addon.core.errors import RigError
-from fdda_addon.core.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
+from fdda_addon.core.mathematics.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
 from fdda_addon.panels.limits import _format_channels
 from fdda_addon.poses.action_range import measured_ranges
 from fdda_addon.poses.measured_limits import GIMBAL_LOCK_NOTE, describe_limits, set_limits_from_actions

@@ -15,7 +15,7 @@ from blend_fixtures.characters.base import cage, link, skin
 from blend_fixtures.characters.meshes import body_and_sleeve
 from fdda_addon.cli.pose_notes import REMIX_HINT
 from fdda_addon.core.errors import TRY_AGAIN
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.recording.plan import RecordingSettings

@@ -8,8 +8,8 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.skinning import LinearSkinning
-from fdda_addon.core.surface import Surface
+from fdda_addon.core.mathematics.skinning import LinearSkinning
+from fdda_addon.core.mathematics.surface import Surface
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.rig.reading import read_rig

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from blend_fixtures.elbow import build_elbow
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.rig import STATIC_JOINT
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.scene.scene_rig import find_rig
 

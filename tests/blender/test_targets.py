@@ -10,7 +10,7 @@ import pytest
 
 from blend_fixtures.characters import targets
 from blend_fixtures.elbow import ACTION, FRAMES
-from fdda_addon.core.alembic import read_time_range
+from fdda_addon.core.formats.alembic import read_time_range
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.rig import STATIC_JOINT
 from fdda_addon.scene.blend_file import save_copy
@@ -39,7 +39,7 @@ def of_flesh(rig: Path, path: Path, *options: object) -> Recording:
 
 
 def complex_positions(recording: Recording) -> np.ndarray:
-    from fdda_addon.core.skinning import LinearSkinning
+    from fdda_addon.core.mathematics.skinning import LinearSkinning
 
     skinning = LinearSkinning(recording.rig, recording.partitions)
     return skinning.complex_positions(np.array(recording.pose_matrices), np.array(recording.residuals))

@@ -20,7 +20,7 @@ from blend_fixtures.characters.transforms import (
 )
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.checks.recording import check_recording
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation import heat_map, last_evaluation
 from fdda_addon.evaluation.run import evaluate

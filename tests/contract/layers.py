@@ -23,6 +23,9 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("scene",),
     ("core.checks",),
     ("core.recording",),
+    ("core.formats",),
+    ("core.sentences",),
+    ("core.mathematics", "core.files"),
     ("core",),
 )
 """From the top down. A file imports from its own package and lower layers, not from other packages of its layer."""

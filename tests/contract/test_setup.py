@@ -14,7 +14,7 @@ from types import ModuleType
 import pytest
 from packaging.markers import Marker
 
-from fdda_addon.core.manual_page import make_page
+from fdda_addon.core.sentences.manual_page import make_page
 
 from ..systems import WINDOWS, symbolic_links
 

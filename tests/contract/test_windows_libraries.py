@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import setuptools
 
-from fdda_addon.core import windows_library
-from fdda_addon.core.windows_library import check_cpp_library, loaded_cpp_library_version, read_imports
+from fdda_addon.core.files import windows_library
+from fdda_addon.core.files.windows_library import check_cpp_library, loaded_cpp_library_version, read_imports
 
 from ..systems import WINDOWS
 from .test_setup import package

@@ -8,12 +8,12 @@ import numpy as np
 
 from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.controls import Control
-from fdda_addon.core.partition import make_partitions
-from fdda_addon.core.poses import Channel
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.poses import Channel
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from fdda_addon.core.skinning import LinearSkinning
 
 JOINTS = (Joint("root", -1), Joint("upper", 0), Joint("lower", 1), Joint("hand", 2))
 BONE_LENGTH, RADIUS = 0.25, 0.05

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.assessment import (
+from fdda_addon.core.mathematics.metrics import ErrorStatistics
+from fdda_addon.core.sentences.assessment import (
     assess_evaluation,
     assess_training,
     farther_than_skinning_sentence,
     format_mm,
     rising_from_epoch,
 )
-from fdda_addon.core.metrics import ErrorStatistics
 
 REPORTS = Path(__file__).with_name("reports")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.child_process import OutputLines, child_options, end_process
+from fdda_addon.core.files.child_process import OutputLines, child_options, end_process
 
 PRINT_STATE = "import json, sys; print(json.dumps([sys.flags.optimize, sys.path, 'Jürgen']))"
 

@@ -8,8 +8,8 @@ import pytest
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.model_info import ModelInfo, ModelPartition
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter

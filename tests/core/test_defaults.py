@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_defaults_are_imported_without_numpy():
-    code = "import sys, fdda_addon.core.defaults, fdda_addon.core.report; print('numpy' in sys.modules)"
+    code = "import sys, fdda_addon.core.defaults, fdda_addon.core.formats.report; print('numpy' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "False"
 
 

@@ -16,7 +16,7 @@ from fdda_addon.core.errors import (
     exit_status,
     os_error_text,
 )
-from fdda_addon.core.output import atomic_write
+from fdda_addon.core.files.output import atomic_write
 
 
 def error_caused_by(cause: BaseException) -> OutputError:

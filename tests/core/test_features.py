@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdda_addon.core.features import joint_features, joint_features_in_metres
+from fdda_addon.core.mathematics.features import joint_features, joint_features_in_metres
 
 from .limb import JOINTS, make_rig, random_poses, random_transforms
 

@@ -5,9 +5,9 @@ import os
 
 import pytest
 
-from fdda_addon.core import file_kind
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.output import check_outputs, to_json_text
+from fdda_addon.core.files import file_kind
+from fdda_addon.core.files.output import check_outputs, to_json_text
 
 from .. import systems
 from .tiny_model import tiny_model

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.file_lock import NoLocksError, has_ended, try_lock, wait_for_lock
+from fdda_addon.core.files.file_lock import NoLocksError, has_ended, try_lock, wait_for_lock
 
 from .. import systems
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_LOCK = """
 import sys
-from fdda_addon.core.file_lock import try_lock
+from fdda_addon.core.files.file_lock import try_lock
 file = open(sys.argv[1], "r+b")
 print(try_lock(file.fileno(), sys.argv[2] == "shared"), flush=True)
 sys.stdin.read()

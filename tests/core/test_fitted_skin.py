@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import ModelError, OutputError, RecordingError
-from fdda_addon.core.model import SKIN_KEY, read_model, read_skin
+from fdda_addon.core.formats.model import SKIN_KEY, read_model, read_skin
+from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, skin_from_text, skin_to_text
 from fdda_addon.core.recording.fit_folder import FitPosesWriter, read_fit_poses
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.skin_fit import FitReport, SkinFit, skin_from_text, skin_to_text
 
 from .damage import assert_refused, edit_index
 from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info

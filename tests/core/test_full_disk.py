@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.errors import DiskFullError, OutputError
-from fdda_addon.core.output import write_text
+from fdda_addon.core.files.output import write_text
+from fdda_addon.core.files.temporary import temporary_folder
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.temporary import temporary_folder
 
 from .. import systems
 from .conftest import SMALL_DISK_BYTES
@@ -98,7 +98,7 @@ WRITE_WITH_SIZE_LIMIT = """
 import resource, sys
 from pathlib import Path
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.output import write_text
+from fdda_addon.core.files.output import write_text
 from tests.core.limb import record_limb
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 folder = Path(sys.argv[1])

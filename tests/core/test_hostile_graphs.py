@@ -8,9 +8,9 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.model import CHECKSUM_KEY, check_model
-from fdda_addon.core.model_info import ModelPartition
-from fdda_addon.core.onnx_file import infer_shapes, read_onnx
+from fdda_addon.core.formats.model import CHECKSUM_KEY, check_model
+from fdda_addon.core.formats.model_info import ModelPartition
+from fdda_addon.core.formats.onnx_file import infer_shapes, read_onnx
 
 from .tiny_model import JOINT_COUNT, VERTEX_COUNT, tiny_info, tiny_model, zeros_tensor
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.joint_option import parse_joints
-from fdda_addon.core.key_joints import KeyJointReport, add_influences, select_joints
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.key_joints import KeyJointReport, add_influences, select_joints
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, weights_match
 from fdda_addon.core.rig import Fingerprint, Joint, Rig, rig_differences
-from fdda_addon.core.skin_fit import FitReport, SkinFit, weights_match
 
 REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
 ERRORS = FitReport({"rig": 2.0, "fitted": 1.0}, {"rig": 20.0, "fitted": 10.0})

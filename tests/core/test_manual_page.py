@@ -4,7 +4,7 @@
 import re
 from pathlib import Path
 
-from fdda_addon.core.manual_page import heading_anchor, make_page
+from fdda_addon.core.sentences.manual_page import heading_anchor, make_page
 
 ROOT = Path(__file__).resolve().parents[2]
 MANUAL = (ROOT / "docs" / "manual.md").read_text(encoding="utf-8")

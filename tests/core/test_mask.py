@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.mask import Mask, SkinningBlend
-from fdda_addon.core.skinning import LinearSkinning
+from fdda_addon.core.mathematics.mask import Mask, SkinningBlend
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 
 from .limb import VERTEX_COUNT, make_rig, random_poses
 

@@ -3,7 +3,7 @@
 
 import pytest
 
-from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.formats.messages import Message, MessageType
 
 SAMPLE_MESSAGES = [
     Message(MessageType.STARTED, {"partitions": 3, "poses": 100, "vertices": 90, "device": "cpu"}),

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import (
+from fdda_addon.core.mathematics.metrics import (
     NO_ERROR_COLOR,
     distances,
     error_statistics,

@@ -11,9 +11,9 @@ import pytest
 from onnx import TensorProto, helper
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.model import check_rig, read_model, read_model_info
-from fdda_addon.core.model_info import ModelInfo, ModelPartition
-from fdda_addon.core.poses import Channel
+from fdda_addon.core.formats.model import check_rig, read_model, read_model_info
+from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
+from fdda_addon.core.mathematics.poses import Channel
 
 from .. import systems
 from .limb import make_rig

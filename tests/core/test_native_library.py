@@ -5,7 +5,7 @@ import ctypes
 
 import pytest
 
-from fdda_addon.core.native_library import loader_winerror, runtime_advice
+from fdda_addon.core.files.native_library import loader_winerror, runtime_advice
 
 from ..systems import WINDOWS
 

@@ -7,8 +7,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.model import check_model
-from fdda_addon.core.onnx_file import OnnxContents, read_onnx
+from fdda_addon.core.formats.model import check_model
+from fdda_addon.core.formats.onnx_file import OnnxContents, read_onnx
 
 from .tiny_model import JOINT_COUNT, VERTEX_COUNT, in_subgraph, tiny_info, tiny_model, with_external_data, zeros_tensor
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core import output
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.output import (
+from fdda_addon.core.files import output
+from fdda_addon.core.files.output import (
     atomic_write,
     atomic_write_all,
     check_folder_writable,
@@ -226,7 +226,7 @@ CHECK_PATHS_AS_NOBODY = """
 import os, sys
 from pathlib import Path
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.output import check_folder_writable, check_writable
+from fdda_addon.core.files.output import check_folder_writable, check_writable
 os.setuid(65534)
 for check, path in ((check_writable, sys.argv[1]), (check_folder_writable, sys.argv[1])):
     try:

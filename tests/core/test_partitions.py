@@ -5,7 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdda_addon.core.partition import assume_nearby_influences, main_joints, make_partitions, partition_colors
+from fdda_addon.core.mathematics.partition import (
+    assume_nearby_influences,
+    main_joints,
+    make_partitions,
+    partition_colors,
+)
 
 from .limb import INFLUENCING, VERTEX_COUNT, make_rig, partitions_of
 

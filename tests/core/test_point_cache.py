@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import PointCacheError
-from fdda_addon.core.point_cache import PointCacheWriter, read_point_cache
+from fdda_addon.core.formats.point_cache import PointCacheWriter, read_point_cache
 
 
 @pytest.fixture

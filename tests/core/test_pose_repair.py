@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.pose_repair import repair_pose
+from fdda_addon.core.formats.pose_repair import repair_pose
 
 from .limb import random_transforms
 from .tiny_model import JOINT_COUNT, tiny_info

@@ -11,7 +11,7 @@ import pytest
 from fdda_addon.core.checks import residual_scan
 from fdda_addon.core.checks.recording import WARNING_NAMES, check_recording, compute_bone_lengths, merges_sentence
 from fdda_addon.core.checks.warning import RecordingWarning, format_length, format_list, format_with_noun
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.index import Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import STATIC_JOINT

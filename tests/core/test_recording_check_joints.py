@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from fdda_addon.core.controls import Control
-from fdda_addon.core.partition import make_partitions
-from fdda_addon.core.poses import Channel
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import STATIC_JOINT, Joint
 

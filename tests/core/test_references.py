@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from fdda_addon.core.features import joint_features
-from fdda_addon.core.references import choose_references, has_reference_choice, minimum_arborescence
+from fdda_addon.core.mathematics.features import joint_features
+from fdda_addon.core.mathematics.references import choose_references, has_reference_choice, minimum_arborescence
 from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig, read_joints
 
 from .limb import JOINTS, make_rig, random_rotations, random_transforms

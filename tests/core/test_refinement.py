@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import Channel
-from fdda_addon.core.refinement import Probes, choose_poses, nearest_recorded_distances
+from fdda_addon.core.mathematics.poses import Channel
+from fdda_addon.core.mathematics.refinement import Probes, choose_poses, nearest_recorded_distances
 
 CHANNELS = (
     Channel("a", "rotation", 0, -1, 1),

@@ -4,9 +4,14 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel, sample_pose
-from fdda_addon.core.remix import PoseSampler, Remix, find_limbs, replace_bone_channels
-from fdda_addon.core.rotations import multiply_quaternions, rotation_vectors, to_quaternions, to_rotation_vectors
+from fdda_addon.core.mathematics.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel, sample_pose
+from fdda_addon.core.mathematics.remix import PoseSampler, Remix, find_limbs, replace_bone_channels
+from fdda_addon.core.mathematics.rotations import (
+    multiply_quaternions,
+    rotation_vectors,
+    to_quaternions,
+    to_rotation_vectors,
+)
 
 FRAMES = 50
 

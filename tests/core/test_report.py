@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core import report as report_format
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.report import checkpoint_path, page_path, read_report, report_path, write_report
+from fdda_addon.core.formats import report as report_format
+from fdda_addon.core.formats.report import checkpoint_path, page_path, read_report, report_path, write_report
 
 ERRORS = {"mean": 0.1, "rms": 0.2, "p99": 0.5, "p999": 1, "max": 2.5}
 REPORT = {

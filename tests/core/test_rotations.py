@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.rotations import euler_angles, rotation_vectors, total_range_width
+from fdda_addon.core.mathematics.rotations import euler_angles, rotation_vectors, total_range_width
 
 
 def axis_quaternions(axis: int, angles: np.ndarray) -> np.ndarray:

@@ -4,7 +4,14 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import Channel, Margin, bones_with_changed_range, make_margin, sample_pose, widen_ranges
+from fdda_addon.core.mathematics.poses import (
+    Channel,
+    Margin,
+    bones_with_changed_range,
+    make_margin,
+    sample_pose,
+    widen_ranges,
+)
 
 CHANNELS = (
     Channel("a", "rotation", 0, -1.0, 3.0),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.checks.seams import check_seams
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording
 
 from .good_recording import RING_COUNT, VERTICES_PER_RING, single_warning_text, warning_texts, with_rig

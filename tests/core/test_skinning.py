@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RigError
-from fdda_addon.core.skinning import LinearSkinning, SkinBlock, skin_matrices
+from fdda_addon.core.mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
 
 from .limb import JOINTS, VERTEX_COUNT, make_rig, partitions_of, random_poses, random_residuals, random_transforms
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.partition import main_joints, make_partitions, small_partition_merges
+from fdda_addon.core.mathematics.partition import main_joints, make_partitions, small_partition_merges
 from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, Rig
 
 

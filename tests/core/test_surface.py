@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.partition import Partition
-from fdda_addon.core.surface import Surface, SurfaceComparison, angles_between, are_faces, surface_errors
+from fdda_addon.core.mathematics.partition import Partition
+from fdda_addon.core.mathematics.surface import Surface, SurfaceComparison, angles_between, are_faces, surface_errors
 
 from .limb import make_rig, partitions_of
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.checks.target import check_target, unsettled_sentence
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import ACTION, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import RecordedTarget, Repeatability
-from fdda_addon.core.skinning import LinearSkinning
 
 from .good_recording import good_recording, with_positions
 

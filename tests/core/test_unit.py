@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import distances, error_statistics
-from fdda_addon.core.model_info import ModelInfo
+from fdda_addon.core.formats.model_info import ModelInfo
+from fdda_addon.core.mathematics.metrics import distances, error_statistics
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording

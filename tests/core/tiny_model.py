@@ -8,8 +8,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY
-from fdda_addon.core.model_info import ModelInfo, ModelPartition
+from fdda_addon.core.formats.model import CHECKSUM_KEY, METADATA_KEY
+from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
 from fdda_addon.core.rig import Fingerprint, Joint
 
 JOINT_COUNT, VERTEX_COUNT = 3, 4

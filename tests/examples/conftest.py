@@ -11,7 +11,7 @@ import pytest
 from mathutils import Euler, Matrix
 
 from fdda_addon.core.controls import Control
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import STATIC_JOINT, Joint

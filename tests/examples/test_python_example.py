@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
 
 from .conftest import CONTROL, ROOT, Character, expected_positions
 

@@ -19,7 +19,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from fdda_addon.core.model import read_model_info
+from fdda_addon.core.formats.model import read_model_info
 
 from .conftest import ROOT, Character, Rotations, expected_positions
 

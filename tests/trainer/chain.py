@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fdda_addon.core.partition import make_partitions
-from fdda_addon.core.poses import Channel
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Fingerprint, Joint, Rig

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from fdda_addon.core.metrics import distances
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.formats.report import checkpoint_path
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.report import checkpoint_path
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network as ModelNetwork
 from trainer import compression
 from trainer.__main__ import main

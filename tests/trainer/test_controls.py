@@ -12,13 +12,13 @@ import pytest
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.metrics import distances
-from fdda_addon.core.model import read_model_info
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.config import TrainingConfig

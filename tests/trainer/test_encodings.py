@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Joint
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from trainer.__main__ import main
 from trainer.report.error_analysis import (

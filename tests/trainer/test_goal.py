@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.report import Verdict
+from fdda_addon.core.formats.report import Verdict
 from trainer.goal import evaluate_goal
 
 

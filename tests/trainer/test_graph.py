@@ -10,11 +10,11 @@ import pytest
 
 import trainer.train
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.model import read_model_info
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.export import network_nodes
 from trainer.export.export import check_parity, measure, open_session, reference_positions

@@ -11,13 +11,13 @@ import onnx
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fdda_addon.core.model import read_model_info
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.formats.report import checkpoint_path
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording

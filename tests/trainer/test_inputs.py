@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 import pytest
 
-from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from trainer.__main__ import main
 from trainer.inputs import network_inputs

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.mathematics.partition import Partition, make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
 from fdda_addon.core.rig import Joint, Rig
-from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from trainer.fits.joint_fit import joint_regression
 
 from .chain import chain_angles, chain_rig, pose_chain, rotation

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import KEY_JOINTS_STAGE
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fitted_weights, read_key_joints
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from fdda_addon.core.skinning import LinearSkinning
 from trainer.skin.choice import choose_key_joints
 from trainer.skin.job import fit_folder
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.checks.recording import check_recording
-from fdda_addon.core.features import FEATURES_PER_JOINT
-from fdda_addon.core.model import read_model_info
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.formats.report import report_path
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT
+from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.report import report_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording

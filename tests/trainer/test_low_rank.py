@@ -7,10 +7,10 @@ import numpy as np
 import onnx
 import pytest
 
-from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.mathematics.partition import Partition, make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from trainer.__main__ import main
 from trainer.export.graph import build_graph
 from trainer.fits import low_rank

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import distances
-from fdda_addon.core.model import read_model_info
-from fdda_addon.core.partition import Partition, main_joints, make_partitions
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.partition import Partition, main_joints, make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig
-from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.fits.joint_fit import joint_regression, joints_on_path

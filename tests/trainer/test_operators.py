@@ -7,8 +7,8 @@ import onnx
 import pytest
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.model import check_model
-from fdda_addon.core.onnx_file import FREE_ELEMENTS, infer_shapes, read_onnx
+from fdda_addon.core.formats.model import check_model
+from fdda_addon.core.formats.onnx_file import FREE_ELEMENTS, infer_shapes, read_onnx
 from trainer.__main__ import main
 from trainer.config import ACTIVATIONS
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig

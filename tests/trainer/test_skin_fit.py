@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.messages import STOP_FILE_VARIABLE, Message, MessageType
+from fdda_addon.core.formats.messages import STOP_FILE_VARIABLE, Message, MessageType
+from fdda_addon.core.mathematics.skin_fit import SkinFit
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.arrays import array_header
 from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted_weights
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from fdda_addon.core.skin_fit import SkinFit
-from fdda_addon.core.skinning import LinearSkinning
 from trainer.skin.__main__ import main
 from trainer.skin.job import fit_folder, measure
 from trainer.skin.solver import fit_skin, simplex_weights

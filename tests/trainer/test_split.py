@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.poses import Margin
+from fdda_addon.core.mathematics.poses import Margin
 from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording, read_recording
 from trainer.config import TrainingConfig

@@ -8,10 +8,10 @@ import numpy as np
 import onnx
 import pytest
 
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.formats.report import checkpoint_path
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.report import checkpoint_path
-from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording

@@ -8,12 +8,12 @@ import onnx
 import onnxruntime
 import pytest
 
-from fdda_addon.core.features import joint_features
-from fdda_addon.core.metrics import distances
-from fdda_addon.core.model import check_rig, read_model_info
+from fdda_addon.core.formats.model import check_rig, read_model_info
+from fdda_addon.core.mathematics.features import joint_features
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.config import ACTIVATIONS, TrainingConfig
 from trainer.data.split import split_recording

@@ -13,7 +13,7 @@ import sys
 import numpy as np
 import pytest
 
-from fdda_addon.core.messages import STOP_FILE_VARIABLE, Message, MessageType
+from fdda_addon.core.formats.messages import STOP_FILE_VARIABLE, Message, MessageType
 from trainer.__main__ import main
 from trainer.process import run_with_messages
 from trainer.progress import JsonMessageSink

@@ -9,9 +9,9 @@ import zipfile
 import numpy as np
 import pytest
 
+from fdda_addon.core.formats.report import checkpoint_path
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.report import checkpoint_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording

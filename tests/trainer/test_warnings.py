@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.formats.messages import Message, MessageType
 from trainer.__main__ import main
 
 from .conftest import QUICK_OPTIONS

@@ -3,11 +3,11 @@
 
 import numpy as np
 
-from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from fdda_addon.core.skinning import LinearSkinning
 
 from .chain import chain_angles, chain_info, pose_chain, rotation
 

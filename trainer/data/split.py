@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fdda_addon.core.counts import format_count
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording.index import RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint
+from fdda_addon.core.sentences.counts import format_count
 
 from ..config import TrainingConfig
 

@@ -10,9 +10,7 @@ import onnx
 import onnxruntime
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.features import FEATURES_PER_JOINT, FLOAT32_ROUNDING_RATIO
-from fdda_addon.core.metrics import distances, error_statistics
-from fdda_addon.core.model import (
+from fdda_addon.core.formats.model import (
     CHECKSUM_KEY,
     CONFIDENCE_OUTPUT,
     CONTROLS_INPUT,
@@ -22,11 +20,13 @@ from fdda_addon.core.model import (
     SKIN_KEY,
     read_model_info,
 )
-from fdda_addon.core.model_info import LIMITS_KEY, OBJECT_KEY, ModelInfo, ModelPartition
+from fdda_addon.core.formats.model_info import LIMITS_KEY, OBJECT_KEY, ModelInfo, ModelPartition
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, FLOAT32_ROUNDING_RATIO
+from fdda_addon.core.mathematics.metrics import distances, error_statistics
+from fdda_addon.core.mathematics.skin_fit import skin_to_text
+from fdda_addon.core.mathematics.skinning import LinearSkinning
+from fdda_addon.core.mathematics.surface import Surface, SurfaceComparison, surface_errors, surface_json
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.skin_fit import skin_to_text
-from fdda_addon.core.skinning import LinearSkinning
-from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
 
 from ..blocks import block_slices
 from ..fits.half_rotations import regression_matrices

@@ -12,7 +12,7 @@ K components, V vertices.
 import onnx
 from onnx import TensorProto, helper
 
-from fdda_addon.core.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT
+from fdda_addon.core.formats.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT
 
 from ..graph_builder import GraphBuilder
 from ..model import TrainedModel

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdda_addon.core.model import CONFIDENCE_OUTPUT
+from fdda_addon.core.formats.model import CONFIDENCE_OUTPUT
 
 from ..graph_builder import GraphBuilder
 from ..inputs.block import VECTOR_SIZE

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdda_addon.core.features import FEATURES_PER_JOINT
-from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSE_INPUT
+from fdda_addon.core.formats.model import CONFIDENCE_OUTPUT, POSE_INPUT
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT
 from fdda_addon.core.rig import Rig
 
 from ..fits.half_rotations import MIN_DIVISOR

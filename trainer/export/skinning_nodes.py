@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSITIONS_OUTPUT
-from fdda_addon.core.skinning import SkinBlock
+from fdda_addon.core.formats.model import CONFIDENCE_OUTPUT, POSITIONS_OUTPUT
+from fdda_addon.core.mathematics.skinning import SkinBlock
 
 from ..graph_builder import GraphBuilder
 from ..inputs.block import MATRIX_COLUMNS, VECTOR_SIZE

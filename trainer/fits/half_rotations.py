@@ -9,10 +9,10 @@ Dual Quaternion Blending, 2008.
 
 import numpy as np
 
-from fdda_addon.core.features import joint_features
+from fdda_addon.core.mathematics.features import joint_features
+from fdda_addon.core.mathematics.skinning import skin_matrices
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import skin_matrices
 
 from .joint_fit import joint_regression
 
@@ -28,7 +28,7 @@ def half_rotation_matrices(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
     """Compute the half-rotation matrices V_j = Q_j A_j B_j^-1, with A_j = (R_j - R_j^T) / (3 + tr R_j).
 
     Q_j = P_r B_r^-1 B_j is the joint as its reference joint r carries it along. R_j is the rotation and scale of the
-    joint relative to Q_j, the upper left of F_j in `core.features`. Where R_j rotates by an angle a, A_j is
+    joint relative to Q_j, the upper left of F_j in `core.mathematics.features`. Where R_j rotates by an angle a, A_j is
     sin a / (2 + cos a) [axis]x: within three hundredths of 0.687 sin (a/2) up to 120 degrees, and 0 at 0 and at 180.
 
     Args:

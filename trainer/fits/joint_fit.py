@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
 from ..blocks import block_slices

@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 
@@ -33,7 +33,7 @@ class Vectors:
 
 @dataclass(frozen=True)
 class JointVectors:
-    """The features of joints in the graph: the four columns of the matrix F_j of each joint (`core.features`).
+    """The features of joints in the graph: the four columns of the matrix F_j of each joint (`mathematics.features`).
 
     Attributes:
         name: name of the (N, 4 B + 1, 3) vectors: the columns of B joints, and a zero vector.

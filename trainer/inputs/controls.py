@@ -7,8 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from fdda_addon.core.model import CONTROLS_INPUT
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.formats.model import CONTROLS_INPUT
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import Rig
 
 from ..graph_builder import GraphBuilder

@@ -7,8 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, joint_features
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import Rig
 
 from ..graph_builder import GraphBuilder
@@ -17,7 +17,7 @@ from .block import MATRIX_COLUMNS, VECTOR_SIZE, FeatureBlock, JointVectors, Stat
 
 @dataclass(frozen=True)
 class JointFeatures(FeatureBlock):
-    """Twelve features for each of J joints (`core.features`). Every fourth feature is a length in mesh units.
+    """Twelve features for each of J joints (`mathematics.features`). Every fourth feature is a length in mesh units.
 
     Attributes:
         references: (J,) reference joint of each joint, -1 for mesh-object space.

@@ -7,8 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, joint_features
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import sparse
 
+from fdda_addon.core.mathematics.surface import adjacent_corners
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.surface import adjacent_corners
 
 from .surface_frame_vectors import SurfaceFrames
 

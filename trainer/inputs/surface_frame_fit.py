@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdda_addon.core.mathematics.skinning import skin_matrices
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import skin_matrices
 
 from ..data.split import Split
 from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression

@@ -15,8 +15,8 @@ from typing import Self
 
 import numpy as np
 
-from fdda_addon.core.model import POSE_INPUT
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.formats.model import POSE_INPUT
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 

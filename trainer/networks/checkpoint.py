@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.input_file import open_input
+from fdda_addon.core.files.input_file import open_input
 from fdda_addon.core.recording.arrays import MAX_VALUE, NPY_HEADER_ERRORS
 from fdda_addon.core.rig import Fingerprint
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdda_addon.core.controls import Control
-from fdda_addon.core.features import FEATURES_PER_JOINT
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT
+from fdda_addon.core.mathematics.partition import Partition
+from fdda_addon.core.mathematics.skinning import SkinBlock
 from fdda_addon.core.rig import STATIC_JOINT, Rig
-from fdda_addon.core.skinning import SkinBlock
 
 MARGIN_RATIO = 0.1
 """Margin of the box on each side, as a part of the range."""

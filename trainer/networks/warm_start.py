@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.formats.report import checkpoint_path
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.report import checkpoint_path
 
 from ..config import TrainingConfig
 from ..inputs.network_inputs import check_states

@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 from fdda_addon.core.errors import FDDAError, TrainingError
-from fdda_addon.core.file_kind import PAGE
-from fdda_addon.core.output import check_outputs, write_text
-from fdda_addon.core.report import page_path, read_evaluation, read_report
-from fdda_addon.core.terminal import escape_unencodable_output
+from fdda_addon.core.files.file_kind import PAGE
+from fdda_addon.core.files.output import check_outputs, write_text
+from fdda_addon.core.files.terminal import escape_unencodable_output
+from fdda_addon.core.formats.report import page_path, read_evaluation, read_report
 
 from ..process import missing_package_error
 

@@ -6,8 +6,8 @@ from dataclasses import asdict
 
 import numpy as np
 
-from fdda_addon.core.metrics import error_statistics
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.metrics import error_statistics
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdda_addon.core.features import FEATURES_PER_JOINT
-from fdda_addon.core.partition import Partition
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT
+from fdda_addon.core.mathematics.partition import Partition
+from fdda_addon.core.mathematics.refinement import nearest_recorded_distances
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.refinement import nearest_recorded_distances
 
 from ..data.split import Split
 from ..fits.half_rotations import regression_matrices

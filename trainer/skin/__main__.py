@@ -9,9 +9,9 @@ import argparse
 import sys
 from pathlib import Path
 
+from fdda_addon.core.files.terminal import escape_unencodable_output
 from fdda_addon.core.joint_option import ALL, parse_joints
-from fdda_addon.core.skin_fit import FIT_KINDS
-from fdda_addon.core.terminal import escape_unencodable_output
+from fdda_addon.core.mathematics.skin_fit import FIT_KINDS
 
 from ..process import StopRequest, missing_package_error, run_with_messages
 from ..progress import JsonMessageSink, MessageSink

@@ -8,11 +8,11 @@ import numpy as np
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
-from fdda_addon.core.partition import joints_with_weight, make_partitions
+from fdda_addon.core.mathematics.partition import joints_with_weight, make_partitions
+from fdda_addon.core.mathematics.references import choose_references, has_reference_choice
+from fdda_addon.core.mathematics.skinning import are_invertible, skin_matrices
 from fdda_addon.core.recording.fit_folder import FitPoses
-from fdda_addon.core.references import choose_references, has_reference_choice
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import are_invertible, skin_matrices
 
 from .input_blocks import LENGTH_RATIO, InputBlocks
 from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments

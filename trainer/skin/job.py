@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.joint_option import ALL, KEY_JOINTS_STAGE
-from fdda_addon.core.messages import MessageType
-from fdda_addon.core.metrics import distances
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted_weights, write_key_joints
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skin_fit import FitReport, SkinFit
-from fdda_addon.core.skinning import LinearSkinning
 
 from ..blocks import block_slices
 from ..progress import MessageSink
@@ -34,7 +34,7 @@ def fit_folder(
 
     Args:
         folder: written by `FitPosesWriter`.
-        kind: one of `core.skin_fit.FIT_KINDS`.
+        kind: one of `core.mathematics.skin_fit.FIT_KINDS`.
         sink: receives progress, and last the result.
         metres_per_unit: as in `Rig`.
         joints: the joints that may have weights: the option `joints`, "all", "auto", or a number.

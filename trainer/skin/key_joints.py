@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdda_addon.core.key_joints import KeyJointReport
+from fdda_addon.core.mathematics.key_joints import KeyJointReport
+from fdda_addon.core.mathematics.skinning import skin_matrices
 from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import reference_order
-from fdda_addon.core.skinning import skin_matrices
 
 from .input_blocks import MIN_SPREAD, InputBlocks, predict
 

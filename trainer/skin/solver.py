@@ -15,9 +15,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import nnls
 
+from fdda_addon.core.mathematics.skin_fit import INFLUENCES
+from fdda_addon.core.mathematics.skinning import skin_matrices
 from fdda_addon.core.recording.fit_folder import FitPoses
-from fdda_addon.core.skin_fit import INFLUENCES
-from fdda_addon.core.skinning import skin_matrices
 
 from ..blocks import block_slices
 

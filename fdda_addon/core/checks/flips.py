@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..features import joint_features_in_metres
-from ..partition import Partition
+from ..mathematics.features import joint_features_in_metres
+from ..mathematics.partition import Partition
 from ..recording.reader import Recording
 from .residual_scan import ResidualScan
 from .warning import RecordingWarning, format_length, joint_name

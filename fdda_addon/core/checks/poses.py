@@ -5,9 +5,9 @@ import hashlib
 
 import numpy as np
 
+from ..mathematics.skinning import skin_matrices
 from ..recording.index import ACTION, MIRRORED, STRIP
 from ..recording.reader import Recording
-from ..skinning import skin_matrices
 from .warning import RecordingWarning, format_length, format_with_noun
 
 _SOURCE_LABELS = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}

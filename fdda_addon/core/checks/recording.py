@@ -3,11 +3,11 @@
 
 import numpy as np
 
-from ..counts import format_count
 from ..defaults import MIN_PARTITION_VERTICES
-from ..features import float32_rounding, joint_features_in_metres
+from ..mathematics.features import float32_rounding, joint_features_in_metres
 from ..recording.reader import Recording
 from ..rig import STATIC_JOINT_LABEL, Rig
+from ..sentences.counts import format_count
 from .flips import check_flips
 from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..partition import Partition
+from ..mathematics.partition import Partition
 from ..recording.reader import Recording
 
 MAX_SCANNED_POSES = 1000

@@ -5,7 +5,7 @@ import itertools
 
 import numpy as np
 
-from ..partition import main_joints
+from ..mathematics.partition import main_joints
 from ..rig import STATIC_JOINT, Rig
 from .warning import RecordingWarning, format_length
 

@@ -10,10 +10,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..partition import main_joints
+from ..mathematics.partition import main_joints
+from ..mathematics.surface import adjacent_corners
 from ..recording.reader import Recording
 from ..rig import Rig
-from ..surface import adjacent_corners
 from .warning import RecordingWarning, format_length
 
 POSITION_DIGITS = 5

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..counts import format_count
+from ..mathematics.skinning import LinearSkinning
 from ..recording.index import ACTION, STRIP, Source
 from ..recording.reader import Recording
-from ..skinning import LinearSkinning
+from ..sentences.counts import format_count
 from .warning import RecordingWarning, format_length, format_list
 
 MAX_DISTANCE_RATIO = 0.2

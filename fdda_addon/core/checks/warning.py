@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from ..errors import RecordingError
-from ..messages import WARNING_LINE
+from ..formats.messages import WARNING_LINE
 from ..rig import STATIC_JOINT_LABEL, Rig
 
 MAX_LISTED = 3

@@ -11,8 +11,8 @@ from typing import BinaryIO
 import numpy as np
 
 from ..errors import RecordingError, os_error_text
-from ..input_file import open_input
-from ..skinning import are_invertible
+from ..files.input_file import open_input
+from ..mathematics.skinning import are_invertible
 
 NPY_HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
 """Errors that numpy raises for a damaged header of a `.npy` file, apart from ValueError."""

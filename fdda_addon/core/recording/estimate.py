@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..counts import format_count
 from ..errors import DiskFullError
-from ..output import nearest_existing_folder
+from ..files.output import nearest_existing_folder
 from ..rig import STATIC_JOINT_LABEL, Rig
+from ..sentences.counts import format_count
 from .arrays import array_shapes
 from .reader import Recording
 

@@ -7,9 +7,9 @@ from dataclasses import asdict
 
 import numpy as np
 
-from ..counts import format_count
 from ..errors import BusyError, OutputError, RecordingError, os_error_text
-from ..input_file import open_input
+from ..files.input_file import open_input
+from ..sentences.counts import format_count
 from .arrays import STREAMED_ARRAY_NAMES, array_header, array_shapes, check_pose_values, streamed_arrays
 from .index import REFINED, Source, read_index, write_index
 from .lock import RecordingLock

@@ -14,10 +14,10 @@ from types import TracebackType
 import numpy as np
 
 from ..errors import OutputError, RecordingError, os_error_text
-from ..input_file import open_input
+from ..files.input_file import open_input
+from ..mathematics.skin_fit import INFLUENCES, are_skin_weights
+from ..mathematics.skinning import are_invertible
 from ..rig import Fingerprint, Joint, Rig
-from ..skin_fit import INFLUENCES, are_skin_weights
-from ..skinning import are_invertible
 from .arrays import NPY_HEADER_ERRORS, array_header, check_pose_values, read_array_header
 
 MIN_POSES = 10

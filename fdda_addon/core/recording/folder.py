@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import OutputError, RecordingError, os_error_text
-from ..key_joints import select_joints
+from ..mathematics.key_joints import select_joints
+from ..mathematics.skin_fit import weights_match
 from ..rig import Fingerprint, Rig, read_joints, rig_differences
-from ..skin_fit import weights_match
 from .folder_check import is_available, is_recording, remove_recording_files
 from .index import INDEX_NAME, REFINED, find_different_keys, read_index, read_info
 from .lock import RecordingLock

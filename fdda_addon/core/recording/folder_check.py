@@ -5,9 +5,9 @@ import os
 from pathlib import Path
 
 from ..errors import OutputError, RecordingError, os_error_text
-from ..file_kind import RECORDING
-from ..open_files import remove_file
-from ..output import check_folder_writable, is_temporary_name
+from ..files.file_kind import RECORDING
+from ..files.open_files import remove_file
+from ..files.output import check_folder_writable, is_temporary_name
 from .arrays import ARRAY_NAMES, STREAMED_ARRAY_NAMES
 from .index import INDEX_NAME
 from .lock import LOCK_NAME, RecordingLock

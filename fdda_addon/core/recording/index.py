@@ -8,12 +8,12 @@ from pathlib import Path
 
 from ..controls import read_controls
 from ..errors import OutputError, RecordingError, os_error_text
-from ..input_file import read_input
-from ..output import atomic_write, to_json_text
-from ..poses import Channel, Margin
+from ..files.input_file import read_input
+from ..files.output import atomic_write, to_json_text
+from ..mathematics.poses import Channel, Margin
+from ..mathematics.skin_fit import SkinFit
+from ..mathematics.surface import MIN_CORNERS
 from ..rig import Fingerprint, read_joints, read_name
-from ..skin_fit import SkinFit
-from ..surface import MIN_CORNERS
 from ..unit import read_unit
 from .target import RecordedTarget, Repeatability
 

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from ..errors import BusyError
-from ..file_lock import NoLocksError, has_ended, try_lock
+from ..files.file_lock import NoLocksError, has_ended, try_lock
 
 LOCK_NAME = "recording.lock"
 MAX_OWNER_BYTES = 1000

@@ -11,11 +11,11 @@ import numpy as np
 
 from ..controls import read_controls
 from ..errors import RecordingError
-from ..partition import Partition, make_partitions
+from ..mathematics.partition import Partition, make_partitions
+from ..mathematics.skin_fit import are_skin_weights
+from ..mathematics.skinning import are_invertible
+from ..mathematics.surface import are_faces
 from ..rig import Fingerprint, Rig, read_joints
-from ..skin_fit import are_skin_weights
-from ..skinning import are_invertible
-from ..surface import are_faces
 from ..unit import read_unit
 from .arrays import MAX_VALUE, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array
 from .index import RecordingInfo, read_index, read_info

@@ -4,8 +4,8 @@
 import math
 from dataclasses import dataclass
 
-from ..counts import format_count
 from ..rig import read_name
+from ..sentences.counts import format_count
 
 STATISTIC_NAMES = ("mean", "rms", "p99", "p999", "max")
 POSE, FRAMES, SIMULATION = "pose", "frames", "simulation"

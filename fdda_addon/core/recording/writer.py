@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import OutputError, RecordingError, os_error_text
-from ..input_file import open_input
-from ..open_files import remove_file
-from ..partition import Partition
+from ..files.input_file import open_input
+from ..files.open_files import remove_file
+from ..mathematics.partition import Partition
 from ..rig import Rig, rest_matrices_match
 from ..unit import read_unit, unit_to_json
 from .arrays import (

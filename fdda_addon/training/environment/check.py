@@ -4,9 +4,9 @@
 import json
 import subprocess
 
-from ...core.child_process import child_options
 from ...core.errors import os_error_text
-from ...core.native_library import runtime_advice
+from ...core.files.child_process import child_options
+from ...core.files.native_library import runtime_advice
 from ..process_exit import explain_exit_status
 from .check_result import CheckResult
 from .folder import PACKAGES, ROOT

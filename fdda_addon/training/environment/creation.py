@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from ...core.child_process import child_options
 from ...core.errors import TrainerEnvironmentError, os_error_text
+from ...core.files.child_process import child_options
 from ...core.progress import Progress
 from .check import check
 from .check_result import CheckResult

@@ -15,8 +15,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ...core.errors import TrainerEnvironmentError, os_error_text
-from ...core.file_lock import NoLocksError, try_lock
-from ...core.path_limits import MAX_WINDOWS_PATH_LENGTH
+from ...core.files.file_lock import NoLocksError, try_lock
+from ...core.files.path_limits import MAX_WINDOWS_PATH_LENGTH
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """Module name of the installed extension, "bl_ext.REPOSITORY.fdda"; empty if the add-on is not installed."""

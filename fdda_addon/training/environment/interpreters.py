@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...core.child_process import child_options
+from ...core.files.child_process import child_options
 from .folder import PINNED_REQUIREMENTS
 
 TIMEOUT_SECONDS = 30.0

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from .defaults import TOLERANCE_MM
-from .metrics import ErrorStatistics
+from ..defaults import TOLERANCE_MM
+from ..mathematics.metrics import ErrorStatistics
 
 MAX_GOOD_RATIO = 0.7
 """Largest ratio of an error of the model to that of skinning alone at which the model clearly beats it."""
@@ -55,7 +55,7 @@ def assess_training(report: Mapping) -> Assessment:
     """Assess a training.
 
     Args:
-        report: the content of `report.json`, as `core.report.read_report` returns it.
+        report: the content of `report.json`, as `core.formats.report.read_report` returns it.
     """
     model, skinning = (_held_out_errors(report, method) for method in ("fdda", "linear"))
     warnings = []

@@ -13,7 +13,7 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-from .input_file import open_input
+from ..files.input_file import open_input
 
 SIGNATURE = b"Ogawa"
 TIME_SAMPLINGS_INDEX = 4

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .errors import RigError
+from ..errors import RigError
+from ..rig import Rig
 from .partition import Partition, make_partitions
-from .rig import Rig
 
 
 def skin_matrices(pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.ndarray:

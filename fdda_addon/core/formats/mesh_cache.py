@@ -4,8 +4,8 @@
 import struct
 from pathlib import Path
 
-from .errors import PointCacheError, os_error_text
-from .input_file import open_input
+from ..errors import PointCacheError, os_error_text
+from ..files.input_file import open_input
 from .point_cache import read_point_cache
 
 _MDD_HEADER = struct.Struct(">ii")

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from .joint_option import AUTO, parse_joints
+from ..joint_option import AUTO, parse_joints
+from ..rig import KEY_JOINTS_PREFIX, Fingerprint, Joint, Rig
 from .partition import Partition
-from .rig import KEY_JOINTS_PREFIX, Fingerprint, Joint, Rig
 
 MAX_NAMED_JOINTS = 3
 

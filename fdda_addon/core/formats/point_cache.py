@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from .errors import PointCacheError, os_error_text
+from ..errors import PointCacheError, os_error_text
 
 SIGNATURE = b"POINTCACHE2\0"
 VERSION = 1

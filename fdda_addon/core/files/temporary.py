@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from .errors import DiskFullError, OutputError, os_error_text
+from ..errors import DiskFullError, OutputError, os_error_text
 
 
 def check_temporary_folder() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .rig import Rig
+from ..rig import Rig
 from .skinning import LinearSkinning
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .defaults import MIN_PARTITION_VERTICES
-from .rig import Rig
+from ..defaults import MIN_PARTITION_VERTICES
+from ..rig import Rig
 
 INFLUENCE_TOLERANCE = 1e-4
 """A joint influences a partition when it changes a local residual by more than this ratio of the rig's size."""

@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from .controls import Control, read_controls
-from .partition import Partition, make_partitions
-from .poses import Channel
-from .rig import Fingerprint, Joint, Rig, read_joints
-from .unit import read_unit, unit_to_json
+from ..controls import Control, read_controls
+from ..mathematics.partition import Partition, make_partitions
+from ..mathematics.poses import Channel
+from ..rig import Fingerprint, Joint, Rig, read_joints
+from ..unit import read_unit, unit_to_json
 
 VERSION = 1
 MAX_METADATA_LENGTH = 16 << 20
@@ -53,7 +53,7 @@ class ModelInfo:
         vertex_count: number of vertices of the mesh.
         fingerprint: fingerprint of the recorded rig.
         partitions: partitions in ascending order of their main joints; the output `confidence` has the same order.
-        feature_low, feature_high: (J, 12) float32, range of the joint features (core.features) in training.
+        feature_low, feature_high: (J, 12) float32, range of the joint features (core.mathematics.features) in training.
         controls: controls with their ranges in training.
         held_out_mm: errors over the held-out poses, mm, by the names of `metrics.ErrorStatistics`.
         parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.

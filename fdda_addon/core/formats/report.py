@@ -8,9 +8,9 @@ import enum
 import json
 from pathlib import Path
 
-from .errors import TrainingError, os_error_text
-from .input_file import read_input
-from .output import to_json_text, write_text
+from ..errors import TrainingError, os_error_text
+from ..files.input_file import read_input
+from ..files.output import to_json_text, write_text
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 CHECKPOINT_SUFFIX = ".checkpoint.npz"

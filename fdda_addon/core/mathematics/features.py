@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from .rig import Rig
+from ..rig import Rig
 
 FEATURES_PER_JOINT = 12
 FLOAT32_ROUNDING_RATIO = 2.0**-21
@@ -15,7 +15,7 @@ amplifies it."""
 
 
 def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, references: np.ndarray) -> np.ndarray:
-    """Compute the transform of each joint relative to its reference joint (`core.references`) and to the rest pose.
+    """Compute the transform of each joint relative to its reference joint (`references`) and to the rest pose.
 
     F_j = (B_r^-1 B_j)^-1 P_r^-1 P_j for joint j with reference joint r, rest matrices B and pose matrices P.
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import ModelError, os_error_text
-from .input_file import read_input
+from ..errors import ModelError, os_error_text
+from ..files.input_file import read_input
+from ..mathematics.skin_fit import skin_from_text
+from ..rig import Rig, rig_differences
 from .model_info import ModelInfo
 from .onnx_file import infer_shapes, read_onnx
-from .rig import Rig, rig_differences
-from .skin_fit import skin_from_text
 
 METADATA_KEY = "fdda"
 SKIN_KEY = "fdda_skin"

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from .errors import OutputError, os_error_text
+from ..errors import OutputError, os_error_text
 from .file_kind import FileKind
 from .open_files import remove_file, replace_file
 from .path_limits import check_path, comparable_path, is_windows

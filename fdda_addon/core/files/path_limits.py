@@ -6,7 +6,7 @@ import re
 import sys
 from pathlib import Path, PurePath, PureWindowsPath
 
-from .errors import OutputError
+from ..errors import OutputError
 
 MAX_NAME_BYTES = 255
 MAX_WINDOWS_PATH_LENGTH = 259

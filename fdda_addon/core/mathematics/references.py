@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .rig import STATIC_JOINT, Rig
+from ..rig import STATIC_JOINT, Rig
 from .skinning import are_invertible, skin_matrices
 
 LENGTH_RATIO = 0.05
