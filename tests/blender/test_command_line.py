@@ -260,7 +260,7 @@ def test_bind_sets_use_in_render(elbow_files, tmp_path):
     assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend", "--use-in-render") == 0
     mesh_object = open_in_new_session(tmp_path / "b.blend")
     assert mesh_object.fdda.use_in_render
-    assert [m.show_render for m in mesh_object.modifiers] == [False, False, True]
+    assert [m.show_render for m in mesh_object.modifiers] == [False, False, True, True]
 
 
 def test_a_bound_file_shows_the_rig_without_the_add_on(elbow_files, tmp_path):

@@ -89,8 +89,8 @@ def test_a_packed_model_that_is_trained_again_is_packed_again(rig, elbow_files, 
     add_model(rig.mesh_object, model_files.Path(model))
     assert rig.mesh_object.fdda.packed.session_uid == before, "the same file is not packed again"
     with open(model, "ab") as file:
-        # An unknown field changes the file but not the model.
-        file.write(b"\xfa\x3f\x00")
+        # A documentation string changes the file but not the model.
+        file.write(b"\x32\x01x")
     add_model(rig.mesh_object, model_files.Path(model))
     assert packed_model.read(rig.mesh_object.fdda.packed) == model_files.Path(model).read_bytes()
     assert len(rig.mesh_object.fdda.models) == 1 and len(bpy.data.texts) == 1
