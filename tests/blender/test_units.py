@@ -49,6 +49,8 @@ STEP = 0.01
 """Millimeters; what rounding makes 100 meters from the origin."""
 AGREE = 0.2
 """Relative difference of figures: rounding differs with the unit, and a training makes more of it."""
+LARGEST_AGREE = 0.5
+"""Relative difference of largest errors. That of a single vertex is 0.33 to 0.47 mm with four seeds of the training."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ def assert_agree(own: dict, meters: dict) -> None:
     """Statistics of two evaluations or reports agree."""
     for way in ("fdda", "linear"):
         for name, value in meters[way].items():
-            assert own[way][name] == pytest.approx(value, rel=AGREE, abs=STEP)
+            agree = LARGEST_AGREE if name == "max" else AGREE
+            assert own[way][name] == pytest.approx(value, rel=agree, abs=STEP)
 
 
 def test_linear_skinning_of_the_elbow_is_off_by_millimetres(characters):
