@@ -49,8 +49,6 @@ STEP = 0.01
 """Millimeters; what rounding makes 100 meters from the origin."""
 AGREE = 0.2
 """Relative difference of figures: rounding differs with the unit, and a training makes more of it."""
-LARGEST_AGREE = 0.5
-"""Relative difference of largest errors. That of a single vertex is 0.33 to 0.47 mm with four seeds of the training."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def characters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Character]
         for _, recording, model, _ in files.values():
             train(recording, model, "--epochs", 40)
         for rig, _, model, evaluation in files.values():
-            assert run("evaluate", rig, model, "--json", evaluation, "--poses", 20) == 0
+            assert run("evaluate", rig, model, "--json", evaluation, "--poses", 100) == 0
     finally:
         fdda_addon.unregister()
     return {
@@ -96,8 +94,7 @@ def assert_agree(own: dict, meters: dict) -> None:
     """Statistics of two evaluations or reports agree."""
     for way in ("fdda", "linear"):
         for name, value in meters[way].items():
-            agree = LARGEST_AGREE if name == "max" else AGREE
-            assert own[way][name] == pytest.approx(value, rel=agree, abs=STEP)
+            assert own[way][name] == pytest.approx(value, rel=AGREE, abs=STEP)
 
 
 def test_linear_skinning_of_the_elbow_is_off_by_millimetres(characters):
@@ -205,5 +202,5 @@ def test_a_copy_that_is_scaled_up_has_the_figures_of_its_model(characters):
     rig.armature_object.scale = (3.0, 3.0, 3.0)
     bpy.context.view_layer.update()
     assert metres_per_unit(rig.mesh_object) == 3.0
-    *_, evaluation = evaluate(rig, character.model, EvaluationSettings(poses=20, surface=False))
+    *_, evaluation = evaluate(rig, character.model, EvaluationSettings(poses=100, surface=False))
     assert evaluation.fdda.mean == pytest.approx(character.evaluation["fdda"]["mean"], rel=1e-3)
