@@ -59,7 +59,11 @@ BLENDER_4_5 = (
     "recording", "command_process", "playback", "playback_of_edits", "linked_files", "extension", "renders",
 )  # fmt: skip
 SMALL = {
-    "core": ("tests/core/test_output.py", "tests/core/test_recording_writer.py", "tests/core/test_recording_lock.py"),
+    "core": (
+        "tests/core/files/test_output.py",
+        "tests/core/test_recording_writer.py",
+        "tests/core/test_recording_lock.py",
+    ),
     "blender": ("tests/blender/test_playback.py", "-k", "strength"),
 }
 """Core files that write; and a test whose fixture records, trains and binds."""

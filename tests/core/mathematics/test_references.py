@@ -11,7 +11,7 @@ from fdda_addon.core.mathematics.features import joint_features
 from fdda_addon.core.mathematics.references import choose_references, has_reference_choice, minimum_arborescence
 from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig, read_joints
 
-from .limb import JOINTS, make_rig, random_rotations, random_transforms
+from ..limb import JOINTS, make_rig, random_rotations, random_transforms
 
 POSES = 16
 NONE_FIXED = np.zeros(4, bool)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fdda_addon.core.sentences.manual_page import heading_anchor, make_page
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 MANUAL = (ROOT / "docs" / "manual.md").read_text(encoding="utf-8")
 
 

@@ -7,7 +7,7 @@ import pytest
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.mathematics.surface import Surface, SurfaceComparison, angles_between, are_faces, surface_errors
 
-from .limb import make_rig, partitions_of
+from ..limb import make_rig, partitions_of
 
 CUBE_POSITIONS = np.float32([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 CUBE_FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

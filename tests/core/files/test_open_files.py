@@ -19,7 +19,7 @@ from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
-from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
+from ..limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
 
 windows_only = pytest.mark.skipif(sys.platform != "win32", reason="Only on Windows, an open file cannot be replaced.")
 READ_REPEATEDLY = """

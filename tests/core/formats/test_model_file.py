@@ -15,9 +15,9 @@ from fdda_addon.core.formats.model import check_rig, read_model, read_model_info
 from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
 from fdda_addon.core.mathematics.poses import Channel
 
-from .. import systems
-from .limb import make_rig
-from .tiny_model import in_subgraph, tiny_info, tiny_model, with_external_data, zeros_tensor
+from ... import systems
+from ..limb import make_rig
+from ..tiny_model import in_subgraph, tiny_info, tiny_model, with_external_data, zeros_tensor
 
 
 def save_model(tmp_path, model) -> os.PathLike:

@@ -12,7 +12,7 @@ from fdda_addon.core.recording.index import ACTION, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import RecordedTarget, Repeatability
 
-from .good_recording import good_recording, with_positions
+from ..good_recording import good_recording, with_positions
 
 FRAME_COUNT = 40
 TARGET = RecordedTarget("flesh", "frames")

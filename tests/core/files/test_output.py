@@ -24,9 +24,9 @@ from fdda_addon.core.files.output import (
 )
 from fdda_addon.core.recording.estimate import check_disk_space
 
-from .. import systems
+from ... import systems
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def file_names(folder: Path) -> list[str]:

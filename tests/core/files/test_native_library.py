@@ -7,7 +7,7 @@ import pytest
 
 from fdda_addon.core.files.native_library import loader_winerror, runtime_advice
 
-from ..systems import WINDOWS
+from ...systems import WINDOWS
 
 RUNTIME = "install Microsoft's Visual C++ runtime from https://aka.ms/vs/17/release/vc_redist."
 PYBIND = "DLL load failed while importing onnxruntime_pybind11_state: "

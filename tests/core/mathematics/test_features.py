@@ -7,7 +7,7 @@ import numpy as np
 
 from fdda_addon.core.mathematics.features import joint_features, joint_features_in_metres
 
-from .limb import JOINTS, make_rig, random_poses, random_transforms
+from ..limb import JOINTS, make_rig, random_poses, random_transforms
 
 
 def reference_features(pose: np.ndarray, rest: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from fdda_addon.core.sentences.assessment import (
     rising_from_epoch,
 )
 
-REPORTS = Path(__file__).with_name("reports")
+REPORTS = Path(__file__).parents[1] / "reports"
 
 
 def read(name: str) -> dict:

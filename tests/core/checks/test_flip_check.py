@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.checks.flips import find_similar_poses
 from fdda_addon.core.recording.reader import Recording
 
-from .good_recording import (
+from ..good_recording import (
     BONE_LENGTH,
     JOINTS,
     ROTATION_LIMIT,

@@ -147,7 +147,7 @@ def test_a_report_that_is_too_large_is_refused(tmp_path, monkeypatch):
 
 
 def test_the_formats_page_names_every_key():
-    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
     section = text.partition("\n## Training report\n")[2].partition("\n## ")[0]
 
     def key_names(kind: object) -> set[str]:

@@ -10,7 +10,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import check_model
 from fdda_addon.core.formats.onnx_file import OnnxContents, read_onnx
 
-from .tiny_model import JOINT_COUNT, VERTEX_COUNT, in_subgraph, tiny_info, tiny_model, with_external_data, zeros_tensor
+from ..tiny_model import JOINT_COUNT, VERTEX_COUNT, in_subgraph, tiny_info, tiny_model, with_external_data, zeros_tensor
 
 CUSTOM_NODE = helper.make_node("Run", ["positions"], ["y"], domain="com.example")
 

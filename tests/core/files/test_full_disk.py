@@ -16,11 +16,11 @@ from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
-from .. import systems
-from .conftest import SMALL_DISK_BYTES
-from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
+from ... import systems
+from ..conftest import SMALL_DISK_BYTES
+from ..limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 FULL_DISK_ERROR = "No space left on device"
 
 

@@ -7,7 +7,7 @@ import pytest
 from fdda_addon.core.mathematics.mask import Mask, SkinningBlend
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 
-from .limb import VERTEX_COUNT, make_rig, random_poses
+from ..limb import VERTEX_COUNT, make_rig, random_poses
 
 MASK_WEIGHTS = np.linspace(0, 1, VERTEX_COUNT).astype(np.float32)
 

@@ -12,9 +12,9 @@ import pytest
 
 from fdda_addon.core.files.file_lock import NoLocksError, has_ended, try_lock, wait_for_lock
 
-from .. import systems
+from ... import systems
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 HOLD_LOCK = """
 import sys
 from fdda_addon.core.files.file_lock import try_lock

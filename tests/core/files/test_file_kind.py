@@ -9,8 +9,8 @@ from fdda_addon.core.errors import OutputError
 from fdda_addon.core.files import file_kind
 from fdda_addon.core.files.output import check_outputs, to_json_text
 
-from .. import systems
-from .tiny_model import tiny_model
+from ... import systems
+from ..tiny_model import tiny_model
 
 FILES_BY_KIND = {
     file_kind.BLEND: [b"BLENDER-v405", b"BLENDER17-01v0502", b"\x28\xb5\x2f\xfd\x00", b"\x1f\x8b\x08"],

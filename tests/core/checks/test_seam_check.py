@@ -10,7 +10,7 @@ from fdda_addon.core.checks.seams import check_seams
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording
 
-from .good_recording import RING_COUNT, VERTICES_PER_RING, single_warning_text, warning_texts, with_rig
+from ..good_recording import RING_COUNT, VERTICES_PER_RING, single_warning_text, warning_texts, with_rig
 
 GAP_RATIO = 0.01
 """Distance of torn vertices, as a part of the size of the character."""

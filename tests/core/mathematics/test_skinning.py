@@ -7,7 +7,7 @@ import pytest
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
 
-from .limb import JOINTS, VERTEX_COUNT, make_rig, partitions_of, random_poses, random_residuals, random_transforms
+from ..limb import JOINTS, VERTEX_COUNT, make_rig, partitions_of, random_poses, random_residuals, random_transforms
 
 
 @pytest.fixture(scope="module")

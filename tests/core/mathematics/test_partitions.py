@@ -12,7 +12,7 @@ from fdda_addon.core.mathematics.partition import (
     partition_colors,
 )
 
-from .limb import INFLUENCING, VERTEX_COUNT, make_rig, partitions_of
+from ..limb import INFLUENCING, VERTEX_COUNT, make_rig, partitions_of
 
 
 def test_main_joint_is_the_first_with_the_largest_weight():

@@ -12,7 +12,7 @@ from fdda_addon.core.formats.model import CHECKSUM_KEY, check_model
 from fdda_addon.core.formats.model_info import ModelPartition
 from fdda_addon.core.formats.onnx_file import infer_shapes, read_onnx
 
-from .tiny_model import JOINT_COUNT, VERTEX_COUNT, tiny_info, tiny_model, zeros_tensor
+from ..tiny_model import JOINT_COUNT, VERTEX_COUNT, tiny_info, tiny_model, zeros_tensor
 
 
 def assert_refused(model, *phrases: str) -> str:

@@ -6,8 +6,8 @@ import pytest
 
 from fdda_addon.core.formats.pose_repair import repair_pose
 
-from .limb import random_transforms
-from .tiny_model import JOINT_COUNT, tiny_info
+from ..limb import random_transforms
+from ..tiny_model import JOINT_COUNT, tiny_info
 
 DISTANCE = 1000.0
 """Distance of the character from the origin, mesh units."""
