@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import fdda_addon
 from fdda_addon.core.mathematics.poses import sample_pose
+from fdda_addon.core.progress import run_job
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
@@ -39,8 +40,7 @@ CROWD_SIZE = 20
 def frames(rig: str, model: str, count: str = "100") -> dict:
     """Time a frame with the rig, linear skinning, the model and constant positions, as the verb `benchmark` does."""
     bpy.ops.wm.open_mainfile(filepath=rig)
-    *_, frame_times = benchmark(find_rig(), Path(model), int(count))
-    return frame_times.to_json()
+    return run_job(benchmark(find_rig(), Path(model), int(count))).to_json()
 
 
 def recording(rig: str, poses: str = "60") -> dict:

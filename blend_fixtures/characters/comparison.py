@@ -10,6 +10,7 @@ import numpy as np
 
 from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.poses import Channel
+from fdda_addon.core.progress import run_job
 from fdda_addon.evaluation.run import evaluate, set_held_out_pose
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.poses.sampling import model_channels
@@ -106,8 +107,7 @@ def _measure_errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[fl
     settings = replace(HELD_OUT_SETTINGS, target=row.recording.target)
     if not row.recording.poses:
         settings = replace(settings, poses=0, actions=row.recording.actions)
-    *_, evaluation = evaluate(scene_rig, network, settings)
-    held_out = evaluation.held_out
+    held_out = run_job(evaluate(scene_rig, network, settings)).held_out
     rest = rest_positions(scene_rig.mesh_object.data)
     moved_distances = distances(held_out.positions, rest, metres_per_unit(scene_rig.mesh_object))
     return tuple(float(meters.mean()) * 1000 for meters in (held_out.linear, held_out.fdda, moved_distances))

@@ -18,7 +18,6 @@ from fdda_addon.arm.joints import ACTION_NAME
 from fdda_addon.cli.files import open_file
 from fdda_addon.cli.progress import ProgressPrinter
 from fdda_addon.core.defaults import FILM_TIMED_FRAMES
-from fdda_addon.core.progress import Progress
 from fdda_addon.evaluation.film import FDDA, FDDA_ERROR, LINEAR, LINEAR_ERROR, RIG, FilmSettings, film
 from fdda_addon.evaluation.results import PoseErrors
 from fdda_addon.evaluation.run import evaluate_action
@@ -30,21 +29,13 @@ FILMS = {"arm.mp4": (RIG, FDDA), "arm_error.mp4": (LINEAR_ERROR, FDDA_ERROR)}
 WIDTH, TEXT_SCALE = 1280, 1.6
 
 
-def last_result(steps: object) -> object:
-    """Print the progress of a job, and return its result."""
-    with ProgressPrinter() as progress:
-        for step in steps:
-            if isinstance(step, Progress):
-                progress.show(step.stage, step.done, step.total)
-    return step
-
-
 def evaluate_demo(folder: Path) -> tuple[SceneRig, Path, PoseErrors, dict[str, float]]:
     """Open the arm of the demo, and return its rig, model, the errors in its action, and the frame times by column."""
     open_file(folder / "arm.blend")
     scene_rig, model = find_rig(), folder / "arm.onnx"
-    times = last_result(benchmark(scene_rig, model, FILM_TIMED_FRAMES)).frame_times("")
-    errors = last_result(evaluate_action(scene_rig, model, ACTION_NAME)).held_out
+    with ProgressPrinter() as progress:
+        times = progress.run(benchmark(scene_rig, model, FILM_TIMED_FRAMES)).frame_times("")
+        errors = progress.run(evaluate_action(scene_rig, model, ACTION_NAME)).held_out
     return scene_rig, model, errors, {RIG: times.rig, LINEAR: times.linear, FDDA: times.fdda}
 
 
@@ -54,7 +45,8 @@ def main(demo_folder: Path, folder: Path) -> None:
     fps = bpy.context.scene.render.fps
     for name, columns in FILMS.items():
         settings = FilmSettings(columns, VIEW, fps, times, width=WIDTH, text_scale=TEXT_SCALE)
-        result = last_result(film(scene_rig, model, errors, 1, folder / name, settings))
+        with ProgressPrinter() as progress:
+            result = progress.run(film(scene_rig, model, errors, 1, folder / name, settings))
         print(f"{folder / name}: {result.frames} frames, {result.size[0]} x {result.size[1]} pixels")
 
 

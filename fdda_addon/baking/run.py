@@ -15,7 +15,7 @@ from ..core.files import file_kind
 from ..core.files.output import atomic_write, atomic_write_all, check_outputs
 from ..core.formats.point_cache import PointCacheWriter, read_point_cache
 from ..core.mathematics.mask import SkinningBlend
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..poses.clip import Clip, find_clips
 from ..poses.clip_player import clip_player
 from ..rig.modifier_stack import check_evaluable, read_stack
@@ -72,8 +72,8 @@ class Bake:
     files: tuple[Path, ...]
 
 
-def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSettings) -> Iterator[Progress | Bake]:
-    """Bake an action, as a generator that does its work while it is iterated.
+def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSettings) -> Job[Bake]:
+    """Bake an action while the generator is iterated.
 
     A .pc2 file contains the positions in mesh-object space. A .blend file is a copy of the open file in which the mesh
     plays the positions from a point cache beside the file, or from shape keys. The scene is restored when the generator
@@ -84,9 +84,6 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
         model: path of the model, or the loaded model.
         out: path of the .pc2 or .blend file to write.
         settings: settings of the bake.
-
-    Yields:
-        Progress, and finally the Bake.
 
     Raises:
         WrongUsageError: `out` has another extension, or the range of frames is empty or invalid.
@@ -122,7 +119,7 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
                 with temporary_copy(scene_rig.mesh_object) as mesh_object, _scene_range(frames):
                     play_point_cache(mesh_object, stack, files[1], frames.start)
                     save_copy(blend)
-    yield Bake(frames, files)
+    return Bake(frames, files)
 
 
 def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> tuple[Path, ...]:

@@ -5,7 +5,6 @@ import argparse
 from pathlib import Path
 
 from ..baking.run import BakeSettings, bake, output_files
-from ..core.progress import Progress
 from ..core.sentences.counts import format_count
 from .files import add_rig_options, open_rig
 from .outputs import add_overwrite_option
@@ -44,11 +43,9 @@ def run(options: argparse.Namespace) -> None:
     output_files(options.out, settings, (options.rig, options.model))
     scene_rig = open_rig(options)
     with ProgressPrinter() as progress:
-        for step in bake(scene_rig, options.model, options.out, settings):
-            if isinstance(step, Progress):
-                progress.show(step.stage, step.done, step.total)
+        baked = progress.run(bake(scene_rig, options.model, options.out, settings))
     animation_name = settings.action or "the scene"
-    for path in step.files[1:]:
+    for path in baked.files[1:]:
         print(f"{path}: the positions, to be kept beside {options.out.name}")
-    frame_text = format_count(len(step.frames), "frame")
-    print(f"{options.out}: {frame_text} of {animation_name} ({step.frames[0]} to {step.frames[-1]})")
+    frame_text = format_count(len(baked.frames), "frame")
+    print(f"{options.out}: {frame_text} of {animation_name} ({baked.frames[0]} to {baked.frames[-1]})")

@@ -6,16 +6,13 @@ fast rig would save. `--fast-rig` measures the latter alone.
 """
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
 from ..core.files.file_kind import BENCHMARK
 from ..core.files.output import check_outputs, write_json
 from ..core.files.temporary import check_temporary_folder
-from ..core.progress import Progress
 from ..fast_rig.saving import measure_saving
 from ..runtime.binding import model_disabled
 from ..timing.benchmark import benchmark
@@ -64,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
         return
     if options.fast_rig:
         with ProgressPrinter() as progress:
-            saving = _last_step(measure_saving(open_rig(options), options.rig), progress)
+            saving = progress.run(measure_saving(open_rig(options), options.rig))
         write_json(options.json, saving.to_json() | {"unit": "ms"})
         print(saving.sentence)
         return
@@ -72,7 +69,7 @@ def run(options: argparse.Namespace) -> None:
     for name, (scene_rig, model) in open_rigs(options).items():
         try:
             with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
-                benchmarks[name] = _last_step(benchmark(scene_rig, model, options.frames), progress)
+                benchmarks[name] = progress.run(benchmark(scene_rig, model, options.frames))
         except FDDAError as error:
             # The times of the other meshes took minutes.
             errors.append(error)
@@ -87,20 +84,12 @@ def run(options: argparse.Namespace) -> None:
 def _profile(options: argparse.Namespace) -> None:
     scene_rig, failure = open_rig(options), None
     with ProgressPrinter() as progress:
-        profile = _last_step(profile_frame(scene_rig), progress)
+        profile = progress.run(profile_frame(scene_rig))
         try:
-            profile = replace(profile, fast_rig=_last_step(measure_saving(scene_rig, options.rig), progress))
+            profile = replace(profile, fast_rig=progress.run(measure_saving(scene_rig, options.rig)))
         except FDDAError as error:
             profile, failure = replace(profile, fast_rig_problem=str(error)), error
     write_json(options.json, profile.to_json())
     print(profile.table())
     if failure is not None and exit_status(failure) == TRY_AGAIN:
         raise failure
-
-
-def _last_step(steps: Iterator[Any], progress: ProgressPrinter) -> Any:
-    """Print the progress of a measurement, and return its result."""
-    for step in steps:
-        if isinstance(step, Progress):
-            progress.show(step.stage, step.done, step.total)
-    return step

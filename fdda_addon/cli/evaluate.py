@@ -8,7 +8,6 @@ from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED, FILM_TIMED_FRAMES
 from ..core.errors import WrongUsageError
 from ..core.files.file_kind import EVALUATION, PICTURE, VIDEO
 from ..core.files.output import atomic_write_all, check_outputs, to_json_text
-from ..core.progress import Progress
 from ..core.sentences.assessment import farther_than_skinning_sentence
 from ..core.sentences.counts import format_count
 from ..evaluation.results import Evaluation
@@ -132,34 +131,24 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
 
     from ..evaluation.film import FDDA, LABELS, LINEAR, RIG, FilmSettings, film
     from ..scene.time_stretching import time_ratio
-    from ..timing.benchmark import Benchmark, benchmark
+    from ..timing.benchmark import benchmark
 
     clip = find_clips([scene_rig], options.action, options.strip)[0]
     with ProgressPrinter() as progress:
-        for step in benchmark(scene_rig, model, FILM_TIMED_FRAMES):
-            if isinstance(step, Progress):
-                progress.show(step.stage, step.done, step.total)
-            elif isinstance(step, Benchmark):
-                times = step.frame_times("")
+        times = progress.run(benchmark(scene_rig, model, FILM_TIMED_FRAMES)).frame_times("")
         settings = FilmSettings(
             fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base * time_ratio(),
             times_ms={RIG: times.rig, FDDA: times.fdda} | ({LINEAR: times.linear} if times.linear else {}),
             reference_label=f"Target {options.target}" if options.target else LABELS[RIG],
         )
         with model_disabled(scene_rig.mesh_object):
-            steps = film(scene_rig, model, evaluation.actions[0], clip.frames.start, options.video, settings)
-            for step in steps:
-                if isinstance(step, Progress):
-                    progress.show(step.stage, step.done, step.total)
+            progress.run(film(scene_rig, model, evaluation.actions[0], clip.frames.start, options.video, settings))
 
 
 def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:
     """Evaluate a model, and print the progress to stderr."""
     with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
-        for step in evaluate(scene_rig, model, settings):
-            if isinstance(step, Progress):
-                progress.show(step.stage, step.done, step.total)
-    return step
+        return progress.run(evaluate(scene_rig, model, settings))
 
 
 def table(evaluation: Evaluation) -> str:

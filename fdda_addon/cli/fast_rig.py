@@ -42,7 +42,6 @@ def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
     from ..core.files.file_kind import BLEND
     from ..core.files.output import check_outputs
-    from ..core.progress import Progress
     from ..fast_rig.controls import check_choices
     from ..fast_rig.frame_times import measure_frames
     from ..fast_rig.run import make_fast_rig
@@ -57,20 +56,13 @@ def run(options: argparse.Namespace) -> None:
     _check_other_file(options.out, options.rig)
     rigs_and_models = list(open_rigs(options).values())
     object_name = rigs_and_models[0][0].mesh_object.name
-    times = None
     with ProgressPrinter() as progress:
-        for step in make_fast_rig(rigs_and_models, options.out, tuple(options.controls)):
-            if isinstance(step, Progress):
-                progress.show(step.stage, step.done, step.total)
-        fast_rig = step
+        fast_rig = progress.run(make_fast_rig(rigs_and_models, options.out, tuple(options.controls)))
         print(f"{options.out}: {_summary(fast_rig)}")
         if options.frames:
             controls, size = fast_rig.controls, fast_rig.size
-            for step in measure_frames(options.rig, options.out, object_name, controls, options.frames, size):
-                if isinstance(step, Progress):
-                    progress.show(step.stage, step.done, step.total)
-            times = step
-    if times is not None:
+            times = progress.run(measure_frames(options.rig, options.out, object_name, controls, options.frames, size))
+    if options.frames:
         print(f"{options.out}: {times.sentence}")
 
 

@@ -5,6 +5,8 @@ import sys
 import time
 from typing import TextIO
 
+from ..core.progress import Job, Result, run_job
+
 BAR_WIDTH = 30
 PLAIN_LINES_PER_STAGE = 10
 """Number of lines for each stage if stderr is no terminal."""
@@ -17,6 +19,10 @@ class ProgressPrinter:
         self._stream = stream or sys.stderr
         self._uses_bar = self._stream.isatty()
         self._stage, self._last_tenth, self._start, self._has_open_line = "", -1, 0.0, False
+
+    def run(self, job: Job[Result]) -> Result:
+        """Iterate a job, print its progress, and return its result."""
+        return run_job(job, lambda step: self.show(step.stage, step.done, step.total, step.detail))
 
     def show(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Print that `done` of `total` steps of a stage are complete."""

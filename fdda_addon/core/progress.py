@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Progress of a job; the generator that runs the job yields it."""
+"""Jobs: generators that work while they are iterated, yield their progress and return their result."""
 
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from typing import TypeVar
 
 
 @dataclass(frozen=True)
@@ -20,3 +22,19 @@ class Progress:
     total: int
     note: str = ""
     detail: str = ""
+
+
+Result = TypeVar("Result")
+Job = Generator[Progress | None, None, Result]
+"""A job; it yields None while it waits for another process."""
+
+
+def run_job(job: Job[Result], show: Callable[[Progress], object] | None = None) -> Result:
+    """Iterate a job to its end, show its progress, and return its result."""
+    while True:
+        try:
+            step = next(job)
+        except StopIteration as end:
+            return end.value
+        if show and step:
+            show(step)

@@ -14,7 +14,7 @@ from ..core.errors import OutputError, os_error_text
 from ..core.files.output import TEMPORARY_PREFIX
 from ..core.mathematics.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, NO_ERROR_METRES, distances, heat_colors
 from ..core.mathematics.skinning import LinearSkinning
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.mask import read_mask
@@ -84,8 +84,8 @@ class Film:
 
 def film(
     scene_rig: SceneRig, model: Path | Network, errors: PoseErrors, first_frame: int, path: Path, settings: FilmSettings
-) -> Iterator[Progress | Film]:
-    """Write the film of an action, as a generator that does its work while it is iterated.
+) -> Job[Film]:
+    """Write the film of an action while the generator is iterated.
 
     The file appears when it is complete. Closing the generator leaves no file and no data.
 
@@ -96,9 +96,6 @@ def film(
         first_frame: number of the first frame.
         path: path of the video (`video.check_video_path`).
         settings: the settings.
-
-    Yields:
-        Progress, and the Film at the end.
 
     Raises:
         ModelError: the model cannot be read, or was trained for another rig.
@@ -119,7 +116,7 @@ def film(
                     yield Progress("encoding", count, len(pictures))
     except OSError as error:
         raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; nothing was changed.") from error
-    yield Film(len(pictures), size)
+    return Film(len(pictures), size)
 
 
 def render_frames(

@@ -14,7 +14,7 @@ from ..core.mathematics.metrics import distances
 from ..core.mathematics.poses import Channel, sample_pose, widen_ranges
 from ..core.mathematics.skinning import LinearSkinning
 from ..core.mathematics.surface import Surface, SurfaceComparison, surface_errors
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable
@@ -42,9 +42,7 @@ FIRST_HELD_OUT_INDEX = 1 << 33
 poses differ from all recorded poses, even with the same seed."""
 
 
-def evaluate(
-    scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings
-) -> Iterator[Progress | Evaluation]:
+def evaluate(scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings) -> Job[Evaluation]:
     """Compare a model with its rig while the generator is iterated.
 
     If the mesh object has a mask, the mask is applied to the model. The scene is restored when the generator ends, is
@@ -54,9 +52,6 @@ def evaluate(
         scene_rig: the rig.
         model: path of the model, or the loaded model.
         settings: the poses to compare.
-
-    Yields:
-        Progress, and the Evaluation at the end.
 
     Raises:
         RigError: the rig cannot be evaluated.
@@ -92,7 +87,7 @@ def evaluate(
         for clip in clips:
             poses = pose_setter.show_frames(player, clip, range(len(clip.frames)))
             action_errors.append((yield from comparison.compare(clip.title, poses)))
-    yield Evaluation(
+    return Evaluation(
         skinning.partitions,
         skinning.rig.joint_names,
         held_out or action_errors[0],
@@ -105,13 +100,12 @@ def evaluate(
 
 def evaluate_action(
     scene_rig: SceneRig, model: Path | Network, name: str, target: TargetSettings = NO_TARGET
-) -> Iterator[Progress | Evaluation]:
+) -> Job[Evaluation]:
     """Compare only the positions, and only on the frames of one action, which become `Evaluation.held_out`."""
     settings = EvaluationSettings(poses=0, actions=(name,), surface=False, target=target)
-    for step in evaluate(scene_rig, model, settings):
-        if isinstance(step, Evaluation):
-            step.actions = []
-        yield step
+    evaluation = yield from evaluate(scene_rig, model, settings)
+    evaluation.actions = []
+    return evaluation
 
 
 def _prepare(scene_rig: SceneRig, model: Path | Network, is_rig_compared: bool) -> tuple[Network, LinearSkinning]:
@@ -190,18 +184,12 @@ class _Comparison:
             faces = Surface(rig.face_starts, rig.face_vertices)
             self._surface = SurfaceComparison(faces, rig.rest_positions, skinning.partitions)
 
-    def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
+    def compare(self, name: str, poses: Iterator[None]) -> Job[PoseErrors]:
         """Compare rig, model and linear skinning in a set of poses.
 
         Args:
             name: name of the set.
             poses: iterator that sets the next pose in each iteration.
-
-        Yields:
-            Progress.
-
-        Returns:
-            The PoseErrors.
         """
         all_matrices, all_positions, all_controls, fdda_errors, linear_errors, surface_comparisons = (
             [],

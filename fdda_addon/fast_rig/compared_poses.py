@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Quaternion
 
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..poses.action_range import action_frames
 from ..scene.action_slots import ActionSlots, dependencies, slots_of_action
 from ..scene.animated_values import animated_values, set_value
@@ -67,15 +67,12 @@ class Evaluation(NamedTuple):
     objects: dict[str, list[np.ndarray]]
 
 
-def evaluate_poses(poses: ComparedPoses, stage: str) -> Iterator[Progress | Evaluation]:
-    """Evaluate bones and objects in all poses, as a generator that restores the rig.
+def evaluate_poses(poses: ComparedPoses, stage: str) -> Job[Evaluation]:
+    """Evaluate bones and objects in all poses while the generator is iterated, and restore the rig.
 
     Args:
         poses: the poses.
         stage: stage of the progress.
-
-    Yields:
-        Progress, and at the end the Evaluation.
     """
     armature_object, shown_poses = poses.armature_object, list(_pose_setters(poses))
     bone_reader = PoseMatrixReader(armature_object, poses.bone_names)
@@ -97,7 +94,7 @@ def evaluate_poses(poses: ComparedPoses, stage: str) -> Iterator[Progress | Eval
             matrices[index] = bone_reader.read(armature_object.evaluated_get(depsgraph))
             object_reader.read(depsgraph)
             yield Progress(stage, index + 1, len(shown_poses))
-    yield Evaluation(matrices, object_reader.values)
+    return Evaluation(matrices, object_reader.values)
 
 
 def differing_bones(poses: ComparedPoses, before: np.ndarray, after: np.ndarray, tolerance: float) -> dict[str, float]:

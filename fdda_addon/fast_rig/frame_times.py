@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Times the frames of a full rig and of its fast rig, by opening both files in turns."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import FDDAError
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..poses.action_range import action_frames
 from ..runtime.binding import model_disabled
 from ..scene.action_slots import dependencies, slots_of_action
@@ -63,8 +63,8 @@ def measure_frames(
     frames: int,
     size: float,
     rounds: int = ROUNDS,
-) -> Iterator[Progress | RigTimes]:
-    """Time frames of both files in turns, as a generator that works while it is iterated; it leaves `fast` open.
+) -> Job[RigTimes]:
+    """Time frames of both files in turns while the generator is iterated; leave `fast` open.
 
     The files play an action that both have, or the same random poses where they have none.
 
@@ -75,9 +75,6 @@ def measure_frames(
         frames: number of frames to time with each rig.
         size: size of the full rig, armature units.
         rounds: number of rounds; each opens both files.
-
-    Yields:
-        Progress, and at the end the RigTimes.
 
     Raises:
         FDDAError: a file cannot be opened.
@@ -95,7 +92,7 @@ def measure_frames(
             calls = _frame_calls(armature_object, action_name, controls, size, calls_range)
             times[path] += _time_calls(calls, shows_rig=path == full)
             yield Progress("frames", 2 * round_index + index + 1, 2 * rounds)
-    yield RigTimes(tuple(times[full]), tuple(times[fast]))
+    return RigTimes(tuple(times[full]), tuple(times[fast]))
 
 
 def _open_rig(path: Path, object_name: str) -> bpy.types.Object:

@@ -4,7 +4,6 @@
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
@@ -13,7 +12,7 @@ import bpy
 from ..core.errors import FDDAError, os_error_text
 from ..core.files.child_process import OutputLines, child_options, end_process
 from ..core.files.temporary import new_temporary_file
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 
 ROOT = Path(__file__).resolve().parents[2]
 KILL_AFTER_SECONDS = 5.0
@@ -61,8 +60,8 @@ class VerbProcess:
         """Return whether the process has not ended."""
         return self._process.poll() is None
 
-    def steps(self) -> Iterator[Progress | str | None]:
-        """Yield Progress, None while there is none, and at the end the output of the verb.
+    def steps(self) -> Job[str]:
+        """Yield the progress of the verb, and return its output.
 
         Raises:
             FDDAError: the verb has failed; its text is that of the verb.
@@ -81,7 +80,7 @@ class VerbProcess:
             status = self._process.returncode
             raise FDDAError(error_text or f"The other Blender ended with status {status}, without a result.")
         self._output.seek(0)
-        yield self._output.read()
+        return self._output.read()
 
     def __enter__(self) -> Self:
         return self

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Makes a fast rig of the open file: binds the models, removes what nothing needs, compares, and saves a copy."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import bpy
 
 from ..core.errors import ModelError, RigError
 from ..core.formats.model import read_model
-from ..core.progress import Progress
+from ..core.progress import Job
 from ..core.rig import STATIC_JOINT
 from ..core.sentences.counts import format_count
 from ..rig.modifier_stack import check_evaluable
@@ -21,6 +20,7 @@ from ..scene.controls import owner_of
 from ..scene.scene_rig import SceneRig
 from .compared_poses import (
     ComparedPoses,
+    Evaluation,
     differing_bones,
     evaluate_poses,
     infinite_bones,
@@ -81,10 +81,8 @@ class FastRig:
     unrepeated: tuple[str, ...] = ()
 
 
-def make_fast_rig(
-    rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choices: tuple[str, ...]
-) -> Iterator[Progress | FastRig]:
-    """Make a fast rig of the open file and save it, as a generator that works while it is iterated.
+def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choices: tuple[str, ...]) -> Job[FastRig]:
+    """Make a fast rig of the open file and save it while the generator is iterated.
 
     The open file is changed and not saved itself, so run this in a process of its own.
 
@@ -92,9 +90,6 @@ def make_fast_rig(
         rigs_and_models: the rigs, which share one armature, each with the path of its model.
         out: path of the file to write.
         choices: the control bones to keep, as for `control_bones`.
-
-    Yields:
-        Progress, and at the end the FastRig.
 
     Raises:
         FDDAError: a rig or model is refused, a bone that is read or posed or an object that is rendered looks different
@@ -120,7 +115,7 @@ def make_fast_rig(
     bones_before = len(armature_object.data.bones)
     keyed = {action.name: keyed_bones(armature_object, action) for action in actions}
     removed = _remove_unneeded(scene_rigs, joint_names, controls)
-    after = yield from _evaluate(poses, "fast rig")
+    after = yield from evaluate_poses(poses, "fast rig")
 
     if differences := differing_bones(poses, before.matrices, after.matrices, TOLERANCE):
         raise RigError(
@@ -140,7 +135,7 @@ def make_fast_rig(
             "--controls collection:NAME."
         )
     save_copy(out)
-    yield FastRig(
+    return FastRig(
         armature_object.name,
         poses.size,
         bones_before,
@@ -219,17 +214,19 @@ def _model_nodes(scene_rigs: list[SceneRig]) -> list[Node]:
     return nodes
 
 
-def _evaluate_full_rig(poses: ComparedPoses) -> Iterator[Progress]:
-    """Yield progress, and return the full rig's Evaluation and the names of the objects that do not repeat.
+def _evaluate_full_rig(poses: ComparedPoses) -> Job[tuple[Evaluation, list[str]]]:
+    """Evaluate the full rig; return also the names of the objects that do not repeat.
 
     Simulated objects may depend on the poses before.
 
     Raises:
         RigError: the bones do not repeat.
     """
-    full = yield from _evaluate(poses, "full rig")
+    full = yield from evaluate_poses(poses, "full rig")
     # Of an action, only objects, which may be simulated: its first frame may depend on the pose before.
-    again = yield from _evaluate(replace(poses, actions=poses.actions[:1], pose_count=REPEATED_POSES), "repeated poses")
+    again = yield from evaluate_poses(
+        replace(poses, actions=poses.actions[:1], pose_count=REPEATED_POSES), "repeated poses"
+    )
     indices = [
         *range(REPEATED_POSES),
         *range(poses.pose_count, poses.pose_count + len(again.matrices) - REPEATED_POSES),
@@ -241,14 +238,6 @@ def _evaluate_full_rig(poses: ComparedPoses) -> Iterator[Progress]:
         )
     first = {name: [values[index] for index in indices] for name, values in full.objects.items()}
     return full, list(differing_objects(first, again.objects, TOLERANCE))
-
-
-def _evaluate(poses: ComparedPoses, stage: str) -> Iterator[Progress]:
-    """Yield the progress of `evaluate_poses`, and return its Evaluation."""
-    for step in evaluate_poses(poses, stage):
-        if isinstance(step, Progress):
-            yield step
-    return step
 
 
 def _named_bones(differences: dict[str, float]) -> str:

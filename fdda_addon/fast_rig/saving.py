@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measures what a fast rig would save, also for a character without a model."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -9,7 +8,7 @@ import numpy as np
 
 from ..core.errors import RigError
 from ..core.files.temporary import temporary_folder
-from ..core.progress import Progress
+from ..core.progress import Job
 from ..core.rig import STATIC_JOINT
 from ..rig.dependencies import read_dependencies
 from ..rig.modifier_stack import check_evaluable
@@ -28,7 +27,7 @@ ROUNDS, FRAMES_PER_ROUND = 5, 12
 """Each round opens both files, and measures them one after the other."""
 
 
-def measure_saving(scene_rig: SceneRig, file: Path) -> Iterator[Progress | FastRigSaving]:
+def measure_saving(scene_rig: SceneRig, file: Path) -> Job[FastRigSaving]:
     """Time a rig, and a copy without what its visible controls and its joints do not need.
 
     The joints are the bones with weights on the mesh, and those that deform it in other ways. The open file is changed
@@ -37,9 +36,6 @@ def measure_saving(scene_rig: SceneRig, file: Path) -> Iterator[Progress | FastR
     Args:
         scene_rig: the rig.
         file: the open file, as it is saved.
-
-    Yields:
-        Progress, and at the end the FastRigSaving.
 
     Raises:
         FDDAError: a model cannot replace the modifiers, bones cannot be removed, or a file cannot be written or opened.
@@ -60,14 +56,13 @@ def measure_saving(scene_rig: SceneRig, file: Path) -> Iterator[Progress | FastR
     with temporary_folder() as folder:
         pruned_file = folder / "pruned.blend"
         save_copy(pruned_file)
-        for step in measure_frames(file, pruned_file, object_name, controls, ROUNDS * FRAMES_PER_ROUND, size, ROUNDS):
-            if isinstance(step, Progress):
-                yield step
+        frames = ROUNDS * FRAMES_PER_ROUND
+        times = yield from measure_frames(file, pruned_file, object_name, controls, frames, size, ROUNDS)
     full, pruned = (
-        Duration.of([float(np.median(times)) for times in np.split(np.array(all_times), ROUNDS)])
-        for all_times in (step.full, step.fast)
+        Duration.of([float(np.median(round_times)) for round_times in np.split(np.array(all_times), ROUNDS)])
+        for all_times in (times.full, times.fast)
     )
-    yield FastRigSaving(vertex_count, bone_count, kept_count, len(joints), len(controls), full, pruned)
+    return FastRigSaving(vertex_count, bone_count, kept_count, len(joints), len(controls), full, pruned)
 
 
 def _joint_names(scene_rig: SceneRig) -> set[str]:

@@ -6,10 +6,11 @@ A timer iterates them. A modal operator would end when its window, such as the p
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import bpy
 
+from ..core.progress import Job, Progress, Result
 from .job import current_runner, redraw
 from .state import ENVIRONMENT, JobState
 
@@ -18,31 +19,25 @@ THREAD_JOIN_SECONDS = 10.0
 """Longest time to wait for the end of a canceled thread."""
 
 
-def iterate_in_thread(
-    steps: Iterator[object], state: JobState, cancel: Callable[[], None] | None = None
-) -> Iterator[object]:
-    """Iterate `steps` in a thread, because they block; they must not use data of Blender.
+def iterate_in_thread(job: Job[Result], state: JobState, cancel: Callable[[], None] | None = None) -> Job[Result]:
+    """Iterate a job in a thread, because it blocks; it must not use data of Blender.
 
     Args:
-        steps: the steps of the job.
+        job: the job.
         state: state of the job, whose `cancel_requested` is checked.
-        cancel: thread-safe function that makes `steps` end soon; None if they cannot be canceled.
-
-    Yields:
-        The values of `steps`, and None while there is no new one.
+        cancel: thread-safe function that makes `job` end soon; None if it cannot be canceled.
 
     Raises:
-        BaseException: the exception that `steps` has raised.
+        BaseException: the exception that `job` has raised.
     """
-    results: queue.SimpleQueue[tuple[object, BaseException | None]] = queue.SimpleQueue()
+    steps: queue.SimpleQueue[Progress | BaseException | None] = queue.SimpleQueue()
 
     def work() -> None:
         try:
-            for step in steps:
-                results.put((step, None))
-            results.put((None, StopIteration()))
+            while True:
+                steps.put(next(job))
         except BaseException as error:  # Raised again in the main thread.
-            results.put((None, error))
+            steps.put(error)
 
     thread = threading.Thread(target=work, name=f"FDDA: {state.title}", daemon=True)
     thread.start()
@@ -53,14 +48,14 @@ def iterate_in_thread(
                 is_cancel_sent = True
                 cancel()
             try:
-                step, error = results.get_nowait()
+                step = steps.get_nowait()
             except queue.Empty:
                 yield None
                 continue
-            if isinstance(error, StopIteration):
-                return
-            if error is not None:
-                raise error
+            if isinstance(step, StopIteration):
+                return step.value
+            if isinstance(step, BaseException):
+                raise step
             yield step
     finally:
         if cancel and thread.is_alive():

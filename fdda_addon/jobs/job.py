@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """State of running and ended jobs, which panels draw, and functions that run and stop jobs.
 
-A job is a generator. It yields `Progress`, None while it waits, and at most one other value: its result. One job at a
-time works on a character (`operators.job` iterates it), and one on the training environment (`background` iterates it).
+One job at a time works on a character (`operators.job` iterates it), and one on the training environment (`background`
+iterates it).
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import bpy
 from bpy.app.handlers import persistent
 
 from ..core.errors import FDDAError
-from ..core.progress import Progress
+from ..core.progress import Job
 from ..scene import draw_cache
 from .state import CHARACTER, ENVIRONMENT, JobState
 
@@ -65,7 +65,7 @@ class JobRunner:
     def __init__(
         self,
         state: JobState,
-        steps: Iterator,
+        steps: Job[object],
         finish: Callable[[object], str],
         cancel_message: Callable[[], str],
         ends_itself: bool = False,
@@ -118,15 +118,13 @@ class JobRunner:
         while True:
             try:
                 step = next(self.steps)
-            except StopIteration:
+            except StopIteration as end:
+                self.result = end.value
                 return True
             if step is None:
                 self.is_waiting = True
                 return False
-            if isinstance(step, Progress):
-                self.state.show(step)
-            else:
-                self.result = step
+            self.state.show(step)
             if self.state.cancel_requested or time.monotonic() >= deadline:
                 return False
 

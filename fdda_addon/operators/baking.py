@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operator that bakes the deformed mesh to a file, which plays without the add-on."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
-from ..baking.run import BakeSettings, bake
+from ..baking.run import Bake, BakeSettings, bake
 from ..core.errors import OutputError
+from ..core.progress import Job
 from ..core.sentences.counts import format_count
 from ..runtime.model_files import network_of
 from .confirm import ChooseFileFirst
@@ -68,7 +68,7 @@ class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         # The sidebar has the fields; the file browser would list them again.
         pass
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[Bake]:
         scene_rig = self.bound_rig(context)
         if not self.filepath:
             raise OutputError("No file was chosen; give the name of a .pc2 or .blend file.")
@@ -76,9 +76,9 @@ class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         frames = (self.frame_start, self.frame_end) if self.use_frames else None
         settings = BakeSettings(self.action, frames, self.shape_keys, strength=strength)
         out = Path(bpy.path.abspath(self.filepath))
-        yield from bake(scene_rig, network_of(scene_rig.mesh_object), out, settings)
+        return (yield from bake(scene_rig, network_of(scene_rig.mesh_object), out, settings))
 
-    def finish(self, _context: bpy.types.Context, result: object) -> str:
+    def finish(self, _context: bpy.types.Context, result: Bake) -> str:
         names = " and ".join(path.name for path in result.files)
         return f"Baked {format_count(len(result.frames), 'frame')} to {names}."
 

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operator that records a rig, trains a model on the recording, and binds the model."""
 
-from collections.abc import Iterator
-
 import bpy
 
 from ..core.errors import RigError
+from ..core.progress import Job
 from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import planned_pose_count
@@ -31,7 +30,7 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_rig(context)
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[float | None]:
         rigs = self.rigs(context)
         for rig in rigs:
             if rig.mesh_object.library is not None:
@@ -47,15 +46,9 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
             for step in record_rigs(self.rig(context), missing, resume):
                 yield step
                 if self.state.cancel_requested:
-                    return
+                    return None
         self.changes_scene = self.state.changes_scene = False
-        meshes = [(rig.mesh_object, recording, model) for rig, recording, model in files]
-        for number, (mesh_object, recording, model) in enumerate(meshes):
-            self.state.begin_object(mesh_object.name if len(meshes) > 1 else "")
-            self.state.plan.begin_training(number)
-            yield from self.train(mesh_object, recording, model)
-            if self.state.cancel_requested:
-                return
+        return (yield from self.train_all([(rig.mesh_object, recording, model) for rig, recording, model in files]))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         self.add_trained_models_to_list()

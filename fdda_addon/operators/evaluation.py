@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section "Compare with Rig": evaluate the model, color the mesh, show the rig, open the report."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +9,10 @@ import bpy
 from ..core.defaults import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..core.errors import ModelError, RigError
 from ..core.formats.report import REPORT_HTML, page_path
-from ..core.progress import Progress
+from ..core.progress import Job
 from ..evaluation import heat_map, last_evaluation, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
+from ..evaluation.results import Evaluation
 from ..evaluation.run import evaluate, evaluate_action
 from ..evaluation.settings import EvaluationSettings
 from ..models import model_list
@@ -60,10 +60,10 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_bound_model(context)
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[list[tuple[int, Evaluation]]]:
         rigs = self.bound_rigs(context)
         self._action = self._action_name(rigs[0]) if self.source == "ACTION" else ""
-        self._evaluations: list[tuple[int, object]] = []
+        evaluations: list[tuple[int, Evaluation]] = []
         for scene_rig in rigs:
             mesh_object = scene_rig.mesh_object
             self.state.begin_object(mesh_object.name if len(rigs) > 1 else "")
@@ -71,20 +71,16 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
             target = target_settings(mesh_object.fdda.settings)
             with model_disabled(mesh_object):
                 if self._action:
-                    steps = evaluate_action(scene_rig, network, self._action, replace(target, max_settle_frames=0))
+                    job = evaluate_action(scene_rig, network, self._action, replace(target, max_settle_frames=0))
                 else:
                     settings = EvaluationSettings(
                         self.poses, self.seed, surface=False, target=replace(target, pre_roll=0)
                     )
-                    steps = evaluate(scene_rig, network, settings)
-                for step in steps:
-                    if isinstance(step, Progress):
-                        yield step
-                    else:
-                        self._evaluations.append((uid, step))
-        yield self._evaluations
+                    job = evaluate(scene_rig, network, settings)
+                evaluations.append((uid, (yield from job)))
+        return evaluations
 
-    def finish(self, context: bpy.types.Context, result: list[tuple[int, object]]) -> str:
+    def finish(self, context: bpy.types.Context, result: list[tuple[int, Evaluation]]) -> str:
         first_frame = action_frames(bpy.data.actions[self._action]).start if self._action else 0
         sentences = []
         for uid, evaluation in result:

@@ -2,7 +2,6 @@
 """The operator that makes a fast rig of the saved file, in another Blender."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -10,6 +9,7 @@ import bpy
 from ..core.errors import OutputError, RigError
 from ..core.files.temporary import temporary_folder
 from ..core.formats.model import read_model
+from ..core.progress import Job
 from ..fast_rig.process import VerbProcess
 from ..runtime import packed_model
 from ..runtime.model_files import model_path
@@ -66,7 +66,7 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
     def subject(self, context: bpy.types.Context) -> int:
         return self.bound_rig(context).mesh_object.session_uid
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[str]:
         scene_rig = self.bound_rig(context)
         self._check_saved(scene_rig)
         choices = [*(["visible"] if self.visible else []), *(["keyed"] if self.keyed else [])]
@@ -87,10 +87,10 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
             names = [f"--object={mesh_objects[0].name}"] if len(mesh_objects) == 1 else []
             arguments = [bpy.data.filepath, str(model), out, *names, "--controls", *choices]
             with VerbProcess("fast-rig", arguments) as process:
-                yield from process.steps()
+                return (yield from process.steps())
 
-    def finish(self, _context: bpy.types.Context, result: object) -> str:
-        lines = [line.strip() for line in str(result).splitlines()]
+    def finish(self, _context: bpy.types.Context, result: str) -> str:
+        lines = [line.strip() for line in result.splitlines()]
         # The first and the last line begin with the path of the file.
         start = re.match(r".*\.blend: ", lines[0], re.IGNORECASE)
         prefix = start[0] if start else ""

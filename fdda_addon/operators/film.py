@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operator that renders the film of an action: rig, linear skinning, model and heat map side by side."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -10,9 +9,9 @@ from ..core.defaults import FILM_TIMED_FRAMES
 from ..core.errors import RigError
 from ..core.files.file_kind import VIDEO
 from ..core.files.output import check_outputs
-from ..core.progress import Progress
+from ..core.progress import Job
 from ..core.sentences.counts import format_count
-from ..evaluation.film import FDDA, LINEAR, RIG, FilmSettings, film
+from ..evaluation.film import FDDA, LINEAR, RIG, Film, FilmSettings, film
 from ..evaluation.picture import View
 from ..evaluation.run import evaluate_action
 from ..evaluation.video import check_video_path
@@ -72,7 +71,7 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.prop_search(self, "action", bpy.data, "actions")
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[tuple[Path, Film]]:
         scene_rig, scene = self.bound_rig(context), context.scene
         path = Path(bpy.path.abspath(self.filepath))
         check_video_path(path)
@@ -80,18 +79,18 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
         name = self._action_name(scene_rig)
         network = network_of(scene_rig.mesh_object)
         with model_disabled(scene_rig.mesh_object):
-            times = (yield from _result(benchmark(scene_rig, None, FILM_TIMED_FRAMES))).frame_times("")
+            times = (yield from benchmark(scene_rig, None, FILM_TIMED_FRAMES)).frame_times("")
             settings = FilmSettings(
                 view=View.from_direction(self.direction) if any(self.direction) else View(),
                 fps=scene.render.fps / scene.render.fps_base * time_ratio(),
                 times_ms={RIG: times.rig, FDDA: times.fdda} | ({LINEAR: times.linear} if times.linear else {}),
             )
-            evaluation = yield from _result(evaluate_action(scene_rig, network, name))
+            evaluation = yield from evaluate_action(scene_rig, network, name)
             first_frame = action_frames(find_action(name)).start
-            result = yield from _result(film(scene_rig, network, evaluation.held_out, first_frame, path, settings))
-        yield path, result
+            result = yield from film(scene_rig, network, evaluation.held_out, first_frame, path, settings)
+        return path, result
 
-    def finish(self, _context: bpy.types.Context, result: object) -> str:
+    def finish(self, _context: bpy.types.Context, result: tuple[Path, Film]) -> str:
         path, film = result
         return f"Rendered {format_count(film.frames, 'frame')} to {path.name}."
 
@@ -100,16 +99,6 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
         if not name:
             raise RigError(f"'{scene_rig.armature_object.name}' has no action; give it one.")
         return name
-
-
-def _result(steps: Iterator[object]) -> Iterator[object]:
-    """Yield the progress of a job, and return its result."""
-    for step in steps:
-        if isinstance(step, Progress):
-            yield step
-        else:
-            result = step
-    return result
 
 
 CLASSES = (FDDA_OT_render_comparison,)

@@ -2,13 +2,13 @@
 """The operator of the section "Rig" that profiles a frame."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 
 import bpy
 
 from ..core.errors import FDDAError
 from ..core.files.temporary import temporary_folder
+from ..core.progress import Job
 from ..fast_rig.process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements
@@ -19,7 +19,7 @@ from .job import JobOperator
 from .rig_operator import RigOperator
 
 
-def last_profile(mesh_object: bpy.types.Object) -> "FrameProfile | None":
+def last_profile(mesh_object: bpy.types.Object) -> FrameProfile | None:
     """Return the last profile of a mesh; None if there is none with its current number of vertices."""
     profile = measurements.last(FDDA_OT_profile_frame.verb, mesh_object)
     return profile if profile is not None and profile.vertices == len(mesh_object.data.vertices) else None
@@ -39,36 +39,31 @@ class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_rig(context)
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[FrameProfile]:
         scene_rig = self.rig(context)
-        for step in profile_frame(scene_rig):
-            yield step
-        yield from _with_fast_rig(step, scene_rig.mesh_object.name)
+        profile = yield from profile_frame(scene_rig)
+        return (yield from _with_fast_rig(profile, scene_rig.mesh_object.name))
 
-    def finish(self, context: bpy.types.Context, result: "FrameProfile") -> str:
+    def finish(self, context: bpy.types.Context, result: FrameProfile) -> str:
         measurements.store(self.verb, self.rig(context).mesh_object, result)
         largest_part = max(result.parts, key=lambda part: part.duration.median)
         share = largest_part.duration.median / max(result.total, 1e-9)
         return f"A frame takes {result.total:.2f} ms; {largest_part.title} takes {share:.0%}."
 
 
-def _with_fast_rig(profile: "FrameProfile", object_name: str) -> Iterator[object]:
-    """Measure what a fast rig would save, in another Blender with a copy of the open file.
-
-    Yields:
-        Progress, None while there is none, and at the end the profile with the result.
-    """
+def _with_fast_rig(profile: FrameProfile, object_name: str) -> Job[FrameProfile]:
+    """Measure what a fast rig would save, in another Blender with a copy of the open file; add it to a profile."""
     try:
         with temporary_folder() as folder:
             file, result_file = folder / "rig.blend", folder / "saving.json"
             save_copy(file)
             arguments = [str(file), "--fast-rig", f"--object={object_name}", "--json", str(result_file)]
             with VerbProcess("benchmark", arguments) as process:
-                yield from (step for step in process.steps() if not isinstance(step, str))
+                yield from process.steps()
             saving = FastRigSaving.from_json(json.loads(result_file.read_text(encoding="utf-8")))
-        yield replace(profile, fast_rig=saving)
+        return replace(profile, fast_rig=saving)
     except FDDAError as error:
-        yield replace(profile, fast_rig_problem=str(error))
+        return replace(profile, fast_rig_problem=str(error))
 
 
 CLASSES = (FDDA_OT_profile_frame,)

@@ -6,11 +6,11 @@ runs the job to its end.
 """
 
 import time
-from collections.abc import Iterator
 
 import bpy
 
 from ..core.errors import FDDAError
+from ..core.progress import Job
 from ..jobs.job import JobRunner, current, redraw, request_cancel, stop, unregister
 from ..jobs.state import JobState
 
@@ -46,8 +46,8 @@ class JobOperator:
     ends_itself = False
     """Whether `steps` checks `state.cancel_requested` and ends by itself. Otherwise the generator is closed."""
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        """Yield `Progress`, None while the job waits, and at last the result.
+    def steps(self, context: bpy.types.Context) -> Job[object]:
+        """Run the job while the generator is iterated.
 
         Closing the generator cancels the job. A step should take less than `TICK_BUDGET`.
         """

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section "Model": bind and unbind a model, switch the deformation, relink, measure the speed."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
 from ..core.errors import FDDAError, ModelError
+from ..core.progress import Job
 from ..evaluation import side_by_side
 from ..models import model_list
 from ..models.entries import active_entry, bound_model_name, format_file_size
@@ -15,7 +15,7 @@ from ..properties.preferences import packs_models
 from ..runtime.binding import model_disabled, unbind
 from ..scene.scene_rig import SceneRig, check_full_rig, remaining_rig_note
 from ..timing import frame_times
-from ..timing.benchmark import benchmark
+from ..timing.benchmark import Benchmark, benchmark
 from .job import JobOperator
 from .model_operator import ModelFileOperator, ModelOperator
 
@@ -228,12 +228,12 @@ class FDDA_OT_measure_model(ModelOperator, JobOperator, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_bound_model(context)
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[Benchmark]:
         scene_rig = self.bound_rig(context)
         with model_disabled(scene_rig.mesh_object):
-            yield from benchmark(scene_rig, None, self.frames)
+            return (yield from benchmark(scene_rig, None, self.frames))
 
-    def finish(self, context: bpy.types.Context, result: object) -> str:
+    def finish(self, context: bpy.types.Context, result: Benchmark) -> str:
         mesh_object = self.bound_rig(context).mesh_object
         times = result.frame_times(mesh_object.fdda.model)
         frame_times.store(mesh_object, times)

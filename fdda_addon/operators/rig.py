@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section "Rig": add the sample arm, measure the speed of the rig."""
 
-from collections.abc import Iterator
-
 import bpy
 from mathutils import Matrix
 
 from ..arm.rig import build_arm
+from ..core.progress import Job
 from ..scene.viewport import frame_objects
 from ..timing import measurements
 from ..timing.rig_cost import RigCost, measure
@@ -14,7 +13,7 @@ from .job import JobOperator
 from .rig_operator import RigOperator
 
 
-def measured_cost(mesh_object: bpy.types.Object) -> "RigCost | None":
+def measured_cost(mesh_object: bpy.types.Object) -> RigCost | None:
     """Return the measured cost of a rig; None if it was not measured with its current number of vertices."""
     cost = measurements.last(FDDA_OT_measure.verb, mesh_object)
     return cost if cost is not None and cost.vertices == len(mesh_object.data.vertices) else None
@@ -98,10 +97,10 @@ class FDDA_OT_measure(RigOperator, JobOperator, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_rig(context)
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        yield from measure(self.rig(context))
+    def steps(self, context: bpy.types.Context) -> Job[RigCost]:
+        return (yield from measure(self.rig(context)))
 
-    def finish(self, context: bpy.types.Context, result: "RigCost") -> str:
+    def finish(self, context: bpy.types.Context, result: RigCost) -> str:
         measurements.store(self.verb, self.rig(context).mesh_object, result)
         return f"{result.rig:.2f} ms per frame with the rig. {result.sentence}"
 

@@ -5,14 +5,14 @@ Invoked in a window, an operator runs in the background (`jobs.background`). If 
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 from bpy.props import StringProperty
 
 from ..core.errors import FDDAError, TrainerEnvironmentError
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..jobs.background import iterate_in_thread, run_in_background, unregister
 from ..jobs.job import JobRunner, current, request_cancel
 from ..jobs.state import ENVIRONMENT, JobState
@@ -22,8 +22,8 @@ from ..training.environment.check_result import CheckResult
 from ..training.environment.creation import EnvironmentCreation
 
 WAIT_SECONDS = 0.05
-_EnvironmentJob = tuple[Iterator[Progress | CheckResult], Callable[[], None] | None]
-"""The steps of a job, and a function that cancels them; None if they cannot be canceled."""
+_EnvironmentJob = tuple[Job[CheckResult], Callable[[], None] | None]
+"""A job, and a function that cancels it; None if it cannot be canceled."""
 
 
 class _EnvironmentOperator:
@@ -37,7 +37,7 @@ class _EnvironmentOperator:
         return True
 
     def steps(self) -> _EnvironmentJob:
-        """Return the steps of the job, and the function that cancels it.
+        """Return the job, and the function that cancels it.
 
         Raises:
             FDDAError: the job cannot start.
@@ -70,20 +70,25 @@ class _EnvironmentOperator:
 
     def _begin(self) -> JobRunner:
         try:
-            steps, cancel = self.steps()
+            job, cancel = self.steps()
         except FDDAError as error:
-            steps, cancel = iter([CheckResult("ERROR", str(error))]), None
-        return start_job(self.bl_idname.partition("_OT_")[2], self.bl_label, steps, cancel, type(self).store_result)
+            job, cancel = _failed_job(error), None
+        return start_job(self.bl_idname.partition("_OT_")[2], self.bl_label, job, cancel, type(self).store_result)
 
     def _end(self, state: JobState) -> set[str]:
         self.report({state.outcome_level}, state.outcome)
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
 
+def _failed_job(error: FDDAError) -> Job[CheckResult]:
+    yield None
+    raise error
+
+
 def start_job(
     verb: str,
     title: str,
-    steps: Iterator[Progress | CheckResult],
+    job: Job[CheckResult],
     cancel: Callable[[], None] | None,
     store_result: Callable[[CheckResult], None],
 ) -> JobRunner:
@@ -91,26 +96,25 @@ def start_job(
 
     Args:
         verb, title: attributes of its `JobState`.
-        steps: iterator of progress and, at last, the result. A thread iterates it.
-        cancel: thread-safe function that makes `steps` end soon; None if the job cannot be canceled.
+        job: the job. A thread iterates it.
+        cancel: thread-safe function that makes `job` end soon; None if the job cannot be canceled.
         store_result: called in the main thread with the result.
     """
     state = JobState(verb, title, works_on=ENVIRONMENT, can_cancel=cancel is not None)
 
-    def check_results() -> Iterator[object]:
+    def job_in_thread() -> Job[CheckResult]:
         try:
-            yield from iterate_in_thread(steps, state, cancel)
+            return (yield from iterate_in_thread(job, state, cancel))
         except FDDAError as error:
-            yield CheckResult("WARNING" if state.cancel_requested else "ERROR", str(error))
+            return CheckResult("WARNING" if state.cancel_requested else "ERROR", str(error))
 
-    def finish(outcome: CheckResult | None) -> str:
-        outcome = outcome or CheckResult("ERROR", f"{title} ended without a result.")
+    def finish(outcome: CheckResult) -> str:
         store_result(outcome)
         if outcome.level != "INFO":
             raise TrainerEnvironmentError(outcome.message)
         return outcome.message
 
-    return JobRunner(state, check_results(), finish, lambda: f"{title} was canceled.", ends_itself=True)
+    return JobRunner(state, job_in_thread(), finish, lambda: f"{title} was canceled.", ends_itself=True)
 
 
 class FDDA_OT_check_trainer(_EnvironmentOperator, bpy.types.Operator):
@@ -126,9 +130,9 @@ class FDDA_OT_check_trainer(_EnvironmentOperator, bpy.types.Operator):
         session.store_result(outcome)
 
 
-def _check(python: choice.TrainerPython) -> Iterator[Progress | CheckResult]:
+def _check(python: choice.TrainerPython) -> Job[CheckResult]:
     yield Progress(f"asking '{python.path}'", 0, 0)
-    yield choice.check_trainer_python(python)
+    return choice.check_trainer_python(python)
 
 
 class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operator):
@@ -183,12 +187,12 @@ class FDDA_OT_remove_trainer_environment(_EnvironmentOperator, bpy.types.Operato
         return _remove(folder.environment_folder()), None
 
 
-def _remove(path: Path) -> Iterator[Progress | CheckResult]:
+def _remove(path: Path) -> Job[CheckResult]:
     yield Progress(f"removing '{path}'", 0, 0)
     with folder.creation_lock(path):
         existed = path.exists()
         folder.remove_environment(path)
-    yield CheckResult(
+    return CheckResult(
         "INFO", "The training environment was removed." if existed else "There is no training environment."
     )
 

@@ -2,7 +2,6 @@
 """The operator that trains a model in another process and shows the progress."""
 
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from bpy.app.handlers import persistent
 
 from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.formats.messages import WARNING_LINE, MessageType
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..core.recording.index import read_index
 from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, training_steps
@@ -36,14 +35,14 @@ class TrainingOperator(RigOperator):
 
     def train(
         self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool = False
-    ) -> Iterator[object]:
-        """Train a model, or follow its running training. Yield progress as `steps` does, and at last the seconds.
+    ) -> Job[float | None]:
+        """Train a model, or follow its running training; return the seconds, or None if it was canceled.
 
         Raises:
             FDDAError: the recording is not complete, or the training fails.
         """
         # No data of Blender is used from here on, because the user may change it.
-        mesh_uid, start = mesh_object.session_uid, time.monotonic()
+        mesh_uid, start, seconds = mesh_object.session_uid, time.monotonic(), None
         state = self.state
         state.curves.update(training=[], validation=[])
         with self._training(mesh_object, recording, model, warm_start) as training:
@@ -55,6 +54,7 @@ class TrainingOperator(RigOperator):
                         if message.type is MessageType.FINISHED:
                             # This message may come after a cancellation, if the trainer was writing the model.
                             self.trained_models.append((mesh_uid, model))
+                            seconds = float(message.values["seconds"])
                         yield self._to_progress(message)
                         continue
                     if not state.total:
@@ -66,6 +66,20 @@ class TrainingOperator(RigOperator):
                     # Another file is opened, or Blender quits.
                     training.detach()
                 raise
+        return seconds
+
+    def train_all(
+        self, files: list[tuple[bpy.types.Object, Path, Path]], warm_start: bool = False
+    ) -> Job[float | None]:
+        """Train the models of meshes, each with its recording and model; return the seconds of the last training."""
+        seconds = None
+        for number, (mesh_object, recording, model) in enumerate(files):
+            self.state.begin_object(mesh_object.name if len(files) > 1 else "")
+            self.state.plan.begin_training(number)
+            seconds = (yield from self.train(mesh_object, recording, model, warm_start)) or seconds
+            if self.state.cancel_requested:
+                break
+        return seconds
 
     def training_plan(self, mesh_object: bpy.types.Object, pose_count: int) -> list[JobStep]:
         """Return the steps of a training on a recording with this number of poses."""
@@ -87,8 +101,8 @@ class TrainingOperator(RigOperator):
             arguments += ["--warm-start"]
         return Training(arguments) if bpy.app.background else DetachedTraining(arguments, model)
 
-    def _to_progress(self, message: object) -> object:
-        """Convert a message of the trainer to `Progress` or the result; return None for other messages."""
+    def _to_progress(self, message: object) -> Progress | None:
+        """Convert a message of the trainer to `Progress`; return None for other messages."""
         values, state = message.values, self.state
         if message.type is MessageType.PREPARING:
             return Progress("partitions prepared", values["done"], values["total"])
@@ -100,8 +114,6 @@ class TrainingOperator(RigOperator):
             return Progress("epochs", values["epoch"], values["epochs"])
         if message.type is MessageType.WARNING:
             state.warnings.append(WARNING_LINE.format(**values))
-        elif message.type is MessageType.FINISHED:
-            return float(values["seconds"])
         return None
 
     def add_trained_models_to_list(self) -> None:
@@ -199,16 +211,11 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
         recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
         return recording, Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+    def steps(self, context: bpy.types.Context) -> Job[float | None]:
         files = [(rig.mesh_object, *self._files(rig.mesh_object)) for rig in self.rigs(context)]
         plans = (self.training_plan(mesh_object, _pose_count(recording)) for mesh_object, recording, _ in files)
         self.state.plan = JobPlan([step for plan in plans for step in plan])
-        for number, (mesh_object, recording, model) in enumerate(files):
-            self.state.begin_object(mesh_object.name if len(files) > 1 else "")
-            self.state.plan.begin_training(number)
-            yield from self.train(mesh_object, recording, model, self.warm_start)
-            if self.state.cancel_requested:
-                return
+        return (yield from self.train_all(files, self.warm_start))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         self.add_trained_models_to_list()

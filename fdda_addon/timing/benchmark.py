@@ -17,7 +17,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..runtime import model_files, playback
@@ -131,8 +131,8 @@ def _round(value: float) -> float:
     return round(float(value), 4)
 
 
-def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[Progress | Benchmark]:
-    """Time a rig and a model, as a generator that does its work while it is iterated.
+def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Job[Benchmark]:
+    """Time a rig and a model while the generator is iterated.
 
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
 
@@ -140,9 +140,6 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         scene_rig: the rig.
         model: path of the model; None for the bound model.
         frames: number of frames to time for each variant.
-
-    Yields:
-        Progress, and the Benchmark at the end.
 
     Raises:
         RigError: as `check_full_rig`, or the rig cannot be evaluated.
@@ -182,7 +179,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         controls = np.zeros((1, len(network.info.controls)), np.float32)
         calls = [lambda: network.positions(pose_matrices, controls)] * (frames + WARM_UP_FRAMES)
         inference = time_calls(calls)[WARM_UP_FRAMES:]
-    yield Benchmark(
+    return Benchmark(
         len(mesh_object.data.vertices),
         frames_per_round * len(ratios),
         **{"linear": [], **times},

@@ -6,12 +6,12 @@ single bones or too small to measure.
 """
 
 import statistics
-from collections.abc import Generator, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import bpy
 
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..rig.bone_paths import split_bone_path
 from .armature_copy import RemovablePart, armature_copy
 from .durations import Duration, scene_times
@@ -65,9 +65,7 @@ class BoneGroup:
         }
 
 
-def find_expensive_groups(
-    armature_object: bpy.types.Object, frames: range
-) -> Generator[Progress, None, tuple[BoneGroup, ...]]:
+def find_expensive_groups(armature_object: bpy.types.Object, frames: range) -> Job[tuple[BoneGroup, ...]]:
     """Find the bones of an armature whose constraints and drivers take the most time.
 
     Args:
@@ -91,11 +89,11 @@ def find_expensive_groups(
 
 def _divide(
     armature_object: bpy.types.Object, parts: dict[str, list[RemovablePart]], full_scene: bpy.types.Scene, frames: range
-) -> Generator[Progress, None, list[BoneGroup]]:
+) -> Job[list[BoneGroup]]:
     """Divide the bones with `parts` into groups, the one that takes the most time first."""
     measured_count = 0
 
-    def measure(names: Iterable[str]) -> Generator[Progress, None, BoneGroup]:
+    def measure(names: Iterable[str]) -> Job[BoneGroup]:
         nonlocal measured_count
         group = _measure_group(armature_object, parts, names, full_scene, frames)
         measured_count += 1

@@ -2,14 +2,14 @@
 """Times the evaluation of scenes and the drawing of windows."""
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import bpy
 import numpy as np
 
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..scene.temporary_state import temporary_attributes
 
 WARM_UP_FRAMES = 2
@@ -81,7 +81,7 @@ def temporary_armature_scene(armature_object: bpy.types.Object) -> Iterator[bpy.
         bpy.data.scenes.remove(scene)
 
 
-def time_redraws(frames: range, rounds: int, frames_per_round: int) -> Generator[Progress, None, list[float]]:
+def time_redraws(frames: range, rounds: int, frames_per_round: int) -> Job[list[float]]:
     """Time the drawing of the active window after each frame, which includes sending changed meshes to the GPU.
 
     Returns:

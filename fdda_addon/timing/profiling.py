@@ -12,7 +12,7 @@ from contextlib import ExitStack
 import bpy
 
 from ..core.errors import RigError
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..rig.modifier_stack import check_posable, deforming_modifiers, is_fdda_modifier
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
@@ -28,14 +28,11 @@ MIN_SHARE = 0.01
 """Smallest share of an object in a frame that is divided into its modifiers."""
 
 
-def profile_frame(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]:
-    """Profile a frame of the scene, as a generator that works while it is iterated.
+def profile_frame(scene_rig: SceneRig) -> Job[FrameProfile]:
+    """Profile a frame of the scene while the generator is iterated.
 
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards. A bound
     model does not play meanwhile. In a window, it also draws.
-
-    Yields:
-        Progress, and the FrameProfile at the end.
 
     Raises:
         RigError: as `check_full_rig` and `check_posable`, or there is no action and no bone that random poses may move.
@@ -43,10 +40,10 @@ def profile_frame(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]:
     check_full_rig(scene_rig.mesh_object)
     with model_disabled(scene_rig.mesh_object):
         check_posable(scene_rig)
-        yield from _profile_shown_rig(scene_rig)
+        return (yield from _profile_shown_rig(scene_rig))
 
 
-def _profile_shown_rig(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]:
+def _profile_shown_rig(scene_rig: SceneRig) -> Job[FrameProfile]:
     with temporary_animation(scene_rig) as frames:
         measurement = _Measurement(scene_rig, frames)
         with temporary_armature_scene(scene_rig.armature_object) as armature_scene:
@@ -58,7 +55,7 @@ def _profile_shown_rig(scene_rig: SceneRig) -> Iterator[Progress | FrameProfile]
     if redraw_rounds:
         parts.append(FramePart(DRAWING, "", "", Duration.of(redraw_rounds)))
     vertex_count, frame = len(scene_rig.mesh_object.data.vertices), Duration.of(measurement.frame_rounds)
-    yield FrameProfile(vertex_count, frame, tuple(parts), groups, *_model_savings(scene_rig, parts))
+    return FrameProfile(vertex_count, frame, tuple(parts), groups, *_model_savings(scene_rig, parts))
 
 
 class _Measurement:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measures the time of a frame with a rig, and estimates the time with a model before a model is trained."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.progress import Progress
+from ..core.progress import Job, Progress
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, check_full_rig
@@ -61,13 +60,10 @@ def estimate_playback_ms(vertex_count: int) -> float:
     return PLAYBACK_MS + PLAYBACK_MS_PER_VERTEX * vertex_count
 
 
-def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
-    """Time a rig and its Armature modifier alone, alternately, as a generator that works while it is iterated.
+def measure(scene_rig: SceneRig) -> Job[RigCost]:
+    """Time a rig and its Armature modifier alone, alternately, while the generator is iterated.
 
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
-
-    Yields:
-        Progress, and the RigCost at the end.
 
     Raises:
         RigError: as `check_full_rig`, or the rig cannot be evaluated.
@@ -90,4 +86,4 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
                 ratios.append(float(np.median(rig_times) / np.median(linear_times)))
                 times["rig"] += rig_times
                 times["linear"] += linear_times
-    yield RigCost(len(mesh_object.data.vertices), *(float(np.median(times[variant])) for variant in ("rig", "linear")))
+    return RigCost(len(mesh_object.data.vertices), *(float(np.median(times[variant])) for variant in ("rig", "linear")))

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The state of a scene as values that can be compared, to check that a job restores everything it changes."""
 
-from collections.abc import Iterator
-
 import bpy
 import numpy as np
 
+from fdda_addon.core.progress import Job, Result, run_job
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 TRANSFORM_PROPERTIES = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
@@ -90,14 +89,13 @@ def set_unusual_state(rig: SceneRig) -> None:
     bpy.context.view_layer.objects.active = rig.mesh_object
 
 
-def drain(steps: Iterator, stop_after: int | None = None) -> object:
-    """Iterate to the end or close the iterator after a number of steps; return the last step."""
-    passed_steps = []
-    for step in steps:
-        passed_steps.append(step)
-        if len(passed_steps) == stop_after:
-            steps.close()
-    return passed_steps[-1]
+def drain(job: Job[Result], stop_after: int | None = None) -> Result:
+    """Run a job to its end and return its result, or close it after a number of steps."""
+    if stop_after is None:
+        return run_job(job)
+    for _ in zip(range(stop_after), job, strict=False):
+        pass
+    return job.close()
 
 
 def assert_same_state(before: dict, after: dict) -> None:

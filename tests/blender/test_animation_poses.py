@@ -9,6 +9,7 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.mathematics.skinning import LinearSkinning
+from fdda_addon.core.progress import run_job
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
@@ -285,8 +286,8 @@ def test_evaluation_of_an_action_needs_no_range_of_motion(trained_folder):
     rig = SceneRig(bpy.data.objects["body"], bpy.data.objects["figure_rig"])
     for bone in rig.armature_object.pose.bones:
         bone.lock_rotation = (True, True, True)
-    *_, evaluation = evaluate(
-        rig, trained_folder / "figure.onnx", EvaluationSettings(0, actions=(WAVE,), surface=False)
+    evaluation = run_job(
+        evaluate(rig, trained_folder / "figure.onnx", EvaluationSettings(0, actions=(WAVE,), surface=False))
     )
     assert evaluation.held_out is evaluation.actions[0] and evaluation.held_out.name == WAVE
     with pytest.raises(RigError, match="nothing to evaluate: 0 poses and no action; give --poses or --action"):

@@ -10,7 +10,7 @@ import pytest
 
 import fdda_addon
 from fdda_addon.core.errors import FDDAError
-from fdda_addon.core.progress import Progress
+from fdda_addon.core.progress import Job, Progress
 from fdda_addon.jobs import background
 from fdda_addon.jobs.background import iterate_in_thread, run_in_background
 from fdda_addon.jobs.job import JobRunner, current, request_cancel, state_of
@@ -23,7 +23,7 @@ class ControlledWork:
     def __init__(self, error: BaseException | None = None):
         self.go, self.canceled, self.threads, self.error = threading.Event(), threading.Event(), set(), error
 
-    def steps(self) -> Iterator[object]:
+    def steps(self) -> Job[str]:
         self.threads.add(threading.current_thread())
         yield Progress("waiting", 0, 2)
         while not self.go.wait(0.005):
@@ -32,7 +32,7 @@ class ControlledWork:
         if self.error:
             raise self.error
         yield Progress("going", 1, 2)
-        yield "done"
+        return "done"
 
     def start_job(self) -> JobRunner:
         state = JobState("fetch", "Fetching", works_on=ENVIRONMENT)

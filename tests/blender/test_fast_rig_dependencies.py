@@ -8,6 +8,7 @@ import pytest
 from blend_fixtures.characters.bones import NewBone, add_bones
 from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
+from fdda_addon.core.progress import run_job
 from fdda_addon.fast_rig.compared_poses import ComparedPoses, differing_bones, evaluate_poses
 from fdda_addon.fast_rig.controls import control_bones
 from fdda_addon.fast_rig.dependency_graph import Node
@@ -37,8 +38,7 @@ def kept_for_joints(scene_rig: SceneRig) -> tuple[set[Node], set[Node]]:
 def joint_matrices(scene_rig: SceneRig, *control_names: str) -> tuple[ComparedPoses, np.ndarray]:
     """Evaluate `lower` in some random poses of control bones."""
     poses = ComparedPoses(scene_rig.armature_object, ("lower",), control_names, (), SIZE, pose_count=POSE_COUNT)
-    *_, evaluation = evaluate_poses(poses, "poses")
-    return poses, evaluation.matrices
+    return poses, run_job(evaluate_poses(poses, "poses")).matrices
 
 
 @pytest.mark.parametrize("name", DEPENDENCIES)

@@ -7,6 +7,7 @@ import pytest
 from blend_fixtures.characters.base import link
 from blend_fixtures.characters.dependencies import UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
+from fdda_addon.core.progress import run_job
 from fdda_addon.fast_rig.compared_poses import ComparedPoses, evaluate_poses
 from fdda_addon.fast_rig.graph_reader import shown_objects
 from fdda_addon.fast_rig.object_values import differing_objects, driven_properties
@@ -325,12 +326,12 @@ def test_the_comparison_finds_all_that_renders_show_differently():
     shown = tuple(shown_objects([scene_rig]))
     driven = tuple(driven_properties(shown))
     poses = ComparedPoses(armature_object, ("lower",), ("control",), (action,), 0.5, shown, driven, pose_count=2)
-    *_, before = evaluate_poses(poses, "poses")
-    *_, again = evaluate_poses(poses, "poses")
+    before = run_job(evaluate_poses(poses, "poses"))
+    again = run_job(evaluate_poses(poses, "poses"))
     assert differing_objects(before.objects, again.objects, 0.0) == {}
     for curve in animation_curves(action):
         curve.mute = True
     # Blender leaves what it set where a driver is removed.
     bpy.data.lights["lamp"].animation_data.drivers.remove(bpy.data.lights["lamp"].animation_data.drivers[0])
-    *_, after = evaluate_poses(poses, "poses")
+    after = run_job(evaluate_poses(poses, "poses"))
     assert differing_objects(before.objects, after.objects, 1e-5).keys() == expected

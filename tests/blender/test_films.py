@@ -13,7 +13,7 @@ from mathutils import Matrix
 
 from blend_fixtures.elbow import ACTION
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.progress import Progress
+from fdda_addon.core.progress import Progress, run_job
 from fdda_addon.evaluation import video
 from fdda_addon.evaluation.film import (
     FDDA,
@@ -47,8 +47,7 @@ def shorten_action() -> None:
 def errors(rig: SceneRig, elbow_files) -> PoseErrors:
     """Return the errors on the shortened action of the elbow, whose file is open."""
     shorten_action()
-    *_, evaluation = evaluate_action(rig, elbow_files.model, ACTION)
-    return evaluation.held_out
+    return run_job(evaluate_action(rig, elbow_files.model, ACTION)).held_out
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -108,7 +107,8 @@ def test_the_verb_writes_a_film_of_the_action(rig: SceneRig, elbow_files, tmp_pa
 @pytest.mark.parametrize("suffix", [".mp4", ".webm"])
 def test_a_film_is_written_in_both_formats(errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path, suffix: str):
     before, out = datablocks(), tmp_path / f"film{suffix}"
-    *progress, result = film(rig, elbow_files.model, errors, FIRST, out, SMALL)
+    progress = []
+    result = run_job(film(rig, elbow_files.model, errors, FIRST, out, SMALL), progress.append)
     assert list(dict.fromkeys(step.stage for step in progress)) == ["film", "encoding"]
     assert progress[3] == Progress("film", 4, 4) and progress[-1] == Progress("encoding", 4, 4)
     assert isinstance(result, Film) and result.frames == 4

@@ -13,6 +13,7 @@ import pytest
 
 from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.core.errors import TRY_AGAIN
+from fdda_addon.core.progress import run_job
 from fdda_addon.jobs import job
 from fdda_addon.operators.frame_profile import last_profile
 from fdda_addon.panels import frame_profile as frame_profile_panel
@@ -58,8 +59,7 @@ def hide_extra_bones(rig: SceneRig) -> None:
 
 
 def profile_of(rig: SceneRig) -> FrameProfile:
-    *_, profile = profile_frame(rig)
-    return profile
+    return run_job(profile_frame(rig))
 
 
 def test_the_parts_add_up_to_the_frame_and_the_slow_modifier_is_the_largest(slow_rig):

@@ -39,7 +39,7 @@ class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wa
                 if number == self.at:
                     yield from self._misbehave()
                 yield Progress("numbers", number + 1, self.upto)
-            yield sum(range(self.upto))
+            return sum(range(self.upto))
         finally:
             events.append("given back")
 

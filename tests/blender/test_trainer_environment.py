@@ -13,9 +13,10 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import TrainerEnvironmentError
+from fdda_addon.core.progress import run_job
 from fdda_addon.jobs.job import JobRunner, current, state_of, stop
 from fdda_addon.jobs.state import ENVIRONMENT
-from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, start_job
+from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, _check, start_job
 from fdda_addon.training.environment import choice, folder, session, source_checks
 from fdda_addon.training.environment.choice import Origin
 from fdda_addon.training.environment.creation import EnvironmentCreation
@@ -48,7 +49,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An environment that is complete."""
     path = tmp_path_factory.mktemp("made") / "trainer"
-    *_, answer = EnvironmentCreation(path, path.with_name("log"), wheels, sys.executable).steps()
+    answer = run_job(EnvironmentCreation(path, path.with_name("log"), wheels, sys.executable).steps())
     assert answer.level == "INFO"
     return path
 
@@ -112,7 +113,7 @@ def test_settings_of_pip_and_of_a_launcher_do_not_change_where_and_what_is_insta
     for name, value in (variables | {"PIP_PROXY": "http://me:secret@nowhere", "PYTHONHOME": "/nowhere"}).items():
         monkeypatch.setenv(name, value)
     log = tmp_path / "log"
-    *_, answer = EnvironmentCreation(tmp_path / "trainer", log, base=sys.executable).steps()
+    answer = run_job(EnvironmentCreation(tmp_path / "trainer", log, base=sys.executable).steps())
     assert answer.level == "INFO" and folder.folder_state(tmp_path / "trainer") is FolderState.READY
     used = re.search(r"Settings of pip that are used: (.*)", log.read_text())[1].split(", ")
     assert {"find-links", "no-index", "proxy"} <= set(used) <= {"find-links", "no-index", "proxy", "cert"}
@@ -302,9 +303,7 @@ def test_unregistering_cancels_a_running_creation(user: Path, wheels: Path):
 
 
 def test_the_result_of_a_background_check_is_stored(own: Path):
-    python = choice.select_python()
-    steps = (choice.check_trainer_python(python) for _ in range(1))
-    run = start_job("check_trainer", "Check", steps, None, session.store_result)
+    run = start_job("check_trainer", "Check", _check(choice.select_python()), None, session.store_result)
     assert not run.work(0) and not run.state.can_cancel and not bpy.ops.fdda.cancel_trainer_environment.poll()
     wait_for(lambda: run.work(0))
     assert state_of("check_trainer").outcome == session.check_result.message

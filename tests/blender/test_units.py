@@ -21,6 +21,7 @@ from blend_fixtures.characters.transforms import (
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.progress import run_job
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation import heat_map, last_evaluation
 from fdda_addon.evaluation.run import evaluate
@@ -163,7 +164,7 @@ def test_the_heat_map_shows_millimetres(characters, name):
     character = characters[name]
     bpy.ops.wm.open_mainfile(filepath=str(character.rig))
     rig = find_rig()
-    *_, evaluation = evaluate(rig, character.model, EvaluationSettings(poses=4, surface=False))
+    evaluation = run_job(evaluate(rig, character.model, EvaluationSettings(poses=4, surface=False)))
     last = last_evaluation.store(rig.mesh_object, evaluation, character.model.name)
     assert last.worst_poses(1)[0][1] == pytest.approx(last.total["fdda"].max, rel=1e-5)
     assert 0.05 < last.total["fdda"].max < 50
@@ -202,5 +203,5 @@ def test_a_copy_that_is_scaled_up_has_the_figures_of_its_model(characters):
     rig.armature_object.scale = (3.0, 3.0, 3.0)
     bpy.context.view_layer.update()
     assert metres_per_unit(rig.mesh_object) == 3.0
-    *_, evaluation = evaluate(rig, character.model, EvaluationSettings(poses=100, surface=False))
+    evaluation = run_job(evaluate(rig, character.model, EvaluationSettings(poses=100, surface=False)))
     assert evaluation.fdda.mean == pytest.approx(character.evaluation["fdda"]["mean"], rel=1e-3)

@@ -15,7 +15,7 @@ from typing import IO
 
 from ...core.errors import TrainerEnvironmentError, os_error_text
 from ...core.files.child_process import child_options
-from ...core.progress import Progress
+from ...core.progress import Job, Progress
 from .check import check
 from .check_result import CheckResult
 from .folder import (
@@ -53,21 +53,21 @@ class EnvironmentCreation:
         self._last_lines: list[str] = []
         self._has_changed_folder = False
 
-    def steps(self) -> Iterator[Progress | CheckResult]:
-        """Install the environment; yield progress, and last the result of the check.
+    def steps(self) -> Job[CheckResult]:
+        """Install the environment, and return the result of its check.
 
         Raises:
             TrainerEnvironmentError: the installation failed or was canceled, and the folder was removed.
         """
         try:
-            yield from self._steps()
+            return (yield from self._steps())
         except OSError as error:
             raise TrainerEnvironmentError(
                 f"The training environment cannot be written ({os_error_text(error)}: "
                 f"'{error.filename or self.folder}'); make room or check the permissions, and install it again."
             ) from error
 
-    def _steps(self) -> Iterator[Progress | CheckResult]:
+    def _steps(self) -> Job[CheckResult]:
         with creation_lock(self.folder), _open_log(self.log) as log:
             check_source(self.folder, self.wheels)
             yield Progress("looking for a Python", 0, 0)
@@ -89,7 +89,7 @@ class EnvironmentCreation:
             finally:
                 if self._has_changed_folder and not complete:
                     remove_environment(self.folder)
-        yield result
+        return result
 
     def cancel(self) -> None:
         """Cancel the installation. Thread-safe."""
@@ -114,7 +114,7 @@ class EnvironmentCreation:
             raise self._no_python_error(f"{candidates[0]} {candidates[0].problem}" if candidates else "none runs")
         return suitable
 
-    def _create_venv(self, interpreters: list[Interpreter], log: IO[str]) -> Iterator[Progress]:
+    def _create_venv(self, interpreters: list[Interpreter], log: IO[str]) -> Job[Interpreter]:
         """Create the virtual environment with the first interpreter that succeeds, and return that interpreter."""
         for interpreter in interpreters:
             yield Progress(f"making it from {interpreter}", 0, 0)
@@ -184,7 +184,7 @@ class EnvironmentCreation:
             raise TrainerEnvironmentError(f"The packages were installed but do not work: {result.message}")
         return result
 
-    def _run(self, command: list[str], log: IO[str], variables: Mapping[str, str] = {}) -> Iterator[Progress]:
+    def _run(self, command: list[str], log: IO[str], variables: Mapping[str, str] = {}) -> Job[int]:
         """Run a command with further environment variables, and return its exit status.
 
         Its current folder is outside of the environment, which Windows could not remove otherwise.
