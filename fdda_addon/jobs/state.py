@@ -78,6 +78,11 @@ class JobState:
     _shown_fraction: float = 0.0
 
     @property
+    def busy_text(self) -> str:
+        """Return why an operator must wait."""
+        return f"{self.title} is under way; wait for it or cancel it"
+
+    @property
     def fraction(self) -> float:
         """Return the completed ratio of the job, 0 to 1: by time if it has a plan, else of its only stage."""
         if self.plan is None:

@@ -10,11 +10,11 @@ from ..core.errors import OutputError
 from ..core.progress import Job
 from ..core.sentences.counts import format_count
 from ..runtime.model_files import network_of
-from .confirm import ChooseFileFirst
-from .model_operator import ModelOperator
+from .job import FileJobOperator
+from .rig_operator import NEEDS_MODEL
 
 
-class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):
+class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
     bl_idname = "fdda.bake"
     bl_label = "Bake"
     bl_description = (
@@ -22,6 +22,7 @@ class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         "of this .blend file"
     )
     bl_options = {"REGISTER"}
+    needs = NEEDS_MODEL
     verb, title = "bake", "Bake"
 
     filepath: bpy.props.StringProperty(
@@ -49,20 +50,10 @@ class FDDA_OT_bake(ModelOperator, ChooseFileFirst, bpy.types.Operator):
     frame_start: bpy.props.IntProperty(name="Start", description="First frame", default=1, options={"SKIP_SAVE"})
     frame_end: bpy.props.IntProperty(name="End", description="Last frame", default=250, options={"SKIP_SAVE"})
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound_model(context)
-
     def suggested_path(self, context: bpy.types.Context) -> str:
         name = bpy.path.clean_name(self.bound_rig(context).mesh_object.name)
         file = Path(bpy.data.filepath).stem or "character"
         return f"//{file}_{name}_baked{'.pc2' if self.point_cache else '.blend'}"
-
-    invoke, execute = ChooseFileFirst.invoke, ChooseFileFirst.execute
-
-    def confirmed_properties(self) -> dict[str, object]:
-        names = ("object", "filepath", "action", "shape_keys", "use_frames", "frame_start", "frame_end")
-        return {name: getattr(self, name) for name in names}
 
     def draw(self, _context: bpy.types.Context) -> None:
         # The sidebar has the fields; the file browser would list them again.

@@ -9,13 +9,12 @@ from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import planned_pose_count
 from ..scene.scene_rig import SceneRig, armature_of
-from .job import JobOperator
 from .playback import bind_model
 from .recording import is_recorded, record_rigs, recording_plan
 from .training import TrainingOperator
 
 
-class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
+class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
     bl_idname = "fdda.build_model"
     bl_label = "Record, Train & Bind"
     bl_description = (
@@ -25,10 +24,6 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
     bl_options = {"REGISTER"}
     verb, title = "build_model", "Record, Train & Bind"
     ends_itself = True
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
         rigs = self.rigs(context)

@@ -22,18 +22,18 @@ from ..properties.recording_options import target_settings
 from ..properties.view import active_action_name, show_graph
 from ..runtime.binding import model_disabled
 from ..runtime.model_files import network_of
-from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import SceneRig, check_full_rig
 from ..scene.viewport import redraw_views
 from .job import JobOperator
-from .model_operator import ModelOperator
+from .rig_operator import NEEDS_MODEL, RigOperator
 
 
-class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
+class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.evaluate"
     bl_label = "Evaluate"
     bl_description = "Compare the bound model with the rig, on the action of the armature or on random poses"
     bl_options = {"REGISTER"}
+    needs = NEEDS_MODEL
     verb, title = "evaluate", "Evaluation"
 
     source: bpy.props.EnumProperty(
@@ -53,12 +53,6 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         name="Poses", description="Number of random poses", default=SIDEBAR_EVALUATION_POSES, min=1
     )
     seed: bpy.props.IntProperty(name="Seed", description="Random seed of the poses", default=EVALUATION_SEED, min=0)
-
-    execute = JobOperator.execute
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound_model(context)
 
     def steps(self, context: bpy.types.Context) -> Job[list[tuple[int, Evaluation]]]:
         rigs = self.bound_rigs(context)
@@ -113,18 +107,10 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         return name
 
 
-class EvaluationOperator(ModelOperator):
+class EvaluationOperator(RigOperator):
     """Mixin for an operator on the last evaluation of a mesh."""
 
-    @classmethod
-    def has_evaluation(cls, context: bpy.types.Context) -> bool:
-        """Return whether any mesh of the scene has an evaluation, else set the poll message. For `poll`."""
-        if not cls.can_change_scene(context):
-            return False
-        if not any_mesh_object(context, last_evaluation.get):
-            cls.poll_message_set("Nothing has been compared in this session; press Evaluate first")
-            return False
-        return True
+    needs = (last_evaluation.get, "Nothing has been compared in this session; press Evaluate first")
 
     def last_evaluation(self, context: bpy.types.Context) -> tuple[object, object]:
         """Return the rig and its last evaluation.
@@ -146,6 +132,7 @@ class FDDA_OT_color_mesh(EvaluationOperator, bpy.types.Operator):
     bl_label = "Color the Mesh"
     bl_description = "Show errors or body parts as colors in the viewport"
     bl_options = {"REGISTER"}
+    needs = None
 
     colors: bpy.props.EnumProperty(
         name="Colors",
@@ -157,10 +144,6 @@ class FDDA_OT_color_mesh(EvaluationOperator, bpy.types.Operator):
         ),
         default="ERRORS",
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.can_change_scene(context)
 
     def apply(self, context: bpy.types.Context) -> str:
         if self.colors == "ERRORS":
@@ -184,10 +167,6 @@ class FDDA_OT_fit_color_range(EvaluationOperator, bpy.types.Operator):
     bl_description = "Fit the range of the heat map to the errors that are shown"
     bl_options = {"REGISTER"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_evaluation(context)
-
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig, _ = self.last_evaluation(context)
         range_mm = heat_map.suggested_range_mm(scene_rig.mesh_object)
@@ -198,15 +177,12 @@ class FDDA_OT_fit_color_range(EvaluationOperator, bpy.types.Operator):
         return f"Max color: {view.range_mm:.3g} mm."
 
 
-class FDDA_OT_open_report(ModelOperator, bpy.types.Operator):
+class FDDA_OT_open_report(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.open_report"
     bl_label = "Open Training Report"
     bl_description = f"Open {REPORT_HTML}, which the training wrote next to the model, in the web browser"
     bl_options = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound_model(context)
+    needs = NEEDS_MODEL
 
     def apply(self, context: bpy.types.Context) -> str:
         path = self._report_page(self.bound_rig(context).mesh_object)
@@ -227,11 +203,12 @@ class FDDA_OT_open_report(ModelOperator, bpy.types.Operator):
         return page_path(model_list.entry_path(mesh_object, entry).resolve())
 
 
-class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
+class FDDA_OT_show_rig(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.show_rig"
     bl_label = "Show the Rig"
     bl_description = "Show the rig together with the model, next to it or over it as a wireframe"
     bl_options = {"REGISTER", "UNDO"}
+    needs = NEEDS_MODEL
 
     placement: bpy.props.EnumProperty(
         name="Show the Rig",
@@ -249,10 +226,6 @@ class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
         subtype="DISTANCE",
         options={"SKIP_SAVE"},
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound_model(context)
 
     def apply(self, context: bpy.types.Context) -> str:
         rigs = self.bound_rigs(context)

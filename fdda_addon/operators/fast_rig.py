@@ -14,11 +14,11 @@ from ..fast_rig.process import VerbProcess
 from ..runtime import packed_model
 from ..runtime.model_files import model_path
 from ..scene.scene_rig import SceneRig, armature_of
-from .confirm import ChooseFileFirst
-from .model_operator import ModelOperator
+from .job import FileJobOperator
+from .rig_operator import NEEDS_MODEL
 
 
-class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
+class FDDA_OT_fast_rig(FileJobOperator, bpy.types.Operator):
     bl_idname = "fdda.fast_rig"
     bl_label = "Fast Rig"
     bl_description = (
@@ -26,6 +26,7 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         "do not need. Relocate the library to this file for rendering"
     )
     bl_options = {"REGISTER"}
+    needs = NEEDS_MODEL
     verb, title = "fast_rig", "Fast Rig"
     changes_scene = False
 
@@ -41,18 +42,9 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         name="Bone Collection", description="Keep the bones of this bone collection", options={"SKIP_SAVE"}
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound_model(context)
-
     def suggested_path(self, context: bpy.types.Context) -> str:
         self._check_saved(self.bound_rig(context))
         return f"//{Path(bpy.data.filepath).stem}_fast.blend"
-
-    invoke, execute = ChooseFileFirst.invoke, ChooseFileFirst.execute
-
-    def confirmed_properties(self) -> dict[str, object]:
-        return {name: getattr(self, name) for name in ("object", "filepath", "visible", "keyed", "collection")}
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.label(text="Made from the saved file", icon="INFO")
@@ -62,9 +54,6 @@ class FDDA_OT_fast_rig(ModelOperator, ChooseFileFirst, bpy.types.Operator):
         self.layout.label(text="Bone Collection:")
         armature = self.bound_rig(context).armature_object.data
         self.layout.prop_search(self, "collection", armature, "collections_all", text="")
-
-    def subject(self, context: bpy.types.Context) -> int:
-        return self.bound_rig(context).mesh_object.session_uid
 
     def steps(self, context: bpy.types.Context) -> Job[str]:
         scene_rig = self.bound_rig(context)

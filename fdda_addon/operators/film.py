@@ -23,17 +23,18 @@ from ..runtime.model_files import network_of
 from ..scene.scene_rig import SceneRig
 from ..scene.time_stretching import time_ratio
 from ..timing.benchmark import benchmark
-from .confirm import ChooseFileFirst
-from .model_operator import ModelOperator
+from .job import FileJobOperator
+from .rig_operator import NEEDS_MODEL
 
 
-class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operator):
+class FDDA_OT_render_comparison(FileJobOperator, bpy.types.Operator):
     bl_idname = "fdda.render_comparison"
     bl_label = "Render Comparison"
     bl_description = (
         "Render a film of the action: rig, linear skinning, model and heat map side by side, as seen in the 3D View"
     )
     bl_options = {"REGISTER"}
+    needs = NEEDS_MODEL
     verb, title = "render_comparison", "Film"
 
     filepath: bpy.props.StringProperty(
@@ -51,10 +52,6 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
         options={"HIDDEN", "SKIP_SAVE"},
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound_model(context)
-
     def suggested_path(self, context: bpy.types.Context) -> str:
         scene_rig = self.bound_rig(context)
         self.action = self._action_name(scene_rig)
@@ -62,11 +59,6 @@ class FDDA_OT_render_comparison(ModelOperator, ChooseFileFirst, bpy.types.Operat
             self.direction = context.region_data.view_matrix.inverted().to_3x3().col[2]
         file = Path(bpy.data.filepath).stem or "character"
         return f"//{bpy.path.clean_name(f'{file}_{scene_rig.mesh_object.name}_{self.action}')}.mp4"
-
-    invoke, execute = ChooseFileFirst.invoke, ChooseFileFirst.execute
-
-    def confirmed_properties(self) -> dict[str, object]:
-        return {name: getattr(self, name) for name in ("object", "filepath", "action", "direction")}
 
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.prop_search(self, "action", bpy.data, "actions")

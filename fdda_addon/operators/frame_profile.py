@@ -16,7 +16,6 @@ from ..timing.fast_rig_saving import FastRigSaving
 from ..timing.frame_profile import FrameProfile
 from ..timing.profiling import profile_frame
 from .job import JobOperator
-from .rig_operator import RigOperator
 
 
 def last_profile(mesh_object: bpy.types.Object) -> FrameProfile | None:
@@ -25,7 +24,7 @@ def last_profile(mesh_object: bpy.types.Object) -> FrameProfile | None:
     return profile if profile is not None and profile.vertices == len(mesh_object.data.vertices) else None
 
 
-class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
+class FDDA_OT_profile_frame(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.profile_frame"
     bl_label = "Profile Frame"
     bl_description = (
@@ -34,10 +33,6 @@ class FDDA_OT_profile_frame(RigOperator, JobOperator, bpy.types.Operator):
     )
     bl_options = {"REGISTER"}
     verb, title = "profile_frame", "Profiling"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Job[FrameProfile]:
         scene_rig = self.rig(context)

@@ -13,6 +13,7 @@ from ..core.errors import FDDAError
 from ..core.progress import Job
 from ..jobs.job import JobRunner, current, redraw, request_cancel, stop, unregister
 from ..jobs.state import JobState
+from .rig_operator import RigOperator
 
 TICK_BUDGET, MAX_BUDGET = 0.03, 0.2
 """Shortest and longest time that a job may work in one tick, seconds. A tick does not interrupt a step.
@@ -30,13 +31,16 @@ VIEW_EVENTS = {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE"
 """Events that a job passes on to Blender while it changes the scene: they navigate the view."""
 
 
-class JobOperator:
-    """Mixin for an operator that runs a job.
+class JobOperator(RigOperator):
+    """Mixin for an operator that runs a job on a rig.
 
     A subclass sets `verb` and `title`, defines `steps` and `finish`, and may define `cancel_message`. FDDAErrors of
-    these are reported, and the operator is canceled.
+    these are reported, and the operator is canceled. An `invoke` that shows a dialog sets `is_confirming`: Blender then
+    calls `execute`, which would block Blender until the job ends, so `execute` invokes the operator again.
     """
 
+    waits_for_all_jobs = True
+    is_confirming = False
     verb = ""
     title = ""
     changes_scene = True
@@ -55,7 +59,7 @@ class JobOperator:
 
     def subject(self, context: bpy.types.Context) -> int:
         """Return the session_uid of the object that the job works on; 0 without one."""
-        return 0
+        return self.rig(context).mesh_object.session_uid
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
         """Process the result of `steps`, and return the message to report."""
@@ -68,20 +72,15 @@ class JobOperator:
     def on_failure(self) -> None:
         """Clean up after an error."""
 
-    @classmethod
-    def is_idle(cls) -> bool:
-        """Return whether no job runs, else set the poll message. For `poll`."""
-        job = current()
-        if job is not None:
-            cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
-        return job is None
-
     @property
     def state(self) -> JobState:
         """Return the state of the job, for its warnings and curves."""
         return self._run.state
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        if self.is_confirming:
+            operator = getattr(bpy.ops.fdda, self.bl_idname.lower().rpartition("_ot_")[2])
+            return operator("INVOKE_DEFAULT", **self.as_keywords())
         if not self._begin(context):
             return {"CANCELLED"}
         while not self._run.work(BACKGROUND_STEP_SECONDS):
@@ -120,13 +119,15 @@ class JobOperator:
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Stop the job, because its window or Blender is closed."""
+        if self.is_confirming:
+            return
         if self._run.state.is_running:
             stop(f"{self.title} ended with its window.")
         self._end_modal(context)
 
     def _begin(self, context: bpy.types.Context) -> bool:
         if (job := current()) is not None:
-            self.report({"ERROR"}, f"{job.title} is under way; wait for it or cancel it.")
+            self.report({"ERROR"}, f"{job.busy_text}.")
             return False
         try:
             state = JobState(self.verb, self.title, self.subject(context), self.changes_scene)
@@ -233,6 +234,33 @@ def _is_view_event(context: bpy.types.Context, event: bpy.types.Event) -> bool:
         if area.type == "VIEW_3D"
         for region in area.regions
     )
+
+
+class FileJobOperator(JobOperator):
+    """Mixin for a job operator that writes the file `filepath`, and shows a file browser if that is empty."""
+
+    filepath: str
+    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+
+    def suggested_path(self, context: bpy.types.Context) -> str:
+        """Return the file that the browser suggests; `//` stands for the folder of the .blend file.
+
+        Raises:
+            FDDAError: the operator cannot run; there is nothing to choose.
+        """
+        raise NotImplementedError
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if self.filepath:
+            return super().invoke(context, event)
+        try:
+            self.filepath = bpy.path.abspath(self.suggested_path(context))
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.is_confirming = True
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
 
 class FDDA_OT_cancel(bpy.types.Operator):

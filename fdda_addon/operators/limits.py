@@ -11,7 +11,7 @@ from ..poses.human_ranges import human_ranges
 from ..poses.mirror import flipped_name
 from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
 from ..scene.compatibility import is_selected
-from .pose_operator import LimitsOperator
+from .poses import LimitsOperator
 
 AXES = "XYZ"
 

@@ -6,7 +6,6 @@ The menu makes Blender's search (F3) find the operators. It leaves out those tha
 
 import bpy
 
-from ..core.errors import RigError
 from ..jobs.job import redraw
 from ..scene.active_rig import cached_active_rig, cached_rigs_of_active_armature, rigs_of_active_armature
 from .rig_operator import RigOperator
@@ -33,24 +32,16 @@ class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
     bl_label = "Show Mesh"
     bl_description = "Show this mesh of the armature in the sidebar"
     bl_options = {"INTERNAL"}
+    waits_for_jobs = False
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_rig(context)
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            mesh_object = self.rig(context).mesh_object
-        except RigError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        context.window_manager.fdda.mesh = mesh_object.name
+    def apply(self, context: bpy.types.Context) -> str:
+        context.window_manager.fdda.mesh = self.rig(context).mesh_object.name
         # The sidebar prefers a mesh that is selected together with the armature.
         for rig in rigs_of_active_armature(context):
             if rig.mesh_object.select_get():
                 rig.mesh_object.select_set(False)
         redraw()
-        return {"FINISHED"}
+        return ""
 
 
 class FDDA_MT_main(bpy.types.Menu):

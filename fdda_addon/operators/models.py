@@ -10,17 +10,18 @@ from ..core.sentences.counts import format_count
 from ..models import model_list
 from ..models.changes import find_changes
 from ..models.entries import format_file_size
-from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import remaining_rig_note
-from .model_operator import ModelFileOperator, ModelOperator
+from .rig_operator import ModelFileOperator, RigOperator
 
 
 def _has_models(mesh_object: bpy.types.Object) -> bool:
     return bool(mesh_object.fdda.models) or mesh_object.fdda.is_bound
 
 
-class ModelListOperator(ModelOperator):
+class ModelListOperator(RigOperator):
     """Mixin for an operator on one model of the Model Library."""
+
+    needs = (_has_models, "The model library is empty; train a model, or add a file")
 
     index: bpy.props.IntProperty(
         name="Index",
@@ -29,16 +30,6 @@ class ModelListOperator(ModelOperator):
         min=-1,
         options={"SKIP_SAVE"},
     )
-
-    @classmethod
-    def has_models(cls, context: bpy.types.Context) -> bool:
-        """Return whether any mesh of the scene has models, else set the poll message. For `poll`."""
-        if not cls.can_change_scene(context):
-            return False
-        if not any_mesh_object(context, _has_models):
-            cls.poll_message_set("The model library is empty; train a model, or add a file")
-            return False
-        return True
 
     def active_entry(self, context: bpy.types.Context) -> tuple[object, object]:
         """Return the rig, and the model of its list at `index`, or the active model.
@@ -59,18 +50,11 @@ class ModelListOperator(ModelOperator):
         return scene_rig, mesh_object.fdda.models[self.index]
 
 
-class FDDA_OT_add_model(ModelOperator, ModelFileOperator, bpy.types.Operator):
+class FDDA_OT_add_model(ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.add_model"
     bl_label = "Add Model"
     bl_description = "Add a model file to the list of this mesh"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.can_change_scene(context)
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        return self.execute(context) if self.filepath else self.open_file_browser(context)
 
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig = self.rig(context)
@@ -88,10 +72,6 @@ class FDDA_OT_remove_model(ModelListOperator, bpy.types.Operator):
     bl_description = "Remove the model from the list, and unbind it. Its file is kept; a packed model is deleted"
     bl_options = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_models(context)
-
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig, entry = self.active_entry(context)
         mesh_object = scene_rig.mesh_object
@@ -106,10 +86,6 @@ class FDDA_OT_pack_model(ModelListOperator, bpy.types.Operator):
     bl_label = "Pack Model"
     bl_description = "Store the model in the .blend file"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_models(context)
 
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig, entry = self.active_entry(context)
@@ -132,10 +108,6 @@ class FDDA_OT_unpack_model(ModelListOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_models(context)
-
     def apply(self, context: bpy.types.Context) -> str:
 
         scene_rig, entry = self.active_entry(context)
@@ -154,10 +126,6 @@ class FDDA_OT_check_model(ModelListOperator, bpy.types.Operator):
     bl_label = "Check Model"
     bl_description = "Report what has changed in the rig since the model was trained"
     bl_options = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_models(context)
 
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig, entry = self.active_entry(context)

@@ -17,7 +17,7 @@ from ..scene.scene_rig import SceneRig, check_full_rig, remaining_rig_note
 from ..timing import frame_times
 from ..timing.benchmark import Benchmark, benchmark
 from .job import JobOperator
-from .model_operator import ModelFileOperator, ModelOperator
+from .rig_operator import NEEDS_MODEL, ModelFileOperator, RigOperator
 
 LARGE_MODEL_BYTES = 32_000_000
 """Larger models are packed on request only, because every save writes a packed model again."""
@@ -73,7 +73,7 @@ def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGrou
     return ""
 
 
-class FDDA_OT_bind(ModelOperator, ModelFileOperator, bpy.types.Operator):
+class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.bind"
     bl_label = "Bind"
     bl_description = "Use a model instead of the rig's modifiers: the active one of the Model Library, or a file"
@@ -90,10 +90,6 @@ class FDDA_OT_bind(ModelOperator, ModelFileOperator, bpy.types.Operator):
         description="Store the model in the .blend file although it is large",
         options={"SKIP_SAVE"},
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.can_change_scene(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         try:
@@ -129,15 +125,12 @@ class FDDA_OT_bind(ModelOperator, ModelFileOperator, bpy.types.Operator):
         return " ".join(bind_model(rig, path, self.pack_large) for rig in rigs)
 
 
-class FDDA_OT_unbind(ModelOperator, bpy.types.Operator):
+class FDDA_OT_unbind(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.unbind"
     bl_label = "Unbind"
     bl_description = "Restore the modifiers of the rig. The model stays in the Model Library"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound_model(context)
+    needs = NEEDS_MODEL
 
     def apply(self, context: bpy.types.Context) -> str:
         names, notes = [], []
@@ -151,11 +144,12 @@ class FDDA_OT_unbind(ModelOperator, bpy.types.Operator):
         return " ".join([f"Unbound {' and '.join(names)}.", *notes])
 
 
-class FDDA_OT_set_mode(ModelOperator, bpy.types.Operator):
+class FDDA_OT_set_mode(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.set_mode"
     bl_label = "Switch Deformation"
     bl_description = "Deform the mesh with the modifiers of the rig, linear skinning alone, or the model"
     bl_options = {"REGISTER", "UNDO"}
+    needs = NEEDS_MODEL
 
     mode: bpy.props.EnumProperty(
         name="Mode",
@@ -167,10 +161,6 @@ class FDDA_OT_set_mode(ModelOperator, bpy.types.Operator):
             ("FDDA", "Model", "The model"),
         ),
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound_model(context)
 
     def apply(self, context: bpy.types.Context) -> str:
         rigs = self.bound_rigs(context)
@@ -189,18 +179,12 @@ class FDDA_OT_set_mode(ModelOperator, bpy.types.Operator):
         return f"{names} {'is' if len(rigs) == 1 else 'are'} deformed by {MODE_NAMES[mode]}."
 
 
-class FDDA_OT_relink(ModelOperator, ModelFileOperator, bpy.types.Operator):
+class FDDA_OT_relink(ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.relink"
     bl_label = "Find Model"
     bl_description = "Choose where the file of the bound model is now"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound_model(context)
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        return self.execute(context) if self.filepath else self.open_file_browser(context)
+    needs = NEEDS_MODEL
 
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig = self.bound_rig(context)
@@ -211,22 +195,17 @@ class FDDA_OT_relink(ModelOperator, ModelFileOperator, bpy.types.Operator):
         return f"'{scene_rig.mesh_object.name}' plays {self.chosen_path()}.{message}"
 
 
-class FDDA_OT_measure_model(ModelOperator, JobOperator, bpy.types.Operator):
+class FDDA_OT_measure_model(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.measure_model"
     bl_label = "Measure Speed of the Model"
     bl_description = "Measure the time per frame of the rig, of linear skinning and of the model"
     bl_options = {"REGISTER"}
+    needs = NEEDS_MODEL
     verb, title = "measure_model", "Measurement"
 
     frames: bpy.props.IntProperty(
         name="Frames", description="Number of frames to measure", default=50, min=5, max=10000
     )
-
-    execute = JobOperator.execute
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound_model(context)
 
     def steps(self, context: bpy.types.Context) -> Job[Benchmark]:
         scene_rig = self.bound_rig(context)

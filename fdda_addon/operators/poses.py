@@ -2,25 +2,26 @@
 """Operators on poses and limits: preview random poses, reset the pose, set the limits of a bone, select a bone."""
 
 import math
+from contextlib import suppress
 
 import bpy
 
-from ..core.errors import RigError
+from ..core.errors import FDDAError, RigError
 from ..core.sentences.counts import format_count
 from ..poses.measured_limits import set_limits_from_actions
 from ..poses.motion_range import clear_rotation_range, set_rotation_range
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
-from ..recording.preview import show_random_pose, show_rest_pose
+from ..recording.preview import show_random_pose, show_rest_pose, shows_random_pose
 from ..scene.compatibility import select_bone
-from .pose_operator import LimitsOperator, PoseOperator
-from .rig_operator import RigOperator
+from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator
 
 
-class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
+class FDDA_OT_preview_pose(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.preview_pose"
     bl_label = "Preview Random Pose"
     bl_description = "Show one of the random poses that will be recorded"
     bl_options = {"REGISTER", "UNDO"}
+    modes = OBJECT_OR_POSE_MODE
 
     number: bpy.props.IntProperty(
         name="Index",
@@ -38,17 +39,37 @@ class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
         return f"Random pose {session.pose_index + 1}."
 
 
-class FDDA_OT_rest_pose(PoseOperator, bpy.types.Operator):
+class FDDA_OT_rest_pose(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.rest_pose"
     bl_label = "Rest Pose"
     bl_description = "Reset all bones to the rest pose, and all extra inputs of the random poses to their defaults"
     bl_options = {"REGISTER", "UNDO"}
+    modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:
         rig = self.rig(context)
         show_rest_pose(rig, complete_settings(rig))
         context.window_manager.fdda.pose_index = -1
         return f"'{rig.armature_object.name}' is in its rest pose."
+
+
+class LimitsOperator(RigOperator):
+    """Mixin for an operator that changes limits. A random pose that the rig shows is then posed within the new ones."""
+
+    modes = OBJECT_OR_POSE_MODE
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            rig = self.rig(context)
+            is_preview = shows_random_pose(rig)
+        except FDDAError:
+            is_preview = False
+        result = super().execute(context)
+        if is_preview and result == {"FINISHED"}:
+            # If all axes are locked now, there is no random pose.
+            with suppress(FDDAError):
+                show_random_pose(rig, recording_settings(rig), context.window_manager.fdda.pose_index)
+        return result
 
 
 class _LimitOperator(LimitsOperator):
@@ -150,19 +171,15 @@ class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
     bl_label = "Select Bone"
     bl_description = "Select this bone in Pose Mode"
     bl_options = {"REGISTER", "UNDO"}
+    waits_for_jobs = False
 
     bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_rig(context)
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def apply(self, context: bpy.types.Context) -> str:
         armature_object = self.rig(context).armature_object
         bone = armature_object.pose.bones.get(self.bone)
         if bone is None:
-            self.report({"ERROR"}, f"'{armature_object.name}' has no bone '{self.bone}'.")
-            return {"CANCELLED"}
+            raise RigError(f"'{armature_object.name}' has no bone '{self.bone}'.")
         mesh_object = self.rig(context).mesh_object
         if context.mode != "POSE":
             if context.mode != "OBJECT":
@@ -173,7 +190,7 @@ class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
         for other_bone in armature_object.pose.bones:
             select_bone(other_bone, other_bone == bone)
         armature_object.data.bones.active = bone.bone
-        return {"FINISHED"}
+        return ""
 
 
 CLASSES = (

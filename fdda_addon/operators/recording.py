@@ -12,7 +12,6 @@ from ..core.errors import FDDAError
 from ..core.recording.folder import remove_recording
 from ..core.recording.index import read_index
 from ..core.sentences.counts import format_count
-from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder
@@ -57,7 +56,7 @@ def is_recorded(path: Path) -> bool:
     return index["complete"] >= index["poses"]
 
 
-class FDDA_OT_record(RigOperator, JobOperator, bpy.types.Operator):
+class FDDA_OT_record(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.record"
     bl_label = "Record"
     bl_description = "Evaluate random poses and the checked actions, and write the deformed mesh to the folder"
@@ -79,10 +78,6 @@ class FDDA_OT_record(RigOperator, JobOperator, bpy.types.Operator):
         if properties.resume:
             return "Continue the recording in the folder where it stopped"
         return cls.bl_description
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         rigs = self.rigs(context)
@@ -107,7 +102,7 @@ class FDDA_OT_record(RigOperator, JobOperator, bpy.types.Operator):
         )
 
 
-class FDDA_OT_refine(RigOperator, JobOperator, bpy.types.Operator):
+class FDDA_OT_refine(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.refine"
     bl_label = "Add Poses at Worst Errors"
     bl_description = "Compare the trained model with the rig, and record more poses where its error is largest"
@@ -117,10 +112,6 @@ class FDDA_OT_refine(RigOperator, JobOperator, bpy.types.Operator):
     poses: bpy.props.IntProperty(
         name="Poses", description="Number of poses to add", default=REFINEMENT_POSES, min=1, options={"SKIP_SAVE"}
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         rig = self.rig(context)
@@ -142,13 +133,7 @@ class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
     bl_label = "Delete Recording"
     bl_description = "Delete the recording in the folder. This cannot be undone"
     bl_options = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if (job := current()) is not None:
-            cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
-            return False
-        return cls.has_rig(context)
+    waits_for_all_jobs = True
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
@@ -173,15 +158,10 @@ class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
         size_text = f"{format_count(count, 'pose')}, {format_file_size(size)}"
         return f"{size_text}, in '{path}'. This cannot be undone. Models are kept."
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            path = recording_folder(self.rig(context).mesh_object)
-            remove_recording(path)
-        except FDDAError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"Deleted the recording '{path.name}'.")
-        return {"FINISHED"}
+    def apply(self, context: bpy.types.Context) -> str:
+        path = recording_folder(self.rig(context).mesh_object)
+        remove_recording(path)
+        return f"Deleted the recording '{path.name}'."
 
 
 CLASSES = (FDDA_OT_record, FDDA_OT_refine, FDDA_OT_delete_recording)

@@ -10,7 +10,6 @@ from ..scene.viewport import frame_objects
 from ..timing import measurements
 from ..timing.rig_cost import RigCost, measure
 from .job import JobOperator
-from .rig_operator import RigOperator
 
 
 def measured_cost(mesh_object: bpy.types.Object) -> RigCost | None:
@@ -86,16 +85,12 @@ def _hide_startup_cube(context: bpy.types.Context) -> bool:
     return is_untouched
 
 
-class FDDA_OT_measure(RigOperator, JobOperator, bpy.types.Operator):
+class FDDA_OT_measure(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.measure"
     bl_label = "Measure Speed"
     bl_description = "Measure the time per frame of this rig, and estimate it for a model"
     bl_options = {"REGISTER"}
     verb, title = "measure", "Measuring"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Job[RigCost]:
         return (yield from measure(self.rig(context)))

@@ -11,16 +11,17 @@ from ..properties.recording_options import recorded_actions, recording_settings
 from ..recording.plan import RecordingSettings, listed_controls
 from ..scene.compatibility import is_selected
 from ..scene.control_names import control_at
-from .pose_operator import PoseOperator
+from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator
 
 
-class FDDA_OT_use_selected_bones(PoseOperator, bpy.types.Operator):
+class FDDA_OT_use_selected_bones(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.use_selected_bones"
     bl_label = "Use Selected Bones"
     bl_description = (
         "Let random poses move the bones that are selected now. Later changes of the selection have no effect"
     )
     bl_options = {"REGISTER", "UNDO"}
+    modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:
         rig = self.rig(context)
@@ -37,11 +38,12 @@ class FDDA_OT_use_selected_bones(PoseOperator, bpy.types.Operator):
         )
 
 
-class FDDA_OT_add_control(PoseOperator, bpy.types.Operator):
+class FDDA_OT_add_control(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.add_control"
     bl_label = "Add Extra Input"
     bl_description = "Make a shape key or another animated number an input of the model. Random poses change it too"
     bl_options = {"REGISTER", "UNDO"}
+    modes = OBJECT_OR_POSE_MODE
 
     name: bpy.props.StringProperty(
         name="Name", description="Name of a shape key, or data path. Empty to choose it later", options={"SKIP_SAVE"}
@@ -65,7 +67,7 @@ class FDDA_OT_add_control(PoseOperator, bpy.types.Operator):
         return f"Added {name or 'an input'}."
 
 
-class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
+class FDDA_OT_add_control_bones(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.add_control_bones"
     bl_label = "Add Bones as Controls"
     bl_description = (
@@ -73,6 +75,7 @@ class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
         "that deform the mesh other than through its deforming bones. Random poses move them too"
     )
     bl_options = {"REGISTER", "UNDO"}
+    modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:
         rig = self.rig(context)
@@ -92,11 +95,12 @@ class FDDA_OT_add_control_bones(PoseOperator, bpy.types.Operator):
         return f"Added {describe_control_bones(rig.armature_object, bone_names, controls)}"
 
 
-class FDDA_OT_remove_control(PoseOperator, bpy.types.Operator):
+class FDDA_OT_remove_control(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_control"
     bl_label = "Remove Extra Input"
     bl_description = "Remove the active input from the list"
     bl_options = {"REGISTER", "UNDO"}
+    modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:
         settings = self.rig(context).mesh_object.fdda.settings

@@ -32,7 +32,7 @@ class _EnvironmentOperator:
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         if (state := current(ENVIRONMENT)) is not None:
-            cls.poll_message_set(f"{state.title} is under way; wait for it or cancel it")
+            cls.poll_message_set(state.busy_text)
             return False
         return True
 

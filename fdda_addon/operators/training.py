@@ -20,14 +20,13 @@ from ..properties.character import model_file, recording_folder
 from ..scene.scene_rig import armature_of
 from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
 from ..training.process import Training
-from .confirm import ConfirmFirst
-from .rig_operator import RigOperator
+from .job import JobOperator
 
 STARTING_STAGE = "starting"
 FOLLOW_DELAY_SECONDS = 0.5
 
 
-class TrainingOperator(RigOperator):
+class TrainingOperator(JobOperator):
     """Mixin for a job operator that trains.
 
     The training continues after Blender quits (`training.detached_process`).
@@ -139,7 +138,7 @@ class TrainingOperator(RigOperator):
         return self._trained_models
 
 
-class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
+class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
     bl_idname = "fdda.train"
     bl_label = "Train"
     bl_description = "Train a model on the recording, in the background. Training continues when Blender is closed"
@@ -177,23 +176,13 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
             )
         return cls.bl_description
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_rig(context)
-
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if not (self.replace or bpy.app.background) and (message := self._models_of_other_rigs(context)):
-            self._is_confirming = True
+            self.is_confirming = self.replace = True
             return context.window_manager.invoke_confirm(
                 self, event, title="Overwrite Another Model?", message=message, confirm_text="Overwrite", icon="WARNING"
             )
-        return ConfirmFirst.invoke(self, context, event)
-
-    def confirmed_properties(self) -> dict[str, object]:
-        properties = {
-            name: getattr(self, name) for name in ("object", "all_meshes", "recording", "model", "warm_start")
-        }
-        return {**properties, "replace": True}
+        return super().invoke(context, event)
 
     def _models_of_other_rigs(self, context: bpy.types.Context) -> str:
         """Return a message about models of other rigs that training would overwrite; empty without one."""

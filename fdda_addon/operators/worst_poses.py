@@ -12,7 +12,7 @@ from ..evaluation import markers
 from ..evaluation.run import set_held_out_pose
 from ..scene.viewport import center_views
 from .evaluation import EvaluationOperator
-from .model_operator import ModelOperator
+from .rig_operator import RigOperator
 
 
 class WorstPosesOperator(EvaluationOperator):
@@ -41,10 +41,6 @@ class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
         name="Markers", description="Maximum number of markers", default=MARKERS, min=1, max=50
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_evaluation(context)
-
     def apply(self, context: bpy.types.Context) -> str:
         _, last, poses = self.worst_poses(context, self.count)
         if not last.name:
@@ -56,18 +52,15 @@ class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
         )
 
 
-class FDDA_OT_remove_markers(ModelOperator, bpy.types.Operator):
+class FDDA_OT_remove_markers(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_markers"
     bl_label = "Remove Markers"
     bl_description = "Remove the timeline markers at the worst frames. Other markers are kept"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not markers.find(context.scene):
-            cls.poll_message_set("There are no markers at worst frames")
-            return False
-        return True
+    def poll_problem(cls, context: bpy.types.Context) -> str:
+        return "" if markers.find(context.scene) else "There are no markers at worst frames"
 
     def apply(self, context: bpy.types.Context) -> str:
         return f"Removed {markers.remove(context.scene)} markers."
@@ -90,10 +83,6 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
         if properties.zoom:
             return "Go to this frame or random pose, and look at the vertex with the largest error"
         return cls.bl_description
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_evaluation(context)
 
     def apply(self, context: bpy.types.Context) -> str:
         message = self._show_pose(context)

@@ -30,8 +30,12 @@ class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wa
     keep: bpy.props.BoolProperty(description="Keep the result in the file")
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        return cls.is_idle()
+    def poll_problem(cls, _context: bpy.types.Context) -> str:
+        state = job.current()
+        return state.busy_text if state else ""
+
+    def subject(self, _context: bpy.types.Context) -> int:
+        return 0
 
     def steps(self, _context: bpy.types.Context) -> Iterator[object]:
         try:
