@@ -20,9 +20,9 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from .baked_files import predicted_in_frames, read_pc2
 from .conftest import ELBOW_RIG, run
 from .figure import FRAMES, WAVE, add_wave, build_figure
+from .poses.test_animation_poses import mirrored, positions_in_frames, positions_of, record_and_read
 from .refusals import save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
-from .test_animation_poses import mirrored, positions_in_frames, positions_of, record_and_read
 
 
 def copy_transforms(rig: SceneRig, control: bpy.types.Object) -> None:

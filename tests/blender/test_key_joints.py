@@ -34,8 +34,8 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from .conftest import assert_plays, run, train
 from .resuming import check_resuming
 from .rig_changes import change_in_edit_mode
+from .runtime.test_changed_rigs import trigger_check
 from .scene_state import assert_same_state, drain, scene_state
-from .test_changed_rigs import trigger_check
 from .waves import wave
 
 SETTINGS = RecordingSettings(poses=80, influence_poses=2, joints="auto")

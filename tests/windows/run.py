@@ -34,37 +34,43 @@ OUTCOME_BY_TAG = {"error": "failed", "failure": "failed", "skipped": "skipped"}
 
 # Of the Blender tier: writing, training, playing and rendering. The others show nothing more about Windows.
 BLENDER = (
-    "recording",
-    "overwriting",
-    "baked_files",
-    "encodings",
-    "documents",
-    "command_process",
-    "background_jobs",
-    "trainer_environment",
-    "trainer_python",
-    "detached_trainings",
-    "refinement",
-    "packed_by_default",
-    "playback",
-    "playback_of_edits",
-    "playing_state",
-    "animated_mode",
-    "linked_files",
-    "extension",
-    "renders",
-    "render_evaluations",
+    "test_recording.py",
+    "cli/test_overwriting.py",
+    "baking/test_baked_files.py",
+    "cli/test_encodings.py",
+    "cli/test_documents.py",
+    "cli/test_command_process.py",
+    "jobs/test_background_jobs.py",
+    "training/test_trainer_environment.py",
+    "training/test_trainer_python.py",
+    "training/test_detached_trainings.py",
+    "test_refinement.py",
+    "runtime/test_packed_by_default.py",
+    "runtime/test_playback.py",
+    "runtime/test_playback_of_edits.py",
+    "runtime/test_playing_state.py",
+    "runtime/test_animated_mode.py",
+    "runtime/test_linked_files.py",
+    "extension/test_extension.py",
+    "runtime/test_renders.py",
+    "runtime/test_render_evaluations.py",
 )
 BLENDER_4_5 = (
-    "recording", "command_process", "playback", "playback_of_edits", "linked_files", "extension", "renders",
-)  # fmt: skip
+    "test_recording.py",
+    "cli/test_command_process.py",
+    "runtime/test_playback.py",
+    "runtime/test_playback_of_edits.py",
+    "runtime/test_linked_files.py",
+    "extension/test_extension.py",
+    "runtime/test_renders.py",
+)
 SMALL = {
     "core": (
         "tests/core/files/test_output.py",
         "tests/core/test_recording_writer.py",
         "tests/core/test_recording_lock.py",
     ),
-    "blender": ("tests/blender/test_playback.py", "-k", "strength"),
+    "blender": ("tests/blender/runtime/test_playback.py", "-k", "strength"),
 }
 """Core files that write; and a test whose fixture records, trains and binds."""
 
@@ -77,8 +83,8 @@ runpy.run_path("setup/environment.py", run_name="__main__")
 # Tests that fail because of Wine, with the reason. They should pass on Windows.
 _CTRL_BREAK = "Wine does not send Ctrl-Break to the group of another process."
 FAILURES_OF_WINE: dict[str, str] = {
-    "tests/blender/test_command_process.py::test_an_interrupted_recording_resumes": _CTRL_BREAK,
-    "tests/blender/test_command_process.py::test_an_interrupted_training_leaves_neither_model_nor_trainer": _CTRL_BREAK,
+    f"tests/blender/cli/test_command_process.py::test_an_interrupted_{test}": _CTRL_BREAK
+    for test in ("recording_resumes", "training_leaves_neither_model_nor_trainer")
 }
 
 
@@ -106,7 +112,7 @@ def process_arguments(line: str, small: bool) -> Iterator[tuple[str, tuple[str, 
         return
     yield "acceptance", ("tests/windows/acceptance.py",)
     for name in BLENDER if line == "5.2" else BLENDER_4_5:
-        yield "blender", (f"tests/blender/test_{name}.py",)
+        yield "blender", (f"tests/blender/{name}",)
     yield "core", ("tests/core",)
     if line == "5.2":
         yield "contract", ("tests/contract",)

@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Mesh, rig, modifiers and action of the arm; the saved fixtures of arm and elbow match the code that builds them."""
+
+import math
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.elbow import build_elbow
+from fdda_addon.arm.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, LOCKED_RANGE, joint
+from fdda_addon.arm.rig import build_arm
+from fdda_addon.arm.sculpt import arm_field
+from fdda_addon.arm.surface import Surface, sculpt_arm
+
+FIXTURES = Path(__file__).resolve().parents[3] / "blend_fixtures"
+VERTEX_COUNTS = {1: 1450, 2: 10_000, 3: 50_000}
+FINGERS = ("index", "middle", "ring", "pinky")
+
+
+@pytest.fixture(scope="module", params=[1, 2, pytest.param(3, marks=pytest.mark.slow)])
+def surface(request) -> tuple[int, Surface]:
+    return request.param, sculpt_arm(request.param)
+
+
+@pytest.fixture(scope="module")
+def arm_file(tmp_path_factory) -> Path:
+    """Build and save the default arm once."""
+    file = tmp_path_factory.mktemp("arm") / "arm.blend"
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    build_arm()
+    bpy.ops.wm.save_as_mainfile(filepath=str(file))
+    return file
+
+
+@pytest.fixture
+def animated(arm_file) -> tuple[bpy.types.Object, bpy.types.Object]:
+    """Open the default arm; return its mesh object and its armature object."""
+    bpy.ops.wm.open_mainfile(filepath=str(arm_file))
+    return bpy.data.objects["arm"], bpy.data.objects["arm_rig"]
+
+
+@pytest.fixture
+def arm(animated) -> tuple[bpy.types.Object, bpy.types.Object]:
+    """Open the default arm and remove its action, so that tests can pose the bones."""
+    animated[1].animation_data.action = None
+    return animated
+
+
+def evaluated_positions(mesh_object: bpy.types.Object) -> np.ndarray:
+    """Return the positions (V, 3) of the mesh after all modifiers, float64, in meters."""
+    bpy.context.view_layer.update()
+    mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
+    positions = np.empty(len(mesh.vertices) * 3)
+    mesh.vertices.foreach_get("co", positions)
+    return positions.reshape(-1, 3)
+
+
+def rest_positions(mesh_object: bpy.types.Object) -> np.ndarray:
+    positions = np.empty(len(mesh_object.data.vertices) * 3)
+    mesh_object.data.vertices.foreach_get("co", positions)
+    return positions.reshape(-1, 3)
+
+
+def bend(rig: bpy.types.Object, name: str, x: float = 0.0, y: float = 0.0, z: float = 0.0):
+    rig.pose.bones[name].rotation_euler = [math.radians(angle) for angle in (x, y, z)]
+
+
+def assert_closed(points: np.ndarray, faces: np.ndarray):
+    """Assert that quads form one closed surface of the topology of a sphere, with normals that point outward."""
+    directed = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
+    assert len(np.unique(directed, axis=0)) == len(directed)
+    edges, uses = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
+    assert (uses == 2).all()
+    assert len(points) - len(edges) + len(faces) == 2
+    corners = points[faces]
+    halves = [np.cross(corners[:, 1], corners[:, 2]), np.cross(corners[:, 2], corners[:, 3])]
+    assert sum(np.einsum("ij,ij->i", corners[:, 0], half).sum() for half in halves) > 0
+
+
+def test_density_sets_the_number_of_vertices(surface):
+    density, arm = surface
+    assert abs(len(arm.points) / VERTEX_COUNTS[density] - 1) < 0.06
+
+
+def test_mesh_is_closed_and_faces_outward(surface):
+    _, arm = surface
+    assert arm.faces.shape[1] == 4
+    assert all(len(set(face)) == 4 for face in arm.faces.tolist())
+    assert_closed(arm.points, arm.faces)
+
+
+def test_face_normals_point_along_the_gradient(surface):
+    """The normal of every quad points in the direction in which the distance to the sculpted surface grows."""
+    _, arm = surface
+    distance, outward = arm_field().distance_and_gradient(arm.points)
+    assert np.abs(distance).max() < 1e-4
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    corners, expected_normals = arm.points[arm.faces], outward[arm.faces].mean(axis=1)
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    assert np.einsum("ij,ij->i", normals, expected_normals).min() > 0.2
+
+
+def test_the_mesh_has_the_lengths_of_an_arm(surface):
+    """Check the distance from shoulder to fingertip in meters, and which fingers are longest."""
+    _, arm = surface
+    tips = {name: arm.points[arm.joints == JOINT_INDEX[f"{name}_3"], 0].max() for name in FINGERS}
+    assert tips["middle"] == pytest.approx(0.30 + 0.26 + 0.19, abs=0.01)
+    assert tips["middle"] > tips["index"] > tips["pinky"] and tips["middle"] > tips["ring"] > tips["pinky"]
+    assert arm.points[arm.joints == JOINT_INDEX["thumb_2"], 0].max() < tips["pinky"]
+
+
+def test_fingers_follow_their_own_bones(surface):
+    """Every vertex of a finger is near the bones of the same finger."""
+    _, arm = surface
+    for name in FINGERS:
+        for i in (1, 2, 3):
+            bone = joint(f"{name}_{i}")
+            points = arm.points[arm.joints == JOINT_INDEX[bone.name]]
+            side = points[:, 1] - (bone.head[1] + bone.tail[1]) / 2
+            assert len(points) and np.abs(side).max() < 0.016
+
+
+@pytest.mark.slow
+def test_two_builds_are_identical():
+    first, second = sculpt_arm(1), sculpt_arm(1)
+    for name in ("points", "faces", "joints", "biceps", "nails"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+
+
+@pytest.mark.parametrize("density", [0, 4, 1.5, "2"])
+def test_other_densities_are_refused(density):
+    with pytest.raises(ValueError, match="densities 1, 2 and 3"):
+        build_arm(density)
+    assert not bpy.data.objects
+
+
+def test_joints_have_their_names_and_parents(arm):
+    _, rig = arm
+    parents = {"shoulder": None, "elbow": "shoulder", "wrist": "elbow"}
+    for digit, count in {"thumb": 3, "index": 4, "middle": 4, "ring": 4, "pinky": 4}.items():
+        parents |= {f"{digit}_{i}": f"{digit}_{i - 1}" if i else "wrist" for i in range(count)}
+    assert len(parents) == 22
+    assert {bone.name: bone.parent and bone.parent.name for bone in rig.data.bones} == parents
+    assert [o.name for o in arm] == ["arm", "arm_rig"]
+
+
+def test_a_positive_rotation_about_x_bends_the_joint(arm):
+    """A positive rotation about local X moves the tail in the direction that the table of joints defines."""
+    _, rig = arm
+    for entry in JOINTS:
+        matrix = rig.data.bones[entry.name].matrix_local
+        assert np.allclose(matrix.col[2][:3], entry.bend, atol=1e-4), entry.name
+        assert np.allclose(matrix.translation, entry.head, atol=1e-6)
+    before = np.array(rig.pose.bones["elbow"].tail)
+    bend(rig, "elbow", x=90)
+    bpy.context.view_layer.update()
+    moved = np.array(rig.pose.bones["elbow"].tail) - before
+    assert np.allclose(moved, (-0.26, -0.26, 0.0), atol=1e-5)
+
+
+def test_each_vertex_follows_one_bone(arm):
+    mesh_object, rig = arm
+    groups = np.array([[(g.group, g.weight) for g in vertex.groups] for vertex in mesh_object.data.vertices])
+    assert groups.shape[1] == 1 and (groups[..., 1] == 1.0).all()
+    vertex_counts = np.bincount(groups[:, 0, 0].astype(int), minlength=22)
+    assert [group.name for group in mesh_object.vertex_groups] == list(JOINT_NAMES)
+    assert vertex_counts.min() >= 20
+    assert [(m.name, m.type) for m in mesh_object.modifiers] == [
+        ("Armature", "ARMATURE"),
+        ("CorrectiveSmooth", "CORRECTIVE_SMOOTH"),
+    ]
+    skin = mesh_object.modifiers["Armature"]
+    assert skin.object == rig and not skin.use_deform_preserve_volume and not skin.use_bone_envelopes
+
+
+def test_the_rest_pose_shows_the_undeformed_mesh(arm):
+    mesh_object, _ = arm
+    assert np.abs(evaluated_positions(mesh_object) - rest_positions(mesh_object)).max() < 1e-6
+
+
+def test_the_elbow_drives_the_biceps_shape_key(arm):
+    mesh_object, rig = arm
+    keys = mesh_object.data.shape_keys
+    driver = keys.animation_data.drivers[0].driver
+    assert driver.is_simple_expression
+    variable = driver.variables[0]
+    assert (variable.type, variable.targets[0].transform_space) == ("TRANSFORMS", "LOCAL_SPACE")
+    for angle, value in ((0, 0.0), (70, 0.5), (140, 1.0), (200, 1.0), (-30, 0.0)):
+        bend(rig, "elbow", x=angle)
+        bpy.context.view_layer.update()
+        evaluated_keys = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.shape_keys
+        assert evaluated_keys.key_blocks["biceps"].value == pytest.approx(value, abs=1e-4)
+
+
+def test_biceps_bulges_on_the_front_of_the_upper_arm(arm):
+    """The shape key moves the bent arm by about 17 mm, in the middle of the upper arm, on the inner side."""
+    mesh_object, rig = arm
+    key = mesh_object.data.shape_keys.key_blocks["biceps"]
+    bend(rig, "elbow", x=140)
+    contracted = evaluated_positions(mesh_object)
+    key.mute = True
+    offsets = np.linalg.norm(contracted - evaluated_positions(mesh_object), axis=1)
+    assert 0.014 < offsets.max() < 0.020
+    x, y, _ = rest_positions(mesh_object)[offsets.argmax()]
+    assert 0.12 < x < 0.22 and y < -0.02
+    owners = [JOINT_NAMES[vertex.groups[0].group] for vertex in mesh_object.data.vertices]
+    assert offsets[[owner not in ("shoulder", "elbow") for owner in owners]].max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "angle", "millimeters"), [("wrist", 60, 6.0), ("index_1", 70, 5.0), ("elbow", 90, 8.0)]
+)
+def test_corrective_smooth_moves_a_bent_joint(arm, name, angle, millimeters):
+    mesh_object, rig = arm
+    smooth = mesh_object.modifiers["CorrectiveSmooth"]
+    assert (smooth.rest_source, smooth.iterations) == ("ORCO", 10)
+    bend(rig, name, x=angle)
+    smoothed = evaluated_positions(mesh_object)
+    smooth.show_viewport = False
+    offsets = np.linalg.norm(smoothed - evaluated_positions(mesh_object), axis=1)
+    assert offsets.max() > millimeters * 1e-3
+    assert np.linalg.norm(rest_positions(mesh_object)[offsets.argmax()] - joint(name).head) < 0.06
+
+
+def test_ik_limits_and_locks_define_the_range_of_motion(arm):
+    _, rig = arm
+    for entry in JOINTS:
+        bone = rig.pose.bones[entry.name]
+        assert bone.rotation_mode == "XYZ" and all(bone.lock_location)
+        for i, axis in enumerate("xyz"):
+            low, high = entry.limits[i]
+            assert getattr(bone, f"use_ik_limit_{axis}")
+            assert math.degrees(getattr(bone, f"ik_min_{axis}")) == pytest.approx(low, abs=1e-3)
+            assert math.degrees(getattr(bone, f"ik_max_{axis}")) == pytest.approx(high, abs=1e-3)
+            assert bone.lock_rotation[i] == ((low, high) == LOCKED_RANGE)
+    assert joint("elbow").limits == ((0, 140), LOCKED_RANGE, LOCKED_RANGE)
+    assert joint("shoulder").limits == ((-90, 90),) * 3
+    assert all(joint(f"{name}_0").limits == ((-20, 20),) * 3 for name in FINGERS)
+
+
+def degrees_outside_range(rig: bpy.types.Object) -> float:
+    """Return the largest angle by which the pose exceeds the range of motion, in degrees."""
+    angles = np.degrees([rig.pose.bones[entry.name].rotation_euler for entry in JOINTS])
+    limits = np.array([entry.limits for entry in JOINTS])
+    return float(np.maximum(limits[..., 0] - angles, angles - limits[..., 1]).max())
+
+
+def test_action_stays_inside_the_range_until_the_last_twenty_frames(animated):
+    _, rig = animated
+    scene = bpy.context.scene
+    assert rig.animation_data.action.name == "arm_drive"
+    assert (scene.frame_start, scene.frame_end, scene.frame_current) == (1, 250, 1)
+    poses = set()
+    for frame in range(1, 251):
+        scene.frame_set(frame)
+        assert (degrees_outside_range(rig) > 0.5) == (frame > 230), frame
+        assert frame > 230 or degrees_outside_range(rig) < 1e-3, frame
+        poses.add(tuple(round(angle, 4) for bone in rig.pose.bones for angle in bone.rotation_euler))
+    assert len(poses) > 200
+    scene.frame_set(240)
+    assert abs(math.degrees(rig.pose.bones["index_0"].rotation_euler.x)) == pytest.approx(50, abs=0.1)
+    assert abs(math.degrees(rig.pose.bones["elbow"].rotation_euler.z)) > 40
+
+
+def test_building_restores_the_preferences():
+    edit = bpy.context.preferences.edit
+    edit.keyframe_new_interpolation_type = "CONSTANT"
+    try:
+        build_arm()
+        assert edit.keyframe_new_interpolation_type == "CONSTANT"
+    finally:
+        edit.keyframe_new_interpolation_type = "BEZIER"
+
+
+@pytest.mark.parametrize(("name", "build"), [("arm", build_arm), ("elbow", build_elbow)])
+def test_the_saved_fixture_equals_a_newly_built_one(name, build):
+    bpy.ops.wm.open_mainfile(filepath=str(FIXTURES / f"{name}.blend"))
+    saved = bpy.data.objects[name]
+    points, weights = (
+        rest_positions(saved),
+        [[(g.group, g.weight) for g in vertex.groups] for vertex in saved.data.vertices],
+    )
+    faces = [tuple(polygon.vertices) for polygon in saved.data.polygons]
+    bpy.context.scene.frame_set(10)
+    posed_points = evaluated_positions(saved)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    fresh, _ = build()
+    assert points == pytest.approx(rest_positions(fresh), abs=1e-6)
+    assert faces == [tuple(polygon.vertices) for polygon in fresh.data.polygons]
+    assert weights == [[(g.group, g.weight) for g in vertex.groups] for vertex in fresh.data.vertices]
+    bpy.context.scene.frame_set(10)
+    assert posed_points == pytest.approx(evaluated_positions(fresh), abs=1e-5)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Several meshes of one armature in one go, and all steps with one button."""
+
+import bpy
+import pytest
+
+from fdda_addon.evaluation import last_evaluation
+from fdda_addon.jobs import job
+from fdda_addon.panels import checks
+from fdda_addon.scene.active_rig import rigs_of_active_armature
+from fdda_addon.scene.scene_rig import SceneRig, armature_of
+
+from ..conftest import ELBOW, ELBOW_RIG
+from ..drawing import texts_of
+from ..panels.test_panel_drawing import draw_section
+from ..scene_state import fresh_elbow
+
+
+@pytest.fixture
+def two(tmp_path) -> tuple[bpy.types.Object, bpy.types.Object]:
+    """The elbow and a copy of it on the same armature, which is active, in a saved file; few poses and epochs."""
+    rig = fresh_elbow()
+    other = rig.mesh_object.copy()
+    other.data = rig.mesh_object.data.copy()
+    bpy.context.scene.collection.objects.link(other)
+    for mesh_object in (rig.mesh_object, other):
+        mesh_object.select_set(False)
+    bpy.context.view_layer.objects.active = rig.armature_object
+    rig.mesh_object.fdda.settings.poses = 30
+    for mesh_object in (rig.mesh_object, other):
+        mesh_object.fdda.settings.epochs = 4
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "two.blend"))
+    return bpy.data.objects[ELBOW], bpy.data.objects["elbow.001"]
+
+
+def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
+    assert [rig.mesh_object for rig in rigs_of_active_armature(bpy.context)] == list(two)
+    assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
+    assert two[1].fdda.settings.poses == 30, "the other takes over how the first is recorded"
+    assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
+    assert job.state_of("train").outcome.startswith("Trained 'two_elbow.onnx' and 'two_elbow_001.onnx' in")
+    assert bpy.ops.fdda.bind(all_meshes=True) == {"FINISHED"}
+    for mode in ("RIG", "LINEAR", "FDDA"):
+        bpy.ops.fdda.set_mode(mode=mode, all_meshes=True)
+        assert [mesh_object.fdda.mode for mesh_object in two] == [mode, mode]
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=3, all_meshes=True)
+    assert all(last_evaluation.get(mesh_object).poses == 3 for mesh_object in two)
+    assert "of 'elbow.001'" in job.state_of("evaluate").outcome
+    bpy.ops.fdda.set_mode(mode="RIG")
+    assert [mesh_object.fdda.mode for mesh_object in two] == ["RIG", "FDDA"]
+    assert bpy.ops.fdda.unbind(all_meshes=True) == {"FINISHED"}
+    assert not any(mesh_object.fdda.is_bound for mesh_object in two)
+
+
+def test_one_button_records_trains_and_binds(two):
+    bpy.context.view_layer.objects.active = two[0]
+    assert bpy.ops.fdda.build_model() == {"FINISHED"}
+    assert bpy.data.is_dirty, "Blender asks before it closes the file"
+    assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
+    checks.check_now(SceneRig(two[0], armature_of(two[0])))
+    # The button says what the errors mean, and its training shows its curves and that the Python works.
+    assert any(text.startswith("Unseen poses: ") for text in texts_of(draw_section("rig")))
+    texts = texts_of(draw_section("training"))
+    assert "Error (mm) per Pass" in texts and not any("not checked yet" in text for text in texts)
+    # Recorded already: it is trained again, and the new model plays.
+    before = two[0].fdda.packed.session_uid
+    two[0].fdda.settings.training_seed = 5
+    assert bpy.ops.fdda.build_model() == {"FINISHED"}
+    assert two[0].fdda.packed.session_uid != before
+
+
+def test_one_button_records_trains_and_binds_all_meshes(two):
+    assert bpy.ops.fdda.build_model(all_meshes=True) == {"FINISHED"}
+    assert all(mesh_object.fdda.mode == "FDDA" for mesh_object in two)
+
+
+def test_all_meshes_is_nothing_where_a_mesh_is_active(two):
+    bpy.context.view_layer.objects.active = two[1]
+    assert rigs_of_active_armature(bpy.context) == []
+    two[1].fdda.settings.poses = 5
+    assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
+    assert job.state_of("record").subject == two[1].session_uid
+
+
+def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
+    from fdda_addon.panels import checks
+    from fdda_addon.panels.trained_file import find_trained_file
+    from fdda_addon.scene.scene_rig import SceneRig
+
+    bpy.context.view_layer.objects.active = two[0]
+    bpy.ops.fdda.record()
+    bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW_RIG]
+    with pytest.raises(RuntimeError, match="two_elbow_001_recording' is not a recording"):
+        bpy.ops.fdda.train(all_meshes=True)
+    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"], "it was trained before the other failed"
+    bpy.context.view_layer.objects.active = two[0]
+    two[0].fdda.models.clear()
+    rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
+    checks.check_now(rig)
+    assert find_trained_file(rig).path.name == "two_elbow.onnx" and not find_trained_file(rig).mismatch
+    assert bpy.ops.fdda.bind() == {"FINISHED"} and two[0].fdda.is_bound
+
+
+def test_a_model_of_another_mesh_of_the_name_is_told(two):
+    from fdda_addon.panels import checks
+    from fdda_addon.panels.trained_file import find_trained_file
+    from fdda_addon.scene.scene_rig import SceneRig
+
+    bpy.context.view_layer.objects.active = two[0]
+    bpy.ops.fdda.record()
+    bpy.ops.fdda.train()
+    two[0].data.vertices[0].co.x += 0.3
+    two[0].data.update()
+    bpy.context.view_layer.update()
+    rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
+    checks.check_now(rig)
+    assert "the rest pose of the mesh differs" in find_trained_file(rig).mismatch

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Verbs that refuse models of another rig and damaged model files with one error message."""
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.formats.model import METADATA_KEY
+from fdda_addon.core.formats.onnx_file import read_onnx
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.scene_rig import find_rig
+
+from ... import systems
+from ..conftest import run, write_edited
+from ..refusals import save_elbow
+
+
+@pytest.fixture(params=["bind", "evaluate", "benchmark"])
+def verb(request, tmp_path):
+    """Return, for each verb that reads a model, a function from the paths of rig and model to its arguments."""
+    more_arguments = {
+        "bind": [tmp_path / "bound.blend"],
+        "evaluate": ["--json", tmp_path / "e.json", "--poses", "2"],
+        "benchmark": ["--json", tmp_path / "b.json", "--frames", "5"],
+    }[request.param]
+    return lambda rig, model: [request.param, rig, model, *more_arguments]
+
+
+def subdivide_mesh(rig) -> None:
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.subdivide()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def bone_editor(change):
+    def edit(rig):
+        bpy.context.view_layer.objects.active = rig.armature_object
+        bpy.ops.object.mode_set(mode="EDIT")
+        change(rig.armature_object.data.edit_bones)
+        bpy.ops.object.mode_set(mode="OBJECT")
+
+    return edit
+
+
+def rename_bone(bones) -> None:
+    bones["lower"].name = "forearm"
+
+
+def move_tail(bones) -> None:
+    bones["lower"].tail.z += 0.1
+
+
+def unparent_bone(bones) -> None:
+    bones["lower"].parent = None
+
+
+def move_vertex(rig) -> None:
+    rig.mesh_object.data.vertices[5].co.x += 0.001
+
+
+def change_weight(rig) -> None:
+    rig.mesh_object.vertex_groups["lower"].add([0], 0.2, "REPLACE")
+
+
+def flip_face(rig) -> None:
+    rig.mesh_object.data.polygons[3].flip()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (subdivide_mesh, "it has 300 vertices, the mesh has "),
+        (bone_editor(rename_bone), "the armature lacks the joint 'lower'; it does not know the joint 'forearm'"),
+        (bone_editor(move_tail), "the rest pose of the armature differs"),
+        (bone_editor(unparent_bone), "its joints have other parents"),
+        (move_vertex, "the rest pose of the mesh differs"),
+        (change_weight, "the skin weights differ"),
+        (flip_face, "the topology of the mesh differs"),
+    ],
+    ids=["vertex count", "joints", "rest pose", "parents", "rest positions", "weights", "topology"],
+)
+def test_a_model_of_another_rig_is_refused(refusal, verb, elbow_files, tmp_path, change, words):
+    assert len(json.loads((elbow_files.recording / "recording.json").read_text())["joints"]) == 2
+    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", change), elbow_files.model))
+    assert text.startswith(f"The model '{elbow_files.model}' was trained for another rig: {words}")
+    assert text.endswith(". Record and train this rig.")
+
+
+def test_a_missing_model_is_refused(refusal, verb, elbow_files, tmp_path):
+    path = tmp_path / "none.onnx"
+    text = refusal(*verb(elbow_files.rig, path))
+    assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
+
+
+@pytest.mark.parametrize("content", [b"", b"text, not a model\n" * 50, bytes(5000)])
+def test_a_file_that_is_not_an_onnx_file_is_refused(refusal, verb, elbow_files, tmp_path, content):
+    path = tmp_path / "m.onnx"
+    path.write_bytes(content)
+    assert refusal(*verb(elbow_files.rig, path)) == (
+        f"The model '{path}' is refused: it is not an ONNX file; give one that train made."
+    )
+
+
+@pytest.mark.parametrize("kept_ratio", [0.1, 0.5, 0.999])
+def test_a_truncated_model_is_refused(refusal, verb, elbow_files, tmp_path, kept_ratio):
+    path, data = tmp_path / "m.onnx", elbow_files.model.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept_ratio)])
+    assert f"The model '{path}' is refused: " in refusal(*verb(elbow_files.rig, path))
+
+
+def add_input(model) -> None:
+    model.graph.input.append(helper.make_tensor_value_info("controls", TensorProto.FLOAT, ["N", 3]))
+
+
+def add_custom_operator(model) -> None:
+    model.graph.node.append(helper.make_node("Run", ["positions"], ["y"], domain="com.example"))
+    model.opset_import.append(helper.make_opsetid("com.example", 1))
+
+
+def add_hidden_operator(model) -> None:
+    value = helper.make_tensor_value_info("inner", TensorProto.FLOAT, None)
+    branch = helper.make_graph([helper.make_node("Run", [], ["inner"], domain="com.example")], "b", [], [value])
+    model.graph.initializer.append(numpy_helper.from_array(np.array(True), "condition"))
+    model.graph.node.append(helper.make_node("If", ["condition"], ["y"], then_branch=branch, else_branch=branch))
+
+
+def keep_data_outside(model) -> None:
+    tensor = next(t for t in model.graph.initializer if t.raw_data)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="../../etc/passwd")
+
+
+def remove_metadata(model) -> None:
+    del model.metadata_props[:]
+
+
+def set_version_2(model) -> None:
+    (prop,) = (prop for prop in model.metadata_props if prop.key == METADATA_KEY)
+    prop.value = json.dumps({**json.loads(prop.value), "version": 2})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (add_input, "it takes the inputs {"),
+        (add_custom_operator, "it has the operator set com.example, which train does not write; give one"),
+        (add_hidden_operator, "it has graphs inside of nodes, which train does not write; give one"),
+        (keep_data_outside, "it has data in other files, which train does not write; give one that train made"),
+        (remove_metadata, "is an ONNX file but not a model of this add-on; give one that train made"),
+        (set_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
+    ],
+)
+def test_onnx_files_that_are_not_models_of_the_add_on_are_refused(refusal, verb, elbow_files, tmp_path, change, words):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
+    text = refusal(*verb(elbow_files.rig, path))
+    assert str(path) in text and words in text
+
+
+def use_unknown_operator(model) -> None:
+    model.graph.node[0].op_type = "NoSuchOperator"
+
+
+def create_loop(model) -> None:
+    model.graph.node[0].input[0] = model.graph.node[-1].output[0]
+
+
+def use_double_input(model) -> None:
+    model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
+
+
+@pytest.mark.parametrize("change", [use_unknown_operator, create_loop])
+def test_invalid_graphs_are_refused_before_onnx_runtime_loads_them(refusal, verb, elbow_files, tmp_path, change):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
+    text = refusal(*verb(elbow_files.rig, path))
+    assert text.startswith(f"The model '{path}' is refused: ") and text.endswith("; give one that train made.")
+
+
+def test_a_graph_with_double_inputs_is_refused(refusal, verb, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", use_double_input)
+    text = refusal(*verb(elbow_files.rig, path))
+    assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
+
+
+def test_weights_that_do_not_match_the_checksum_are_refused(refusal, verb, elbow_files, tmp_path):
+    data = bytearray(elbow_files.model.read_bytes())
+    weights = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
+    data[bytes(data).index(bytes(weights)) + len(weights) // 2] ^= 0x40
+    path = tmp_path / "m.onnx"
+    path.write_bytes(data)
+    assert "is damaged: its checksum is not that of its weights" in refusal(*verb(elbow_files.rig, path))
+
+
+def output_nan(model) -> None:
+    """Multiply the output positions by NaN."""
+    last = next(node for node in model.graph.node if "positions" in node.output)
+    last.output[list(last.output).index("positions")] = "good"
+    model.graph.initializer.append(numpy_helper.from_array(np.float32([np.nan]), "nan"))
+    model.graph.node.append(helper.make_node("Mul", ["good", "nan"], ["positions"]))
+
+
+def test_evaluation_of_a_model_that_returns_nan_is_refused(refusal, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", output_nan)
+    text = refusal("evaluate", elbow_files.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
+    assert f"The model '{path}' gives positions that are not numbers (held-out poses, pose 0)" in text
+
+
+def output_nan_when_straight(model) -> None:
+    """Add 0 / 0 to the positions if an element of the lower joint's matrix is above 0.85, as in a straight arm."""
+    last = next(node for node in model.graph.node if "positions" in node.output)
+    last.output[list(last.output).index("positions")] = "good"
+    for name, value in (("from", [1, 0, 1]), ("to", [2, 1, 2]), ("axes", [1, 2, 3]), ("one", [-1, 1, 1])):
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), f"my_{name}"))
+    model.graph.initializer.append(numpy_helper.from_array(np.float32([0]), "my_zero"))
+    model.graph.initializer.append(numpy_helper.from_array(np.float32([0.85]), "my_limit"))
+    for node in (
+        ("Slice", ["pose_matrices", "my_from", "my_to", "my_axes"], ["my_element"]),
+        ("Sub", ["my_limit", "my_element"], ["my_rest"]),
+        ("Max", ["my_rest", "my_zero"], ["my_part"]),
+        ("Div", ["my_part", "my_part"], ["my_one_or_none"]),
+        ("Mul", ["my_one_or_none", "my_zero"], ["my_nothing"]),
+        ("Reshape", ["my_nothing", "my_one"], ["my_column"]),
+        ("Add", ["good", "my_column"], ["positions"]),
+    ):
+        model.graph.node.append(helper.make_node(*node))
+
+
+@pytest.mark.parametrize("change", [output_nan, output_nan_when_straight])
+def test_playing_a_model_that_returns_nan_shows_an_error(bound_elbow, elbow_files, tmp_path, change, capsys):
+    armature = bpy.data.objects["elbow_rig"]
+    armature.animation_data_clear()
+    bind(find_rig(), write_edited(elbow_files.model, tmp_path / "m.onnx", change))
+    is_error_shown = []
+    for angle in (0.8, -0.8, 0.8):
+        armature.pose.bones["lower"].rotation_euler[0] = angle
+        bpy.context.view_layer.update()
+        is_error_shown.append("gives positions that are not numbers; train it again." in bound_elbow.fdda.status)
+    if change is output_nan:
+        assert is_error_shown == [True, True, True]
+    else:
+        assert sorted(set(is_error_shown)) == [False, True]
+    assert bound_elbow.fdda.mode == "FDDA"
+
+
+def output_fewer_vertices(model) -> None:
+    last = next(node for node in model.graph.node if "positions" in node.output)
+    last.output[list(last.output).index("positions")] = "all"
+    for name, value in (("from", [0]), ("to", [7]), ("axis", [1])):
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), name))
+    model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
+
+
+def test_a_model_whose_output_has_another_shape_is_refused(refusal, verb, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", output_fewer_vertices)
+    assert "is refused: its output 'positions' comes out as (1, 7, 3), not as (1, 300, 3)" in refusal(
+        *verb(elbow_files.rig, path)
+    )
+
+
+def test_a_refused_model_does_not_change_a_bound_object(bound_elbow, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", add_custom_operator)
+    with pytest.raises(FDDAError, match="the operator set"):
+        bind(find_rig(), path)
+    assert bound_elbow.fdda.is_bound and bound_elbow.fdda.mode == "FDDA"
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [False, False, True, True]
+
+
+def test_the_unchanged_model_is_accepted(verb, elbow_files):
+    """This shows that the changes above are the reason for the errors."""
+    assert run(*verb(elbow_files.rig, elbow_files.model)) == 0

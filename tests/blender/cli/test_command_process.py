@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`python -m fdda_addon` as a process: exit statuses, stop signals, and recordings that continue afterwards."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.recording.appender import BATCH_POSES
+
+from ..conftest import run
+from ..refusals import file_contents
+
+ROOT = Path(__file__).resolve().parents[3]
+POSE_COUNT = 8 * BATCH_POSES
+
+INTERRUPT_SIGNAL = "CTRL_BREAK_EVENT" if os.name == "nt" else "SIGINT"
+STOP_SIGNALS = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
+IMPORT_HOOK = """
+import signal, sys
+def hook(event, arguments):
+    global done
+    if event == "import" and arguments[0] == {module!r} and not done:
+        done = True
+        signal.raise_signal(signal.SIGINT)
+done = not "fdda_addon" in sys.orig_argv
+sys.addaudithook(hook)
+"""
+
+REGISTRATION_HOOK = """
+import signal, sys, typing
+def hook(*arguments, **options):
+    signal.raise_signal(signal.SIGINT)
+    return get_type_hints(*arguments, **options)
+get_type_hints = typing.get_type_hints
+if "fdda_addon" in sys.orig_argv:
+    typing.get_type_hints = hook
+"""
+
+
+def start_verb(*arguments: object, **environment: str) -> subprocess.Popen:
+    command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
+    options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {}
+    return subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
+        **options,
+    )
+
+
+def run_to_end(*arguments: object, **environment: str) -> tuple[int, str, str]:
+    process = start_verb(*arguments, **environment)
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def test_a_successful_verb(elbow_files, tmp_path):
+    status, out, err = run_to_end("record", elbow_files.rig, tmp_path / "r", "--poses", 4)
+    assert status == 0, err
+    estimate, recorded = out.splitlines()
+    assert estimate.startswith("4 poses of 300 vertices: "), "Blender's output is hidden"
+    assert recorded.startswith(f"{tmp_path / 'r'}: 4 poses in ")
+    assert err.splitlines()[-1].startswith("poses: 4 of 4, ")
+
+
+def test_a_failed_verb(tmp_path):
+    path = tmp_path / "none.blend"
+    assert run_to_end("record", path, tmp_path / "r") == (
+        1,
+        "",
+        f"Error: There is no file '{path}'; give the path of a .blend file.\n",
+    )
+
+
+def test_wrong_usage():
+    status, out, err = run_to_end("record", "--poses", "many")
+    assert (status, out) == (2, "")
+    assert err.startswith("usage: python -m fdda_addon record")
+
+
+def test_a_file_that_is_not_a_blend_file_prints_one_line(tmp_path):
+    (tmp_path / "text.blend").write_text("text")
+    status, out, err = run_to_end("record", tmp_path / "text.blend", tmp_path / "r")
+    assert (status, out) == (1, "") and err.count("\n") == 1 and err.startswith("Error: Blender cannot open '")
+
+
+def wait_for(condition, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def recorded_pose_count(path: Path) -> int:
+    try:
+        return read_index(path)["complete"]
+    except RecordingError:
+        return -1
+
+
+def test_an_interrupted_recording_resumes(elbow_files, tmp_path):
+    """A recording that Ctrl-C stops and `--resume` continues has the same bytes as an uninterrupted one."""
+    options = ["--poses", POSE_COUNT, "--seed", 5]
+    path = tmp_path / "interrupted"
+    process = start_verb("record", elbow_files.rig, path, *options)
+    wait_for(lambda: recorded_pose_count(path) > 0, process)
+    process.send_signal(getattr(signal, INTERRUPT_SIGNAL))
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert out.count("\n") == 1 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
+    assert 0 < recorded_pose_count(path) < POSE_COUNT
+    assert run("record", elbow_files.rig, path, *options, "--resume") == 0
+    assert run("record", elbow_files.rig, tmp_path / "whole", *options) == 0
+    assert file_contents(path) == file_contents(tmp_path / "whole")
+
+
+def test_a_recording_that_is_killed_resumes(elbow_files, tmp_path):
+    path = tmp_path / "killed"
+    process = start_verb("record", elbow_files.rig, path, "--poses", POSE_COUNT)
+    wait_for(lambda: recorded_pose_count(path) > 0, process)
+    process.kill()
+    process.communicate(timeout=60)
+    assert process.returncode == (1 if os.name == "nt" else -signal.SIGKILL)
+    assert 0 < recorded_pose_count(path) < POSE_COUNT
+    assert run("record", elbow_files.rig, path, "--poses", POSE_COUNT, "--resume") == 0
+    assert run("record", elbow_files.rig, tmp_path / "whole", "--poses", POSE_COUNT) == 0
+    assert file_contents(path) == file_contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    "signal_name", [STOP_SIGNALS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in STOP_SIGNALS[1:])]
+)
+def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow_files, tmp_path, signal_name):
+    """Only the process of the verb gets the signal, as from a batch system."""
+    process = start_verb("train", elbow_files.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
+    for line in process.stderr:
+        if line.startswith("training: "):
+            break
+    process.send_signal(getattr(signal, signal_name))
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err and out == ""
+    assert file_contents(tmp_path) == {}
+    commands = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.is_file()]
+    assert not any(os.fsencode(tmp_path) in command for command in commands)
+
+
+@pytest.mark.parametrize(("module", "error"), [("argparse", ""), ("numpy", "Interrupted.\n")])
+def test_ctrl_c_during_imports(tmp_path, module, error):
+    (tmp_path / "sitecustomize.py").write_text(IMPORT_HOOK.format(module=module))
+    verb = ("record", tmp_path / "none.blend", tmp_path / "r")
+    assert run_to_end(*verb, PYTHONPATH=str(tmp_path)) == (130, "", error)
+
+
+def test_ctrl_c_during_registration(elbow_files, tmp_path):
+    """Blender prints exceptions that are raised while it reads the annotations of a class, and continues."""
+    (tmp_path / "sitecustomize.py").write_text(REGISTRATION_HOOK)
+    status, out, err = run_to_end(
+        "record", elbow_files.rig, tmp_path / "r", "--poses", 10_000, PYTHONPATH=str(tmp_path)
+    )
+    assert (status, out, err) == (130, "", "Interrupted.\n")
+    assert file_contents(tmp_path / "r") == {}
+
+
+def test_names_that_the_console_s_encoding_lacks(tmp_path):
+    """Characters that the code page lacks are printed as escape sequences."""
+    path = tmp_path / "Jürgen Müller 李.blend"
+    for encoding in ("cp1252", "cp850"):
+        status, out, err = run_to_end("record", path, tmp_path / "r", PYTHONIOENCODING=encoding, PYTHONUTF8="0")
+        assert (status, out, "Traceback" in err) == (1, "", False)
+        assert r"\u674e.blend" in err
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_usage_without_a_verb(arguments):
+    status, out, err = run_to_end(*arguments)
+    assert status == (0 if arguments else 2)
+    assert (out or err).startswith("usage: python -m fdda_addon")

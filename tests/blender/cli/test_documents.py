@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Example code of the documentation runs on files that the verbs write; docs/formats.md names every key."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from fdda_addon.core.formats.messages import MessageType
+from fdda_addon.core.recording.arrays import array_shapes
+from fdda_addon.training.process import trainer_python
+
+from ..conftest import run
+
+pytestmark = pytest.mark.one_blender_version
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+FORMATS_PAGE = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+DEVELOPMENT_PAGE = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
+
+
+def chapter(name: str) -> str:
+    """Return the text of a chapter of docs/formats.md."""
+    assert f"\n## {name}\n" in FORMATS_PAGE
+    return FORMATS_PAGE.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
+
+
+def run_code(text: str, folder: Path, python: str = sys.executable, arguments: tuple[object, ...] = ()) -> str:
+    """Run the only code block of a text in a folder, and return its output."""
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    code = textwrap.dedent(code)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(
+        [python, "-W", "error::RuntimeWarning", "-c", code, *map(str, arguments)],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(elbow_files, tmp_path_factory) -> Path:
+    """Make a folder with the elbow's files under the names that the page uses."""
+    folder = tmp_path_factory.mktemp("documents")
+    shutil.copytree(elbow_files.recording, folder / "recording")
+    (folder / "model.onnx").write_bytes(elbow_files.model.read_bytes())
+    for verb, name in (("evaluate", "evaluation.json"), ("benchmark", "benchmark.json")):
+        count = ("--poses", 5) if verb == "evaluate" else ("--frames", 5)
+        assert run(verb, elbow_files.rig, elbow_files.model, "--json", folder / name, *count) == 0
+    return folder
+
+
+def test_code_of_the_recording_chapter_runs(folder):
+    """The code prints the same mean residual of the first pose as `fdda_addon.core`."""
+    from fdda_addon.core.mathematics.metrics import distances
+    from fdda_addon.core.mathematics.skinning import LinearSkinning
+    from fdda_addon.core.recording.reader import read_recording
+
+    recording = read_recording(folder / "recording")
+    skinning, pose = LinearSkinning(recording.rig), recording.pose_matrices[:1]
+    expected = (
+        distances(skinning.complex_positions(pose, recording.residuals[:1]), skinning.positions(pose)).mean() * 1000
+    )
+    output = run_code(chapter("Recording"), folder)
+    shape, value = re.fullmatch(r"(\(300, 3\)) mean residual (\S+) mm\n", output).groups()
+    assert shape and float(value) == pytest.approx(expected, rel=1e-3)
+
+
+def test_code_of_the_model_chapter_runs(folder):
+    assert run_code(chapter("Model"), folder).startswith("['upper', 'lower'] (2, 300, 3) [1. ")
+
+
+def test_code_of_the_evaluation_chapter_runs(folder):
+    lines = run_code(chapter("Evaluation"), folder).splitlines()
+    report = json.loads((folder / "evaluation.json").read_text())
+    assert lines[0].startswith(f"mean {report['fdda']['mean']:.3f} mm, linear skinning ")
+    assert lines[1].startswith("largest error: ")
+
+
+def test_code_of_the_messages_chapter_runs(folder, tmp_path):
+    shutil.copytree(folder / "recording", tmp_path / "recording")
+    lines = run_code(chapter("Trainer messages"), tmp_path, trainer_python()).splitlines()
+    assert len(lines) == 3 and lines[1].startswith("2/2: ") and lines[2] == "finished 0"
+
+
+def test_code_of_the_development_page_runs(elbow_files, tmp_path):
+    """Playback equals the model's output, and the model is nearer to the rig than linear skinning."""
+    debugging = DEVELOPMENT_PAGE.partition("\n## Debugging a wrong frame\n")[2].partition("\n## ")[0]
+    text = run_code(debugging, tmp_path, arguments=(elbow_files.bound, "elbow", 12))
+    playback, model, linear = (
+        float(distance) for distance in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE)
+    )
+    assert playback < 1e-5 and playback < model < 0.002 < linear
+
+
+def dotted_keys(value: dict, prefix: str = "") -> set[str]:
+    """Return the names of all keys; a nested key has the form `a.b`."""
+    keys = set()
+    for key, inner in value.items():
+        keys |= dotted_keys(inner, f"{prefix}{key}.") if isinstance(inner, dict) else {prefix + key}
+    return keys
+
+
+def is_key_documented(text: str, key: str) -> bool:
+    """Return whether inline code of a page contains a key: its dotted name, or its first and last part."""
+    parts = key.split(".")
+    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    words = set(re.findall(r"[a-z_0-9]+(?:\.[a-z_0-9]+)*", " ".join(re.findall(r"`([^`]+)`", text))))
+    return key in words or ((parts[0] in words or ".".join(parts[:-1]) in words) and parts[-1] in words)
+
+
+def test_recording_chapter_names_every_key_and_array(folder):
+    text = chapter("Recording")
+    index = json.loads((folder / "recording" / "recording.json").read_text())
+    keys = dotted_keys(index) | {key for name in ("joints", "partitions") for key in index[name][0]}
+    keys |= {key for name in ("limits", "sources") for key in index["sampling"][name][0]}
+    assert [key for key in sorted(keys) if not is_key_documented(text, key)] == []
+    assert [name for name in array_shapes(1, 1, 1, 1, 1, 3) if f"`{name}.npy`" not in text] == []
+
+
+def test_model_chapter_names_every_key(folder):
+    from fdda_addon.core.formats.model import read_model_info
+
+    value = json.loads(read_model_info(folder / "model.onnx").to_json())
+    keys = set(value) | {key for name in ("joints", "partitions") for key in value[name][0]}
+    keys |= set(value["fingerprint"]) | set(value["held_out_mm"]) | set(value["training_ranges"])
+    assert [key for key in sorted(keys) if not is_key_documented(chapter("Model"), key)] == []
+
+
+def test_metadata_table_names_every_key_of_a_partition():
+    from fdda_addon.core.formats.model_info import ModelPartition
+
+    section = chapter("Model").partition("#### Partitions of a model\n")[2].partition("\n#")[0]
+    keys = [field.name for field in fields(ModelPartition)]
+    assert [key for key in keys if not is_key_documented(section, key)] == []
+
+
+@pytest.mark.parametrize("name", ["evaluation", "benchmark"])
+def test_evaluation_chapter_names_every_key(folder, name):
+    value = json.loads((folder / f"{name}.json").read_text())
+    keys = set(value) | {key for inner in value.values() if isinstance(inner, dict) for key in inner}
+    assert [key for key in sorted(keys) if not is_key_documented(chapter(name.capitalize()), key)] == []
+
+
+def test_messages_chapter_names_every_type_and_its_keys():
+    text = chapter("Trainer messages")
+    rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", text, re.MULTILINE))
+    assert rows.pop("type")
+    assert list(rows) == [kind.value for kind in MessageType]

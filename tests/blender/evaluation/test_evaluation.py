@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Evaluation and benchmark: results equal a direct computation, on poses that no recording contains."""
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.cli.evaluate import table
+from fdda_addon.core.errors import RigError
+from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.metrics import error_statistics
+from fdda_addon.core.mathematics.poses import sample_pose, widen_ranges
+from fdda_addon.core.mathematics.skinning import LinearSkinning
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.evaluation.results import Evaluation, PoseErrors
+from fdda_addon.evaluation.run import FIRST_HELD_OUT_INDEX, evaluate, evaluate_action
+from fdda_addon.evaluation.settings import EvaluationSettings, NamedPose
+from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.rig.reading import read_rig
+from fdda_addon.runtime.network import Network
+from fdda_addon.scene.armature import Poser, clear_pose
+from fdda_addon.scene.mesh import evaluated_positions
+from fdda_addon.timing.benchmark import MAX_ROUNDS
+
+from ..conftest import run
+from ..scene_state import drain
+
+STATISTIC_NAMES = ["mean", "rms", "p99", "p999", "max"]
+
+
+@pytest.fixture(scope="module")
+def report(elbow_files, tmp_path_factory) -> dict:
+    """Return the report of `evaluate --json` with an action and scaled ranges of motion."""
+    path = tmp_path_factory.mktemp("evaluation") / "e.json"
+    options = ["--poses", 12, "--seed", 3, "--action", "elbow_wave", "--range-scale", 1.5, "--range-scale", 2]
+    assert run("evaluate", elbow_files.rig, elbow_files.model, "--json", path, *options) == 0
+    return json.loads(path.read_text())
+
+
+def test_the_table_says_where_the_model_is_farther_than_linear_skinning():
+    arrays = np.zeros((2, 1, 4, 4), np.float32), np.zeros((2, 3, 3), np.float32), np.zeros((2, 0), np.float32)
+    near, far = np.full((2, 3), 0.001, np.float32), np.full((2, 3), 0.002, np.float32)
+    walk, run_errors = PoseErrors("walk", *arrays, fdda=far, linear=near), PoseErrors("run", *arrays, near, far)
+    lines = table(Evaluation((), (), walk, [walk, run_errors])).splitlines()
+    (index,) = (index for index, line in enumerate(lines) if "farther from the rig than linear skinning" in line)
+    assert "2.0 instead of 1.0 mm on average" in lines[index]
+    assert lines.index("walk, 2 poses") < index < lines.index("run, 2 poses")
+
+
+def test_the_report_has_its_documented_keys(report):
+    assert list(report) == [
+        *("unit", "poses", "vertices", "fdda", "linear", "partitions"),
+        *("actions", "scaled_ranges", "named", "normals", "edges"),
+    ]
+    assert (report["unit"], report["poses"], report["vertices"]) == ("mm", 12, 300)
+    assert list(report["fdda"]) == list(report["linear"]) == STATISTIC_NAMES
+    for partition in report["partitions"]:
+        assert list(partition) == ["joint", "vertices", "fdda", "linear"]
+        assert list(partition["fdda"]) == list(partition["linear"]) == STATISTIC_NAMES
+    assert [p["joint"] for p in report["partitions"]] == ["upper", "lower"]
+    assert sum(p["vertices"] for p in report["partitions"]) == 300
+    assert [(e["name"], e["poses"]) for e in report["actions"]] == [("elbow_wave", 30)]
+    assert [(e["name"], e["poses"]) for e in report["scaled_ranges"]] == [
+        ("1.5 times the range", 3),
+        ("2 times the range", 3),
+    ]
+    assert report["named"] == []
+
+
+def test_the_model_is_nearer_than_linear_skinning(report):
+    assert 0 < report["fdda"]["mean"] < report["linear"]["mean"] / 3
+    for values in (report["fdda"], report["linear"]):
+        assert values["mean"] <= values["rms"] <= values["p999"] <= values["max"]
+        assert values["p99"] <= values["p999"]
+
+
+def compute_errors(rig, elbow_files, channels, seed: int, indices) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors (N, V) of model and linear skinning in meters, without the code for evaluation."""
+    arrays = read_rig(rig)
+    skinning, network = LinearSkinning(arrays), Network(elbow_files.model)
+    bones, errors = rig.armature_object.pose.bones, ([], [])
+    poser = Poser(rig, channels)
+    for index in indices:
+        poser.set(sample_pose(channels, seed, index))
+        true_positions = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+        to_mesh = rig.mesh_object.matrix_world.inverted() @ rig.armature_object.matrix_world
+        pose = np.float32([[np.array(to_mesh @ bones[name].matrix) for name in arrays.joint_names]])
+        for error_list, positions in zip(errors, (network.positions(pose), skinning.positions(pose)), strict=True):
+            error_list.append(np.linalg.norm(positions[0] - true_positions, axis=1))
+    return np.array(errors[0]), np.array(errors[1])
+
+
+def test_errors_equal_a_direct_computation(report, rig, elbow_files):
+    rig.armature_object.animation_data_clear()
+    clear_pose(rig.armature_object)
+    channels = sampled_channels(rig, read_rig(rig))
+    fdda, linear = compute_errors(rig, elbow_files, channels, 3, range(FIRST_HELD_OUT_INDEX, FIRST_HELD_OUT_INDEX + 12))
+    for errors, name in ((fdda, "fdda"), (linear, "linear")):
+        assert report[name] == pytest.approx(error_statistics(errors).to_json(), abs=2e-4)
+        mm = errors * 1000
+        assert report[name]["mean"] == pytest.approx(mm.mean(), abs=2e-4)
+        assert report[name]["max"] == pytest.approx(mm.max(), abs=2e-4)
+    for partition, reported in zip(LinearSkinning(read_rig(rig)).partitions, report["partitions"], strict=True):
+        assert reported["vertices"] == len(partition.vertices)
+        assert reported["fdda"]["mean"] == pytest.approx(1000 * fdda[:, partition.vertices].mean(), abs=2e-4)
+    assert widen_ranges(channels, 2)[0].high > channels[0].high
+
+
+def evaluate_with_settings(rig, elbow_files, **settings) -> Evaluation:
+    return drain(evaluate(rig, elbow_files.model, EvaluationSettings(**settings)))
+
+
+def test_held_out_poses_are_not_in_the_recording(rig, elbow_files):
+    """The evaluation uses the seed of the recording."""
+    recording = read_recording(elbow_files.recording)
+    evaluation = evaluate_with_settings(rig, elbow_files, poses=20, seed=recording.info.sampling.seed)
+    for pose in evaluation.held_out.pose_matrices:
+        assert np.abs(recording.pose_matrices - pose).max(axis=(1, 2, 3)).min() > 1e-3
+    assert read_model_info(elbow_files.model).fingerprint == recording.rig.fingerprint
+
+
+def test_the_seed_determines_the_held_out_poses(rig, elbow_files):
+    first, second, other_seed = (evaluate_with_settings(rig, elbow_files, poses=4, seed=seed) for seed in (1, 1, 2))
+    assert first.to_json() == second.to_json()
+    assert np.abs(first.held_out.pose_matrices - other_seed.held_out.pose_matrices).max() > 1e-2
+
+
+def test_a_named_pose_is_evaluated(rig, elbow_files):
+    pose = NamedPose("fold", {"lower": (1.5, 0, 0), "upper": (0, 0.2, 0)})
+    (errors,) = evaluate_with_settings(rig, elbow_files, poses=1, named=(pose,)).named
+    assert errors.name == "fold" and errors.fdda.shape == (1, 300)
+    rig.armature_object.animation_data_clear()
+    clear_pose(rig.armature_object)
+    bones = rig.armature_object.pose.bones
+    bones["lower"].rotation_euler, bones["upper"].rotation_euler = (1.5, 0, 0), (0, 0.2, 0)
+    true_positions = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+    np.testing.assert_allclose(errors.positions[0], true_positions, atol=1e-6)
+
+
+def test_frames_of_an_action_are_evaluated(rig, elbow_files):
+    (errors,) = evaluate_with_settings(rig, elbow_files, poses=1, actions=("elbow_wave",)).actions
+    for frame in (1, 10, 22):
+        bpy.context.scene.frame_set(frame)
+        true_positions = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+        np.testing.assert_allclose(errors.positions[frame - 1], true_positions, atol=1e-6)
+
+
+def test_a_bound_file_is_compared_with_its_rig(elbow_files, tmp_path):
+    for name, file in (("rig", elbow_files.rig), ("bound", elbow_files.bound)):
+        assert run("evaluate", file, elbow_files.model, "--json", tmp_path / name, "--poses", 3) == 0
+    first, second = (json.loads((tmp_path / name).read_text()) for name in ("rig", "bound"))
+    assert first == second and first["linear"]["mean"] > 0.1
+
+
+def test_evaluate_prints_a_table_of_the_report(elbow_files, tmp_path, capfd):
+    arguments = ["--json", tmp_path / "e.json", "--poses", 3, "--action", "elbow_wave"]
+    assert run("evaluate", elbow_files.rig, elbow_files.model, *arguments) == 0
+    captured = capfd.readouterr()
+    report = json.loads((tmp_path / "e.json").read_text())
+    for values in (report, report["actions"][0]):
+        for method, label in (("linear", "linear skinning"), ("fdda", "FDDA")):
+            row = "".join(f"{values[method][name]:>10.4f}" for name in STATISTIC_NAMES)
+            assert f"  {label:<22}{row}" in captured.out
+    assert "evaluation: 33 of 33, " in captured.err
+
+
+def pixels(path) -> np.ndarray:
+    """Return the pixels (height, width, 4) of a picture, float32."""
+    image = bpy.data.images.load(str(path))
+    values = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)
+
+
+def test_the_heat_map_shows_colored_errors(elbow_files, tmp_path):
+    path = tmp_path / "heat.png"
+    arguments = ["--json", tmp_path / "e.json", "--poses", 5, "--heatmap", path]
+    assert run("evaluate", elbow_files.rig, elbow_files.model, *arguments) == 0
+    # Text in a picture could reveal paths and names of the user's computer.
+    assert not any(kind in path.read_bytes() for kind in (b"tEXt", b"zTXt", b"iTXt"))
+    assert path.read_bytes().startswith(b"\x89PNG")
+    picture = pixels(path)[..., :3]
+    assert min(picture.shape[:2]) > 300
+    # Vertices without an error are green. Linear skinning has errors of millimeters, in other colors.
+    green = (picture[..., 1] > 1.5 * picture[..., 0]) & (picture[..., 1] > 1.5 * picture[..., 2])
+    blue = picture[..., 2] > 1.3 * picture[..., 1]
+    assert green.mean() > 0.02 and blue.mean() > 0.02
+    assert len(np.unique((picture * 16).astype(int).reshape(-1, 3), axis=0)) > 30
+
+
+def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path, capfd):
+    path = tmp_path / "b.json"
+    assert run("benchmark", elbow_files.rig, elbow_files.model, "--json", path, "--frames", 12) == 0
+    report = json.loads(path.read_text())
+    methods = ["rig", "linear", "fdda", "floor", "inference"]
+    assert list(report) == [
+        "unit",
+        "vertices",
+        "frames",
+        "blender",
+        "processor",
+        "cores",
+        *methods,
+        "ratio",
+        "is_faster",
+        "constant_bytes",
+    ]
+    assert (report["unit"], report["vertices"]) == ("ms", 300)
+    # At least five rounds of three frames; more while the times vary.
+    assert report["frames"] in range(15, 3 * MAX_ROUNDS + 1, 3)
+    assert report["blender"] == bpy.app.version_string
+    for method in methods:
+        assert 0 < report[method]["median"] <= report[method]["p90"]
+    assert report["linear"]["median"] < report["rig"]["median"]
+    assert report["ratio"] == pytest.approx(report["rig"]["median"] / report["fdda"]["median"], rel=0.05)
+    out = capfd.readouterr().out
+    assert report["is_faster"] == (report["ratio"] > 1) == ("x faster than the rig" in out)
+    assert report["is_faster"] != ("Not worth it here" in out)
+    assert report["constant_bytes"] == Network(elbow_files.model).info.constant_bytes > 10_000
+    assert f"{report['constant_bytes'] / 1e6:.2f}" in out
+
+
+def test_an_action_has_the_same_errors_with_and_without_held_out_poses(rig, elbow_files):
+    settings = EvaluationSettings(1, actions=("elbow_wave",))
+    with_held_out = drain(evaluate(rig, elbow_files.model, settings)).actions[0]
+    action_only = drain(evaluate_action(rig, Network(elbow_files.model), "elbow_wave"))
+    assert action_only.held_out.name == "elbow_wave"
+    np.testing.assert_allclose(action_only.held_out.fdda, with_held_out.fdda, atol=1e-6)
+    assert sum(len(partition.vertices) for partition in action_only.partitions) == with_held_out.fdda.shape[1]
+    with pytest.raises(RigError, match="no action 'jump'"):
+        drain(evaluate_action(rig, elbow_files.model, "jump"))

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The button that makes a fast rig: another Blender works on the saved file."""
+
+import subprocess
+import sys
+import tempfile
+import time
+from types import SimpleNamespace
+
+import bpy
+import pytest
+
+from fdda_addon.core.progress import Progress
+from fdda_addon.fast_rig import process as verb_process
+from fdda_addon.fast_rig.process import VerbProcess
+from fdda_addon.jobs import job
+from fdda_addon.operators.fast_rig import FDDA_OT_fast_rig, _write_models
+
+from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose
+from .test_playback import refused
+
+
+@pytest.fixture
+def saved(bound_elbow, tmp_path):
+    """Save the bound elbow, with its model packed, into a folder without the model's file."""
+    bpy.context.view_layer.objects.active = bound_elbow
+    bpy.ops.fdda.pack_model()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elbow.blend"))
+    return tmp_path
+
+
+def test_a_fast_rig_is_written_and_the_open_file_stays(saved, elbow_files):
+    content = (saved / "elbow.blend").read_bytes()
+    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.blend")) == {"FINISHED"}
+    assert "fast.blend: 'elbow_rig' has 2 of 2 bones; the model reads 2" in job.state_of("fast_rig").outcome
+    assert "times as fast" in job.state_of("fast_rig").outcome
+    assert bpy.data.filepath == str(saved / "elbow.blend") and (saved / "elbow.blend").read_bytes() == content
+    assert not bpy.data.objects[ELBOW].fdda.is_fast_rig
+    bpy.ops.wm.open_mainfile(filepath=str(saved / "fast.blend"))
+    mesh_object = bpy.data.objects[ELBOW]
+    assert mesh_object.fdda.is_fast_rig and "CorrectiveSmooth" not in mesh_object.modifiers
+    pose(angle=0.7)
+    assert_plays(mesh_object, elbow_files.model)
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(saved / "again.blend")), "'elbow' is a fast rig already")
+
+
+def test_a_fast_rig_is_not_compared_with_what_is_left_of_the_rig(bound_elbow):
+    bound_elbow.fdda.is_fast_rig = True
+    bpy.context.view_layer.objects.active = bound_elbow
+    sentence = "'elbow' belongs to a fast rig, which lacks modifiers and bones of the full rig"
+    for operator in (
+        lambda: bpy.ops.fdda.set_mode(mode="RIG"),
+        lambda: bpy.ops.fdda.set_mode(mode="NEXT"),
+        lambda: bpy.ops.fdda.show_rig(placement="BESIDE"),
+        lambda: bpy.ops.fdda.evaluate(source="RANDOM", poses=2),
+        lambda: bpy.ops.fdda.measure_model(frames=5),
+        bpy.ops.fdda.measure,
+        bpy.ops.fdda.profile_frame,
+        bpy.ops.fdda.record,
+    ):
+        refused(operator, sentence)
+    assert bound_elbow.fdda.mode == "FDDA"
+    assert bpy.ops.fdda.set_mode(mode="LINEAR") == {"FINISHED"}
+
+
+REMAINING = "'elbow' belongs to a fast rig: without a model, only what is left of its bones and modifiers deforms it."
+
+
+@pytest.mark.parametrize("is_fast_rig", [False, True])
+def test_a_fast_rig_without_a_model_says_what_deforms_the_mesh(saved, is_fast_rig, capfd):
+    bpy.data.objects[ELBOW].fdda.is_fast_rig = is_fast_rig
+    assert bpy.ops.fdda.unbind() == {"FINISHED"}
+    assert (REMAINING in capfd.readouterr().out) == is_fast_rig
+    assert bpy.ops.fdda.bind() == {"FINISHED"}
+    assert bpy.data.objects[ELBOW].fdda.use_in_render == is_fast_rig
+    assert bpy.ops.fdda.remove_model() == {"FINISHED"}
+    assert capfd.readouterr().out.count(REMAINING) == is_fast_rig
+
+
+def test_the_sentence_of_the_verb_is_the_report(saved):
+    """The other Blender refuses an armature that another object uses."""
+    other = bpy.data.objects.new("other", bpy.data.objects[ELBOW_RIG].data)
+    bpy.context.scene.collection.objects.link(other)
+    bpy.ops.wm.save_mainfile()
+    out = saved / "fast.blend"
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(out)), "'other' uses the armature of 'elbow_rig' too")
+    assert not out.exists()
+
+
+def test_a_canceled_job_ends_the_other_blender_and_writes_nothing(saved, elbow_files):
+    before = sorted(path.name for path in saved.iterdir())
+    arguments = [str(saved / "elbow.blend"), str(elbow_files.model), str(saved / "fast.blend"), "--frames", "100000"]
+    with VerbProcess("fast-rig", arguments) as process:
+        steps = process.steps()
+        while not isinstance(next(steps), Progress):
+            time.sleep(0.01)
+        assert process.is_running
+    assert not process.is_running
+    assert sorted(path.name for path in saved.iterdir()) == before
+
+
+def test_the_other_blender_registers_an_add_on_that_it_does_not_load(monkeypatch):
+    """Blender evaluates the expression before it runs the command."""
+    monkeypatch.setattr(verb_process, "bpy", SimpleNamespace(app=SimpleNamespace(binary_path="/blender")))
+    program, option, expression, *command = verb_process._command()
+    assert (program, option, command) == ("/blender", "--python-expr", ["--command", "fdda"])
+    script = f"{expression}\n{expression}\nassert sys.modules['fdda_addon'].is_registered()\nprint('done')"
+    result = subprocess.run([sys.executable, "-P", "-c", script], cwd="/", capture_output=True, text=True, check=False)
+    assert result.stdout.endswith("done\n"), result.stderr
+
+
+def test_unsaved_files_and_missing_choices_are_refused(saved):
+    out = str(saved / "fast.blend")
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, visible=False, keyed=False), "No controls were chosen")
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, collection="Faces"), "has no bone collection 'Faces'")
+    refused(bpy.ops.fdda.fast_rig, "No file was chosen; give the name of a .blend file.")
+
+
+def test_a_missing_temporary_folder_is_reported(saved, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(saved / "missing"))
+        text = "No temporary file can be written (No such file or directory"
+        refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.blend")), text)
+
+
+def test_a_point_in_the_name_of_the_file_is_kept(saved):
+    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.v2")) == {"FINISHED"}
+    assert (saved / "fast.v2.blend").is_file() and not (saved / "fast.blend").exists()
+
+
+@pytest.mark.parametrize("name", ["fast.blend", "FAST.BLEND"])
+def test_the_report_has_a_sentence_for_each_line_of_the_verb(name):
+    output = f"/folder/{name}: 'rig' has 2 of 3 bones\n  removed 1 object\n/folder/{name}: a frame took 1 ms\n"
+    expected = f"{name}: 'rig' has 2 of 3 bones. Removed 1 object. A frame took 1 ms."
+    assert FDDA_OT_fast_rig.finish(None, None, output) == expected
+
+
+def test_meshes_whose_clean_names_are_equal_keep_their_models(saved, tmp_path_factory):
+    mesh_object = bpy.data.objects[ELBOW]
+    other = mesh_object.copy()
+    bpy.context.scene.collection.objects.link(other)
+    mesh_object.name, other.name = "left arm", "left_arm"
+    folder = tmp_path_factory.mktemp("models")
+    assert _write_models([mesh_object, other], folder) == folder
+    assert len(list(folder.glob("*/*.onnx"))) == 2

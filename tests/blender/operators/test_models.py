@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operators of the section Model Library: several models of a mesh, and changes of the rig since their training."""
+
+import shutil
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.models.entries import bound_entry, format_file_size
+from fdda_addon.runtime.binding import bind
+from fdda_addon.timing import frame_times
+
+from ... import systems
+from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose, write_edited
+from .test_playback import refused
+
+
+@pytest.fixture
+def second(elbow_files, tmp_path):
+    """A copy of the elbow's model with another name, outside the folder of the .blend file."""
+    return Path(shutil.copy(elbow_files.model, tmp_path / "second.onnx"))
+
+
+def test_switching_between_models(rig, elbow_files, second):
+    bpy.ops.fdda.add_model(filepath=str(elbow_files.model))
+    bpy.ops.fdda.add_model(filepath=str(second))
+    bpy.ops.fdda.add_model(filepath=str(elbow_files.model))
+    fdda = rig.mesh_object.fdda
+    assert [entry.name for entry in fdda.models] == ["elbow", "second"] and fdda.model_index == 0
+    for index, name in ((1, "second"), (0, "elbow"), (1, "second")):
+        fdda.model_index = index
+        fdda.use_in_render = True
+        bpy.ops.fdda.bind()
+        assert bound_entry(rig.mesh_object).name == name and fdda.use_in_render
+        pose(angle=0.5 + index)
+        assert_plays(rig.mesh_object, elbow_files.model)
+    assert sum(m.type == "NODES" for m in rig.mesh_object.modifiers) == 1
+
+
+def test_removing_a_model_unbinds_it(rig, elbow_files, second):
+    bpy.ops.fdda.add_model(filepath=str(second))
+    bpy.ops.fdda.bind(filepath=str(elbow_files.model))
+    fdda = rig.mesh_object.fdda
+    bpy.ops.fdda.remove_model(index=0)
+    assert fdda.is_bound and [entry.name for entry in fdda.models] == ["elbow"]
+    bpy.ops.fdda.remove_model()
+    assert not fdda.is_bound and not fdda.models and elbow_files.model.is_file()
+    refused(bpy.ops.fdda.remove_model, "The model library is empty")
+
+
+def test_the_model_list_is_saved_with_the_file(bound_elbow, elbow_files):
+    assert [(entry.name, entry.path) for entry in bound_elbow.fdda.models] == [("elbow", "//elbow.onnx")]
+
+
+def test_a_model_of_another_rig_is_not_added(rig, elbow_files):
+    rig.armature_object.data.bones["lower"].name = "forearm"
+    refused(lambda: bpy.ops.fdda.add_model(filepath=str(elbow_files.model)), "it does not know the joint 'forearm'")
+    assert not rig.mesh_object.fdda.models
+
+
+def test_an_index_outside_the_list_is_refused(bound_elbow):
+    bpy.context.view_layer.objects.active = bound_elbow
+    refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 model and none with index 3")
+
+
+def move_vertex() -> None:
+    bpy.data.objects[ELBOW].data.vertices[3].co.x += 0.02
+
+
+def add_vertex() -> None:
+    bpy.data.objects[ELBOW].data.vertices.add(1)
+    bpy.data.objects[ELBOW].vertex_groups["lower"].add([len(bpy.data.objects[ELBOW].data.vertices) - 1], 1.0, "REPLACE")
+
+
+def paint_weight() -> None:
+    bpy.data.objects[ELBOW].vertex_groups["upper"].add([0], 0.37, "REPLACE")
+    bpy.data.objects[ELBOW].vertex_groups["lower"].add([0], 0.63, "REPLACE")
+
+
+def rename_bone() -> None:
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "forearm"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (move_vertex, "the rest pose of the mesh differs"),
+        (add_vertex, "vertices, the mesh has"),
+        (paint_weight, "the skin weights differ"),
+        (rename_bone, "lacks the joint 'lower'"),
+    ],
+)
+def test_the_check_of_an_outdated_model_names_the_change(bound_elbow, change, words):
+    bpy.context.view_layer.objects.active = bound_elbow
+    assert bpy.ops.fdda.check_model() == {"FINISHED"}
+    bound_elbow.fdda.mode = "RIG"
+    change()
+    refused(
+        bpy.ops.fdda.check_model, "elbow was trained for an earlier state of this rig", words, "record and train again"
+    )
+
+
+def test_a_changed_range_of_motion_is_reported_and_does_not_prevent_playback(bound_elbow, elbow_files):
+    from fdda_addon.models.changes import find_changes
+    from fdda_addon.scene.scene_rig import find_rig
+
+    bpy.context.view_layer.objects.active = bound_elbow
+    assert not find_changes(find_rig(), bound_elbow.fdda.models[0]).sentence
+    bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
+    found = find_changes(find_rig(), bound_elbow.fdda.models[0])
+    assert found.bones_with_changed_range == ("lower",) and not found.prevents_playback
+    assert "The range of motion of 'lower' has changed since elbow was trained" in found.sentence
+    assert bpy.ops.fdda.check_model() == {"FINISHED"}
+    pose(angle=0.1)
+    assert_plays(bound_elbow, elbow_files.model)
+
+
+def test_a_listed_model_outside_the_folder_of_the_file_is_refused(bound_elbow, elbow_files, second):
+    bpy.context.view_layer.objects.active = bound_elbow
+    entry = bound_elbow.fdda.models.add()
+    entry.name, entry.path = "second", str(second)
+    bound_elbow.fdda.model_index = 1
+    refused(bpy.ops.fdda.bind, "lies outside the folder of 'bound.blend'")
+    refused(bpy.ops.fdda.pack_model, "lies outside the folder")
+    refused(bpy.ops.fdda.check_model, "lies outside the folder")
+    assert bound_entry(bound_elbow).name == "elbow"
+    bpy.ops.fdda.bind(filepath=str(second))
+    assert bound_entry(bound_elbow).name == "second" and len(bound_elbow.fdda.models) == 2
+
+
+def test_a_model_file_that_is_replaced_is_reloaded(bound_elbow, elbow_files, second, tmp_path):
+    """Training again replaces the file of a bound model."""
+    import onnx
+
+    from fdda_addon.evaluation import last_evaluation
+    from fdda_addon.models import model_list
+
+    bpy.context.view_layer.objects.active = bound_elbow
+    path = tmp_path / "second.onnx"
+    bpy.ops.fdda.bind(filepath=str(path))
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
+    bpy.ops.fdda.measure_model(frames=5)
+    assert frame_times.get(bound_elbow) is not None
+    pose(angle=1.3)
+    before = assert_plays(bound_elbow, path)
+
+    def double(proto: onnx.ModelProto) -> None:
+        node = next(node for node in proto.graph.node if "positions" in node.output)
+        node.output[0] = "before"
+        proto.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
+
+    write_edited(path, path, double)
+    model_list.add_model(bound_elbow, path)
+    bpy.context.view_layer.update()
+    after = assert_plays(bound_elbow, path)
+    np.testing.assert_allclose(after, 2 * before, atol=1e-5)
+    assert last_evaluation.get(bound_elbow) is None and frame_times.get(bound_elbow) is None
+    assert len(bound_elbow.fdda.models) == 2
+
+
+def test_the_section_describes_the_problems_of_models(bound_elbow, elbow_files):
+    from fdda_addon.panels import checks
+    from fdda_addon.panels import models as section
+    from fdda_addon.panels.timed_value import timed_values
+    from fdda_addon.scene.scene_rig import find_rig
+
+    bpy.context.view_layer.objects.active = bound_elbow
+    checks.check_now(find_rig())
+    assert timed_values.compute_now(section._find_problems, bound_elbow) == {}
+    bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
+    checks.check_now(find_rig())
+    ((icon, sentence),) = timed_values.compute_now(section._find_problems, bound_elbow).values()
+    assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
+    bound_elbow.fdda.models[0].path = "//away.onnx"
+    ((icon, sentence),) = timed_values.compute_now(section._find_problems, bound_elbow).values()
+    assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
+
+
+def test_file_sizes_are_formatted_in_kilobytes_and_megabytes():
+    assert [format_file_size(count) for count in (2_340, 1_340_169)] == ["2.3 kB", "1.3 MB"]
+
+
+def test_a_replaced_model_file_of_equal_size_is_reloaded_when_it_is_bound(rig, second, tmp_path):
+    from onnx import numpy_helper
+
+    def negate(proto) -> None:
+        """Negate the largest array."""
+        tensor = max(proto.graph.initializer, key=lambda tensor: len(tensor.raw_data))
+        tensor.CopyFrom(numpy_helper.from_array(-numpy_helper.to_array(tensor), tensor.name))
+
+    path = write_edited(second, tmp_path / "m.onnx", lambda proto: None)
+    size = path.stat().st_size
+    bind(rig, path)
+    pose(angle=1.3)
+    before = assert_plays(rig.mesh_object, path)
+    assert write_edited(path, path, negate).stat().st_size == size
+    bind(rig, path)
+    bpy.context.view_layer.update()
+    assert np.abs(assert_plays(rig.mesh_object, path) - before).max() > 1e-3

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every section draws without a window, and few of its fields are open at first."""
+
+import webbrowser
+from pathlib import Path
+from types import MethodType, SimpleNamespace
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+import bpy
+import pytest
+
+from fdda_addon.evaluation import last_evaluation
+from fdda_addon.operators.meshes import MENU_OPERATORS
+from fdda_addon.panels import MODULES, checks, models, playback
+from fdda_addon.panels.timed_value import timed_values
+from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
+from fdda_addon.scene.scene_rig import SceneRig
+
+from ..conftest import ELBOW_RIG
+from ..drawing import Context, DrawnElement, Layout, texts_of
+
+MAX_OPEN_FIELDS = 5
+"""Number of fields that a section shows at most before the user opens a sub-panel."""
+
+
+def draw_section(name: str) -> list[DrawnElement]:
+    """Return what a section draws, and check that its header has the button of the manual."""
+    section, drawn, drawn_header = getattr(bpy.types, f"FDDA_PT_{name}"), [], []
+    header = SimpleNamespace(layout=Layout(drawn_header), bl_label=section.bl_label, is_done=section.is_done)
+    header.has_warning = section.has_warning
+    section.draw_header_preset(header, Context())
+    assert "Manual" in texts_of(drawn_header)
+    panel = SimpleNamespace(layout=Layout(drawn), verbs=section.verbs, is_done=section.is_done)
+    for method_name in ("enabled_layout", *(name for name in vars(section) if name.startswith("_draw"))):
+        setattr(panel, method_name, MethodType(getattr(section, method_name), panel))
+    section.draw(panel, Context())
+    return drawn
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_section_of_a_rig_draws_few_fields(rig: SceneRig, name: str):
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    checks.check_now(rig)
+    drawn = draw_section(name)
+    assert drawn
+    fields = [text for kind, text, is_open in drawn if kind == "field" and is_open]
+    assert len(fields) <= MAX_OPEN_FIELDS, fields
+
+
+def test_missing_limits_are_named_beside_the_button_that_records(rig: SceneRig, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    text, bones = "No rotation limits yet: set them in Training Poses first.", rig.armature_object.pose.bones
+    for bone in bones:
+        bone.lock_rotation = (False, False, False)
+        for axis in range(3):
+            clear_rotation_range(bone, axis)
+    checks.check_now(rig)
+    assert text in texts_of(draw_section("rig"))
+    set_rotation_range(bones[1], 0, 0.0, 2.0)
+    checks.check_now(rig)
+    assert text not in texts_of(draw_section("rig"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("rig", "Replaced by the Model:"),
+        ("poses", "Also Record Actions"),
+        ("recording", "Record"),
+        ("training", "Train"),
+        ("playback", "Confidence in This Pose"),
+        ("evaluation", "Max Color (mm)"),
+        ("models", "Matches this rig"),
+    ],
+)
+def test_a_section_of_a_bound_model_draws(bound_elbow: bpy.types.Object, name: str, text: str):
+    bpy.context.view_layer.objects.active = bound_elbow
+    checks.check_now(SceneRig(bound_elbow, bpy.data.objects[ELBOW_RIG]))
+    bpy.ops.fdda.evaluate()
+    bpy.ops.fdda.measure_model(frames=5)
+    bpy.ops.fdda.color_mesh(colors="ERRORS")
+    timed_values.compute_now(playback._read_confidence, bound_elbow)
+    timed_values.compute_now(models._find_problems, bound_elbow)
+    assert text in texts_of(draw_section(name))
+
+
+def test_a_fast_rig_offers_no_comparison_with_the_rig(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    sections = ("rig", "playback", "evaluation")
+    compared = {"Record, Train & Bind", "Measure Speed", "Frame Profile", "Rig", "Evaluate", "Beside"}
+    full_texts = {text for name in sections for text in texts_of(draw_section(name))}
+    assert compared <= full_texts
+    bound_elbow.fdda.is_fast_rig = True
+    fast_texts = {text for name in sections for text in texts_of(draw_section(name))}
+    assert not compared & fast_texts and {"Skinning", "Model", "Unbind"} <= fast_texts
+    assert "This is a fast rig: compare the model in the file of the full rig." in fast_texts
+
+
+def test_a_fast_rig_in_which_no_model_plays_says_so(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    note = "'elbow' belongs to a fast rig: without a model, only what is left of its bones and modifiers deforms it."
+
+    def says_so() -> bool:
+        return any(text.startswith(note) for text in texts_of(draw_section("playback")))
+
+    bound_elbow.fdda.is_fast_rig = bound_elbow.fdda.use_in_render = True
+    assert not says_so()
+    # The user hides the modifier, which shows the rig in a full rig.
+    bound_elbow.modifiers["FDDA"].show_viewport = False
+    bpy.context.view_layer.update()
+    assert bound_elbow.fdda.mode == "RIG" and says_so()
+    bpy.ops.fdda.unbind()
+    assert says_so()
+    bound_elbow.fdda.is_fast_rig = False
+    assert not says_so()
+
+
+def test_a_fast_rig_says_where_no_model_plays(bound_elbow: bpy.types.Object):
+    """In some frames, or in renders, while the viewport shows the model."""
+    bpy.context.view_layer.objects.active = bound_elbow
+
+    def notes() -> list[str]:
+        return [text for text in texts_of(draw_section("playback")) if "belongs to a fast rig" in text]
+
+    bound_elbow.fdda.is_fast_rig, bound_elbow.fdda.use_in_render = True, False
+    left = "only what is left of its bones and modifiers deforms it."
+    assert notes() == [
+        f"'elbow' belongs to a fast rig: in renders, where the model is off, {left} Switch Use in Render on, or open "
+        "the file of the full rig."
+    ]
+    bound_elbow.fdda.use_in_render = True
+    assert notes() == []
+    keyed = f"'elbow' belongs to a fast rig: where its keyed or driven mode is Rig, {left} Remove these keys or the "
+    bound_elbow.keyframe_insert("fdda.mode", frame=1)
+    assert len(notes()) == 1 and notes()[0].startswith(keyed)
+    bound_elbow.animation_data_clear()
+    assert notes() == []
+    bound_elbow.driver_add("fdda.mode")
+    assert len(notes()) == 1 and notes()[0].startswith(keyed)
+    bound_elbow.fdda.is_fast_rig = False
+    assert notes() == []
+
+
+def test_a_removed_modifier_can_be_bound_again(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    bpy.context.view_layer.update()
+    bound_elbow.modifiers.remove(bound_elbow.modifiers["FDDA"])
+    bpy.context.view_layer.update()
+    assert "was removed; bind the model again" in bound_elbow.fdda.status
+    texts = texts_of(draw_section("playback"))
+    assert "Bind Again" in texts and "Try Again" not in texts
+    assert bpy.ops.fdda.bind(object=bound_elbow.name) == {"FINISHED"}
+    assert bound_elbow.fdda.mode == "FDDA" and not bound_elbow.fdda.status
+    bound_elbow.modifiers["FDDA"].show_viewport = False
+    bpy.context.view_layer.update()
+    assert "Try Again" in texts_of(draw_section("playback"))
+
+
+def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(bound_elbow: bpy.types.Object, capfd):
+    bpy.context.view_layer.objects.active = bound_elbow
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=3)
+    index, error_mm = last_evaluation.get(bound_elbow).worst_poses(1)[0]
+    assert f"Pose {index + 1}: {error_mm:.2f} mm" in texts_of(draw_section("evaluation"))
+    bpy.ops.fdda.jump_to_worst()
+    assert f"Random pose {index + 1}: max error {error_mm:.2f} mm." in capfd.readouterr().out
+
+
+def test_the_menu_has_all_operators_but_those_that_need_a_button_of_a_panel():
+    in_menu = {name.removeprefix("fdda.") for group in MENU_OPERATORS for name in group}
+    assert set(dir(bpy.ops.fdda)) - in_menu == {
+        *("add_trusted_folder", "remove_trusted_folder"),
+        *("cancel", "cancel_trainer_environment", "open_trainer_log", "remove_trainer_environment"),
+        *("set_limit", "clear_limit", "show_bone", "show_mesh", "copy_objects"),
+    }
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_section_without_a_rig_draws(name: str):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    texts = texts_of(draw_section(name))
+    if name == "rig":
+        assert "Add Sample Arm" in texts
+
+
+def test_lists_draw_their_items(bound_elbow: bpy.types.Object):
+    bpy.context.view_layer.objects.active = bound_elbow
+    control = bound_elbow.fdda.settings.controls.add()
+    control.name, control.has_range = "flex", True
+    assert list_items("poses") == [
+        "Record elbow_wave 1…30",
+        "Select upper ±45°  ±45°  ±45°",
+        "Select lower 0…120°  locked  locked",
+        "flex 0…1",
+    ]
+    assert list_items("models") == ["Name"]
+
+
+def list_items(section_name: str) -> list[str]:
+    """Return the text of each list item that a section draws. Of a field, the text is the name of its property."""
+    return [text for kind, text, _ in draw_section(section_name) if kind == "list item"]
+
+
+def test_the_button_in_the_header_of_a_section_opens_the_manual(monkeypatch: pytest.MonkeyPatch):
+    addresses = []
+    monkeypatch.setattr(webbrowser, "open", addresses.append)
+    assert bpy.ops.fdda.help(section="Training Poses") == {"FINISHED"}
+    (address,) = addresses
+    page, _, anchor = address.partition("#")
+    assert anchor == "training-poses"
+    assert f'id="{anchor}"' in Path(url2pathname(urlsplit(page).path)).read_text(encoding="utf-8")

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Random poses in the margin around the range of motion, for which the rig's own limits are muted."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.mathematics.poses import Channel
+from fdda_addon.core.mathematics.skinning import skin_matrices
+from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.poses.suspended_limits import SuspendedLimits
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+
+from ..conftest import run, train
+from ..refusals import file_contents, save_elbow
+from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state
+
+pytestmark = pytest.mark.one_blender_version
+
+SETTINGS = RecordingSettings(poses=40, margin=2.0, influence_poses=2, actions=("elbow_wave",))
+INSIDE = 30
+"""Number of random poses inside the range of motion. They come first, and the other 10 are in the margin."""
+
+
+@pytest.fixture
+def rig(tmp_path) -> Path:
+    return save_elbow(tmp_path / "elbow.blend")
+
+
+def opened(rig: Path) -> SceneRig:
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    return find_rig()
+
+
+def recorded(rig: Path, path: Path, settings: RecordingSettings = SETTINGS) -> Recording:
+    drain(record(opened(rig), path, settings))
+    return read_recording(path)
+
+
+def bends(recording: Recording) -> np.ndarray:
+    """Return the rotation of the lower bone relative to the upper bone, in axes of the lower bone, (N, 3, 3)."""
+    rig = recording.rig
+    skin = skin_matrices(np.array(recording.pose_matrices, np.float64), rig.rest_matrices.astype(np.float64))
+    rest = rig.rest_matrices[1, :3, :3].astype(np.float64)
+    return rest.T @ np.linalg.inv(skin[:, 0, :3, :3]) @ skin[:, 1, :3, :3] @ rest
+
+
+def angles(rotations: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+
+
+def test_poses_of_the_margin_leave_the_limits_and_locked_axes(rig, tmp_path):
+    recording = recorded(rig, tmp_path / "r")
+    margin = recording.info.sampling.margin
+    assert (margin.factor, margin.poses) == (2.0, 10)
+    own, turned = recording.info.sampling.channels, bends(recording)
+    (bend,) = (c for c in own if c.name == "lower")
+    # Inside the range of motion the bone rotates about one axis only; in the margin it rotates about all axes.
+    about = np.eye(3)[bend.axis]
+    off_axis = np.degrees(np.arccos(np.clip(turned @ about @ about, -1, 1)))
+    assert off_axis[:INSIDE].max() < 0.1 < 5 < off_axis[INSIDE : SETTINGS.poses].max()
+    middle, half = (bend.low + bend.high) / 2, (bend.high - bend.low) / 2
+    assert angles(turned)[:INSIDE].max() <= math.degrees(middle + half) + 0.1
+    assert angles(turned)[INSIDE : SETTINGS.poses].max() > math.degrees(middle + half) + 5
+
+
+def test_poses_inside_and_frames_are_those_of_a_recording_without_a_margin(rig, tmp_path):
+    """After the poses of the margin, axes are locked and limits are active again for the frames of the action."""
+    without = recorded(rig, tmp_path / "without", replace(SETTINGS, margin=1.0))
+    recording = recorded(rig, tmp_path / "with")
+    for name in ("pose_matrices", "residuals"):
+        ours, theirs = np.array(getattr(recording, name)), np.array(getattr(without, name))
+        assert np.array_equal(ours[:INSIDE], theirs[:INSIDE])
+        assert np.array_equal(ours[SETTINGS.poses :], theirs[SETTINGS.poses :])
+    assert without.info.sampling.margin is None
+    assert recording.info.sampling.channels == without.info.sampling.channels
+
+
+def test_the_scene_is_restored_after_a_whole_and_an_interrupted_recording(rig, tmp_path):
+    found = opened(rig)
+    muted = {c.name: c.mute for bone in found.armature_object.pose.bones for c in bone.constraints}
+    before = scene_state(found)
+    drain(record(found, tmp_path / "whole", SETTINGS))
+    steps = record(found, tmp_path / "broken", SETTINGS)
+    for step in steps:
+        if step.stage == "poses" and step.done == INSIDE + 5:
+            break
+    steps.close()
+    assert {c.name: c.mute for bone in found.armature_object.pose.bones for c in bone.constraints} == muted
+    assert_same_state(before, scene_state(found))
+
+
+@pytest.mark.parametrize("at", [12, INSIDE + 3, SETTINGS.poses + 4])
+def test_a_resumed_recording_equals_an_uninterrupted_one_bit_for_bit(rig, tmp_path, at):
+    drain(record(opened(rig), tmp_path / "whole", SETTINGS))
+    steps = record(opened(rig), tmp_path / "broken", SETTINGS)
+    for step in steps:
+        if step.stage == "poses" and step.done == at:
+            break
+    steps.close()
+    drain(record(opened(rig), tmp_path / "broken", replace(SETTINGS, resume=True)))
+    assert file_contents(tmp_path / "broken") == file_contents(tmp_path / "whole")
+
+
+def test_a_recording_cannot_be_resumed_with_another_margin(rig, tmp_path):
+    drain(record(opened(rig), tmp_path / "r", SETTINGS), stop_after=10)
+    with pytest.raises(RecordingError, match=r"recorded differently \(sampling\.margin"):
+        drain(record(opened(rig), tmp_path / "r", replace(SETTINGS, margin=1.5, resume=True)))
+
+
+def test_only_limits_that_would_change_a_pose_are_muted():
+    found = fresh_elbow()
+    bone = found.armature_object.pose.bones["lower"]
+    (limit,) = bone.constraints
+    world, weak = (bone.constraints.new("LIMIT_ROTATION") for _ in range(2))
+    world.owner_space, weak.owner_space, weak.influence = "WORLD", "LOCAL", 0.0
+    for constraint in (world, weak):
+        constraint.use_limit_x = True
+    channels = tuple(
+        Channel("lower", "rotation", axis, getattr(limit, f"min_{letter}"), getattr(limit, f"max_{letter}"))
+        for axis, letter in enumerate("xyz")
+    )
+    inside = np.array([(channel.low + channel.high) / 2 for channel in channels])
+    with SuspendedLimits(found.armature_object, channels) as limits:
+        for beyond, off in ((0.0, False), (3.0, True), (0.0, False), (-3.0, True)):
+            limits.suspend(inside + beyond)
+            assert (limit.mute, world.mute, weak.mute) == (off, False, False)
+    assert not limit.mute
+
+
+def test_record_accepts_margins_from_1_to_4(rig, tmp_path, capfd):
+    assert run("record", rig, tmp_path / "r", "--poses", 20, "--margin", 1.5) == 0
+    margin = read_recording(tmp_path / "r").info.sampling.margin
+    assert (margin.factor, margin.poses) == (1.5, 5)
+    for value in ("0.5", "4.5", "nan"):
+        assert run("record", rig, tmp_path / "s", "--margin", value) == 2
+        assert "--margin must be 1, for none, to 4 times the range of motion." in capfd.readouterr().err
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_margin_at_least_halves_the_error_beyond_the_range(tmp_path):
+    """The rig is evaluated without its limits, so that `evaluate` can pose it beyond the range of motion."""
+    found = fresh_elbow()
+    for bone in found.armature_object.pose.bones:
+        for constraint in bone.constraints:
+            constraint.influence = 0.0
+    rig = tmp_path / "elbow.blend"
+    save_copy(rig)
+    errors = {}
+    for margin in ("1", "2"):
+        recording, model, out = tmp_path / margin, tmp_path / f"{margin}.onnx", tmp_path / f"{margin}.json"
+        assert run("record", rig, recording, "--poses", 200, "--margin", margin) == 0
+        train(recording, model, "--epochs", 60)
+        assert run("evaluate", rig, model, "--json", out, "--poses", 40, "--range-scale", 2) == 0
+        errors[margin] = _errors(out)
+    assert errors["2"][1] < errors["1"][1] / 2
+    assert errors["2"][0] < 1.5 * errors["1"][0]
+
+
+def _errors(path: Path) -> tuple[float, float]:
+    """Return the mean error inside the range of motion and the mean error at twice the range, mm."""
+    found = json.loads(path.read_text())
+    return found["fdda"]["mean"], found["scaled_ranges"][0]["fdda"]["mean"]

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`--sample remix`: random poses that combine the limbs of recorded actions."""
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.core.errors import RigError
+from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION_VECTOR
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.panels import checks
+from fdda_addon.poses.remix import read_remix
+from fdda_addon.properties.recording_options import recording_settings
+from fdda_addon.recording.plan import RecordingSettings, make_pose_sampler, read_sampled_rig
+from fdda_addon.scene.armature import Poser, clear_pose
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+
+from ..conftest import run
+
+WAVE, STILL, TURN = "wave", "one frame", "turn the dial"
+
+
+@pytest.fixture
+def waving(rig: SceneRig) -> SceneRig:
+    """The elbow with an action that rotates both bones, moves the upper one and turns a property."""
+    armature_object = rig.armature_object
+    upper, lower = armature_object.pose.bones["upper"], armature_object.pose.bones["lower"]
+    armature_object.animation_data_create().action = bpy.data.actions.new(WAVE)
+    armature_object["dial"] = 0.0
+    armature_object.id_properties_ui("dial").update(min=-1.0, max=1.0)
+    upper.rotation_mode, upper.lock_rotation = "QUATERNION", (False, True, False)
+    for frame in range(1, 41):
+        upper.rotation_quaternion = np.array([1.0, 0.3 * np.sin(frame), 0.0, 0.2 * np.cos(frame)])
+        upper.location[2] = frame / 1000
+        lower.rotation_euler[0] = frame / 40
+        armature_object["dial"] = np.cos(frame)
+        for owner, path in (
+            *((upper, path) for path in ("rotation_quaternion", "location")),
+            (lower, "rotation_euler"),
+            (armature_object, '["dial"]'),
+        ):
+            owner.keyframe_insert(path, frame=frame)
+    armature_object.animation_data.action = None
+    bpy.data.actions[WAVE].use_fake_user = True
+    clear_pose(armature_object)
+    return rig
+
+
+def test_remixed_frames_show_the_pose_of_the_action(waving):
+    """Without noise, the channels of a frame set the rotation, location and property that the action shows."""
+    action = bpy.data.actions[WAVE]
+    remix = read_remix(waving, [action])
+    kinds = {(channel.name, channel.kind, channel.axis) for channel in remix.channels}
+    assert kinds == {
+        *((bone, ROTATION_VECTOR, axis) for bone in ("upper", "lower") for axis in range(3)),
+        ("upper", LOCATION, 2),
+        ('armature_object/["dial"]', CONTROL, 0),
+    }
+    assert remix.values.shape == (40, 8)
+    # The lower bone is the only child of the upper one, so they are one limb; the property is another.
+    assert remix.limbs.tolist() == [0] * 7 + [remix.limbs[-1]] and remix.limbs[-1] != 0
+    assert remix.has_noise.tolist() == [True, False, True, False, True, True, True, False]
+    armature_object, bones = waving.armature_object, waving.armature_object.pose.bones
+    for frame in (1, 17, 40):
+        armature_object.animation_data.action = action
+        bpy.context.scene.frame_set(frame)
+        expected = [np.array(bones[name].matrix_basis) for name in ("upper", "lower")]
+        dial = armature_object["dial"]
+        armature_object.animation_data.action = None
+        clear_pose(armature_object)
+        Poser(waving, remix.channels).set(remix.values[frame - 1])
+        for matrix, name in zip(expected, ("upper", "lower"), strict=True):
+            assert np.array(bones[name].matrix_basis) == pytest.approx(matrix, abs=1e-5)
+        assert armature_object["dial"] == pytest.approx(dial)
+
+
+def test_frames_of_an_action_that_does_not_key_a_bone_have_its_rest_pose(waving):
+    action = bpy.data.actions.new("nod")
+    waving.armature_object.animation_data.action = action
+    lower = waving.armature_object.pose.bones["lower"]
+    for frame in (1, 10):
+        lower.rotation_euler[0] = frame / 10
+        lower.keyframe_insert("rotation_euler", frame=frame)
+    remix = read_remix(waving, [action, bpy.data.actions[WAVE]])
+    upper = [n for n, channel in enumerate(remix.channels) if channel.name == "upper"]
+    assert not remix.values[:10, upper].any() and remix.values[10:, upper].any(axis=1).all()
+
+
+def test_a_recording_remixes_its_actions(waving, tmp_path):
+    save_copy(tmp_path / "rig.blend")
+    options = ("--sample", "remix", "--action", WAVE, "--poses", 30, "--seed", 4)
+    assert run("record", tmp_path / "rig.blend", tmp_path / "recording", *options) == 0
+    recording = read_recording(tmp_path / "recording")
+    random_source, action_source = recording.info.sampling.sources
+    assert (random_source.kind, random_source.name, random_source.poses) == ("random", "remix", 30)
+    assert action_source.poses == 40
+    settings = RecordingSettings(poses=30, seed=4, sample=("remix",), actions=(WAVE,))
+    rig = find_rig()
+    _, channels = read_sampled_rig(rig, settings)
+    sampler = make_pose_sampler(rig, settings)
+    assert sampler.remix is not None and sampler.draw_pose(channels, 2).shape == (len(channels),)
+    assert np.ptp(np.array(recording.pose_matrices[:30]), axis=0).max() > 0.5
+
+
+def test_remixed_poses_need_actions(waving):
+    with pytest.raises(RigError, match=r"Remixed poses combine the limbs of recorded actions; name some \(--action"):
+        read_sampled_rig(waving, RecordingSettings(sample=("remix",)))
+
+
+def test_an_action_that_moves_no_bone_is_refused(waving):
+    bpy.data.actions.new("still")
+    with pytest.raises(RigError, match="There is no pose to remix: 'still' moves no bone of 'elbow_rig'"):
+        read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=("still",)))
+
+
+def add_actions_without_motion(armature_object: bpy.types.Object) -> None:
+    """Add an action of one frame, and one that moves a property and keeps a bone where it is."""
+    for name, frames in ((STILL, [1]), (TURN, [1, 10])):
+        armature_object.animation_data.action = bpy.data.actions.new(name)
+        for frame in frames:
+            armature_object.pose.bones["lower"].rotation_euler[0] = 0.5
+            armature_object.pose.bones["lower"].keyframe_insert("rotation_euler", frame=frame)
+            if name == TURN:
+                armature_object["dial"] = frame / 10
+                armature_object.keyframe_insert('["dial"]', frame=frame)
+        armature_object.animation_data.action = None
+        bpy.data.actions[name].use_fake_user = True
+    clear_pose(armature_object)
+
+
+def test_a_single_pose_is_refused(waving):
+    add_actions_without_motion(waving.armature_object)
+    with pytest.raises(RigError, match="There is only one pose to remix: nothing of 'elbow_rig' moves in 'one frame'"):
+        read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=(STILL,)))
+    read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=(STILL, WAVE)))
+
+
+def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "waving.blend"))
+    settings = waving.mesh_object.fdda.settings
+    settings.sample = "REMIX"
+    with pytest.raises(RigError, match="is set to Limbs from the Checked Actions, but no action is checked"):
+        recording_settings(waving)
+    bpy.data.actions[WAVE].fdda.record = True
+    assert recording_settings(waving).sample == ("remix",)
+    assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
+
+
+@pytest.mark.parametrize(
+    "options, has_hint",
+    [
+        (["--action", WAVE], True),
+        (["--action", WAVE, "--action", STILL], True),
+        (["--action", WAVE, "--sample", "remix"], False),
+        (["--action", WAVE, "--poses", 0], False),
+        ([], False),
+        # There is no motion of bones to combine.
+        (["--action", STILL], False),
+        (["--action", TURN], False),
+        # Poses that are chosen already cannot change.
+        (["--action", WAVE, "--resume"], False),
+    ],
+)
+def test_recording_actions_with_random_poses_suggests_to_remix(waving, tmp_path, capsys, options, has_hint):
+    add_actions_without_motion(waving.armature_object)
+    path = tmp_path / "rig.blend"
+    save_copy(path)
+    poses = [] if "--poses" in options else ["--poses", 12]
+    assert run("record", path, tmp_path / "recording", *poses, *options) == 0
+    assert ("with --sample remix they combine limbs" in capsys.readouterr().out) == has_hint

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Recording, evaluation and benchmarks restore the scene, however they end."""
+
+import bpy
+import pytest
+
+from fdda_addon.core.errors import RigError
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.evaluation.run import evaluate
+from fdda_addon.evaluation.settings import EvaluationSettings
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.runtime.binding import model_disabled
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.timing.benchmark import benchmark
+
+from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state, set_unusual_state
+
+
+@pytest.fixture
+def unusual_rig() -> SceneRig:
+    """Build an elbow whose animation, pose and selection differ from all defaults."""
+    rig = fresh_elbow()
+    set_unusual_state(rig)
+    return rig
+
+
+@pytest.fixture
+def before(unusual_rig) -> dict:
+    """Return the state of the scene before the test."""
+    state = scene_state(unusual_rig)
+    assert state["frame"] == (7, 0.25) and state["animation"][:3] == ("other", state["animation"][1], True)
+    return state
+
+
+RECORDING_SETTINGS = RecordingSettings(poses=8, actions=("elbow_wave",))
+EVALUATION_SETTINGS = EvaluationSettings(poses=8, actions=("elbow_wave",), range_scales=(2.0,))
+
+
+def test_a_changed_pose_is_detected(unusual_rig, before):
+    """Without this, the other tests would pass whatever jobs leave behind."""
+    unusual_rig.armature_object.pose.bones["lower"].rotation_euler[0] = 0
+    after = scene_state(unusual_rig)
+    assert after["pose"] != before["pose"]
+    with pytest.raises(AssertionError):
+        assert_same_state({"positions": before["positions"]}, after)
+
+
+def test_a_complete_recording_restores_the_scene(unusual_rig, before, tmp_path):
+    drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+    assert_same_state(before, scene_state(unusual_rig))
+
+
+@pytest.mark.parametrize("step", [1, 7, 11, 12])
+def test_a_canceled_recording_restores_the_scene(unusual_rig, before, tmp_path, step):
+    drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS), stop_after=step)
+    assert_same_state(before, scene_state(unusual_rig))
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_recording_with_an_error_restores_the_scene(unusual_rig, before, tmp_path, monkeypatch, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(RecordingWriter, "append", fail)
+    with pytest.raises(error):
+        drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+    assert_same_state(before, scene_state(unusual_rig))
+    assert not (tmp_path / "r").exists()
+
+
+def test_recording_a_missing_action_restores_the_scene(unusual_rig, before, tmp_path):
+    with pytest.raises(RigError):
+        drain(record(unusual_rig, tmp_path / "r", RecordingSettings(actions=("none",))))
+    assert_same_state(before, scene_state(unusual_rig))
+
+
+def test_recording_adds_no_animation_data(tmp_path):
+    rig = fresh_elbow()
+    rig.armature_object.animation_data_clear()
+    before = scene_state(rig)
+    drain(record(rig, tmp_path / "r", RECORDING_SETTINGS))
+    assert rig.armature_object.animation_data is None
+    assert_same_state(before, scene_state(rig))
+
+
+def test_recording_assigns_no_action(tmp_path):
+    rig = fresh_elbow()
+    rig.armature_object.animation_data.action = None
+    before = scene_state(rig)
+    drain(record(rig, tmp_path / "r", RECORDING_SETTINGS))
+    assert_same_state(before, scene_state(rig))
+
+
+@pytest.mark.skipif(bpy.app.version < (4, 4, 0), reason="actions have no slots")
+def test_recording_assigns_no_slot(unusual_rig, tmp_path):
+    unusual_rig.armature_object.animation_data.action_slot = None
+    before = scene_state(unusual_rig)
+    drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+    assert unusual_rig.armature_object.animation_data.action_slot is None
+    assert_same_state(before, scene_state(unusual_rig))
+
+
+def test_tweak_mode_is_refused_and_not_left(unusual_rig, tmp_path):
+    """In tweak mode Blender accepts no other action, so recording could not restore the scene."""
+    animation = unusual_rig.armature_object.animation_data
+    animation.action = None
+    animation.nla_tracks[0].select = animation.nla_tracks[0].strips[0].select = True
+    animation.use_tweak_mode = True
+    assert animation.use_tweak_mode
+    before = scene_state(unusual_rig)
+    with pytest.raises(RigError, match="'elbow_rig' is in tweak mode of the NLA editor; leave it first"):
+        drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+    assert_same_state(before, scene_state(unusual_rig))
+
+
+def test_a_hidden_object_is_refused(unusual_rig, tmp_path):
+    unusual_rig.mesh_object.hide_viewport = True
+    bpy.context.view_layer.update()
+    with pytest.raises(RigError, match="'elbow' is hidden, so Blender does not evaluate it"):
+        drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+
+
+@pytest.mark.parametrize("name", ["elbow", "elbow_rig"])
+def test_edit_mode_is_refused(unusual_rig, tmp_path, name):
+    bpy.context.view_layer.objects.active = bpy.data.objects[name]
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(RigError, match="'elbow' or its armature is in edit mode; leave it first"):
+        drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+
+
+def test_an_armature_in_rest_position_is_refused(unusual_rig, tmp_path):
+    unusual_rig.armature_object.data.pose_position = "REST"
+    with pytest.raises(RigError, match="'elbow_rig' shows its rest position; set it to pose"):
+        drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+
+
+def test_a_disabled_armature_modifier_is_refused(unusual_rig, tmp_path):
+    unusual_rig.mesh_object.modifiers["Armature"].show_viewport = False
+    with pytest.raises(RigError, match="The Armature modifier of 'elbow' is switched off in the viewport"):
+        drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
+
+
+@pytest.mark.parametrize("step", [None, 3, 12])
+def test_an_evaluation_restores_the_scene(rig, elbow_files, step):
+    set_unusual_state(rig)
+    before = scene_state(rig)
+    drain(evaluate(rig, elbow_files.model, EVALUATION_SETTINGS), stop_after=step)
+    assert_same_state(before, scene_state(rig))
+
+
+@pytest.mark.parametrize("step", [None, 2])
+def test_a_benchmark_restores_the_scene(rig, elbow_files, step):
+    set_unusual_state(rig)
+    before = scene_state(rig)
+    drain(benchmark(rig, elbow_files.model, 5), stop_after=step)
+    assert_same_state(before, scene_state(rig))
+
+
+def test_a_benchmark_of_a_bound_rig_without_an_action_restores_the_scene(bound_elbow, elbow_files):
+    rig = find_rig()
+    rig.armature_object.animation_data_clear()
+    before = scene_state(rig)
+    assert before["binding"] == (True, "FDDA", "")
+    with model_disabled(rig.mesh_object):
+        drain(benchmark(rig, elbow_files.model, 5))
+    assert_same_state(before, scene_state(rig))

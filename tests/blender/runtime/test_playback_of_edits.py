@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Playback after the character is edited, renamed or partly deleted."""
+
+import bpy
+import numpy as np
+
+from fdda_addon.runtime import playback_modifier
+
+from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, predicted_positions
+
+
+def test_edit_mode(bound_elbow, elbow_files):
+    bpy.context.view_layer.objects.active = bound_elbow
+    bpy.ops.object.mode_set(mode="EDIT")
+    pose(angle=1.5)
+    in_edit_mode = evaluated_positions(bound_elbow)
+    assert np.abs(in_edit_mode - predicted_positions(bound_elbow, elbow_files.model)).max() < 1e-5
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert np.array_equal(assert_plays(bound_elbow, elbow_files.model), in_edit_mode)
+
+
+def test_edit_mode_that_changes_the_topology(bound_elbow, elbow_files, capsys):
+    bpy.context.view_layer.objects.active = bound_elbow
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.subdivide()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    pose(angle=1.0)
+    pose(angle=1.2)
+    assert bound_elbow.fdda.mode == "RIG"
+    assert f"has {len(bound_elbow.data.vertices)} vertices and its model was trained for" in bound_elbow.fdda.status
+    assert capsys.readouterr().out.count("switched off") == 1
+
+
+def test_renaming(bound_elbow, elbow_files):
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    bound_elbow.name, armature_object.name = "other", "other rig"
+    pose("other rig", angle=1.3)
+    assert_plays(bound_elbow, elbow_files.model)
+
+
+def test_deleting_the_mesh(bound_elbow):
+    bpy.data.objects.remove(bound_elbow)
+    pose(angle=1.3)
+    bpy.context.scene.frame_set(7)
+
+
+def test_deleting_the_armature(bound_elbow, capsys):
+    bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
+    bpy.context.view_layer.update()
+    bpy.context.scene.frame_set(7)
+    bpy.context.scene.frame_set(8)
+    assert bound_elbow.fdda.mode == "RIG"
+    assert "'elbow' has no Armature modifier with an armature any more" in bound_elbow.fdda.status
+    assert capsys.readouterr().out.count("switched off") == 1
+    assert [m.show_viewport for m in bound_elbow.modifiers] == [True, True, False, False]
+
+
+def test_deleting_the_armature_comes_back_with_undo(bound_elbow, elbow_files):
+    pose(angle=1.0)
+    bpy.ops.ed.undo_push(message="posed")
+    bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
+    bpy.context.view_layer.update()
+    bpy.ops.ed.undo_push(message="deleted")
+    bpy.ops.ed.undo()
+    pose(angle=1.4)
+    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
+
+
+def test_renamed_bone_is_reported(bound_elbow, elbow_files):
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "forearm"
+    bound_elbow.fdda.mode = "RIG"
+    path = elbow_files.bound.with_name("renamed.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    bpy.data.objects[ELBOW].fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    assert "lacks the joint 'lower'" in bpy.data.objects[ELBOW].fdda.status
+
+
+def test_a_bone_that_is_added(bound_elbow, elbow_files):
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    bone = armature_object.data.edit_bones.new("a_prop")
+    bone.tail = (0, 0, 0.1)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    pose(angle=0.8)
+    assert_plays(bound_elbow, elbow_files.model)
+
+
+def test_removed_modifier_is_reported(bound_elbow):
+    bound_elbow.modifiers.remove(playback_modifier.find_modifier(bound_elbow))
+    pose(angle=1.0)
+    bound_elbow.fdda.mode = "LINEAR"
+    assert bound_elbow.fdda.mode == "RIG"
+    assert "removed; bind the model again" in bound_elbow.fdda.status

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Trainers that are missing, lack a package, fail or die: `train` prints an error message and writes no model."""
+
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from fdda_addon.core.errors import TRY_AGAIN
+from fdda_addon.core.formats.messages import Message, MessageType
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+from fdda_addon.training.process import trainer_command
+
+from ..conftest import run
+from ..stand_ins import import_from, print_message_code, stand_in_trainer
+
+pytestmark = pytest.mark.one_blender_version
+
+
+@pytest.fixture
+def train_refusal(refusal, elbow_files, tmp_path):
+    """Return a function that runs `train` on the elbow's recording, and returns its error message."""
+
+    def run_train(*options: object, status: int = 1) -> str:
+        return refusal("train", elbow_files.recording, tmp_path / "m.onnx", *options, status=status)
+
+    return run_train
+
+
+STARTED = print_message_code(MessageType.STARTED, partitions=1, poses=1, vertices=1, device="cpu")
+PROGRESSED = print_message_code(MessageType.PROGRESS, epoch=1, epochs=2, validation_mm=0.5)
+
+
+def test_a_python_without_torch_is_reported(train_refusal, tmp_path, monkeypatch):
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    (packages / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")
+    import_from(packages, monkeypatch)
+    text = train_refusal()
+    python = os.environ.get(PYTHON_VARIABLE) or sys.executable
+    assert text.startswith(f"Training needs the Python package 'torch', which {python} does not have; install torch")
+    assert PYTHON_VARIABLE in text
+
+
+def test_a_python_that_cannot_import_the_trainer_is_reported(train_refusal, tmp_path, monkeypatch):
+    stand_in_trainer(
+        tmp_path,
+        monkeypatch,
+        "import subprocess",
+        "status = subprocess.call([sys.executable, '-I', '-S', *sys.orig_argv[1:]])",
+    )
+    assert re.match(
+        r"The trainer ended with status 1 before it was done \(.*trainer.*\); no model was written", train_refusal()
+    )
+
+
+def test_a_trainer_in_the_current_folder_is_not_run(tmp_path):
+    (tmp_path / "trainer").mkdir()
+    for name in ("__init__", "__main__"):
+        (tmp_path / "trainer" / f"{name}.py").write_text("raise SystemExit('another trainer')")
+    command, environment = trainer_command(["--help"])
+    result = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0 and "usage: " in result.stdout, result.stderr
+
+
+def test_a_missing_python_is_reported(train_refusal, monkeypatch):
+    monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
+    assert re.fullmatch(
+        r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); set "
+        "FDDA_TRAINER_PYTHON to a Python that has torch.",
+        train_refusal(),
+    )
+
+
+def test_a_python_that_is_not_executable_is_reported(train_refusal, tmp_path, monkeypatch):
+    path = tmp_path / "python"
+    path.write_text("")
+    monkeypatch.setenv(PYTHON_VARIABLE, str(path))
+    assert "cannot be started (" in train_refusal()
+
+
+def test_a_trainer_that_fails_without_output_is_reported(train_refusal, tmp_path, monkeypatch):
+    stand_in_trainer(tmp_path, monkeypatch, status=3)
+    assert train_refusal() == "The trainer ended with status 3 before it was done; no model was written, train again."
+
+
+def test_a_trainer_that_exits_with_0_before_it_is_done_is_reported(train_refusal, tmp_path, monkeypatch):
+    stand_in_trainer(tmp_path, monkeypatch, STARTED)
+    assert "The trainer ended with status 0 before it was done;" in train_refusal()
+
+
+def test_a_trainer_that_writes_an_error_and_exits_is_reported(train_refusal, tmp_path, monkeypatch):
+    stand_in_trainer(tmp_path, monkeypatch, "sys.stderr.write('first\\nImportError: Jürgen 李\\n')", status=1)
+    assert train_refusal() == (
+        "The trainer ended with status 1 before it was done (ImportError: Jürgen 李); no model was written, train "
+        "again."
+    )
+
+
+@pytest.mark.parametrize("verb", ["train", "record"])
+def test_a_missing_temporary_folder_is_reported(refusal, elbow_files, tmp_path, monkeypatch, verb):
+    arguments = {
+        "train": ["train", elbow_files.recording, tmp_path / "m.onnx"],
+        "record": ["record", elbow_files.rig, tmp_path / "r", "--poses", 20, "--fit-linear", "hard"],
+    }[verb]
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", None)
+        patch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "none")])
+        text = refusal(*arguments, status=TRY_AGAIN)
+    assert text.startswith("No temporary file can be written (No usable temporary directory found in [")
+    assert text.endswith("); make room there, or name another folder in TMPDIR.")
+
+
+def test_a_trainer_that_lacks_a_library_is_reported(train_refusal, tmp_path, monkeypatch):
+    error = "ImportError: DLL load failed while importing _C: Das angegebene Modul wurde nicht gefunden."
+    stand_in_trainer(tmp_path, monkeypatch, f"sys.stderr.write({error!r})", status=1)
+    text = train_refusal()
+    assert f"({error}); install Microsoft's Visual C++ runtime from https://aka.ms/vs/17/release/vc_redist." in text
+
+
+def test_a_trainer_that_is_killed_is_reported(train_refusal, tmp_path, monkeypatch):
+    """On Windows, a process that the Task Manager kills has exit status 1, like a process that fails."""
+    kill = "os.kill(os.getpid(), getattr(signal, 'SIGKILL', 15))"
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, PROGRESSED, kill)
+    cause = "was ended from outside" if os.name == "nt" else "was ended by signal 9"
+    assert (
+        train_refusal(status=TRY_AGAIN) == f"The trainer {cause} before it was done; no model was written, train again."
+    )
+
+
+def test_a_trainer_that_crashes_is_reported(train_refusal, tmp_path, monkeypatch):
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, "import faulthandler", "faulthandler._read_null()")
+    cause = "crashed: access violation, status 0xC0000005" if os.name == "nt" else "was ended by signal 11"
+    assert train_refusal(status=TRY_AGAIN).startswith(f"The trainer {cause}")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="/dev/full is Linux's")
+@pytest.mark.parametrize("is_silent", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_a_trainer_whose_disk_is_full_is_reported(elbow_files, train_refusal, tmp_path, monkeypatch, is_silent):
+    """The trainer cannot write to stdout, and in one case not to stderr."""
+    lines = ["os.dup2(os.open('/dev/full', os.O_WRONLY), 1)", *(["os.dup2(1, 2)"] if is_silent else [])]
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    code = "\n".join(["import os, sys", "if 'trainer' in sys.orig_argv:", *(f"    {line}" for line in lines), ""])
+    (packages / "sitecustomize.py").write_text(code)
+    import_from(packages, monkeypatch)
+    text = train_refusal("--epochs", 1, status=TRY_AGAIN)
+    assert is_silent or "No space left on device; make room, end other programs, or try again." in text
+
+
+def test_an_error_message_of_the_trainer_is_shown(train_refusal, tmp_path, monkeypatch):
+    stand_in_trainer(
+        tmp_path, monkeypatch, STARTED, print_message_code(MessageType.FAILED, text="The sky fell; wait."), status=1
+    )
+    assert train_refusal() == "The sky fell; wait."
+
+
+def test_lines_that_are_not_messages_are_ignored(train_refusal, tmp_path, monkeypatch):
+    noise = ["print('a warning')", "print('{}')", "sys.stdout.buffer.write(b'\\xfc\\n')", STARTED, "print()"]
+    stand_in_trainer(tmp_path, monkeypatch, *noise, print_message_code(MessageType.FAILED, text="Enough."))
+    assert train_refusal() == "Enough."
+
+
+@pytest.mark.parametrize("lines", [(STARTED, print_message_code(MessageType.CANCELLED)), ()])
+def test_a_trainer_that_another_program_cancels_ends_with_status_130(elbow_files, tmp_path, monkeypatch, lines):
+    stand_in_trainer(tmp_path, monkeypatch, *lines, status=130)
+    assert run("train", elbow_files.recording, tmp_path / "m.onnx") == 130
+    assert not (tmp_path / "m.onnx").exists()
+
+
+def test_a_trainer_that_ignores_the_stop_request_is_killed(tmp_path, monkeypatch):
+    """Leaving the `with` block ends a process that would run for an hour and ignores requests."""
+    from fdda_addon.training import process
+
+    monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, "time.sleep(3600)")
+    with process.Training([]) as training:
+        assert next(training.messages()).type is MessageType.STARTED
+        popen = training._process
+    assert popen.returncode not in (None, 0) and not training._stop_file.exists()
+
+
+def test_polling_a_silent_trainer_does_not_block(tmp_path, monkeypatch):
+    """A modal operator polls for messages. A poll returns at once, and a canceled trainer ends without an error."""
+    from fdda_addon.training import process
+
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, "time.sleep(3600)")
+    with process.Training([]) as training:
+        messages = training.messages(wait=False)
+        message = next_message(messages)
+        assert message.type is MessageType.STARTED
+        seconds = []
+        for _ in range(100):
+            start = time.monotonic()
+            assert next(messages) is None
+            seconds.append(time.monotonic() - start)
+        assert statistics.median(seconds) < 0.0005  # Other processes may delay some polls.
+        assert max(seconds) < 1
+        monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
+        training.cancel()
+        assert next_message(messages) is None
+
+
+def next_message(messages: Iterator[Message | None], seconds: float = 20) -> Message | None:
+    """Poll until a training has a message and return the message, or None if the training ends."""
+    deadline = time.monotonic() + seconds
+    for message in messages:
+        if message is not None:
+            return message
+        assert time.monotonic() < deadline, "neither a message nor an end"
+        time.sleep(0.01)
+    return None

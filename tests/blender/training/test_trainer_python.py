@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Checks whether a Python can train, or can be the base of a training environment."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from fdda_addon.core.errors import TrainerEnvironmentError
+from fdda_addon.training.environment import check, creation, folder, interpreters, source_checks
+from fdda_addon.training.environment.check_result import CheckResult
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, excess_path_length, interpreter_path
+from fdda_addon.training.environment.interpreters import find_interpreters, query_interpreter
+
+from ..conftest import run
+from ..stand_ins import import_from, write_program
+from .tiny_wheels import TORCH
+
+ROOT = Path(__file__).resolve().parents[3]
+ADVICE = "do this"
+
+
+def asked(python: object) -> CheckResult:
+    return check.check(str(python), ADVICE)
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The first folder of Python's import path, with a module for each package."""
+    import_from(tmp_path / "packages", monkeypatch)
+    for name in PACKAGES:
+        (tmp_path / "packages" / name).mkdir(parents=True)
+        (tmp_path / "packages" / name / "__init__.py").write_text(
+            (TORCH if name == "torch" else "").replace("{version}", "9")
+        )
+    return tmp_path / "packages"
+
+
+def test_a_python_with_all_packages_can_train(packages: Path):
+    answer = asked(sys.executable)
+    version = ".".join(map(str, sys.version_info[:3]))
+    assert answer.level == "INFO" and answer.message == f"Ready to train on the CPU: Python {version}, torch 9."
+    assert answer.details[0] == f"Python {version}: {sys.executable}" and answer.details[-1] == "Device: the CPU"
+
+
+def test_check_trainer_prints_the_result(packages: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture):
+    monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
+    assert run("check-trainer") == 0
+    assert capfd.readouterr().out.splitlines()[-1].startswith("Ready to train on the CPU: ")
+    monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
+    assert run("check-trainer") == 1
+    assert re.fullmatch(
+        r"Error: The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); set "
+        r"FDDA_TRAINER_PYTHON to a Python that has torch\.\n",
+        capfd.readouterr().err,
+    )
+
+
+CARD = """
+from unittest.mock import MagicMock
+__version__ = "9"
+class cuda(MagicMock):
+    is_available = staticmethod(lambda: True)
+    get_device_name = staticmethod(lambda index: f"Card {index}")
+    synchronize = MagicMock()
+ones = MagicMock()
+"""
+
+
+def test_the_device_is_named(packages: Path):
+    (packages / "torch/__init__.py").write_text(CARD)
+    answer = asked(sys.executable)
+    assert "Ready to train on Card 0: " in answer.message and answer.details[-1] == "Device: Card 0 (CUDA)"
+
+
+def test_a_card_that_cannot_be_used_is_named(packages: Path):
+    error = "RuntimeError('CUDA error: no kernel image is available\\nCompile with `TORCH_USE_CUDA_DSA`')"
+    (packages / "torch/__init__.py").write_text(f"{CARD}ones.side_effect = {error}\n")
+    answer = asked(sys.executable)
+    assert answer.level == "INFO" and answer.details[-1] == "Device: the CPU"
+    assert answer.message.startswith(
+        "Ready to train on the CPU, because Card 0 cannot be used (CUDA error: no kernel image is available): Python"
+    )
+
+
+def test_output_of_imported_packages_is_ignored(packages: Path):
+    with (packages / "torch/__init__.py").open("a") as file:
+        file.write("print('[1, 2]', end='')\n")
+    assert asked(sys.executable).level == "INFO"
+
+
+def test_missing_packages_are_named(packages: Path):
+    (packages / "sitecustomize.py").write_text(
+        "import sys\nsys.modules.update(dict.fromkeys(['torch', 'onnx', 'numpy']))\n"
+    )
+    answer = asked(sys.executable)
+    assert answer.level == "ERROR" and answer.message.endswith("lacks torch, onnx and numpy; do this.")
+
+
+def test_a_broken_package_is_named_with_its_error(packages: Path):
+    (packages / "torch/__init__.py").write_text("raise OSError('libtorch.so: no such file')\n")
+    answer = asked(sys.executable)
+    assert answer.level == "ERROR" and "torch of " in answer.message and "libtorch.so: no such file" in answer.message
+    (packages / "torch/__init__.py").write_text("import typing_extensions_of_nobody\n")
+    assert (
+        "torch of " in asked(sys.executable).message and "typing_extensions_of_nobody" in asked(sys.executable).message
+    )
+
+
+def test_an_old_python_is_refused(tmp_path: Path):
+    said = json.dumps({"version": [3, 9, 18], "packages": {}, "broken": {}})
+    python = write_program(tmp_path / "python3.9", f"print({said!r})")
+    assert asked(python).message == f"'{python}' is Python 3.9.18, and the trainer needs 3.11 or later; do this."
+
+
+def test_a_missing_python_is_refused():
+    sentence = r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); do this\."
+    assert re.fullmatch(sentence, asked("/none/python").message)
+
+
+@pytest.mark.parametrize("said", ["", "hello", "5", "{}", '{"version": 3}'])
+def test_a_program_that_is_no_python_is_refused(tmp_path: Path, said: str):
+    python = write_program(tmp_path / "program", f"print({said!r})")
+    answer = asked(python)
+    assert answer.level == "ERROR"
+    assert answer.message.startswith(f"'{python}' does not answer as a Python does (status 0); do this.")
+
+
+def test_the_error_of_a_failing_python_is_shown(tmp_path: Path):
+    answer = asked(write_program(tmp_path / "program", "sys.exit('wrong machine of Jürgen 李')"))
+    assert "(wrong machine of Jürgen 李)" in answer.message
+    answer = asked(write_program(tmp_path / "crashes", "import faulthandler", "faulthandler._read_null()"))
+    assert ("(crashed: access violation" if os.name == "nt" else "(was ended by signal 11") in answer.message
+
+
+def test_a_hanging_python_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(check, "TIMEOUT_SECONDS", 0.5)
+    assert asked(write_program(tmp_path / "program", "time.sleep(5)")).message.endswith(
+        "did not answer in 0 s; do this."
+    )
+
+
+def test_candidates_are_run_to_find_the_usable_python(tmp_path: Path):
+    shim = write_program(tmp_path / "python3.13", "sys.exit('this version is not selected')")
+    hangs = write_program(tmp_path / "hangs")
+    python, real = sys.executable, sys.executable
+    if os.name != "nt":
+        real = write_program(tmp_path / "real", f"os.execv({python!r}, [{python!r}, *sys.argv[1:]])")
+    found = list(find_interpreters(iter([[shim], [hangs], ["/none"], [real], [sys.executable]])))
+    assert [(base.path, base.version, base.problem) for base in found] == [(sys.executable, sys.version_info[:2], "")]
+
+
+@pytest.mark.parametrize(
+    ("answer", "lacks"),
+    [
+        ([[3, 10], True, [], "/p"], "is none of 3.11, 3.12, 3.13"),
+        ([[3, 13], False, [], "/p"], "is not 64-bit"),
+        ([[3, 13], True, ["ensurepip", "venv"], "/p"], "lacks the module ensurepip"),
+    ],
+)
+def test_a_base_python_says_what_it_lacks(tmp_path: Path, answer: list, lacks: str):
+    base = query_interpreter([write_program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
+    assert base.problem == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
+
+
+def test_blenders_python_is_the_first_candidate(monkeypatch: pytest.MonkeyPatch):
+    assert next(interpreters.default_candidates()) == [sys.executable]
+    assert next(find_interpreters()).path == sys.executable
+
+
+def test_a_training_without_blenders_program_finds_the_environment_that_blender_made(tmp_path: Path):
+    own = tmp_path / "datafiles" / "fdda" / "trainer"
+    python = interpreter_path(own)
+    python.parent.mkdir(parents=True)
+    (own / COMPLETION_MARKER).write_text("made with other versions\n")
+    python.write_text("no program")
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    environment.pop(PYTHON_VARIABLE, None)
+    command = [sys.executable, "-m", "fdda_addon", "check-trainer"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.stderr.startswith(f"Error: The trainer's Python '{python}' cannot be started ("), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [
+        (
+            "OSError('[WinError 1114] … Error loading \"c10.dll\"')",
+            "install Microsoft's Visual C++ runtime from https:",
+        ),
+        (
+            "OSError('libtorch.so: cannot open shared object file')",
+            "install the package of this Linux that has 'libtorch",
+        ),
+    ],
+)
+def test_the_advice_on_a_library_that_cannot_be_loaded_is_shown(packages: Path, error: str, advice: str):
+    (packages / "torch/__init__.py").write_text(f"raise {error}\n")
+    assert f"); {advice}" in asked(sys.executable).message
+
+
+@pytest.fixture
+def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folders as Windows has them, with Pythons of every kind."""
+    names = {
+        "LOCALAPPDATA": "Local",
+        "APPDATA": "Roaming",
+        "ProgramFiles": "Program Files",
+        "ProgramW6432": "Program Files",
+        "SYSTEMDRIVE": "C",
+        "PYENV_ROOT": "pyenv-win",
+    }
+    for variable, name in names.items():
+        monkeypatch.setenv(variable, str(tmp_path / name))
+    monkeypatch.delenv("UV_PYTHON_INSTALL_DIR", raising=False)
+    monkeypatch.setattr(
+        interpreters, "_registry_interpreters", lambda version: iter([tmp_path / f"of_registry/{version}/python.exe"])
+    )
+    monkeypatch.setenv(
+        "PATH", os.pathsep.join(str(tmp_path / name) for name in ("Local/Microsoft/WindowsApps", "path"))
+    )
+    for name in (
+        "of_registry/3.13/python.exe",
+        "Local/Programs/Python/Python313/python.exe",
+        "Program Files/Python311/python.exe",
+        "Roaming/uv/python/cpython-3.12.9-windows-x86_64-none/python.exe",
+        "pyenv-win/versions/3.11.9/python.exe",
+        "Local/Microsoft/WindowsApps/python.exe",
+        "Local/Microsoft/WindowsApps/python3.13.exe",
+        "path/python.exe",
+        "path/py.exe",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+@pytest.mark.one_blender_version
+def test_pythons_are_searched_in_the_folders_of_windows(windows_folders: Path):
+    """Python.org, the launcher, uv and pyenv-win are searched; the alias of the Microsoft Store is skipped."""
+    found = [
+        (Path(path).relative_to(windows_folders).as_posix(), *rest)
+        for path, *rest in interpreters._windows_candidates()
+    ]
+    assert found == [
+        ("of_registry/3.13/python.exe",),
+        ("Local/Programs/Python/Python313/python.exe",),
+        ("path/py.exe", "-3.13"),
+        ("Program Files/Python311/python.exe",),
+        ("pyenv-win/versions/3.11.9/python.exe",),
+        ("path/py.exe", "-3.11"),
+        ("Roaming/uv/python/cpython-3.12.9-windows-x86_64-none/python.exe",),
+        ("path/py.exe", "-3.12"),
+        ("path/python.exe",),
+    ]
+
+
+@pytest.mark.skipif(os.name != "nt", reason="the registry is Windows'")
+def test_a_python_of_the_registry_is_found(tmp_path: Path):
+    import winreg
+
+    key = r"Software\Python\FDDATest"
+    with winreg.CreateKey(winreg.HKEY_CURRENT_USER, rf"{key}\3.13-64\InstallPath") as opened:
+        winreg.SetValue(opened, "", winreg.REG_SZ, str(tmp_path))
+    try:
+        assert tmp_path / "python.exe" in interpreters._registry_interpreters("3.13") and not [
+            *interpreters._registry_interpreters("3.1")
+        ]
+    finally:
+        for name in (rf"{key}\3.13-64\InstallPath", rf"{key}\3.13-64", key):
+            winreg.DeleteKey(winreg.HKEY_CURRENT_USER, name)
+
+
+@pytest.mark.one_blender_version
+def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    extension = r"AppData\Roaming\Blender Foundation\Blender\5.2\extensions\.user\user_default\fdda\trainer"
+    temporary = r"AppData\Local\Temp\fdda-12345678"
+
+    def missing(name: str) -> int:
+        return excess_path_length(*(Path(rf"C:\Users\{name}\{rest}") for rest in (extension, temporary)))
+
+    assert [missing(letters * "x") for letters in (15, 33, 34, 60)] == [0, 0, 1, 27]
+    monkeypatch.setattr(source_checks, "has_path_limit", lambda: True)
+    monkeypatch.setattr(source_checks, "excess_path_length", lambda *_: 7)
+    with pytest.raises(TrainerEnvironmentError, match=r"would be 7 letters too long for Windows; allow long paths \("):
+        list(creation.EnvironmentCreation(tmp_path / "trainer", tmp_path / "log").steps())
+    assert not (tmp_path / "trainer").exists()
+
+
+@pytest.mark.one_blender_version
+def test_package_names_match_the_trainer_group_of_pyproject():
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
+    assert set(folder.PACKAGES) == {requirement.partition("==")[0] for requirement in groups["trainer"]}
+    assert all(path.is_file() for path in map(folder.requirements_file, folder.PINNED_REQUIREMENTS))
