@@ -60,7 +60,11 @@ def unregister() -> None:
             blender_handlers.remove(handler)
     handlers.unregister()
     for package in (panels, operators, properties):
-        _unregister_package(package)
+        for module in reversed(_modules(package)):
+            if hasattr(module, "unregister"):
+                module.unregister()
+            for cls in reversed(module.CLASSES):
+                bpy.utils.unregister_class(cls)
 
 
 def handler_table() -> list[tuple[str, Callable[..., None]]]:
@@ -96,15 +100,6 @@ def _register_package(package: ModuleType) -> None:
             bpy.utils.register_class(cls)
         if hasattr(module, "register"):
             module.register()
-
-
-def _unregister_package(package: ModuleType) -> None:
-    """Undo `_register_package`."""
-    for module in reversed(_modules(package)):
-        if hasattr(module, "unregister"):
-            module.unregister()
-        for cls in reversed(module.CLASSES):
-            bpy.utils.unregister_class(cls)
 
 
 def _modules(package: ModuleType) -> list[ModuleType]:

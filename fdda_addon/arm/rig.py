@@ -29,11 +29,44 @@ def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
     """
     surface = sculpt_arm(density)
     armature_object = _create_armature_object()
-    _set_range_of_motion(armature_object)
+    # Set the range of motion as IK limits and locks, which do not clamp posing, so an action may exceed it.
+    for joint in JOINTS:
+        bone = armature_object.pose.bones[joint.name]
+        bone.rotation_mode = ROTATION_MODE
+        bone.lock_location = (True, True, True)
+        bone.lock_scale = (True, True, True)
+        bone.lock_rotation = tuple(limits == LOCKED_RANGE for limits in joint.limits)
+        for axis, (low, high) in zip("xyz", joint.limits, strict=True):
+            setattr(bone, f"lock_ik_{axis}", (low, high) == LOCKED_RANGE)
+            setattr(bone, f"use_ik_limit_{axis}", True)
+            setattr(bone, f"ik_min_{axis}", math.radians(low))
+            setattr(bone, f"ik_max_{axis}", math.radians(high))
     mesh_object = _create_mesh_object(surface)
     mesh_object.parent = armature_object
-    _add_skinning(mesh_object, armature_object, surface.joints)
-    _add_biceps(mesh_object, armature_object, surface)
+    for index, name in enumerate(JOINT_NAMES):
+        group = mesh_object.vertex_groups.new(name=name)
+        group.add(np.flatnonzero(surface.joints == index).tolist(), 1.0, "REPLACE")
+    modifier = mesh_object.modifiers.new("Armature", "ARMATURE")
+    modifier.object = armature_object
+    modifier.use_vertex_groups = True
+    modifier.use_bone_envelopes = False
+    modifier.use_deform_preserve_volume = False
+    basis = mesh_object.shape_key_add(name="Basis", from_mix=False)
+    key = mesh_object.shape_key_add(name=BICEPS_KEY, from_mix=False)
+    key.relative_key = basis
+    write(key.data, COORDINATE_ELEMENT, (surface.points + surface.biceps).astype(np.float32))
+    driver = key.driver_add("value").driver
+    driver.type = "SCRIPTED"
+    variable = driver.variables.new()
+    variable.name = "elbow"
+    variable.type = "TRANSFORMS"
+    target = variable.targets[0]
+    target.id = armature_object
+    target.bone_target = "elbow"
+    target.transform_type = "ROT_X"
+    target.transform_space = "LOCAL_SPACE"
+    # Blender evaluates such a simple expression itself, even if Python scripts are disabled.
+    driver.expression = f"clamp(elbow / {math.radians(ELBOW_FLEXION):.6f}, 0, 1)"
     _add_smoothing(mesh_object, density)
     assign_drive_action(armature_object)
     bpy.context.view_layer.update()
@@ -68,21 +101,6 @@ def _create_armature_object() -> bpy.types.Object:
     return armature_object
 
 
-def _set_range_of_motion(armature_object: bpy.types.Object):
-    """Set the range of motion as IK limits and locks, which do not clamp posing, so an action may exceed it."""
-    for joint in JOINTS:
-        bone = armature_object.pose.bones[joint.name]
-        bone.rotation_mode = ROTATION_MODE
-        bone.lock_location = (True, True, True)
-        bone.lock_scale = (True, True, True)
-        bone.lock_rotation = tuple(limits == LOCKED_RANGE for limits in joint.limits)
-        for axis, (low, high) in zip("xyz", joint.limits, strict=True):
-            setattr(bone, f"lock_ik_{axis}", (low, high) == LOCKED_RANGE)
-            setattr(bone, f"use_ik_limit_{axis}", True)
-            setattr(bone, f"ik_min_{axis}", math.radians(low))
-            setattr(bone, f"ik_max_{axis}", math.radians(high))
-
-
 def _create_mesh_object(surface: Surface) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(ARM_OBJECT)
     mesh.from_pydata(surface.points.tolist(), [], surface.faces.tolist())
@@ -108,36 +126,6 @@ def _create_material(name: str, color: tuple[float, float, float, float], roughn
     shader.inputs["Subsurface Weight"].default_value = 0.15
     shader.inputs["Subsurface Scale"].default_value = 0.01
     return material
-
-
-def _add_skinning(mesh_object: bpy.types.Object, armature_object: bpy.types.Object, vertex_joints: np.ndarray):
-    for index, name in enumerate(JOINT_NAMES):
-        group = mesh_object.vertex_groups.new(name=name)
-        group.add(np.flatnonzero(vertex_joints == index).tolist(), 1.0, "REPLACE")
-    modifier = mesh_object.modifiers.new("Armature", "ARMATURE")
-    modifier.object = armature_object
-    modifier.use_vertex_groups = True
-    modifier.use_bone_envelopes = False
-    modifier.use_deform_preserve_volume = False
-
-
-def _add_biceps(mesh_object: bpy.types.Object, armature_object: bpy.types.Object, surface: Surface):
-    basis = mesh_object.shape_key_add(name="Basis", from_mix=False)
-    key = mesh_object.shape_key_add(name=BICEPS_KEY, from_mix=False)
-    key.relative_key = basis
-    write(key.data, COORDINATE_ELEMENT, (surface.points + surface.biceps).astype(np.float32))
-    driver = key.driver_add("value").driver
-    driver.type = "SCRIPTED"
-    variable = driver.variables.new()
-    variable.name = "elbow"
-    variable.type = "TRANSFORMS"
-    target = variable.targets[0]
-    target.id = armature_object
-    target.bone_target = "elbow"
-    target.transform_type = "ROT_X"
-    target.transform_space = "LOCAL_SPACE"
-    # Blender evaluates such a simple expression itself, even if Python scripts are disabled.
-    driver.expression = f"clamp(elbow / {math.radians(ELBOW_FLEXION):.6f}, 0, 1)"
 
 
 def _add_smoothing(mesh_object: bpy.types.Object, density: int):

@@ -64,7 +64,15 @@ def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
             yield object_copy
         finally:
             object_copy.user_remap(mesh_object)
-            _remove_object(object_copy)
+            # Remove also its mesh and the action of its shape keys if nothing else uses them.
+            mesh = object_copy.data
+            animation = mesh.shape_keys.animation_data if mesh.shape_keys else None
+            action = animation.action if animation else None
+            bpy.data.objects.remove(object_copy)
+            if mesh.users == 0:
+                bpy.data.meshes.remove(mesh)
+                if action is not None and action.users == 0:
+                    bpy.data.actions.remove(action)
             mesh_object.name = name
 
 
@@ -134,18 +142,6 @@ def play_shape_keys(
     for index, point in enumerate(curve.keyframe_points):
         point.co, point.interpolation = ((first_frame + index) * time_ratio(), index + 1), "LINEAR"
     curve.update()
-
-
-def _remove_object(mesh_object: bpy.types.Object) -> None:
-    """Remove an object from the file; remove its mesh and the action of its shape keys if nothing else uses them."""
-    mesh = mesh_object.data
-    animation = mesh.shape_keys.animation_data if mesh.shape_keys else None
-    action = animation.action if animation else None
-    bpy.data.objects.remove(mesh_object)
-    if mesh.users == 0:
-        bpy.data.meshes.remove(mesh)
-        if action is not None and action.users == 0:
-            bpy.data.actions.remove(action)
 
 
 def _remove_deformation(mesh_object: bpy.types.Object, stack: ModifierStack) -> int:

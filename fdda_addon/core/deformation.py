@@ -187,7 +187,16 @@ def _setting_differences(
         # A setting may exist in one version of Blender only.
         if setting not in current or _are_equal(recorded_value, current[setting], tolerance):
             continue
-        if _is_control(group_label, name, setting, control_paths):
+        escaped = name.replace("\\", "\\\\").replace('"', '\\"')
+        owner, struct = {
+            "modifier": (MESH_OBJECT, f'modifiers["{escaped}"]'),
+            "shape key": (SHAPE_KEYS, f'key_blocks["{escaped}"]'),
+        }.get(group_label, ("", ""))
+        paths = (f"{struct}.{setting}", f'{struct}["{setting}"]')
+        if any(
+            control_owner == owner and _ARRAY_INDEX.sub("", versionless_path(control_path)) in paths
+            for control_owner, control_path in control_paths
+        ):
             continue
         setting_label = f"'{setting}' of the {group_label} '{name}'"
         if current[setting] is None:
@@ -198,19 +207,6 @@ def _setting_differences(
         else:
             clauses.append(f"{setting_label} differs")
     return clauses
-
-
-def _is_control(group_label: str, name: str, setting: str, control_paths: set[tuple[str, str]]) -> bool:
-    escaped = name.replace("\\", "\\\\").replace('"', '\\"')
-    owner, struct = {
-        "modifier": (MESH_OBJECT, f'modifiers["{escaped}"]'),
-        "shape key": (SHAPE_KEYS, f'key_blocks["{escaped}"]'),
-    }.get(group_label, ("", ""))
-    paths = (f"{struct}.{setting}", f'{struct}["{setting}"]')
-    return any(
-        control_owner == owner and _ARRAY_INDEX.sub("", versionless_path(control_path)) in paths
-        for control_owner, control_path in control_paths
-    )
 
 
 def _are_equal(value: object, current: object, abs_tolerance: float) -> bool:

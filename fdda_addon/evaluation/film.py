@@ -214,20 +214,17 @@ class _FilmPicture(Picture):
             self._cells.append((name, cell_mesh, curve))
         bottom = top + 2 * size + cell_size[1]
         if {LINEAR_ERROR, FDDA_ERROR} & set(settings.columns):
-            self._add_scale((gap, -(bottom + size)), size)
+            # Add the colors of the heat map, from no error to `max_error`.
+            x, y = gap, -(bottom + size)
+            colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
+            self.add_strip((x, y), (size, size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
+            self.add_text(f"below {NO_ERROR_METRES * 1000:g} mm", (x + 1.5 * size, y), 0.9 * size)
+            self.add_strip((x + 12 * size, y), (16 * size, size), colors)
+            self.add_text(f"{self._source.max_error * 1000:g} mm and above", (x + 28.5 * size, y), 0.9 * size)
             bottom += 2.6 * size
         self.height = bottom + gap
         width = min(settings.width, int(MAX_HEIGHT * self.width / self.height))
         self.set_up_render(is_sculpted=False, width_pixels=width, antialiasing="FXAA")
-
-    def _add_scale(self, position: tuple[float, float], size: float) -> None:
-        """Add the colors of the heat map, from no error to `max_error`."""
-        x, y = position
-        colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
-        self.add_strip((x, y), (size, size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
-        self.add_text(f"below {NO_ERROR_METRES * 1000:g} mm", (x + 1.5 * size, y), 0.9 * size)
-        self.add_strip((x + 12 * size, y), (16 * size, size), colors)
-        self.add_text(f"{self._source.max_error * 1000:g} mm and above", (x + 28.5 * size, y), 0.9 * size)
 
     def show(self, index: int, title: str) -> None:
         """Show a frame, given its index, with a title."""

@@ -145,7 +145,17 @@ class Overlay:
         gpu.state.depth_mask_set(True)
         try:
             for mesh in self.meshes(context):
-                _draw_mesh(mesh, shader, region_view)
+                attributes = {"position": mesh.positions, "normal": mesh.normals, "color": mesh.colors}
+                vertices = gpu.types.GPUVertBuf(_vertex_format(attributes), len(mesh.positions))
+                for name, values in attributes.items():
+                    vertices.attr_fill(name, values)
+                batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=mesh.triangles)
+                shader.bind()
+                shader.uniform_float("transform", region_view.perspective_matrix @ mesh.matrix)
+                towards_viewer = (region_view.view_matrix @ mesh.matrix).to_3x3().inverted_safe().col[2].normalized()
+                shader.uniform_float("towards", towards_viewer)
+                shader.uniform_float("offset", DEPTH_OFFSET)
+                batch.draw(shader)
         finally:
             gpu.state.depth_mask_set(False)
             gpu.state.depth_test_set("NONE")
@@ -154,26 +164,51 @@ class Overlay:
     def _draw_legend(self) -> None:
         lines, range_mm = self.legend(bpy.context)
         if lines:
-            _draw_lines(bpy.context, lines, range_mm)
+            # Draw the lines of the legend, and below them the colors of a heat map.
+            ui_scale = bpy.context.preferences.system.ui_scale
+            visible_regions = [region for region in bpy.context.area.regions if region.width > 1]
+            left_x = 24 * ui_scale + sum(region.width for region in visible_regions if region.type == "TOOLS")
+            # The legend is above the Adjust Last Operation panel, which is the region HUD.
+            bottom_y = 30 * ui_scale + sum(region.height for region in visible_regions if region.type == "HUD")
+            blf.size(0, 12 * ui_scale)
+            blf.enable(0, blf.SHADOW)
+            blf.shadow(0, 5, 0, 0, 0, 0.9)
+            if range_mm is not None:
+                height, width = 14 * ui_scale, 240 * ui_scale
+                strip_bottom = bottom_y + 18 * ui_scale
+                colors = viewport_colors(np.linspace(0, 1, 65), 1.0)
+                x_values = left_x + width * np.linspace(0, 1, len(colors))
+                corners = [(x, y) for x in x_values for y in (strip_bottom, strip_bottom + height)]
+                rgba = [(*color, 1.0) for color in colors.tolist() for _ in range(2)]
+                shader = gpu.shader.from_builtin("SMOOTH_COLOR")
+                batch = batch_for_shader(shader, "TRI_STRIP", {"pos": corners, "color": rgba})
+                batch.draw(shader)
+                for fraction, text in ((0, "0"), (0.5, f"{range_mm / 2:.4g}"), (1, f"{range_mm:.4g} mm and more")):
+                    half_width = blf.dimensions(0, text.split(" ")[0])[0] / 2
+                    _draw_text(text, left_x + fraction * width - half_width, bottom_y)
+                bottom_y += 46 * ui_scale
+            for line in reversed(lines):
+                _draw_text(line, left_x, bottom_y)
+                bottom_y += 18 * ui_scale
+            blf.disable(0, blf.SHADOW)
 
     def _mesh_shader(self) -> gpu.types.GPUShader:
         if self._shader is None:
-            self._shader = _create_mesh_shader()
+            info = gpu.types.GPUShaderCreateInfo()
+            info.push_constant("MAT4", "transform")
+            info.push_constant("VEC3", "towards")
+            info.push_constant("FLOAT", "offset")
+            for slot, name in enumerate(("position", "normal", "color")):
+                info.vertex_in(slot, "VEC3", name)
+            interface = gpu.types.GPUStageInterfaceInfo("fdda_interface")
+            interface.smooth("VEC3", "paint")
+            interface.smooth("FLOAT", "shade")
+            info.vertex_out(interface)
+            info.fragment_out(0, "VEC4", "outcome")
+            info.vertex_source(VERTEX_SHADER)
+            info.fragment_source(FRAGMENT_SHADER)
+            self._shader = gpu.shader.create_from_info(info)
         return self._shader
-
-
-def _draw_mesh(mesh: OverlayMesh, shader: gpu.types.GPUShader, region_view: bpy.types.RegionView3D) -> None:
-    attributes = {"position": mesh.positions, "normal": mesh.normals, "color": mesh.colors}
-    vertices = gpu.types.GPUVertBuf(_vertex_format(attributes), len(mesh.positions))
-    for name, values in attributes.items():
-        vertices.attr_fill(name, values)
-    batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=mesh.triangles)
-    shader.bind()
-    shader.uniform_float("transform", region_view.perspective_matrix @ mesh.matrix)
-    towards_viewer = (region_view.view_matrix @ mesh.matrix).to_3x3().inverted_safe().col[2].normalized()
-    shader.uniform_float("towards", towards_viewer)
-    shader.uniform_float("offset", DEPTH_OFFSET)
-    batch.draw(shader)
 
 
 def _draw_bones(context: bpy.types.Context, bones: list[OverlayBone]) -> None:
@@ -199,60 +234,6 @@ def _vertex_format(names: Iterable[str]) -> gpu.types.GPUVertFormat:
     for name in names:
         vertex_format.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
     return vertex_format
-
-
-def _create_mesh_shader() -> gpu.types.GPUShader:
-    info = gpu.types.GPUShaderCreateInfo()
-    info.push_constant("MAT4", "transform")
-    info.push_constant("VEC3", "towards")
-    info.push_constant("FLOAT", "offset")
-    for slot, name in enumerate(("position", "normal", "color")):
-        info.vertex_in(slot, "VEC3", name)
-    interface = gpu.types.GPUStageInterfaceInfo("fdda_interface")
-    interface.smooth("VEC3", "paint")
-    interface.smooth("FLOAT", "shade")
-    info.vertex_out(interface)
-    info.fragment_out(0, "VEC4", "outcome")
-    info.vertex_source(VERTEX_SHADER)
-    info.fragment_source(FRAGMENT_SHADER)
-    return gpu.shader.create_from_info(info)
-
-
-def _draw_lines(context: bpy.types.Context, lines: list[str], range_mm: float | None) -> None:
-    """Draw the lines of the legend, and below them the colors of a heat map."""
-    ui_scale = context.preferences.system.ui_scale
-    visible_regions = [region for region in context.area.regions if region.width > 1]
-    left_x = 24 * ui_scale + sum(region.width for region in visible_regions if region.type == "TOOLS")
-    # The legend is above the Adjust Last Operation panel, which is the region HUD.
-    bottom_y = 30 * ui_scale + sum(region.height for region in visible_regions if region.type == "HUD")
-    blf.size(0, 12 * ui_scale)
-    blf.enable(0, blf.SHADOW)
-    blf.shadow(0, 5, 0, 0, 0, 0.9)
-    if range_mm is not None:
-        _draw_color_scale(left_x, bottom_y, ui_scale, range_mm)
-        bottom_y += 46 * ui_scale
-    for line in reversed(lines):
-        _draw_text(line, left_x, bottom_y)
-        bottom_y += 18 * ui_scale
-    blf.disable(0, blf.SHADOW)
-
-
-def _draw_color_scale(left: float, bottom: float, ui_scale: float, range_mm: float) -> None:
-    height, width = 14 * ui_scale, 240 * ui_scale
-    strip_bottom = bottom + 18 * ui_scale
-    _draw_strip(left, strip_bottom, width, height, viewport_colors(np.linspace(0, 1, 65), 1.0))
-    for fraction, text in ((0, "0"), (0.5, f"{range_mm / 2:.4g}"), (1, f"{range_mm:.4g} mm and more")):
-        half_width = blf.dimensions(0, text.split(" ")[0])[0] / 2
-        _draw_text(text, left + fraction * width - half_width, bottom)
-
-
-def _draw_strip(left: float, bottom: float, width: float, height: float, colors: np.ndarray) -> None:
-    x_values = left + width * np.linspace(0, 1, len(colors))
-    corners = [(x, y) for x in x_values for y in (bottom, bottom + height)]
-    rgba = [(*color, 1.0) for color in colors.tolist() for _ in range(2)]
-    shader = gpu.shader.from_builtin("SMOOTH_COLOR")
-    batch = batch_for_shader(shader, "TRI_STRIP", {"pos": corners, "color": rgba})
-    batch.draw(shader)
 
 
 def _draw_text(text: str, x: float, y: float) -> None:

@@ -97,7 +97,14 @@ def driver_needs(driver: bpy.types.Driver) -> Iterator[Node]:
             elif variable.type == "SINGLE_PROP" and target.id is not None:
                 yield from _path_needs(target.id, target.data_path)
     if driver.type == "SCRIPTED":
-        yield from _expression_needs(driver.expression)
+        # Yield the objects and bones whose names are quoted in an expression, such as `bpy.data.objects["rig"]`.
+        for match in _QUOTED_TEXT.finditer(driver.expression):
+            name = match["text"]
+            if (scene_object := bpy.data.objects.get(name)) is not None:
+                yield datablock_node(scene_object)
+            for armature_object in bpy.data.objects:
+                if is_armature(armature_object) and name in armature_object.data.bones:
+                    yield bone_node(armature_object, name)
 
 
 def _context_needs(target: bpy.types.DriverTarget) -> Iterator[Node]:
@@ -133,17 +140,6 @@ def _pointer(datablock: bpy.types.ID, path: str) -> _Pointer | None:
         if isinstance(value, bpy.types.ID):
             return _Pointer(value, part.end())
     return None
-
-
-def _expression_needs(expression: str) -> Iterator[Node]:
-    """Yield the objects and bones whose names are quoted in an expression, such as `bpy.data.objects["rig"]`."""
-    for match in _QUOTED_TEXT.finditer(expression):
-        name = match["text"]
-        if (scene_object := bpy.data.objects.get(name)) is not None:
-            yield datablock_node(scene_object)
-        for armature_object in bpy.data.objects:
-            if is_armature(armature_object) and name in armature_object.data.bones:
-                yield bone_node(armature_object, name)
 
 
 def _armature_objects(datablock: bpy.types.ID) -> list[bpy.types.Object]:

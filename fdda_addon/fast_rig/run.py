@@ -98,7 +98,20 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
     scene_rigs = [scene_rig for scene_rig, _ in rigs_and_models]
     armature_object = _shared_armature(scene_rigs)
     for scene_rig, model in rigs_and_models:
-        _bind_packed(scene_rig, model)
+        # Bind a model and pack it.
+        mesh_object = scene_rig.mesh_object
+        unbind(mesh_object)
+        check_evaluable(scene_rig)
+        data = read_model(model)[1]
+        text = packed_model.pack(model.name, data)
+        bind(scene_rig, model, use_in_render=True, packed_text=text)
+        binding = mesh_object.fdda
+        # The other models of the library were trained for the full rig, and their files may not be there.
+        binding.models.clear()
+        entry = binding.models.add()
+        entry.name, entry.path, entry.packed, entry.packed_bytes = model.stem, binding.model, text, len(data)
+        binding.model_index = 0
+        _evaluate_model(mesh_object)
     networks = [network_of(rig.mesh_object) for rig in scene_rigs]
     joint_names = tuple(dict.fromkeys(n for network in networks for n in network.info.joint_names if n != STATIC_JOINT))
     controls = tuple(sorted(control_bones(armature_object, choices)))
@@ -164,23 +177,6 @@ def _shared_armature(scene_rigs: list[SceneRig]) -> bpy.types.Object:
         if scene_rig.mesh_object.fdda.is_fast_rig:
             raise RigError(f"'{scene_rig.mesh_object.name}' is a fast rig already; give the file of the full rig.")
     return scene_rigs[0].armature_object
-
-
-def _bind_packed(scene_rig: SceneRig, model: Path) -> None:
-    """Bind a model and pack it."""
-    mesh_object = scene_rig.mesh_object
-    unbind(mesh_object)
-    check_evaluable(scene_rig)
-    data = read_model(model)[1]
-    text = packed_model.pack(model.name, data)
-    bind(scene_rig, model, use_in_render=True, packed_text=text)
-    binding = mesh_object.fdda
-    # The other models of the library were trained for the full rig, and their files may not be there.
-    binding.models.clear()
-    entry = binding.models.add()
-    entry.name, entry.path, entry.packed, entry.packed_bytes = model.stem, binding.model, text, len(data)
-    binding.model_index = 0
-    _evaluate_model(mesh_object)
 
 
 def _remove_unneeded(scene_rigs: list[SceneRig], joint_names: tuple[str, ...], controls: tuple[str, ...]) -> Removed:

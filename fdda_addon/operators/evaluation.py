@@ -2,7 +2,6 @@
 """Operators of the section "Compare with Rig": evaluate the model, color the mesh, show the rig, open the report."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import bpy
 
@@ -185,7 +184,12 @@ class FDDA_OT_open_report(RigOperator, bpy.types.Operator):
     needs = NEEDS_MODEL
 
     def apply(self, context: bpy.types.Context) -> str:
-        path = self._report_page(self.bound_rig(context).mesh_object)
+        mesh_object = self.bound_rig(context).mesh_object
+        entry = bound_entry(mesh_object)
+        if entry is None:
+            model_list.add_bound_model(mesh_object)
+            entry = bound_entry(mesh_object)
+        path = page_path(model_list.entry_path(mesh_object, entry).resolve())
         if not path.is_file():
             raise ModelError(f"There is no report '{path}'; move it next to the model, or train again.")
         try:
@@ -193,14 +197,6 @@ class FDDA_OT_open_report(RigOperator, bpy.types.Operator):
         except RuntimeError as error:
             raise ModelError(f"No web browser could be started; open '{path}' yourself.") from error
         return f"Opened {path} in the web browser."
-
-    def _report_page(self, mesh_object: bpy.types.Object) -> Path:
-        """Return the path of the training report of the bound model, an HTML page."""
-        entry = bound_entry(mesh_object)
-        if entry is None:
-            model_list.add_bound_model(mesh_object)
-            entry = bound_entry(mesh_object)
-        return page_path(model_list.entry_path(mesh_object, entry).resolve())
 
 
 class FDDA_OT_show_rig(RigOperator, bpy.types.Operator):

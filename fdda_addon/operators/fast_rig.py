@@ -69,7 +69,7 @@ class FDDA_OT_fast_rig(FileJobOperator, bpy.types.Operator):
         mesh_objects = [
             o
             for o in context.scene.objects
-            if o.type == "MESH" and o.fdda.is_bound and _uses_armature(o, scene_rig.armature_object)
+            if o.type == "MESH" and o.fdda.is_bound and armature_of(o) == scene_rig.armature_object
         ]
         with temporary_folder() as folder:
             model = _write_models(mesh_objects, folder)
@@ -102,10 +102,6 @@ class FDDA_OT_fast_rig(FileJobOperator, bpy.types.Operator):
             raise RigError(f"'{mesh_object.name}' comes from a library; open the file of the character.")
         if not bpy.data.filepath:
             raise RigError("Save the .blend file first: the fast rig is made from the saved file.")
-
-
-def _uses_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
-    return armature_of(mesh_object) == armature_object
 
 
 def _write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:

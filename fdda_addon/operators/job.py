@@ -163,7 +163,15 @@ class JobOperator(RigOperator):
         progress = (state.stage, state.done, len(state.warnings), state.cancel_requested)
         if progress != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
             self._drawn_progress, self._last_redraw = progress, now
-            self._show_status(context)
+            # Show the progress in the status bar, beside Blender's hints if the user can work meanwhile.
+            text = f"{self.title}: {self.state.sentence}"
+            if self.state.remaining_seconds is not None:
+                text += f", {self.state.remaining_text.lower()}"
+            if self.changes_scene:
+                self._set_status_text(context, f"{text} (ESC: cancel)")
+            elif len(context.window.modal_operators) <= 1:
+                # Another modal operator, such as Move, shows its own keys.
+                self._set_status_text(context, text)
             redraw()
         return None
 
@@ -176,17 +184,6 @@ class JobOperator(RigOperator):
             bpy.ops.ed.undo_push(message=self.title)
         self.report({state.outcome_level}, state.outcome)
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
-
-    def _show_status(self, context: bpy.types.Context) -> None:
-        """Show the progress in the status bar, beside Blender's hints if the user can work meanwhile."""
-        text = f"{self.title}: {self.state.sentence}"
-        if self.state.remaining_seconds is not None:
-            text += f", {self.state.remaining_text.lower()}"
-        if self.changes_scene:
-            self._set_status_text(context, f"{text} (ESC: cancel)")
-        elif len(context.window.modal_operators) <= 1:
-            # Another modal operator, such as Move, shows its own keys.
-            self._set_status_text(context, text)
 
     def _set_status_text(self, context: bpy.types.Context, text: str | None) -> None:
         """Show a text in the status bar; None restores Blender's own."""

@@ -46,7 +46,19 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene
-        hidden = _hide_startup_cube(context)
+        cube = context.scene.objects.get("Cube")
+        hidden = (
+            cube is not None
+            and cube.type == "MESH"
+            and len(cube.data.vertices) == 8
+            and not cube.modifiers
+            and cube.animation_data is None
+            and cube.matrix_world == Matrix.Identity(4)
+            and cube.visible_get()
+        )
+        if hidden:
+            cube.hide_set(True)
+            cube.hide_render = True
         frames = (scene.frame_start, scene.frame_end, scene.frame_current)
         has_animation = len(bpy.data.actions) > 0
         mesh_object, armature_object = build_arm(int(self.density))
@@ -65,24 +77,6 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
             {"INFO"}, f"Added '{mesh_object.name}' with {count:,} vertices on '{armature_object.name}'.{remark}"
         )
         return {"FINISHED"}
-
-
-def _hide_startup_cube(context: bpy.types.Context) -> bool:
-    """Hide the default cube if it is unchanged; return whether it was hidden."""
-    cube = context.scene.objects.get("Cube")
-    is_untouched = (
-        cube is not None
-        and cube.type == "MESH"
-        and len(cube.data.vertices) == 8
-        and not cube.modifiers
-        and cube.animation_data is None
-        and cube.matrix_world == Matrix.Identity(4)
-        and cube.visible_get()
-    )
-    if is_untouched:
-        cube.hide_set(True)
-        cube.hide_render = True
-    return is_untouched
 
 
 class FDDA_OT_measure(JobOperator, bpy.types.Operator):

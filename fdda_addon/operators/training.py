@@ -89,7 +89,12 @@ class TrainingOperator(JobOperator):
         if not bpy.app.background and is_detached(model):
             return AttachedTraining(model)
         _check_recording(recording)
-        _make_folder(model)
+        try:
+            model.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"Cannot make the folder '{model.parent}': {os_error_text(error)}; choose another."
+            ) from error
         keep_former_model(model)
         settings = mesh_object.fdda.settings
         arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
@@ -231,15 +236,6 @@ def _pose_count(recording: Path) -> int:
         return read_index(recording)["poses"]
     except FDDAError:
         return 0
-
-
-def _make_folder(model: Path) -> None:
-    try:
-        model.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"Cannot make the folder '{model.parent}': {os_error_text(error)}; choose another."
-        ) from error
 
 
 def _follow_detached_training() -> None:

@@ -88,7 +88,11 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
         message = self._show_pose(context)
         if self.zoom:
             scene_rig, last, poses = self.worst_poses(context, self.rank)
-            _look_at_vertex(scene_rig.mesh_object, int(last.errors["fdda"][poses[-1][0]].argmax()))
+            index = int(last.errors["fdda"][poses[-1][0]].argmax())
+            evaluated_object = scene_rig.mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+            # Modifiers that add vertices, such as a subdivision, keep the first ones.
+            position = evaluated_object.matrix_world @ evaluated_object.data.vertices[index].co
+            center_views(position, max(max(evaluated_object.dimensions) / 20, 1e-4))
         return message
 
     def _show_pose(self, context: bpy.types.Context) -> str:
@@ -104,14 +108,6 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
         context.view_layer.update()
         context.window_manager.fdda_view.pose = index
         return f"Random pose {index + 1}: max error {error_mm:.2f} mm."
-
-
-def _look_at_vertex(mesh_object: bpy.types.Object, index: int) -> None:
-    """Look at a vertex of a mesh object in all viewports, from as near as a tenth of the object."""
-    evaluated_object = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    # Modifiers that add vertices, such as a subdivision, keep the first ones.
-    position = evaluated_object.matrix_world @ evaluated_object.data.vertices[index].co
-    center_views(position, max(max(evaluated_object.dimensions) / 20, 1e-4))
 
 
 CLASSES = (FDDA_OT_add_worst_markers, FDDA_OT_remove_markers, FDDA_OT_jump_to_worst)

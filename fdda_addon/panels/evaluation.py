@@ -44,7 +44,15 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         elif scene_rig.mesh_object.fdda.is_fast_rig:
             draw_wrapped(layout, context, "This is a fast rig: compare the model in the file of the full rig.", "INFO")
         else:
-            _draw_side_by_side(layout, context, scene_rig)
+            column = layout.column(align=True)
+            column.label(text="Show the Rig")
+            row = column.row(align=True)
+            current_placement = side_by_side.display_mode(scene_rig.mesh_object)
+            for placement, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
+                button = row.operator("fdda.show_rig", text=text, depress=current_placement == placement)
+                button.placement = placement
+                if mesh_count(context):
+                    button.all_meshes = True
             self._draw_evaluate(context, scene_rig)
         last = last_evaluation.get(scene_rig.mesh_object)
         if last is not None:
@@ -54,7 +62,11 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             _draw_worst(layout, context, view, last)
         if scene_rig.mesh_object.fdda.is_bound:
             if not scene_rig.mesh_object.fdda.is_fast_rig:
-                _draw_film(layout, context)
+                state = job.state_of("render_comparison")
+                if state is None or not state.is_running:
+                    layout.operator("fdda.render_comparison", text="Render Comparison…", icon="RENDER_ANIMATION")
+                if state is not None:
+                    draw_job(layout, context, "render_comparison")
             layout.operator("fdda.open_report", icon="URL")
 
     def _draw_evaluate(self, context: bpy.types.Context, scene_rig: object) -> None:
@@ -86,26 +98,6 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         button.source, button.poses, button.seed = view.source, view.poses, view.seed
         if state is not None and state.outcome_level != "INFO":
             draw_job(layout, context, "evaluate")
-
-
-def _draw_film(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    state = job.state_of("render_comparison")
-    if state is None or not state.is_running:
-        layout.operator("fdda.render_comparison", text="Render Comparison…", icon="RENDER_ANIMATION")
-    if state is not None:
-        draw_job(layout, context, "render_comparison")
-
-
-def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, scene_rig: SceneRig) -> None:
-    column = layout.column(align=True)
-    column.label(text="Show the Rig")
-    row = column.row(align=True)
-    current_placement = side_by_side.display_mode(scene_rig.mesh_object)
-    for placement, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
-        button = row.operator("fdda.show_rig", text=text, depress=current_placement == placement)
-        button.placement = placement
-        if mesh_count(context):
-            button.all_meshes = True
 
 
 def _draw_statistics(

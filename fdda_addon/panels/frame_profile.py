@@ -27,27 +27,23 @@ def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     if state is not None and (state.is_running or state.outcome_level != "INFO"):
         draw_job(body, context, "profile_frame")
     if profile is not None:
-        _draw_parts(body, context, profile)
+        smallest_ms = MIN_SHOWN_SHARE * profile.frame.median
+        shown = [
+            (part, part.duration.median / max(profile.total, 1e-9))
+            for part in profile.parts
+            if part.duration.median >= smallest_ms
+        ]
+        letters = ascii_uppercase[: len(shown)]
+        column = body.column(align=True)
+        _draw_bar(column, [(letter, share) for letter, (_, share) in zip(letters, shown, strict=False)])
+        for index, (part, share) in enumerate(shown):
+            letter, percentage = letters[index : index + 1], f"{share:.0%}" if share >= 0.01 else "<1%"
+            draw_wrapped(column, context, f"{letter}  {percentage}  {part.duration} ms  {part.title}")
         _draw_groups(body, context, profile)
         for sentence in profile.savings_sentences():
             draw_wrapped(body, context, sentence, "INFO")
     if state is None or not state.is_running:
         body.operator("fdda.profile_frame", icon="TIME").object = rig.mesh_object.name
-
-
-def _draw_parts(layout: bpy.types.UILayout, context: bpy.types.Context, profile: "FrameProfile") -> None:
-    smallest_ms = MIN_SHOWN_SHARE * profile.frame.median
-    shown = [
-        (part, part.duration.median / max(profile.total, 1e-9))
-        for part in profile.parts
-        if part.duration.median >= smallest_ms
-    ]
-    letters = ascii_uppercase[: len(shown)]
-    column = layout.column(align=True)
-    _draw_bar(column, [(letter, share) for letter, (_, share) in zip(letters, shown, strict=False)])
-    for index, (part, share) in enumerate(shown):
-        letter, percentage = letters[index : index + 1], f"{share:.0%}" if share >= 0.01 else "<1%"
-        draw_wrapped(column, context, f"{letter}  {percentage}  {part.duration} ms  {part.title}")
 
 
 def _draw_bar(layout: bpy.types.UILayout, segments: list[tuple[str, float]]) -> None:

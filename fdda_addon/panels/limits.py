@@ -158,7 +158,16 @@ def draw_limits(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
     session, bones = context.window_manager.fdda, rig.armature_object.pose.bones
     body.template_list("FDDA_UL_bones", "", rig.armature_object.pose, "bones", session, "bone_index", rows=5)
     if 0 <= session.bone_index < len(bones):
-        _draw_bone(body, rig, bones[session.bone_index])
+        # Draw the limits of the active bone of the list; draw nothing if the list does not show the bone.
+        bone = bones[session.bone_index]
+        channels = sampled_channels_by_bone(rig)
+        if channels is None:
+            _draw_limits(body.box(), rig, bone)
+        elif bone.name in channels:
+            if rig.mesh_object.fdda.settings.sample in {"ACTIONS", "REMIX"}:
+                sampling.draw_channels(body.box(), bone, channels[bone.name])
+            else:
+                _draw_limits(body.box(), rig, bone)
     _draw_selected_bones(body, rig)
 
 
@@ -181,18 +190,6 @@ def _draw_selected_bones(layout: bpy.types.UILayout, rig: SceneRig) -> None:
 @draw_cached
 def _count_selected(rig: SceneRig) -> int:
     return sum(map(is_selected, rig.armature_object.pose.bones))
-
-
-def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
-    """Draw the limits of the active bone of the list; draw nothing if the list does not show the bone."""
-    channels = sampled_channels_by_bone(rig)
-    if channels is None:
-        _draw_limits(layout.box(), rig, bone)
-    elif bone.name in channels:
-        if rig.mesh_object.fdda.settings.sample in {"ACTIONS", "REMIX"}:
-            sampling.draw_channels(layout.box(), bone, channels[bone.name])
-        else:
-            _draw_limits(layout.box(), rig, bone)
 
 
 @draw_cached

@@ -75,10 +75,24 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             self._draw_times(context, mesh_object)
             self._draw_confidence(context, mesh_object)
             self._draw_bake(context)
-            _draw_fast_rig(layout, context, mesh_object)
+            if mesh_object.fdda.is_fast_rig:
+                text = (
+                    "This is a fast rig: it lacks modifiers and bones of the full rig. For rendering, relocate the "
+                    "library to the file of the full rig."
+                )
+                draw_wrapped(layout, context, text, "INFO")
+            elif not draw_job(layout, context, "fast_rig"):
+                layout.operator("fdda.fast_rig", text="Fast Rig…", icon="ARMATURE_DATA")
         draw_button(layout, context, "fdda.unbind", "Unbind", "UNLINKED")
         if not mesh_object.fdda.status and (advanced := draw_advanced(layout, "fdda_model_advanced")) is not None:
-            _draw_mask(advanced, mesh_object)
+            # Draw the vertex group that limits the model.
+            binding = mesh_object.fdda
+            mask = advanced.row(align=True)
+            mask.enabled = binding.mode == "FDDA"
+            mask.prop_search(binding, "mask", mesh_object, "vertex_groups")
+            invert = mask.row(align=True)
+            invert.active = bool(binding.mask)
+            invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
 
     def _draw_unbound(self, context: bpy.types.Context, rig: SceneRig) -> None:
         mesh_object = rig.mesh_object
@@ -215,28 +229,6 @@ def _draw_speed(layout: bpy.types.UILayout, context: bpy.types.Context, mesh_obj
         row.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
     if state is not None and (state.is_running or state.outcome_level != "INFO"):
         draw_job(layout, context, "measure_model")
-
-
-def _draw_mask(column: bpy.types.UILayout, mesh_object: bpy.types.Object) -> None:
-    """Draw the vertex group that limits the model."""
-    binding = mesh_object.fdda
-    mask = column.row(align=True)
-    mask.enabled = binding.mode == "FDDA"
-    mask.prop_search(binding, "mask", mesh_object, "vertex_groups")
-    invert = mask.row(align=True)
-    invert.active = bool(binding.mask)
-    invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
-
-
-def _draw_fast_rig(layout: bpy.types.UILayout, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-    if mesh_object.fdda.is_fast_rig:
-        text = (
-            "This is a fast rig: it lacks modifiers and bones of the full rig. For rendering, relocate the "
-            "library to the file of the full rig."
-        )
-        draw_wrapped(layout, context, text, "INFO")
-    elif not draw_job(layout, context, "fast_rig"):
-        layout.operator("fdda.fast_rig", text="Fast Rig…", icon="ARMATURE_DATA")
 
 
 CLASSES = (FDDA_PT_playback,)

@@ -54,7 +54,13 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         row = layout.row(align=True)
         row.prop(context.window_manager.fdda, "preview_pose")
         row.operator("fdda.rest_pose", text="Rest Pose", icon="LOOP_BACK")
-        _draw_sentences(layout, context, rig)
+        # Draw the sentences that come and go, below the buttons, so that these do not move under the mouse.
+        if not _has_poses(rig):
+            draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
+        if limits.lacks_limits(rig):
+            text = "No rotation limits found. Every bone will rotate ±45°; set limits, or press Human Limits."
+            draw_wrapped(layout, context, text, "ERROR")
+        sampling.draw_channel_counts(layout, context, rig)
         limits.draw_limits(layout, context, rig)
         sampling.draw_extra_inputs(layout, rig)
         if (advanced := draw_advanced(layout, "fdda_poses_advanced")) is not None:
@@ -78,16 +84,6 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
     # Only the frames of checked actions are mirrored.
     row.active = any(action.fdda.record for action in actions)
     row.prop(settings, "mirror")
-
-
-def _draw_sentences(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    """Draw the sentences that come and go, below the buttons, so that these do not move under the mouse."""
-    if not _has_poses(rig):
-        draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
-    if limits.lacks_limits(rig):
-        text = "No rotation limits found. Every bone will rotate ±45°; set limits, or press Human Limits."
-        draw_wrapped(layout, context, text, "ERROR")
-    sampling.draw_channel_counts(layout, context, rig)
 
 
 def _has_poses(rig: SceneRig) -> bool:

@@ -54,7 +54,16 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         for problem in check.problems if check else ():
             draw_wrapped(layout.box(), context, problem, "ERROR")
         if check:
-            _draw_replaced(layout, rig.mesh_object, check.replaced_modifiers)
+            mesh_object = rig.mesh_object
+            column = layout.column(align=True)
+            column.label(text="Replaced by the Model:")
+            for modifier in (
+                mesh_object.modifiers[name] for name in check.replaced_modifiers if name in mesh_object.modifiers
+            ):
+                column.label(text=modifier.name, icon=MODIFIER_ICONS.get(modifier.type, "MODIFIER"))
+            if mesh_object.data.shape_keys:
+                count = len(mesh_object.data.shape_keys.key_blocks) - 1
+                column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
         if not is_fast_rig:
             _draw_cost(layout, context, rig)
             draw_profile(layout, context, rig)
@@ -94,16 +103,6 @@ def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     if deforming_count != bone_count:
         count_text = f"{deforming_count:,} of {count_text}"
     column.label(text=f"{rig.armature_object.name}: {count_text}", icon="ARMATURE_DATA")
-
-
-def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, replaced: tuple[str, ...]) -> None:
-    column = layout.column(align=True)
-    column.label(text="Replaced by the Model:")
-    for modifier in (mesh_object.modifiers[name] for name in replaced if name in mesh_object.modifiers):
-        column.label(text=modifier.name, icon=MODIFIER_ICONS.get(modifier.type, "MODIFIER"))
-    if mesh_object.data.shape_keys:
-        count = len(mesh_object.data.shape_keys.key_blocks) - 1
-        column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
 
 
 def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

@@ -75,7 +75,19 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             curves.draw(layout, state.curves)
         if trained is not None and not trained.mismatch:
             _draw_assessment(layout, context, trained.path)
-            _draw_next_buttons(layout, context, rig, trained, can_train)
+            # Draw the buttons that follow a training: the model is bound, or improved.
+            if not rig.mesh_object.fdda.is_bound:
+                row = layout.row()
+                row.scale_y = 1.3
+                bind = row.operator("fdda.bind", text=f"Bind '{trained.path.name}'", icon="LINKED")
+                bind.object, bind.filepath = rig.mesh_object.name, str(trained.path)
+            improve = layout.column(align=True)
+            improve.enabled = can_train
+            improve.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
+            if checkpoint_path(trained.path).is_file():
+                improve.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
+            else:
+                draw_wrapped(layout, context, "Its checkpoint is missing, so training cannot continue from it.", "INFO")
             _draw_report(layout, context, rig, trained.path)
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
             settings = rig.mesh_object.fdda.settings
@@ -156,24 +168,6 @@ def _draw_settings(
         draw_wrapped(layout, context, text, "ERROR")
     elif trained is not None:
         draw_wrapped(layout, context, f"{trained.path.name} exists; Train Again keeps it as the previous model.")
-
-
-def _draw_next_buttons(
-    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile, can_train: bool
-) -> None:
-    """Draw the buttons that follow a training: the model is bound, or improved."""
-    if not rig.mesh_object.fdda.is_bound:
-        row = layout.row()
-        row.scale_y = 1.3
-        bind = row.operator("fdda.bind", text=f"Bind '{trained.path.name}'", icon="LINKED")
-        bind.object, bind.filepath = rig.mesh_object.name, str(trained.path)
-    improve = layout.column(align=True)
-    improve.enabled = can_train
-    improve.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
-    if checkpoint_path(trained.path).is_file():
-        improve.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
-    else:
-        draw_wrapped(layout, context, "Its checkpoint is missing, so training cannot continue from it.", "INFO")
 
 
 def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, model: Path) -> None:

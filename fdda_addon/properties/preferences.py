@@ -66,36 +66,30 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
         layout = self.layout
         layout.label(text="Training needs PyTorch, in a Python of its own. Everything else works without it.")
         draw_own_environment(layout, self)
-        draw_check(layout)
+        _, right = _split_row(layout)
+        right.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
+        if current(ENVIRONMENT) is None:
+            draw_check_result(layout, session.check_result)
         layout.separator()
-        draw_models(layout, self)
+        # Draw the settings of packing, and the folders from which models are loaded.
+        column = layout.column()
+        column.label(text="Models load if packed, or in the .blend file's folder")
+        column.prop(self, "pack_models")
+        column.label(text="Also load models from:")
+        for index, folder in enumerate(self.folders):
+            row = column.row(align=True)
+            row.prop(folder, "path", text="")
+            row.operator("fdda.remove_trusted_folder", text="", icon="REMOVE").index = index
+        column.operator("fdda.add_trusted_folder", text="Add Folder…", icon="ADD")
         header, body = layout.panel("fdda_preferences_advanced", default_closed=True)
         header.label(text="Offline and Existing Python")
         if body is not None:
-            draw_python_options(body, self)
-
-
-def draw_python_options(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
-    """Draw where packages are installed from, the folder of the environment, and a Python to use instead of it."""
-    layout.use_property_split, layout.use_property_decorate = True, False
-    layout.prop(settings, "wheels_folder", placeholder="None: install from the internet")
-    layout.prop(
-        settings, "trainer_python", text="Existing Python (optional)", placeholder="The training environment above"
-    )
-    draw_lines(layout, f"Folder: {environment_folder()}")
-
-
-def draw_models(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
-    """Draw the settings of packing, and the folders from which models are loaded."""
-    column = layout.column()
-    column.label(text="Models load if packed, or in the .blend file's folder")
-    column.prop(settings, "pack_models")
-    column.label(text="Also load models from:")
-    for index, folder in enumerate(settings.folders):
-        row = column.row(align=True)
-        row.prop(folder, "path", text="")
-        row.operator("fdda.remove_trusted_folder", text="", icon="REMOVE").index = index
-    column.operator("fdda.add_trusted_folder", text="Add Folder…", icon="ADD")
+            body.use_property_split, body.use_property_decorate = True, False
+            body.prop(self, "wheels_folder", placeholder="None: install from the internet")
+            body.prop(
+                self, "trainer_python", text="Existing Python (optional)", placeholder="The training environment above"
+            )
+            draw_lines(body, f"Folder: {environment_folder()}")
 
 
 def packs_models() -> bool:
@@ -121,14 +115,6 @@ def wheels_folder() -> str:
     """Return the folder in the field Offline Packages; empty if none is chosen."""
     settings = preferences()
     return settings.wheels_folder if settings else ""
-
-
-def draw_check(layout: bpy.types.UILayout) -> None:
-    """Draw a button that checks the Python for training, and the result of the last check."""
-    _, right = _split_row(layout)
-    right.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
-    if current(ENVIRONMENT) is None:
-        draw_check_result(layout, session.check_result)
 
 
 def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:

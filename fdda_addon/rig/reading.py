@@ -67,7 +67,11 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
     joints = choose_joints(scene_rig, (*skin.bones, STATIC_JOINT) if include_static_joint else skin.bones, extra_joints)
     names = tuple(joint.name for joint in joints)
     skin_joints, skin_weights = skin.arrays({name: index for index, name in enumerate(names)})
-    rest_matrices = joint_rest_matrices(scene_rig, names)
+    rest_matrices = armature_io.rest_matrices(scene_rig.armature_object.data, names)
+    is_bone = np.array([name != STATIC_JOINT for name in names], bool)
+    rest_matrices[is_bone] = (
+        armature_to_mesh_matrix(scene_rig.mesh_object, scene_rig.armature_object) @ rest_matrices[is_bone]
+    )
     _check_rest_matrices(names, rest_matrices)
     faces = mesh_io.topology(mesh_object.data)
     fingerprint = Fingerprint(
@@ -154,18 +158,6 @@ def read_key_joints_rig(
     return replace(selected, fingerprint=replace(selected.fingerprint, deformation=deformation))
 
 
-def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:
-    """Read the rest matrices of joints.
-
-    Returns:
-        (J, 4, 4) float64, mesh-object space, mesh units; the identity for the static joint.
-    """
-    matrices = armature_io.rest_matrices(scene_rig.armature_object.data, names)
-    is_bone = np.array([name != STATIC_JOINT for name in names], bool)
-    matrices[is_bone] = armature_to_mesh_matrix(scene_rig.mesh_object, scene_rig.armature_object) @ matrices[is_bone]
-    return matrices
-
-
 def armature_to_mesh_matrix(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
     """Return the matrix from armature space to mesh-object space, (4, 4) float64, of original or evaluated objects."""
     return np.array(_armature_to_mesh_transform(mesh_object, armature_object), np.float64)
@@ -222,25 +214,22 @@ class PoseReader:
                         f"'{scene_object.name}' has a scale of zero in some pose; look for the key, constraint or "
                         "driver that sets it."
                     )
-            self._set_armature_to_mesh(armature_to_mesh)
+            # The factors of P = T pose inv(T bone_rest) rest, with T from armature to mesh; None for identity.
+            self._armature_to_mesh = armature_to_mesh
+            left_factor = np.array(armature_to_mesh, np.float64)
+            # Compute one inverse per frame instead of one per joint, because rounding changes T in each frame if an
+            # animated parent moves both objects.
+            right_factor = self._inverse_bone_rest @ (np.linalg.inv(left_factor) @ self._rest_matrices)
+            self._left_factor, self._right_factor = (
+                None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor
+                for factor in (left_factor, right_factor)
+            )
         matrices = self._matrix_reader.read(armature_object)
         if self._left_factor is not None:
             matrices = self._left_factor @ matrices
         if self._right_factor is not None:
             matrices = matrices @ self._right_factor
         return np.array(matrices, np.float32, order="C")
-
-    def _set_armature_to_mesh(self, armature_to_mesh: Matrix) -> None:
-        """Compute the factors of P = T pose inv(T bone_rest) rest, with T from armature to mesh; None for identity."""
-        self._armature_to_mesh = armature_to_mesh
-        left_factor = np.array(armature_to_mesh, np.float64)
-        # Compute one inverse per frame instead of one per joint, because rounding changes T in each frame if an
-        # animated parent moves both objects.
-        right_factor = self._inverse_bone_rest @ (np.linalg.inv(left_factor) @ self._rest_matrices)
-        self._left_factor, self._right_factor = (
-            None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor
-            for factor in (left_factor, right_factor)
-        )
 
 
 class PoseEvaluator:

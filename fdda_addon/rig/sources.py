@@ -57,7 +57,11 @@ class Sources:
         """
         self._rig, self._root = scene_rig, root
         self._only_active, self._modifiers = modifiers is not None, frozenset(modifiers or ())
-        self.carriers = _carriers(scene_rig)
+        carriers = [scene_rig.mesh_object, scene_rig.armature_object]
+        for scene_object in carriers:
+            targets = [target for c in scene_object.constraints if not c.mute for target, _ in constraint_targets(c)]
+            carriers += [o for o in (scene_object.parent, *targets) if o is not None and o not in carriers]
+        self.carriers = set(carriers) - {scene_rig.mesh_object}
         self.objects: dict[bpy.types.Object, bool] = {}
         self.datablocks: dict[bpy.types.ID, str] = {}
         self.bones: dict[bpy.types.Object, set[str]] = {}
@@ -271,15 +275,6 @@ class Sources:
             self._add_object(target.id, uses_geometry=False)
             if variable.type == "TRANSFORMS" and (path := _CHANNEL_PATHS.get(target.transform_type)):
                 self.numbers[target.id, path] = None
-
-
-def _carriers(scene_rig: SceneRig) -> set[bpy.types.Object]:
-    """Return the armature object of a rig, and the objects that move its mesh or armature object as a whole."""
-    carriers = [scene_rig.mesh_object, scene_rig.armature_object]
-    for scene_object in carriers:
-        targets = [target for c in scene_object.constraints if not c.mute for target, _ in constraint_targets(c)]
-        carriers += [o for o in (scene_object.parent, *targets) if o is not None and o not in carriers]
-    return set(carriers) - {scene_rig.mesh_object}
 
 
 def constraint_targets(constraint: bpy.types.Constraint) -> Iterator[tuple[bpy.types.Object, str]]:

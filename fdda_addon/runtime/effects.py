@@ -25,7 +25,10 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
         FDDAError: the model cannot be loaded, or does not fit the rig.
     """
     if effect == Effect.REMOVE_PLAYER:
-        _remove_player(character)
+        player_batch.unbatch(character.buffer_uid)
+        session.players.pop(character.buffer_uid, None)
+        character.player = None
+        session.needs_scan = True
     elif effect == Effect.FORGET_CHECK:
         session.passed_checks.pop(character.object_uid, None)
     elif effect == Effect.SCHEDULE_CHECK:
@@ -36,9 +39,17 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
         elif effect == Effect.DISCONNECT:
             playback_modifier.disconnect(mesh_object)
         elif effect == Effect.CREATE_PLAYER:
-            _create_player(character, mesh_object)
+            buffer = _ensure_buffer(character, mesh_object)
+            character.buffer_uid = buffer.session_uid
+            character.reported.clear()
+            character.player = session.players[buffer.session_uid] = Player(mesh_object, buffer)
+            if mesh_object.mode not in STABLE_MODES:
+                session.dispatch(Event.EDIT, character)
         elif effect == Effect.CHECK_RIG:
-            _check_rig(character, mesh_object)
+            reported = set(character.reported)
+            character.reported.clear()
+            if not character.player.check_rig(mesh_object, reported):
+                session.dispatch(Event.OUTDATE, character)
         elif effect == Effect.READ_VISIBILITY:
             modifier_switch.apply_visibility(mesh_object, character.animated)
         elif effect == Effect.TAG_BUFFER:
@@ -48,44 +59,17 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
         elif effect == Effect.CLEAR_STATUS:
             mesh_object.fdda.status = ""
         elif effect == Effect.REPORT:
-            _report(mesh_object, error)
-
-
-def _create_player(character: Character, mesh_object: bpy.types.Object) -> None:
-    buffer = _ensure_buffer(character, mesh_object)
-    character.buffer_uid = buffer.session_uid
-    character.reported.clear()
-    character.player = session.players[buffer.session_uid] = Player(mesh_object, buffer)
-    if mesh_object.mode not in STABLE_MODES:
-        session.dispatch(Event.EDIT, character)
-
-
-def _remove_player(character: Character) -> None:
-    player_batch.unbatch(character.buffer_uid)
-    session.players.pop(character.buffer_uid, None)
-    character.player = None
-    session.needs_scan = True
-
-
-def _check_rig(character: Character, mesh_object: bpy.types.Object) -> None:
-    reported = set(character.reported)
-    character.reported.clear()
-    if not character.player.check_rig(mesh_object, reported):
-        session.dispatch(Event.OUTDATE, character)
+            mesh_object.fdda.mode = "RIG"
+            mesh_object.fdda.status = str(error)
+            # The terminal may be closed; the effects that follow show the rig all the same.
+            with suppress(OSError, ValueError):
+                print(f"FDDA is switched off for '{mesh_object.name}': {error}")
 
 
 def _tag_buffer(character: Character, mesh_object: bpy.types.Object) -> None:
     buffer = playback_modifier.buffer_of_object(mesh_object)
     if buffer is not None and buffer.session_uid == character.buffer_uid:
         buffer.data.update_tag()
-
-
-def _report(mesh_object: bpy.types.Object, error: FDDAError | None) -> None:
-    mesh_object.fdda.mode = "RIG"
-    mesh_object.fdda.status = str(error)
-    # The terminal may be closed; the effects that follow show the rig all the same.
-    with suppress(OSError, ValueError):
-        print(f"FDDA is switched off for '{mesh_object.name}': {error}")
 
 
 def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.types.Object:

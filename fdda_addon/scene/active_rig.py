@@ -94,7 +94,7 @@ def rigs_of_active_armature(context: bpy.types.Context) -> list[SceneRig]:
 
 
 def _meshes_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> list[bpy.types.Object]:
-    meshes = [o for o in context.scene.objects if o.type == "MESH" and _is_deformed_by(o, armature_object)]
+    meshes = [o for o in context.scene.objects if o.type == "MESH" and armature_of(o) == armature_object]
     return [o for o in meshes if not is_comparison(o)]
 
 
@@ -111,7 +111,3 @@ def _choose_mesh(context: bpy.types.Context, armature_object: bpy.types.Object) 
         if len(matches) == 1:
             return matches[0]
     return meshes[0]
-
-
-def _is_deformed_by(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
-    return armature_of(mesh_object) == armature_object

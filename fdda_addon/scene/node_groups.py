@@ -99,7 +99,12 @@ def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:
     while nodes_to_visit:
         node = nodes_to_visit.pop()
         if node.bl_idname != "NodeGroupOutput" and not node.mute:
-            yield from _node_types(node)
+            if node.type == "GROUP" and node.node_tree is not None:
+                yield from _geometry_node_types(node.node_tree)
+            elif node.bl_idname == "GeometryNodeStoreNamedAttribute" and _may_name_positions(node):
+                yield POSITION_NODE
+            else:
+                yield node.bl_idname
         for socket in node.inputs:
             if socket.type != "GEOMETRY" or not socket.enabled:
                 continue
@@ -109,15 +114,6 @@ def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:
             source_nodes = {link.from_node.name: link.from_node for link in links}
             nodes_to_visit += [source for name, source in source_nodes.items() if name not in visited_names]
             visited_names.update(source_nodes)
-
-
-def _node_types(node: bpy.types.Node) -> Iterator[str]:
-    if node.type == "GROUP" and node.node_tree is not None:
-        yield from _geometry_node_types(node.node_tree)
-    elif node.bl_idname == "GeometryNodeStoreNamedAttribute" and _may_name_positions(node):
-        yield POSITION_NODE
-    else:
-        yield node.bl_idname
 
 
 def _may_name_positions(node: bpy.types.Node) -> bool:

@@ -70,17 +70,13 @@ def _point_to_copies(copy: bpy.types.Object, copies: dict[bpy.types.ID, bpy.type
     for bone in copy.pose.bones:
         for constraint in bone.constraints:
             for struct in (constraint, *getattr(constraint, "targets", ())):
-                _replace_pointers(struct, copies)
+                for name in ("target", "pole_target", "space_object"):
+                    value = getattr(struct, name, None)
+                    if value in copies:
+                        setattr(struct, name, copies[value])
     for owner in copies.values():
         for curve in owner.animation_data.drivers if owner.animation_data else ():
             for variable in curve.driver.variables:
                 for target in variable.targets:
                     if target.id in copies:
                         target.id = copies[target.id]
-
-
-def _replace_pointers(struct: bpy.types.bpy_struct, copies: dict[bpy.types.ID, bpy.types.ID]) -> None:
-    for name in ("target", "pole_target", "space_object"):
-        value = getattr(struct, name, None)
-        if value in copies:
-            setattr(struct, name, copies[value])

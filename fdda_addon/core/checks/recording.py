@@ -44,7 +44,11 @@ def check_recording(recording: Recording) -> list[RecordingWarning]:
         The warnings in the order of `WARNING_NAMES`; empty for a good recording.
     """
     scan = scan_residuals(recording)
-    moving = find_moving_joints(recording)
+    low, high = (function(recording.pose_matrices, axis=0) for function in (np.min, np.max))
+    rig, ranges = recording.rig, high - low
+    rounding = float32_rounding(recording.pose_matrices)
+    threshold = max(MIN_MOTION_RATIO * max(1 / rig.metres_per_unit, rig.size), rounding)
+    moving = (ranges[:, :3, :3].max(axis=(1, 2)) > MIN_MOTION_RATIO) | (ranges[:, :3, 3].max(axis=1) > threshold)
     warnings = [
         *check_rest(recording.rig),
         *_check_large_residuals(recording, scan),
@@ -93,15 +97,6 @@ def compute_bone_lengths(rig: Rig) -> np.ndarray:
     children = np.flatnonzero(parents >= 0)
     np.minimum.at(child_distances, parents[children], parent_distances[children])
     return np.where(np.isfinite(child_distances), child_distances, parent_distances)
-
-
-def find_moving_joints(recording: Recording) -> np.ndarray:
-    """Return (J,) bool: which joints have pose matrices that differ between poses."""
-    low, high = (function(recording.pose_matrices, axis=0) for function in (np.min, np.max))
-    rig, ranges = recording.rig, high - low
-    rounding = float32_rounding(recording.pose_matrices)
-    threshold = max(MIN_MOTION_RATIO * max(1 / rig.metres_per_unit, rig.size), rounding)
-    return (ranges[:, :3, :3].max(axis=(1, 2)) > MIN_MOTION_RATIO) | (ranges[:, :3, 3].max(axis=1) > threshold)
 
 
 def _check_large_residuals(recording: Recording, scan: ResidualScan) -> list[RecordingWarning]:

@@ -54,19 +54,15 @@ def _block_html(lines: list[str], folder: str) -> str:
         text = _inline_html(" ".join([heading[2], *lines[1:]]), folder)
         return f'<h{level} id="{heading_anchor(heading[2])}">{text}</h{level}>'
     if first.startswith("|"):
-        return _table_html(lines, folder)
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+        rows = [row for row in rows if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
+        cells = ["".join(f"<td>{_inline_html(cell, folder)}</td>" for cell in row) for row in rows]
+        return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
     if first.startswith("    "):
         return f"<pre>{html.escape(chr(10).join(line[4:] for line in lines), quote=False)}</pre>"
     if re.match(r"- |\d+\. ", first):
         return _list_html(lines, folder)
     return f"<p>{_inline_html(' '.join(lines), folder)}</p>"
-
-
-def _table_html(lines: list[str], folder: str) -> str:
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    rows = [row for row in rows if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
-    cells = ["".join(f"<td>{_inline_html(cell, folder)}</td>" for cell in row) for row in rows]
-    return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
 
 
 def _list_html(lines: list[str], folder: str) -> str:

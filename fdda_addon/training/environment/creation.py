@@ -71,7 +71,20 @@ class EnvironmentCreation:
         with creation_lock(self.folder), _open_log(self.log) as log:
             check_source(self.folder, self.wheels)
             yield Progress("looking for a Python", 0, 0)
-            interpreters = self._find_interpreters(log)
+            if self.base:
+                queried = query_interpreter([self.base])
+                if queried is None:
+                    raise TrainerEnvironmentError(
+                        f"'{self.base}' is no Python that runs; name another, or leave it out."
+                    )
+                candidates = [queried]
+            else:
+                candidates = list(find_interpreters())
+            log.writelines(f"{interpreter} {interpreter.problem or 'can be tried'}\n" for interpreter in candidates)
+            interpreters = [interpreter for interpreter in candidates if not interpreter.problem]
+            self._stop_if_cancelled()
+            if not interpreters:
+                raise self._no_python_error(f"{candidates[0]} {candidates[0].problem}" if candidates else "none runs")
             if self.wheels is not None:
                 check_wheels(self.wheels, interpreters[0], log, self.log)
             complete = False
@@ -81,7 +94,8 @@ class EnvironmentCreation:
                 self._has_changed_folder = True
                 remove_environment(self.folder)
                 interpreter = yield from self._create_venv(interpreters, log)
-                yield from self._install(interpreter, log)
+                with self._temporary() as temporary:
+                    yield from self._install_with(temporary, interpreter, log)
                 yield Progress("checking", 0, 0)
                 result = self._check(log)
                 write_completion_marker(self.folder, interpreter.version)
@@ -97,22 +111,6 @@ class EnvironmentCreation:
             self._cancelled = True
             if self._process is not None:
                 _kill(self._process)
-
-    def _find_interpreters(self, log: IO[str]) -> list[Interpreter]:
-        """Return the suitable interpreters, the best first."""
-        if self.base:
-            queried = query_interpreter([self.base])
-            if queried is None:
-                raise TrainerEnvironmentError(f"'{self.base}' is no Python that runs; name another, or leave it out.")
-            candidates = [queried]
-        else:
-            candidates = list(find_interpreters())
-        log.writelines(f"{interpreter} {interpreter.problem or 'can be tried'}\n" for interpreter in candidates)
-        suitable = [interpreter for interpreter in candidates if not interpreter.problem]
-        self._stop_if_cancelled()
-        if not suitable:
-            raise self._no_python_error(f"{candidates[0]} {candidates[0].problem}" if candidates else "none runs")
-        return suitable
 
     def _create_venv(self, interpreters: list[Interpreter], log: IO[str]) -> Job[Interpreter]:
         """Create the virtual environment with the first interpreter that succeeds, and return that interpreter."""
@@ -130,10 +128,6 @@ class EnvironmentCreation:
             f"No Python on this machine can create the training environment ({reason}); install Python 3.13 with its "
             f"venv module, or choose an existing Python that has torch. '{self.log}' lists what was tried."
         )
-
-    def _install(self, interpreter: Interpreter, log: IO[str]) -> Iterator[Progress]:
-        with self._temporary() as temporary:
-            yield from self._install_with(temporary, interpreter, log)
 
     @contextmanager
     def _temporary(self) -> Iterator[Path]:
