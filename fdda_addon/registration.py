@@ -21,7 +21,11 @@ def register() -> None:
     from .runtime import gltf_export, handlers
 
     for package in (properties, operators, panels):
-        _register_package(package)
+        for module in _modules(package):
+            for cls in module.CLASSES:
+                bpy.utils.register_class(cls)
+            if hasattr(module, "register"):
+                module.register()
     for name, handler in handler_table():
         blender_handlers = getattr(bpy.app.handlers, name)
         if handler not in blender_handlers:
@@ -91,15 +95,6 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
         measurements,
     )
     return [entry for module in modules for entry in module.HANDLERS.items()]
-
-
-def _register_package(package: ModuleType) -> None:
-    """Register the classes of all modules in their order, and call the `register` of each module after its classes."""
-    for module in _modules(package):
-        for cls in module.CLASSES:
-            bpy.utils.register_class(cls)
-        if hasattr(module, "register"):
-            module.register()
 
 
 def _modules(package: ModuleType) -> list[ModuleType]:

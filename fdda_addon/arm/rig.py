@@ -67,7 +67,10 @@ def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
     target.transform_space = "LOCAL_SPACE"
     # Blender evaluates such a simple expression itself, even if Python scripts are disabled.
     driver.expression = f"clamp(elbow / {math.radians(ELBOW_FLEXION):.6f}, 0, 1)"
-    _add_smoothing(mesh_object, density)
+    modifier = mesh_object.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
+    modifier.rest_source = "ORCO"
+    modifier.smooth_type = "SIMPLE"
+    modifier.iterations, modifier.factor = SMOOTHING_SETTINGS[density]
     assign_drive_action(armature_object)
     bpy.context.view_layer.update()
     return mesh_object, armature_object
@@ -126,10 +129,3 @@ def _create_material(name: str, color: tuple[float, float, float, float], roughn
     shader.inputs["Subsurface Weight"].default_value = 0.15
     shader.inputs["Subsurface Scale"].default_value = 0.01
     return material
-
-
-def _add_smoothing(mesh_object: bpy.types.Object, density: int):
-    modifier = mesh_object.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
-    modifier.rest_source = "ORCO"
-    modifier.smooth_type = "SIMPLE"
-    modifier.iterations, modifier.factor = SMOOTHING_SETTINGS[density]

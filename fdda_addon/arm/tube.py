@@ -225,12 +225,8 @@ def add_tube(quads: GridBuilder, tube: Tube) -> list[list[int]]:
     root_rings = range(tube.root, tube.root + divisions.thumb_root)
     for ring_index, (near, far) in enumerate(pairwise(rings)):
         quads.add_band(near, far, skip=range(tube.palm(0), tube.around) if ring_index in root_rings else ())
-    _close_shoulder(quads, tube, rings[0])
-    return rings
-
-
-def _close_shoulder(quads: GridBuilder, tube: Tube, first_ring: list[int]):
-    """Close the shoulder by connecting the columns of the back to the columns of the palm."""
+    # Close the shoulder by connecting the columns of the back to the columns of the palm.
+    first_ring = rings[0]
     divisions = tube.divisions
     rows = [first_ring[: tube.top + 1]]
     for row_index in range(1, divisions.side):
@@ -247,3 +243,4 @@ def _close_shoulder(quads: GridBuilder, tube: Tube, first_ring: list[int]):
     rows.append([first_ring[tube.palm(column)] for column in range(tube.top + 1)])
     quads.sheets["shoulder"] = rows
     quads.add_patch([row[::-1] for row in rows])
+    return rings

@@ -57,7 +57,17 @@ def run(options: argparse.Namespace) -> None:
     if not needs_model:
         check_temporary_folder()  # before the measurements, which take a minute
     if options.profile:
-        _profile(options)
+        scene_rig, failure = open_rig(options), None
+        with ProgressPrinter() as progress:
+            profile = progress.run(profile_frame(scene_rig))
+            try:
+                profile = replace(profile, fast_rig=progress.run(measure_saving(scene_rig, options.rig)))
+            except FDDAError as error:
+                profile, failure = replace(profile, fast_rig_problem=str(error)), error
+        write_json(options.json, profile.to_json())
+        print(profile.table())
+        if failure is not None and exit_status(failure) == TRY_AGAIN:
+            raise failure
         return
     if options.fast_rig:
         with ProgressPrinter() as progress:
@@ -79,17 +89,3 @@ def run(options: argparse.Namespace) -> None:
         print(with_heading(name, result.table()))
     if errors:
         raise errors[0]
-
-
-def _profile(options: argparse.Namespace) -> None:
-    scene_rig, failure = open_rig(options), None
-    with ProgressPrinter() as progress:
-        profile = progress.run(profile_frame(scene_rig))
-        try:
-            profile = replace(profile, fast_rig=progress.run(measure_saving(scene_rig, options.rig)))
-        except FDDAError as error:
-            profile, failure = replace(profile, fast_rig_problem=str(error)), error
-    write_json(options.json, profile.to_json())
-    print(profile.table())
-    if failure is not None and exit_status(failure) == TRY_AGAIN:
-        raise failure

@@ -45,7 +45,20 @@ def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:
     if not options.model.is_dir():
         open_file(options.rig)
         return {"": (find_rig(options.object), options.model)}
-    models = _find_models_by_object(options.model)
+    folder = options.model
+    paths = sorted([*folder.glob("*.onnx"), *folder.glob("*/*.onnx")])
+    if not paths:
+        raise ModelError(
+            f"The folder '{folder}' contains no model; give a folder that train has written for several recordings."
+        )
+    models: dict[str, Path] = {}
+    for path in paths:
+        name = read_model_info(path).object_name
+        if not name:
+            raise ModelError(f"'{path}' has no object name; give this file instead of the folder, with --object NAME.")
+        if name in models:
+            raise ModelError(f"'{models[name]}' and '{path}' are both models of '{name}'; remove one of them.")
+        models[name] = path
     if options.object and options.object not in models:
         names = ", ".join(f"'{name}'" for name in models)
         raise ModelError(f"'{options.model}' has no model of '{options.object}'; it has those of {names}.")
@@ -72,23 +85,3 @@ def to_json_by_object(values: dict[str, dict]) -> dict:
 def with_heading(name: str, text: str) -> str:
     """Return a text below a heading with the name of its rig. A single rig has no name, and so no heading."""
     return f"'{name}':\n{text}" if name else text
-
-
-def _find_models_by_object(folder: Path) -> dict[str, Path]:
-    """Return the models in a folder and its subfolders, by name of their object."""
-    paths = sorted([*folder.glob("*.onnx"), *folder.glob("*/*.onnx")])
-    if not paths:
-        raise ModelError(
-            f"The folder '{folder}' contains no model; give a folder that train has written for several recordings."
-        )
-    models_by_object: dict[str, Path] = {}
-    for path in paths:
-        name = read_model_info(path).object_name
-        if not name:
-            raise ModelError(f"'{path}' has no object name; give this file instead of the folder, with --object NAME.")
-        if name in models_by_object:
-            raise ModelError(
-                f"'{models_by_object[name]}' and '{path}' are both models of '{name}'; remove one of them."
-            )
-        models_by_object[name] = path
-    return models_by_object

@@ -159,7 +159,18 @@ class Overlay:
         finally:
             gpu.state.depth_mask_set(False)
             gpu.state.depth_test_set("NONE")
-        _draw_bones(context, self.bones(context))
+        bones = self.bones(context)
+        if not bones:
+            return
+        shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
+        shader.uniform_float("viewportSize", (context.region.width, context.region.height))
+        for color in {bone.color for bone in bones}:
+            line_ends = [line_end for bone in bones if bone.color == color for line_end in (bone.head, bone.tail)]
+            # A wider dark line below each bone outlines it.
+            for width, line_color in ((BONE_WIDTH_PIXELS + 2, (0, 0, 0, 0.6)), (BONE_WIDTH_PIXELS, color)):
+                shader.uniform_float("lineWidth", width * context.preferences.system.ui_scale)
+                shader.uniform_float("color", line_color)
+                batch_for_shader(shader, "LINES", {"pos": line_ends}).draw(shader)
 
     def _draw_legend(self) -> None:
         lines, range_mm = self.legend(bpy.context)
@@ -209,20 +220,6 @@ class Overlay:
             info.fragment_source(FRAGMENT_SHADER)
             self._shader = gpu.shader.create_from_info(info)
         return self._shader
-
-
-def _draw_bones(context: bpy.types.Context, bones: list[OverlayBone]) -> None:
-    if not bones:
-        return
-    shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
-    shader.uniform_float("viewportSize", (context.region.width, context.region.height))
-    for color in {bone.color for bone in bones}:
-        line_ends = [line_end for bone in bones if bone.color == color for line_end in (bone.head, bone.tail)]
-        # A wider dark line below each bone outlines it.
-        for width, line_color in ((BONE_WIDTH_PIXELS + 2, (0, 0, 0, 0.6)), (BONE_WIDTH_PIXELS, color)):
-            shader.uniform_float("lineWidth", width * context.preferences.system.ui_scale)
-            shader.uniform_float("color", line_color)
-            batch_for_shader(shader, "LINES", {"pos": line_ends}).draw(shader)
 
 
 def _vertex_format(names: Iterable[str]) -> gpu.types.GPUVertFormat:

@@ -161,7 +161,19 @@ class Picture:
                 self._add_cell(factory, cell, center)
         bottom = top + len(rows) * cell_step[1]
         if has_heat_scale:
-            self._add_heat_scale((gap, -(bottom + 1.2 * text_size)), text_size)
+            # Add the colors of the heat map: a box for no error, and a strip from the first to the last stop.
+            x, y = gap, -(bottom + 1.2 * text_size)
+            box_size = 1.2 * text_size
+            self.add_strip((x, y - box_size), (box_size, box_size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
+            label_position = (x + 1.5 * box_size, y - box_size + 0.2 * text_size)
+            self.add_text("none (below 0.0001 cm)", label_position, 0.9 * text_size)
+            left, width = x + 16 * text_size, self.width * 0.35
+            strip_colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
+            self.add_strip((left, y - box_size), (width, box_size), strip_colors)
+            max_metres = HEAT_MAP_STOPS[-1][0]
+            for meters, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (max_metres, "1 cm and above")):
+                label_position = (left + width * meters / max_metres - 0.6 * text_size, y - box_size - 1.2 * text_size)
+                self.add_text(text, label_position, 0.9 * text_size)
             bottom += 4.4 * text_size
         self.height = bottom + gap
 
@@ -189,21 +201,6 @@ class Picture:
         scene_object.color = (*srgb_to_linear(TEXT_COLOR), 1)
         self.move(scene_object, *position)
         return curve
-
-    def _add_heat_scale(self, position: tuple[float, float], text_size: float) -> None:
-        """Add the colors of the heat map: a box for no error, and a strip from the first to the last stop."""
-        x, y = position
-        box_size = 1.2 * text_size
-        self.add_strip((x, y - box_size), (box_size, box_size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
-        label_position = (x + 1.5 * box_size, y - box_size + 0.2 * text_size)
-        self.add_text("none (below 0.0001 cm)", label_position, 0.9 * text_size)
-        left, width = x + 16 * text_size, self.width * 0.35
-        strip_colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
-        self.add_strip((left, y - box_size), (width, box_size), strip_colors)
-        max_metres = HEAT_MAP_STOPS[-1][0]
-        for meters, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (max_metres, "1 cm and above")):
-            label_position = (left + width * meters / max_metres - 0.6 * text_size, y - box_size - 1.2 * text_size)
-            self.add_text(text, label_position, 0.9 * text_size)
 
     def add_strip(self, position: tuple[float, float], size: tuple[float, float], colors: np.ndarray) -> None:
         """Add a rectangle at the position of its lower left corner, with (N, 3) sRGB colors from left to right."""

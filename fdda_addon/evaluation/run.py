@@ -61,7 +61,13 @@ def evaluate(scene_rig: SceneRig, model: Path | Network, settings: EvaluationSet
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     random_pose_count = settings.poses or len(settings.range_scales) or len(settings.named)
-    network, skinning = _prepare(scene_rig, model, is_rig_compared=not settings.target.name)
+    check_full_rig(scene_rig.mesh_object)
+    modifier_stack = check_evaluable(scene_rig)
+    opened = open_model(scene_rig, model)
+    network, rig = opened.network, opened.linear_rig
+    if not settings.target.name:
+        check_time_inputs(scene_rig, rig.controls, modifier_stack)
+    skinning = LinearSkinning(rig, network.info.partitions_of(rig))
     pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count, network.info.controls)
     # A rig that is posed only by actions may have no channels to sample.
     channels = model_channels(scene_rig, skinning.rig, network.info) if settings.poses or settings.range_scales else ()
@@ -106,23 +112,6 @@ def evaluate_action(
     evaluation = yield from evaluate(scene_rig, model, settings)
     evaluation.actions = []
     return evaluation
-
-
-def _prepare(scene_rig: SceneRig, model: Path | Network, is_rig_compared: bool) -> tuple[Network, LinearSkinning]:
-    """Open a model, and check that the rig can be compared with it.
-
-    Args:
-        scene_rig: the rig.
-        model: path of the model, or the loaded model.
-        is_rig_compared: whether the model is compared with the mesh of the rig itself, not with a target.
-    """
-    check_full_rig(scene_rig.mesh_object)
-    stack = check_evaluable(scene_rig)
-    opened = open_model(scene_rig, model)
-    rig = opened.linear_rig
-    if is_rig_compared:
-        check_time_inputs(scene_rig, rig.controls, stack)
-    return opened.network, LinearSkinning(rig, opened.network.info.partitions_of(rig))
 
 
 def set_held_out_pose(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:

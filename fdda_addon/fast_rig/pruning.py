@@ -23,7 +23,10 @@ def remove_bones(armature_object: bpy.types.Object, kept: set[Node]) -> list[str
     names = [bone.name for bone in armature_object.data.bones if bone_node(armature_object, bone.name) not in kept]
     if not names:
         return []
-    _remove_idle_constraints(armature_object, set(names))
+    removed = {bone_node(armature_object, name) for name in names}
+    for bone in armature_object.pose.bones:
+        for constraint in [c for c in bone.constraints if c.mute and not removed.isdisjoint(struct_needs(c))]:
+            bone.constraints.remove(constraint)
     with _edit_mode(armature_object):
         edit_bones = armature_object.data.edit_bones
         for name in names:
@@ -78,14 +81,6 @@ def remove_modifiers(mesh_object: bpy.types.Object, names: Iterable[str]) -> lis
     for name in names:
         mesh_object.modifiers.remove(mesh_object.modifiers[name])
     return names
-
-
-def _remove_idle_constraints(armature_object: bpy.types.Object, removed_bones: set[str]) -> None:
-    """Remove the muted constraints that read removed bones: nothing else reads these, and Blender would complain."""
-    removed = {bone_node(armature_object, name) for name in removed_bones}
-    for bone in armature_object.pose.bones:
-        for constraint in [c for c in bone.constraints if c.mute and not removed.isdisjoint(struct_needs(c))]:
-            bone.constraints.remove(constraint)
 
 
 def check_armature(armature_object: bpy.types.Object) -> None:

@@ -50,7 +50,18 @@ def remove_unneeded(
     for action in (action for action in bpy.data.actions if action.library is None):
         # Saving would drop the actions that only removed objects and constraints use.
         action.use_fake_user = True
-    _write_names_in_paths(scene_rigs)
+    # Write names into the paths of drivers and actions, because removing elements changes the numbers of others.
+    for datablock in bpy.data.user_map():
+        for owner, curve in drivers_of(datablock) if datablock.library is None else ():
+            _write_names(curve, owner)
+            for target in (target for variable in curve.driver.variables for target in variable.targets):
+                _write_names(target, bpy.context.scene if target.id is None else target.id)
+    roots = (scene_rigs[0].armature_object, *(rig.mesh_object for rig in scene_rigs))
+    actions = [action for action in bpy.data.actions if action.library is None]
+    for curves_by_datablock in curves_of_actions(actions, *roots):
+        for datablock, curves in curves_by_datablock.items():
+            for curve in curves:
+                _write_names(curve, datablock)
     shown = [*shown_objects(scene_rigs), armature_object, *(rig.mesh_object for rig in scene_rigs)]
     worlds = [scene.world for scene in bpy.data.scenes if scene.world is not None]
     roots = [*map(datablock_node, (*shown, *bpy.data.scenes, *worlds)), *nodes]
@@ -75,21 +86,6 @@ def remove_unneeded(
 def _replaced_modifiers(mesh_object: bpy.types.Object) -> set[str]:
     """Return the names of the modifiers that a model of an object replaces, on or off."""
     return {m.name for m in (*deforming_modifiers(mesh_object), *recorded_modifiers(mesh_object))}
-
-
-def _write_names_in_paths(scene_rigs: list[SceneRig]) -> None:
-    """Write names into the paths of drivers and actions, because removing elements changes the numbers of others."""
-    for datablock in bpy.data.user_map():
-        for owner, curve in drivers_of(datablock) if datablock.library is None else ():
-            _write_names(curve, owner)
-            for target in (target for variable in curve.driver.variables for target in variable.targets):
-                _write_names(target, bpy.context.scene if target.id is None else target.id)
-    roots = (scene_rigs[0].armature_object, *(rig.mesh_object for rig in scene_rigs))
-    actions = [action for action in bpy.data.actions if action.library is None]
-    for curves_by_datablock in curves_of_actions(actions, *roots):
-        for datablock, curves in curves_by_datablock.items():
-            for curve in curves:
-                _write_names(curve, datablock)
 
 
 def _write_names(owner: bpy.types.FCurve | bpy.types.DriverTarget, datablock: bpy.types.ID) -> None:

@@ -102,32 +102,26 @@ class FDDA_PT_models(Section, bpy.types.Panel):
         column.operator("fdda.remove_model", text="", icon="REMOVE")
         entry = active_entry(mesh_object)
         if entry is not None:
-            self._draw_entry(context, mesh_object, entry)
-
-    def _draw_entry(
-        self, context: bpy.types.Context, mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup
-    ) -> None:
-        layout = self.enabled_layout()
-        problems = timed_values.get(_find_problems, mesh_object, PROBLEMS_SECONDS)
-        problem = (problems or {}).get(_entry_key(entry))
-        if is_bound(mesh_object, entry):
-            layout.operator("fdda.unbind", icon="UNLINKED")
-        else:
-            row = layout.row()
-            row.scale_y = 1.2
-            row.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
-        if entry.packed:
-            draw_wrapped(layout, context, f"Packed, {format_file_size(entry.packed_bytes)}", "PACKAGE")
-            layout.operator("fdda.unpack_model", icon="EXPORT")
-        else:
-            draw_wrapped(layout, context, str(resolve_path(entry.path)), "FILE")
-            layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
-        if problem is not None:
-            box = layout.box()
-            box.alert = problem[0] == "ERROR"
-            draw_wrapped(box, context, problem[1], problem[0])
-        elif problems is not None:
-            draw_wrapped(layout, context, "Matches this rig", "CHECKMARK")
+            problems = timed_values.get(_find_problems, mesh_object, PROBLEMS_SECONDS)
+            problem = (problems or {}).get(_entry_key(entry))
+            if is_bound(mesh_object, entry):
+                layout.operator("fdda.unbind", icon="UNLINKED")
+            else:
+                row = layout.row()
+                row.scale_y = 1.2
+                row.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
+            if entry.packed:
+                draw_wrapped(layout, context, f"Packed, {format_file_size(entry.packed_bytes)}", "PACKAGE")
+                layout.operator("fdda.unpack_model", icon="EXPORT")
+            else:
+                draw_wrapped(layout, context, str(resolve_path(entry.path)), "FILE")
+                layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
+            if problem is not None:
+                box = layout.box()
+                box.alert = problem[0] == "ERROR"
+                draw_wrapped(box, context, problem[1], problem[0])
+            elif problems is not None:
+                draw_wrapped(layout, context, "Matches this rig", "CHECKMARK")
 
 
 CLASSES = (FDDA_UL_models, FDDA_PT_models)

@@ -138,7 +138,16 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             for mode, text in modes:
                 row.prop_enum(binding, "mode", mode, text=text)
         if not mesh_object.fdda.is_fast_rig:
-            _draw_speed(layout, context, mesh_object)
+            times, state = frame_times.get(mesh_object), job.state_of("measure_model")
+            row = layout.row(align=True)
+            if times is not None:
+                row.label(text=f"{times.rig:.2f} → {times.fdda:.2f} ms per frame", icon="TIME")
+                row.operator("fdda.measure_model", text="", icon="FILE_REFRESH")
+                draw_wrapped(layout, context, times.sentence, "CHECKMARK" if times.is_worthwhile else "INFO")
+            else:
+                row.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
+            if state is not None and (state.is_running or state.outcome_level != "INFO"):
+                draw_job(layout, context, "measure_model")
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         strength = column.row()
@@ -215,20 +224,6 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         button.action, button.use_frames = session.bake_action, session.bake_use_frames
         button.frame_start, button.frame_end = session.bake_start, session.bake_end
         button.shape_keys, button.point_cache = session.bake_format == "KEYS", session.bake_format == "PC2"
-
-
-def _draw_speed(layout: bpy.types.UILayout, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-    """Draw the times of a frame with rig and model below the switch between them, and the button that measures them."""
-    times, state = frame_times.get(mesh_object), job.state_of("measure_model")
-    row = layout.row(align=True)
-    if times is not None:
-        row.label(text=f"{times.rig:.2f} → {times.fdda:.2f} ms per frame", icon="TIME")
-        row.operator("fdda.measure_model", text="", icon="FILE_REFRESH")
-        draw_wrapped(layout, context, times.sentence, "CHECKMARK" if times.is_worthwhile else "INFO")
-    else:
-        row.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
-    if state is not None and (state.is_running or state.outcome_level != "INFO"):
-        draw_job(layout, context, "measure_model")
 
 
 CLASSES = (FDDA_PT_playback,)

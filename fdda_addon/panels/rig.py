@@ -49,8 +49,18 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         if not is_fast_rig:
             _draw_build_model(layout, context, rig)
         _draw_meshes(layout, context, rig)
-        _draw_counts(layout, rig)
         check = checks.last_check(rig)
+        column = layout.column(align=True)
+        column.label(
+            text=f"{rig.mesh_object.name}: {format_count(len(rig.mesh_object.data.vertices), 'vertex', 'vertices')}",
+            icon="MESH_DATA",
+        )
+        bone_count = len(rig.armature_object.data.bones)
+        deforming_count = len(check.rig.joints) if check and check.rig else bone_count
+        count_text = format_count(bone_count, "bone")
+        if deforming_count != bone_count:
+            count_text = f"{deforming_count:,} of {count_text}"
+        column.label(text=f"{rig.armature_object.name}: {count_text}", icon="ARMATURE_DATA")
         for problem in check.problems if check else ():
             draw_wrapped(layout.box(), context, problem, "ERROR")
         if check:
@@ -65,7 +75,24 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
                 count = len(mesh_object.data.shape_keys.key_blocks) - 1
                 column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
         if not is_fast_rig:
-            _draw_cost(layout, context, rig)
+            cost = measured_cost(rig.mesh_object)
+            state = job.state_of("measure")
+            if state is not None and (state.is_running or state.outcome_level != "INFO"):
+                draw_job(layout, context, "measure")
+            if cost is not None:
+                column = layout.column(align=True)
+                measured = frame_times.get(rig.mesh_object)
+                for label, time_text in (
+                    ("Rig", f"{cost.rig:.2f} ms per frame"),
+                    ("Armature Only", f"{cost.linear:.2f} ms"),
+                    ("Model", f"{measured.fdda:.2f} ms") if measured else ("Model (estimate)", f"{cost.model:.1f} ms"),
+                ):
+                    row = column.split(factor=0.45)
+                    row.label(text=label)
+                    row.label(text=time_text)
+                draw_wrapped(layout, context, measured.sentence if measured else cost.sentence, "INFO")
+            if state is None or not state.is_running:
+                layout.operator("fdda.measure", text="Measure Speed", icon="TIME")
             draw_profile(layout, context, rig)
 
 
@@ -88,21 +115,6 @@ def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     if len(rigs) > MAX_MESHES:
         box.label(text=f"and {len(rigs) - MAX_MESHES} more; select one to see it")
     box.prop(context.window_manager.fdda, "all_meshes", text=f"Apply to All {len(rigs)} Meshes")
-
-
-def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
-    check = checks.last_check(rig)
-    column = layout.column(align=True)
-    column.label(
-        text=f"{rig.mesh_object.name}: {format_count(len(rig.mesh_object.data.vertices), 'vertex', 'vertices')}",
-        icon="MESH_DATA",
-    )
-    bone_count = len(rig.armature_object.data.bones)
-    deforming_count = len(check.rig.joints) if check and check.rig else bone_count
-    count_text = format_count(bone_count, "bone")
-    if deforming_count != bone_count:
-        count_text = f"{deforming_count:,} of {count_text}"
-    column.label(text=f"{rig.armature_object.name}: {count_text}", icon="ARMATURE_DATA")
 
 
 def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
@@ -134,27 +146,6 @@ def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     draw_wrapped(layout, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
     if not assessment.is_good:
         draw_wrapped(layout, context, "What to do is in the section Training.", "BLANK1")
-
-
-def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    cost = measured_cost(rig.mesh_object)
-    state = job.state_of("measure")
-    if state is not None and (state.is_running or state.outcome_level != "INFO"):
-        draw_job(layout, context, "measure")
-    if cost is not None:
-        column = layout.column(align=True)
-        measured = frame_times.get(rig.mesh_object)
-        for label, time_text in (
-            ("Rig", f"{cost.rig:.2f} ms per frame"),
-            ("Armature Only", f"{cost.linear:.2f} ms"),
-            ("Model", f"{measured.fdda:.2f} ms") if measured else ("Model (estimate)", f"{cost.model:.1f} ms"),
-        ):
-            row = column.split(factor=0.45)
-            row.label(text=label)
-            row.label(text=time_text)
-        draw_wrapped(layout, context, measured.sentence if measured else cost.sentence, "INFO")
-    if state is None or not state.is_running:
-        layout.operator("fdda.measure", text="Measure Speed", icon="TIME")
 
 
 CLASSES = (FDDA_PT_rig,)

@@ -12,7 +12,7 @@ from ..core.mathematics.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATI
 from ..scene.action_slots import curves_of_actions
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
-from .action_range import ChannelRanges, has_width, keyed_ranges, moving_ranges
+from .action_range import has_width, keyed_ranges, moving_ranges
 from .motion_range import (
     AXES,
     DEFAULT,
@@ -97,7 +97,15 @@ def set_limits_from_actions(
         others = " and ".join(f"'{name}'" for name in sorted(animated - {armature_object.name}))
         remedy = f"they animate {others}" if others else "choose actions of this rig"
         raise RigError(f"The actions ({names}) move no bone of '{armature_object.name}'; {remedy}.")
-    bones_near_gimbal_lock = _bones_near_gimbal_lock(keyed_channel_ranges)
+    widths: dict[tuple[str, str], float] = {}
+    for (bone, kind, _), (low, high) in keyed_channel_ranges.items():
+        widths[bone, kind] = widths.get((bone, kind), 0.0) + high - low
+    rotation_vector_widths = [(bone, width) for (bone, kind), width in widths.items() if kind == ROTATION_VECTOR]
+    bones_near_gimbal_lock = {
+        bone
+        for bone, width in rotation_vector_widths
+        if widths[bone, ROTATION] > MAX_WIDENING * width + RANGE_TOLERANCE
+    }
     # An IK solver uses the limits of any bone that it moves.
     has_ik = any(constraint.type == "IK" for bone in armature_object.pose.bones for constraint in bone.constraints)
     all_limits: list[MeasuredLimit] = []
@@ -125,19 +133,6 @@ def _set_limits(bone: bpy.types.PoseBone, limits: list[MeasuredLimit], has_ik: b
                 set_rotation_range(bone, limit.axis, limit.low, limit.high)
         elif settable_limits:
             _set_range_constraint(bone, kind, settable_limits)
-
-
-def _bones_near_gimbal_lock(keyed_channel_ranges: ChannelRanges) -> set[str]:
-    """Find the bones whose ranges of Euler angles allow much larger rotations than the actions have."""
-    widths: dict[tuple[str, str], float] = {}
-    for (bone, kind, _), (low, high) in keyed_channel_ranges.items():
-        widths[bone, kind] = widths.get((bone, kind), 0.0) + high - low
-    rotation_vector_widths = [(bone, width) for (bone, kind), width in widths.items() if kind == ROTATION_VECTOR]
-    return {
-        bone
-        for bone, width in rotation_vector_widths
-        if widths[bone, ROTATION] > MAX_WIDENING * width + RANGE_TOLERANCE
-    }
 
 
 def _is_constant_rotation(bounds: tuple[float, float]) -> bool:

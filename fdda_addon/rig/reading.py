@@ -72,7 +72,13 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
     rest_matrices[is_bone] = (
         armature_to_mesh_matrix(scene_rig.mesh_object, scene_rig.armature_object) @ rest_matrices[is_bone]
     )
-    _check_rest_matrices(names, rest_matrices)
+    # Raise a RigError if a rest matrix, (J, 4, 4), has no inverse.
+    for name, matrix in zip(names, rest_matrices, strict=True):
+        if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < MIN_VOLUME:
+            raise RigError(
+                f"The bone '{name}' has no length or no finite place in the rest pose; give its head and its tail "
+                "places in edit mode."
+            )
     faces = mesh_io.topology(mesh_object.data)
     fingerprint = Fingerprint(
         Fingerprint.digest(*faces),
@@ -110,16 +116,6 @@ def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndar
             f"All {vertex_count:,} vertices of '{object_name}' lie at one point in the rest pose, so the mesh has no "
             "size; give the mesh, or its Basis shape key, its shape."
         )
-
-
-def _check_rest_matrices(names: tuple[str, ...], rest_matrices: np.ndarray) -> None:
-    """Raise a RigError if a rest matrix, (J, 4, 4), has no inverse."""
-    for name, matrix in zip(names, rest_matrices, strict=True):
-        if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < MIN_VOLUME:
-            raise RigError(
-                f"The bone '{name}' has no length or no finite place in the rest pose; give its head and its tail "
-                "places in edit mode."
-            )
 
 
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:

@@ -53,7 +53,9 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
         elif effect == Effect.READ_VISIBILITY:
             modifier_switch.apply_visibility(mesh_object, character.animated)
         elif effect == Effect.TAG_BUFFER:
-            _tag_buffer(character, mesh_object)
+            buffer = playback_modifier.buffer_of_object(mesh_object)
+            if buffer is not None and buffer.session_uid == character.buffer_uid:
+                buffer.data.update_tag()
         elif effect == Effect.SHOW_WARNING:
             mesh_object.fdda.status = character.player.reported_warning = character.player.warning
         elif effect == Effect.CLEAR_STATUS:
@@ -64,12 +66,6 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
             # The terminal may be closed; the effects that follow show the rig all the same.
             with suppress(OSError, ValueError):
                 print(f"FDDA is switched off for '{mesh_object.name}': {error}")
-
-
-def _tag_buffer(character: Character, mesh_object: bpy.types.Object) -> None:
-    buffer = playback_modifier.buffer_of_object(mesh_object)
-    if buffer is not None and buffer.session_uid == character.buffer_uid:
-        buffer.data.update_tag()
 
 
 def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.types.Object:

@@ -148,21 +148,14 @@ def _group_weights(
     has_group = np.zeros(len(mesh_object.data.vertices), bool)
     has_group[entries.vertices] = True
     if any(bone.use_envelope_multiply for bone in bones):
-        entries = _multiply_envelopes(mesh_object, armature_object, bones, entries)
+        weights = entries.weights.copy()
+        points = _rest_points(mesh_object, armature_object, np.arange(len(mesh_object.data.vertices)))
+        for bone_index, bone in enumerate(bones):
+            if bone.use_envelope_multiply:
+                rows = np.flatnonzero(entries.bone_indices == bone_index)
+                weights[rows] *= _envelope(bone, points[entries.vertices[rows]])
+        entries = _SkinEntries(entries.vertices, entries.bone_indices, weights)
     return entries, has_group
-
-
-def _multiply_envelopes(
-    mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone], entries: _SkinEntries
-) -> _SkinEntries:
-    """Multiply the weights by the envelopes of the bones that are set to multiply."""
-    weights = entries.weights.copy()
-    points = _rest_points(mesh_object, armature_object, np.arange(len(mesh_object.data.vertices)))
-    for bone_index, bone in enumerate(bones):
-        if bone.use_envelope_multiply:
-            rows = np.flatnonzero(entries.bone_indices == bone_index)
-            weights[rows] *= _envelope(bone, points[entries.vertices[rows]])
-    return _SkinEntries(entries.vertices, entries.bone_indices, weights)
 
 
 def _envelope_weights(

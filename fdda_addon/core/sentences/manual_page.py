@@ -61,19 +61,15 @@ def _block_html(lines: list[str], folder: str) -> str:
     if first.startswith("    "):
         return f"<pre>{html.escape(chr(10).join(line[4:] for line in lines), quote=False)}</pre>"
     if re.match(r"- |\d+\. ", first):
-        return _list_html(lines, folder)
+        items: list[str] = []
+        for line in lines:
+            if item_match := re.match(r"(?:- |\d+\. )(.*)", line):
+                items.append(item_match[1])
+            else:
+                items[-1] += f" {line.strip()}"
+        tag = "ul" if lines[0].startswith("- ") else "ol"
+        return f"<{tag}>" + "".join(f"<li>{_inline_html(item, folder)}</li>" for item in items) + f"</{tag}>"
     return f"<p>{_inline_html(' '.join(lines), folder)}</p>"
-
-
-def _list_html(lines: list[str], folder: str) -> str:
-    items: list[str] = []
-    for line in lines:
-        if item_match := re.match(r"(?:- |\d+\. )(.*)", line):
-            items.append(item_match[1])
-        else:
-            items[-1] += f" {line.strip()}"
-    tag = "ul" if lines[0].startswith("- ") else "ol"
-    return f"<{tag}>" + "".join(f"<li>{_inline_html(item, folder)}</li>" for item in items) + f"</{tag}>"
 
 
 def _inline_html(text: str, folder: str) -> str:
