@@ -10,8 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..scene.stored_paths import absolute_path
-from . import last_evaluation
-from .loaded_heat_map import loaded_heat_map
+from . import heat_map, last_evaluation
 
 
 def _character_key(mesh_object: bpy.types.Object) -> tuple:
@@ -35,12 +34,11 @@ def _bound_objects() -> list[bpy.types.Object]:
 
 @persistent
 def _on_load_pre(*_: object) -> None:
-    heat_map = loaded_heat_map()
     for mesh_object in _bound_objects() if bpy.data.filepath else []:
         evaluation = last_evaluation.get(mesh_object)
         if evaluation is not None:
             evaluation.closed_character = _character_key(mesh_object)
-            evaluation.was_painted = heat_map is not None and heat_map.paint_kind(mesh_object) == heat_map.ERRORS
+            evaluation.was_painted = heat_map.paint_kind(mesh_object) == heat_map.ERRORS
 
 
 @persistent
@@ -50,8 +48,7 @@ def _on_load_post(*_: object) -> None:
         if evaluation is None:
             continue
         last_evaluation.restore(mesh_object, evaluation)
-        heat_map = loaded_heat_map()
-        if heat_map is not None and evaluation.was_painted:
+        if evaluation.was_painted:
             heat_map.paint_errors(mesh_object)
 
 

@@ -10,7 +10,6 @@ from ..core.errors import ModelError, RigError
 from ..core.formats.report import REPORT_HTML, page_path
 from ..core.progress import Job
 from ..evaluation import heat_map, last_evaluation, side_by_side
-from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..evaluation.results import Evaluation
 from ..evaluation.run import evaluate, evaluate_action
 from ..evaluation.settings import EvaluationSettings
@@ -253,6 +252,4 @@ def unregister() -> None:
         side_by_side.hide_all()
     show_graph(False)
     last_evaluation.clear()
-    heat_map = loaded_heat_map()
-    if heat_map is not None:
-        heat_map.clear_all()
+    heat_map.clear_all()

@@ -5,8 +5,7 @@ import bpy
 
 from ..core.sentences.assessment import assess_evaluation
 from ..core.sentences.counts import format_count
-from ..evaluation import last_evaluation, markers, side_by_side
-from ..evaluation.loaded_heat_map import loaded_heat_map
+from ..evaluation import heat_map, last_evaluation, markers, side_by_side
 from ..jobs import job
 from ..models.entries import bound_model_name
 from ..scene.scene_rig import SceneRig
@@ -165,8 +164,7 @@ def _draw_colors(
     header.label(text="Viewport Colors")
     if body is None:
         return
-    heat_map = loaded_heat_map()
-    painted_colors = heat_map.paint_kind(mesh_object) if heat_map else ""
+    painted_colors = heat_map.paint_kind(mesh_object)
     row = body.row(align=True)
     for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Body Parts")):
         button = row.row(align=True)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.errors import RigError
-from ..scene.material_attributes import material_attributes
 from ..scene.mesh import topology
+from ..scene.node_groups import tree_nodes
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
 from .modifier_effects import (
     INDIRECT_TYPES,
@@ -196,7 +196,7 @@ def find_shape_readers(
         later_names = {m.name for m in mesh_object.modifiers[index + 1 :]} & deforming_names
         rig_reads = {name for each in later_names for name in read_names(mesh_object.modifiers[each])}
         others_read = {name for _, other in enabled if other != modifier for name in read_names(other)}
-        if names is None or not names <= rig_reads - others_read - material_attributes(mesh_object):
+        if names is None or not names <= rig_reads - others_read - _material_attributes(mesh_object):
             readers.append(modifier)
     return readers
 
@@ -365,3 +365,11 @@ def _check_vertex_count(mesh_object: bpy.types.Object, stack: ModifierStack) -> 
             f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into "
             f"{evaluated_count}; switch off the one that changes the topology ({', '.join(suspect_names)})."
         )
+
+
+def _material_attributes(mesh_object: bpy.types.Object) -> set[str]:
+    """Return the names of the attributes and UV maps that the materials of an object read."""
+    materials = [slot.material for slot in mesh_object.material_slots if slot.material is not None]
+    nodes = [node for material in materials for node in tree_nodes(material.node_tree)]
+    properties = ("attribute_name", "layer_name", "uv_map")
+    return {getattr(node, name) for node in nodes for name in properties if hasattr(node, name)}
