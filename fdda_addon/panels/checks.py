@@ -1,118 +1,88 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks rigs for the panels. A timer runs a check after a change; drawing a panel never runs one."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import bpy
 from bpy.app.handlers import persistent
 
 from ..core.errors import RigError
-from ..jobs import job
 from ..properties.recording_options import recording_settings
 from ..recording.plan import RecordingSettings
 from ..recording.rig_check import RigCheck, check_recordable_rig
 from ..scene import draw_cache
 from ..scene.arrays import REST_MATRIX_ELEMENT, read
 from ..scene.scene_rig import SceneRig, armature_of
+from .timed_value import timed_values
 
 CHECK_INTERVAL_SECONDS = 0.3
 """Time between two checks of a rig that changes continuously."""
 
 
-class RigChecks:
-    """The last checks of the rigs of the open file, and what may have changed since.
-
-    Drawing asks for checks, the handlers report changes, and the timer runs the checks. Another file ends all.
+@dataclass
+class RigChanges:
+    """What may have changed since the last checks of the rigs of the open file; another file ends all.
 
     Attributes:
-        checks: by session_uid of the mesh object: the last check, and the `_change_signature` at that time.
-        requested: mesh objects that the timer will check, by session_uid.
+        signatures: `_change_signature` at the last check, by session_uid of the mesh object.
         outdated: mesh objects that may have changed in a way that `_change_signature` does not show, by session_uid.
-        changed_meshes: names of meshes whose geometry or weights have changed.
+        meshes: names of meshes whose geometry or weights have changed.
     """
 
-    def __init__(self) -> None:
-        self.checks: dict[int, tuple[RigCheck, tuple]] = {}
-        self.requested: set[int] = set()
-        self.outdated: set[int] = set()
-        self.changed_meshes: set[str] = set()
+    signatures: dict[int, tuple] = field(default_factory=dict)
+    outdated: set[int] = field(default_factory=set)
+    meshes: set[str] = field(default_factory=set)
 
-    def request(self, uid: int, delay: float) -> None:
-        """Let the timer check a rig."""
-        self.requested.add(uid)
-        if not bpy.app.timers.is_registered(_run_requested_checks):
-            bpy.app.timers.register(_run_requested_checks, first_interval=delay)
-
-    def store(self, mesh_object: bpy.types.Object, check: "RigCheck", signature: tuple) -> None:
-        """Store the check of a rig."""
-        self.outdated.discard(mesh_object.session_uid)
-        self.changed_meshes.discard(mesh_object.data.name)
-        self.checks[mesh_object.session_uid] = check, signature
-
-    def is_mesh_changed(self, mesh_object: bpy.types.Object) -> bool:
+    def has_mesh(self, mesh_object: bpy.types.Object) -> bool:
         """Return whether a mesh has changed since its check; False while it is edited."""
         # Reading a large mesh takes long enough to be noticed at each stroke of a brush.
-        return mesh_object.mode in {"OBJECT", "POSE"} and mesh_object.data.name in self.changed_meshes
-
-    def drawn_values(self) -> dict[int, tuple]:
-        """Return the values of all checks that panels draw, by session_uid of the mesh object."""
-        return {
-            uid: (id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls)
-            for uid, (check, _) in self.checks.items()
-        }
-
-    def clear(self) -> None:
-        """Forget all checks, and remove the timer."""
-        if bpy.app.timers.is_registered(_run_requested_checks):
-            bpy.app.timers.unregister(_run_requested_checks)
-        for state in (self.checks, self.requested, self.outdated, self.changed_meshes):
-            state.clear()
+        return mesh_object.mode in {"OBJECT", "POSE"} and mesh_object.data.name in self.meshes
 
 
-_rigs = RigChecks()
+_changes = RigChanges()
 
 
 @draw_cache.draw_cached
-def last_check(scene_rig: SceneRig) -> "RigCheck | None":
+def last_check(scene_rig: SceneRig) -> RigCheck | None:
     """Return the last check of a rig; None before the first. Schedule a new check if the rig may have changed."""
-    uid = scene_rig.mesh_object.session_uid
-    check, signature = _rigs.checks.get(uid, (None, ()))
-    is_outdated = check is None or uid in _rigs.outdated or signature != _change_signature(scene_rig)
-    if is_outdated or _rigs.is_mesh_changed(scene_rig.mesh_object):
-        _rigs.request(uid, CHECK_INTERVAL_SECONDS if check else 0.0)
+    mesh_object = scene_rig.mesh_object
+    uid, check = mesh_object.session_uid, timed_values.last(_check, mesh_object)
+    is_outdated = check is None or uid in _changes.outdated or _changes.has_mesh(mesh_object)
+    if is_outdated or _changes.signatures[uid] != _change_signature(scene_rig):
+        timed_values.get(_check, mesh_object, CHECK_INTERVAL_SECONDS)
     return check
 
 
-def check_now(scene_rig: SceneRig) -> "RigCheck":
+def check_now(scene_rig: SceneRig) -> RigCheck:
     """Check a rig now, without reading unchanged data again, and return the result."""
+    return timed_values.compute_now(_check, scene_rig.mesh_object)
+
+
+def _check(mesh_object: bpy.types.Object) -> RigCheck | None:
+    armature_object = armature_of(mesh_object)
+    if armature_object is None:
+        return None
+    scene_rig = SceneRig(mesh_object, armature_object)
     try:
         settings, problems = recording_settings(scene_rig), ()
     except RigError as error:
         settings, problems = RecordingSettings(poses=0), (str(error),)
-    mesh_object, signature = scene_rig.mesh_object, _change_signature(scene_rig)
-    previous_check, previous_signature = _rigs.checks.get(mesh_object.session_uid, (None, ((),)))
-    if previous_signature[0] == signature[0] and not _rigs.is_mesh_changed(mesh_object):
-        result = previous_check.recheck(scene_rig, settings)
+    uid, signature = mesh_object.session_uid, _change_signature(scene_rig)
+    previous = timed_values.last(_check, mesh_object)
+    if previous and _changes.signatures[uid][0] == signature[0] and not _changes.has_mesh(mesh_object):
+        result = previous.recheck(scene_rig, settings)
     else:
         result = check_recordable_rig(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)
-    _rigs.store(mesh_object, result, signature)
-    return result
+    _changes.signatures[uid] = signature
+    _changes.outdated.discard(uid)
+    _changes.meshes.discard(mesh_object.data.name)
+    # The same object shows that there is nothing to draw again.
+    return previous if previous and _drawn_values(previous) == _drawn_values(result) else result
 
 
-def _run_requested_checks() -> None:
-    running_job = job.current()
-    previous_values = _rigs.drawn_values()
-    meshes = {o.session_uid: o for o in bpy.data.objects if o.type == "MESH"}
-    for uid in list(_rigs.requested):
-        _rigs.requested.discard(uid)
-        mesh_object = meshes.get(uid)
-        armature_object = mesh_object and armature_of(mesh_object)
-        # A job that changes the scene has changed the pose and the modifiers.
-        if armature_object and not (running_job and running_job.changes_scene):
-            check_now(SceneRig(mesh_object, armature_object))
-    if _rigs.drawn_values() != previous_values:
-        job.redraw()
+def _drawn_values(check: RigCheck) -> tuple:
+    return id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls
 
 
 def _change_signature(scene_rig: SceneRig) -> tuple:
@@ -151,26 +121,28 @@ def _sampling_settings(scene_rig: SceneRig) -> tuple:
 @persistent
 def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     draw_cache.clear()
-    if not _rigs.checks:
+    if not _changes.signatures:
         return
-    _rigs.outdated.update(_rigs.checks)
+    _changes.outdated.update(_changes.signatures)
     for update in depsgraph.updates:
         # Armatures are left out: Blender reports them as changed with every pose.
         if isinstance(update.id, bpy.types.Mesh):
-            _rigs.changed_meshes.add(update.id.name)
+            _changes.meshes.add(update.id.name)
 
 
 @persistent
 def _on_undo(*_: object) -> None:
     draw_cache.clear()
-    _rigs.outdated.update(_rigs.checks)
-    _rigs.changed_meshes.update(mesh.name for mesh in bpy.data.meshes)
+    _changes.outdated.update(_changes.signatures)
+    _changes.meshes.update(mesh.name for mesh in bpy.data.meshes)
 
 
 @persistent
 def _on_load(*_: object) -> None:
     draw_cache.clear_all()
-    _rigs.clear()
+    timed_values.stop()
+    for changes in (_changes.signatures, _changes.outdated, _changes.meshes):
+        changes.clear()
 
 
 HANDLERS = {

@@ -43,6 +43,10 @@ class TimedValues:
                 bpy.app.timers.register(self._timer, first_interval=max(min(self._requested.values()) - now, 0.0))
         return self._values.get(key)
 
+    def last(self, compute: Compute, mesh_object: bpy.types.Object) -> object | None:
+        """Return the last value, None before the first."""
+        return self._values.get((compute, mesh_object.session_uid))
+
     def compute_now(self, compute: Compute, mesh_object: bpy.types.Object) -> object:
         """Compute a value and return it."""
         value = self._values[compute, mesh_object.session_uid] = compute(mesh_object)

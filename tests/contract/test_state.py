@@ -18,7 +18,7 @@ STATE = {
     "evaluation/last_evaluation.py": {"_evaluations": "the last 4 evaluations, also of closed files, until unregister"},
     "evaluation/timeline.py": {"graph": "drawn from start to stop"},
     "jobs/job.py": {"_runners": "the last job of each verb; another file drops ended jobs"},
-    "panels/checks.py": {"_rigs": "checks of rigs, until another file is opened"},
+    "panels/checks.py": {"_changes": "what changed since the checks of rigs, until another file is opened"},
     "panels/curves.py": {"image": "made by the first drawing, freed by unregister"},
     "panels/timed_value.py": {"timed_values": "values that panels draw, until their object is removed, or unregister"},
     "poses/action_range.py": {"_cache": "measured actions, dropped at 64 MB"},
