@@ -29,7 +29,7 @@ def replace_file(source: Path, target: Path) -> None:
     Raises:
         OSError: `os.replace` raised it; EBUSY where another program has a file open for longer than `RETRY_SECONDS`.
     """
-    _retry_while_in_use(lambda: os.replace(source, target), target)
+    _change(target, lambda: os.replace(source, target))
 
 
 def remove_file(path: Path) -> None:
@@ -38,7 +38,7 @@ def remove_file(path: Path) -> None:
     Raises:
         OSError: `os.unlink` raised it; EBUSY where another program has the file open for longer than `RETRY_SECONDS`.
     """
-    _retry_while_in_use(lambda: path.unlink(missing_ok=True), path)
+    _change(path, lambda: path.unlink(missing_ok=True))
 
 
 def open_with_retry(open_file: Callable[[], Result]) -> Result:
@@ -51,7 +51,7 @@ def open_with_retry(open_file: Callable[[], Result]) -> Result:
     return _retry(open_file, OPEN_RETRY_SECONDS, lambda _: os.name == "nt")
 
 
-def _retry_while_in_use(action: Callable[[], None], path: Path) -> None:
+def _change(path: Path, action: Callable[[], None]) -> None:
     def is_in_use(error: PermissionError) -> bool:
         # Windows refuses a folder and a write-protected file permanently.
         is_permanent = os.path.isdir(path) or (os.path.lexists(path) and not os.access(path, os.W_OK))

@@ -18,8 +18,6 @@ from .open_files import remove_file, replace_file
 from .path_limits import check_path, comparable_path, is_windows
 
 TEMPORARY_PREFIX = ".fdda-"
-_TEMPORARY_NAME_PATTERN = r"\.fdda-[0-9a-f]{12}(\..*)?"
-"""Pattern of the temporary names of `atomic_write`."""
 
 
 def check_outputs(
@@ -159,7 +157,10 @@ def atomic_write_all(*paths: Path, keep_on_failure: bool = True) -> Iterator[tup
     temporaries: list[Path] = []
     try:
         for path in paths:
-            temporaries.append(_create_temporary_file(path))
+            temporary = path.with_name(_temporary_name(path))
+            # Unlike a file of `tempfile.mkstemp`, it has the default permissions.
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666))
+            temporaries.append(temporary)
         yield tuple(temporaries)
         for temporary in temporaries:
             with open(temporary, "r+b") as file:  # Windows flushes only files that are open for writing
@@ -179,17 +180,28 @@ def atomic_write_all(*paths: Path, keep_on_failure: bool = True) -> Iterator[tup
 
 def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failure: bool) -> None:
     """Rename the temporary files to their paths: all files or none."""
-    backups: dict[Path, Path | None] = {}
+    backups: dict[Path, Path] = {}
     renamed: list[tuple[Path, Path]] = []
     try:
-        for path in paths[:-1]:
-            backups[path] = _back_up(path)
+        for path in filter(os.path.lexists, paths[:-1]):
+            backups[path] = path.with_name(_temporary_name(path))
+            try:
+                os.link(path, backups[path])
+            except OSError:
+                # Not every file system has hard links.
+                shutil.copy2(path, backups[path])
         for temporary, path in zip(temporaries, paths, strict=True):
             replace_file(temporary, path)
             renamed.append((temporary, path))
     except BaseException as error:
-        failed_path = paths[len(renamed) % len(paths)]
-        changed_paths = [path for temporary, path in reversed(renamed) if not _restore(temporary, path, backups[path])]
+        failed_path, changed_paths = paths[len(renamed) % len(paths)], []
+        for temporary, path in reversed(renamed):
+            try:
+                replace_file(path, temporary)
+                if path in backups:
+                    replace_file(backups[path], path)
+            except OSError:
+                changed_paths.append(path)
         if not isinstance(error, OSError):
             raise
         text = f"{_format_names(changed_paths)} was replaced, and no other" if changed_paths else "nothing was changed"
@@ -201,33 +213,9 @@ def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failur
         raise OutputError(f"Cannot write '{failed_path}': {os_error_text(error)}; {text}.") from error
     finally:
         for path, backup in backups.items():
-            if backup and os.path.lexists(path):
+            if os.path.lexists(path):
                 with suppress(OSError):
                     remove_file(backup)
-
-
-def _back_up(path: Path) -> Path | None:
-    """Link or copy a file to a temporary name before it is replaced; return None where the file does not exist."""
-    if not os.path.lexists(path):
-        return None
-    backup = path.with_name(_temporary_name(path))
-    try:
-        os.link(path, backup)
-    except OSError:
-        # Not every file system has hard links.
-        shutil.copy2(path, backup)
-    return backup
-
-
-def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
-    """Undo the renaming of a file to `path`; return whether this succeeded."""
-    try:
-        replace_file(path, temporary)
-        if backup:
-            replace_file(backup, path)
-    except OSError:
-        return False
-    return True
 
 
 def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
@@ -247,23 +235,14 @@ def _format_names(paths: Iterable[Path]) -> str:
     return ", ".join(f"'{path.name}'" for path in paths)
 
 
-def _create_temporary_file(path: Path) -> Path:
-    """Create an empty file with an unpredictable name beside a path.
-
-    Unlike a file of `tempfile.mkstemp`, it has the default permissions.
-    """
-    temporary = path.with_name(_temporary_name(path))
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666))
-    return temporary
-
-
 def _temporary_name(path: Path) -> str:
+    """Return a name that nobody can predict."""
     return f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}{path.suffix}"
 
 
 def is_temporary_name(name: str) -> bool:
     """Return whether a file has a temporary name of `atomic_write`, left by a process that was killed while writing."""
-    return re.fullmatch(_TEMPORARY_NAME_PATTERN, name, re.DOTALL) is not None
+    return re.fullmatch(r"\.fdda-[0-9a-f]{12}(\..*)?", name, re.DOTALL) is not None
 
 
 def write_text(path: Path, text: str) -> None:
