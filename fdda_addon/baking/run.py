@@ -80,7 +80,6 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
     ends, is closed, or raises, and no incomplete file is left.
 
     Args:
-        scene_rig: the rig.
         model: path of the model, or the loaded model.
         out: path of the .pc2 or .blend file to write.
         settings: settings of the bake.

@@ -117,7 +117,6 @@ def lost_driver_note(recorded: dict, current: dict, controls: Iterable[Control],
 
     Args:
         recorded, current, controls: as for `deformation_differences`.
-        object_name: name of the mesh object.
     """
     control_paths = {control.path for control in controls if control.owner == SHAPE_KEYS}
     names = sorted(recorded.get("drivers", {}).keys() - current.get("drivers", {}).keys())

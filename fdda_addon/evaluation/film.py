@@ -90,12 +90,10 @@ def film(
     The file appears when it is complete. Closing the generator leaves no file and no data.
 
     Args:
-        scene_rig: the rig.
         model: path of the model, or the loaded model.
         errors: the frames of the action, evaluated.
         first_frame: number of the first frame.
         path: path of the video (`video.check_video_path`).
-        settings: the settings.
 
     Raises:
         ModelError: the model cannot be read, or was trained for another rig.

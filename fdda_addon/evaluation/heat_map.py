@@ -57,7 +57,6 @@ def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PART
     """Show the partitions of the bound model as colors, or the partitions of the rig if no model can be read.
 
     Args:
-        scene_rig: the rig.
         min_partition_vertices: smallest number of vertices in a partition of the rig.
 
     Raises:

@@ -108,7 +108,6 @@ class Overlay:
 
         Args:
             context: the context with the dependency graph.
-            mesh_object: the object.
             colors: (V, 3) float32, sRGB.
         """
         evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())

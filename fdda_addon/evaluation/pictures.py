@@ -86,9 +86,7 @@ def draw_comparison(
     """Draw the rig, linear skinning and the model side by side, with a row for each pose.
 
     Args:
-        scene_rig: the rig.
         model: path of the model; it need not be bound.
-        poses: the poses.
         path: path of the PNG file.
         is_heat_map: whether to color each vertex by its distance from the rig.
         title: title of the picture; empty for a default.

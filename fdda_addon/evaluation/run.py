@@ -49,7 +49,6 @@ def evaluate(scene_rig: SceneRig, model: Path | Network, settings: EvaluationSet
     closed, or raises.
 
     Args:
-        scene_rig: the rig.
         model: path of the model, or the loaded model.
         settings: the poses to compare.
 
@@ -118,7 +117,6 @@ def set_held_out_pose(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: 
     """Set one of the random poses of an evaluation.
 
     Args:
-        scene_rig: the rig.
         channels: the channels of the evaluation.
         seed: the seed of the evaluation.
         index: index of the pose in the evaluation.

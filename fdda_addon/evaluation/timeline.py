@@ -81,7 +81,6 @@ class ErrorGraph:
         """Return the GPU batches of the area below the graph and of its line, stored until an argument changes.
 
         Args:
-            evaluation: the evaluation.
             rectangle: left end, right end, bottom and height of the graph, pixels.
             shader: the shader that draws the batches.
         """

@@ -21,7 +21,6 @@ def unread_curves(
     A model reads the transforms of its joints, which the segments do not change.
 
     Args:
-        armature_object: the armature object.
         replaced_modifiers: names of the modifiers that a model replaces, by name of the mesh object.
         controls: names of the bones that animators see.
         kept: what is kept if all segments stay; the objects and bones that are not kept read no curve.
@@ -44,7 +43,6 @@ def _bones_with_read_curves(
     """Yield the bones whose curve deforms an object, or is followed by constraints of it or of its kept bones.
 
     Args:
-        scene_object: the object.
         replaced: names of the modifiers that a model of the object replaces; None if it has no model.
         kept: the kept nodes.
     """

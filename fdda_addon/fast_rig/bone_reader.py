@@ -19,8 +19,6 @@ def add_bones(
     """Add what each bone of an armature object needs, except for drivers.
 
     Args:
-        graph: the graph.
-        armature_object: the armature object.
         animated_paths: RNA paths of the armature object that actions or drivers set. A muted constraint counts unless
             its mute state is constant.
         straight: names of the bones that need no handles, because nothing reads their curve.

@@ -71,7 +71,6 @@ def evaluate_poses(poses: ComparedPoses, stage: str) -> Job[Evaluation]:
     """Evaluate bones and objects in all poses while the generator is iterated, and restore the rig.
 
     Args:
-        poses: the poses.
         stage: stage of the progress.
     """
     armature_object, shown_poses = poses.armature_object, list(_pose_setters(poses))
@@ -101,7 +100,6 @@ def differing_bones(poses: ComparedPoses, before: np.ndarray, after: np.ndarray,
     """Compare the matrices of two evaluations.
 
     Args:
-        poses: the poses.
         before, after: (P, B, 4, 4), as in `Evaluation`.
         tolerance: largest accepted difference, as a ratio of the size of the rig for translations, and absolute for
             rotations and scales.
@@ -129,7 +127,6 @@ def infinite_bones(poses: ComparedPoses, matrices: np.ndarray) -> dict[str, int]
     """Count the poses in which bones have an infinite or undefined place, rotation or scale.
 
     Args:
-        poses: the poses.
         matrices: (P, B, 4, 4), as in `Evaluation`.
 
     Returns:
@@ -149,7 +146,6 @@ def set_random_pose(armature_object: bpy.types.Object, names: Iterable[str], siz
     """Set the channels and custom properties of some bones at random, except locked channels; others do not change.
 
     Args:
-        armature_object: the armature object.
         names: names of the bones. The values of a bone depend only on the seed and on its index in `names`.
         size: size of the rig, armature units.
         seed: seed of the pose.

@@ -30,7 +30,6 @@ def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> 
     """Return the names of the chosen control bones.
 
     Args:
-        armature_object: the armature object.
         choices: each is `visible`, `keyed` (in an action of the file) or `collection:NAME`.
 
     Raises:

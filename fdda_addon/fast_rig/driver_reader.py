@@ -62,8 +62,6 @@ def add_drivers(
     Shaders may read custom properties, but not those of armatures: of these, a driver needs another one that reads it.
 
     Args:
-        graph: the graph.
-        datablock: the datablock.
         optional_paths: prefixes of paths whose drivers the datablock does not need.
         straight: names of bones that do not need the drivers of their B-Bone properties.
     """

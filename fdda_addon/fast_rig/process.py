@@ -32,10 +32,6 @@ class VerbProcess:
     def __init__(self, verb: str, arguments: list[str]):
         """Start the process.
 
-        Args:
-            verb: the verb.
-            arguments: its arguments.
-
         Raises:
             FDDAError: Blender cannot be started, or no temporary file can be written.
         """

@@ -34,7 +34,6 @@ def measure_saving(scene_rig: SceneRig, file: Path) -> Job[FastRigSaving]:
     and replaced by others, so run this in a process of its own.
 
     Args:
-        scene_rig: the rig.
         file: the open file, as it is saved.
 
     Raises:

@@ -23,7 +23,6 @@ def iterate_in_thread(job: Job[Result], state: JobState, cancel: Callable[[], No
     """Iterate a job in a thread, because it blocks; it must not use data of Blender.
 
     Args:
-        job: the job.
         state: state of the job, whose `cancel_requested` is checked.
         cancel: thread-safe function that makes `job` end soon; None if it cannot be canceled.
 

@@ -41,7 +41,6 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
     """Bind a model, pack it if the preferences say so, and return the message to report.
 
     Args:
-        scene_rig: the rig.
         path: file of the model; None for the active model of the Model Library, or else the trained model.
         pack_large: whether to pack a large model too.
 

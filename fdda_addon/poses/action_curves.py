@@ -42,7 +42,6 @@ def channel_values(
     """Evaluate the keyed channels of a bone.
 
     Args:
-        bone: the bone.
         curves: its F-curves.
         frames: F frames.
         rotations: receives the quaternions of a bone that is not keyed as Euler angles.

@@ -62,10 +62,6 @@ def action_frames(action: bpy.types.Action) -> range:
 def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> ChannelRanges:
     """Measure the ranges in which actions move the bones of an armature, at all whole frames.
 
-    Args:
-        armature_object: the armature object.
-        actions: the actions.
-
     Returns:
         Ranges of the channels that the actions key and change, relative to the rest pose: `ROTATION` in radians,
         `LOCATION` in meters, `SCALE` as factors. Rotations are Euler angles as `armature.Poser` sets them: in the
@@ -161,10 +157,6 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
 
     These are custom properties, influences of constraints and values of shape keys. Numbers that do not exist
     in the file, and numbers whose range is too wide for a control, are left out.
-
-    Args:
-        scene_rig: the rig.
-        actions: the actions.
     """
     controls = []
     for (owner, path), bounds in keyed_controls(scene_rig, actions).items():

@@ -61,7 +61,6 @@ class ClipPlayer:
         """Prepare to show clips.
 
         Args:
-            rigs: the rigs.
             clips: the clips that will be shown.
 
         Raises:

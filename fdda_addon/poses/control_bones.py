@@ -27,7 +27,6 @@ def split_control_bones(scene_rig: SceneRig, texts: Iterable[str]) -> tuple[froz
     """Split controls as a user lists them into the names of control bones, and the other texts.
 
     Args:
-        scene_rig: the rig.
         texts: `collection:NAME` for the bones of a collection and its children, `bone:NAME`, or any other text.
 
     Raises:
@@ -47,7 +46,6 @@ def bone_controls(scene_rig: SceneRig, names: frozenset[str], channels: Iterable
     """Make the controls of control bones: what random poses move, and the custom properties that no driver sets.
 
     Args:
-        scene_rig: the rig.
         names: names of the control bones.
         channels: channels of the random poses (`sampling.selected_channels`).
 
@@ -157,7 +155,6 @@ def describe_control_bones(
     """Return a sentence with the number of inputs of control bones, and sentences about what has no range.
 
     Args:
-        armature_object: the armature object.
         names: names of the control bones.
         controls: the controls of these, and any others.
     """

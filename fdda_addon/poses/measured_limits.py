@@ -68,8 +68,6 @@ def set_limits_from_actions(
     otherwise.
 
     Args:
-        scene_rig: the rig.
-        actions: the actions.
         margin: fraction of the width of each range that is added at each end.
 
     Returns:

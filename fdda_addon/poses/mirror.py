@@ -41,7 +41,6 @@ class Mirror:
         """Prepare to mirror poses.
 
         Args:
-            armature_object: the armature object.
             animated_numbers: datablocks and RNA paths of numbers to exchange with the other side, in addition to
                 custom properties of bones.
 

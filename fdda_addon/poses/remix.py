@@ -27,10 +27,6 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
     properties of a bone come from the same frame as its rotation, without noise; numbers that belong to no bone, such
     as shape keys, all come from another frame.
 
-    Args:
-        scene_rig: the rig.
-        actions: the actions.
-
     Raises:
         RigError: the actions move no bone, or have one pose.
     """

@@ -59,7 +59,6 @@ def select_bones(
     """Parse a selection, which may be empty.
 
     Args:
-        scene_rig: the rig.
         texts: as for `sampling.parse_sample_selection`.
         control_bones: names of the bones whose channels are controls.
         recorded_actions: actions whose frames are recorded; control bones without a range move in their ranges.

@@ -43,7 +43,6 @@ def parse_sample_selection(
     """Parse the user's selection of bones and controls.
 
     Args:
-        scene_rig: the rig.
         texts: `selected` for the selected bones, `collection:NAME` for the bones of a collection and its children,
             `action:NAME` for all bones and controls that an action keys, or `bone:NAME`; empty for the default bones.
         find_controls: returns further controls, given the ranges of the sampled numbers of bones (`ranges_by_control`),
@@ -86,7 +85,6 @@ def sampled_channels(
     """Find the channels of a random pose.
 
     Args:
-        scene_rig, rig: the rig.
         selection: the user's selection.
 
     Raises:
@@ -193,7 +191,6 @@ def default_channels(armature_object: bpy.types.Object, names: set[str]) -> tupl
     constraints other than limits are left out too, because setting their channels may have no effect.
 
     Args:
-        armature_object: the armature object.
         names: names of bones to include even if they have no range of motion.
     """
     channels = []

@@ -16,7 +16,6 @@ def describe_independent_objects(
     """Describe the objects whose place deforms a mesh, although neither its rig nor a control or a driver moves them.
 
     Args:
-        scene_rig: the rig.
         sources: everything on which its mesh depends.
         controls: the controls of the model, in the form that `scene.controls.fcurve_target` returns.
 

@@ -17,7 +17,6 @@ def describe_missing_ranges(
     """Describe the numbers that the drivers of a mesh read, and that no control and no driver sets.
 
     Args:
-        scene_rig: the rig.
         sources: everything on which its mesh depends.
         controls: the controls of the model, in the form that `scene.controls.fcurve_target` returns.
 

@@ -175,7 +175,6 @@ def find_shape_readers(
     modifiers read, such as weights.
 
     Args:
-        mesh_object: the object.
         deforming: the modifiers that a model replaces and that are on while the rig is shown.
         end: index after the last modifier that a model replaces.
     """

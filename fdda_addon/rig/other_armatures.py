@@ -45,7 +45,6 @@ def check_other_armatures(
     """Check that bones of other armatures deform a mesh only by channels that are controls or driven.
 
     Args:
-        scene_rig: the rig.
         sources: everything on which its mesh depends.
         controls: the controls of the model, in the form that `scene.controls.fcurve_target` returns.
 

@@ -42,7 +42,6 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
     """Read a rig into arrays.
 
     Args:
-        scene_rig: the rig.
         extra_joints: names of joints besides the bones with weights, such as those of a model or a recording; None as
             for `choose_joints`.
         include_static_joint: add the joint that never moves, which tells the networks the direction of gravity.
@@ -175,7 +174,6 @@ class PoseReader:
         """Prepare to read joints.
 
         Args:
-            scene_rig: the rig.
             names: names of J joints.
             rest_matrices: (J, 4, 4), rest matrices of the joints, mesh-object space.
 
@@ -235,7 +233,6 @@ class PoseEvaluator:
         """Prepare to read a rig.
 
         Args:
-            scene_rig, rig: the rig.
             target: the target whose positions replace those of the rig.
 
         Raises:

@@ -80,7 +80,6 @@ class Settler:
         """Move from the rest pose to a pose, and hold it until the target is at rest, for at most `max_frames` frames.
 
         Args:
-            pose: the pose.
             via_pose: another pose through which the rig moves on the way.
         """
         start_time, scene, frame = time.perf_counter(), bpy.context.scene, self._first_frame
@@ -186,7 +185,6 @@ class SimulatedPoseSetter(PoseSetter):
 
         Args:
             player: the player of the clip.
-            clip: the clip.
             frame_indices: indices of the frames to yield, at least one, from `reversible_frames`.
 
         Yields:

@@ -50,7 +50,6 @@ class Sources:
         """Find everything on which the surface of an object depends.
 
         Args:
-            scene_rig: the rig.
             root: its mesh object, or a target.
             modifiers: names of the modifiers of `root` to follow. If they are given, only modifiers that are on and
                 drivers that can move the surface are followed. None to follow everything.

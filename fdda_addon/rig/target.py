@@ -119,7 +119,6 @@ def find_target(scene_rig: SceneRig, name: str, controls: Iterable[Control] = ()
     """Find the target of a rig by the name of its object.
 
     Args:
-        scene_rig: the rig.
         name: name of the target object.
         controls: numbers that may change the target, because the model reads them.
 
@@ -194,7 +193,6 @@ def temporary_frame_range(target: Target, first_frame: int | None, last_frame: i
     """Extend the frame ranges of a target's simulations, and restore them afterwards.
 
     Args:
-        target: the target.
         first_frame: first frame of all simulations; None to keep their first frames.
         last_frame: the ranges end at this frame or later.
     """

@@ -23,7 +23,6 @@ def make_pose_setter(
     """Make the pose setter for a target, and check that the target can be used.
 
     Args:
-        scene_rig: the rig.
         settings: settings of the target.
         clips: the clips whose frames are evaluated.
         random_pose_count: number of random poses.

@@ -51,7 +51,6 @@ def check_time_inputs(
     """Check that the surface of a mesh depends only on the pose of its armature and on controls.
 
     Args:
-        scene_rig: the rig.
         controls: the controls of the model or the recording.
         stack: the modifiers of the mesh object.
         actions: the actions whose frames are recorded.

@@ -24,7 +24,6 @@ def bind(
     """Bind a model to a rig and play it.
 
     Args:
-        scene_rig: the rig.
         model_path: path of the model file, in any folder. A saved .blend file stores it as a relative path.
         use_in_render: whether final renders show the model instead of the rig.
         packed_text: the text datablock that holds a packed model (`packed_model`); `model_path` is then the path that

@@ -17,8 +17,6 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
     """Apply an effect.
 
     Args:
-        effect: the effect.
-        character: the character.
         error: the reason of `Effect.REPORT`.
 
     Raises:

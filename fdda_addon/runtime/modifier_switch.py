@@ -26,7 +26,6 @@ def evaluated_uses_model(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsg
     """Return whether the evaluated settings of a bound object show its model.
 
     Args:
-        evaluated: the evaluated object.
         depsgraph: the dependency graph that evaluated the object.
         animated: the result of `animated_settings`.
     """

@@ -49,7 +49,6 @@ def read_matching_rig(scene_rig: SceneRig, path: Path, info: ModelInfo) -> Rig:
     """Read a rig with the joints and controls of a model, and check that the model was trained for this rig.
 
     Args:
-        scene_rig: the rig.
         path: path of the model, for error messages.
         info: metadata of the model.
 

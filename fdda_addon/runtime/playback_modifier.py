@@ -29,7 +29,6 @@ def add_modifiers(mesh_object: bpy.types.Object, index: int) -> None:
     but not the modifier, when it is saved where the add-on is missing.
 
     Args:
-        mesh_object: the object.
         index: index of the FDDA modifier in the stack, not counting the modifiers that are added here.
     """
     if find_modifier(mesh_object) is None:

@@ -157,7 +157,6 @@ class Player:
         """Read the mask of the object again if it may have changed.
 
         Args:
-            mesh_object: the object.
             weights_changed: whether weights of its vertex groups may have changed.
 
         Returns:
@@ -204,7 +203,6 @@ class Player:
 
         Args:
             mesh_object: the bound object.
-            armature_object: its armature object.
             owners: the datablocks that own `ControlReader.sources`, in their order.
 
         Returns:

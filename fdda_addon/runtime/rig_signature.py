@@ -53,7 +53,6 @@ def read_signature(
     """Read the signature of a rig: what is quick to read. If it and the mesh are unchanged, the whole rig is unchanged.
 
     Args:
-        scene_rig: the rig.
         unread_bones: names of the bones whose effect the model learned from others (`rig.unread_bones`).
         parts: which parts to read.
 
@@ -145,7 +144,6 @@ def _align_rest_matrices(rig: Rig, joint_names: tuple[str, ...], rest_matrices: 
     joint defines the difference between the two transforms.
 
     Args:
-        rig: the rig.
         joint_names: names of the joints of the model.
         rest_matrices: (J, 4, 4) float32, rest matrices of the model, mesh-object space.
 

@@ -57,7 +57,6 @@ def slots_of_action(action: bpy.types.Action, datablocks: Sequence[bpy.types.ID]
     no effect.
 
     Args:
-        action: the action.
         datablocks: the datablocks of the rig (`dependencies`).
 
     Raises:

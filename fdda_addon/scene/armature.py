@@ -36,7 +36,6 @@ class PoseMatrixReader:
         """Prepare to read bones.
 
         Args:
-            armature_object: the armature object.
             names: names of J bones.
 
         Raises:

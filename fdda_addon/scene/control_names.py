@@ -28,7 +28,6 @@ def control_at(scene_rig: SceneRig, full_data_path: str) -> str:
     """Return the name of the control at a full data path, as Blender's operator Copy Full Data Path writes it.
 
     Args:
-        scene_rig: the rig.
         full_data_path: for example `bpy.data.objects["arm"].data.shape_keys.key_blocks["smile"].value`.
 
     Returns:

@@ -35,7 +35,6 @@ class ControlReader:
         """Prepare to read controls.
 
         Args:
-            scene_rig: the rig.
             controls: C controls.
 
         Raises:
@@ -137,7 +136,6 @@ class ConstrainedBones:
         """Prepare to read bones.
 
         Args:
-            armature_object: the armature object.
             bones: the numbers of each bone that are controls, at least one.
         """
         self._names = [numbers[0][1].bone_name for numbers in bones]

@@ -71,7 +71,6 @@ def read_skin(
     """Read the skin weights of a mesh.
 
     Args:
-        mesh_object: the mesh object.
         armature_object: the armature object that deforms it.
         modifier: the Armature modifier; None if there is none, so that no vertex follows a bone.
     """
@@ -180,7 +179,6 @@ def _envelope(bone: bpy.types.Bone, points: np.ndarray) -> np.ndarray:
     envelopes.
 
     Args:
-        bone: the bone.
         points: (n, 3) float64, armature space, its units.
 
     Returns:

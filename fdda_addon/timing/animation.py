@@ -50,7 +50,6 @@ def key_random_poses(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) ->
     """Key random poses on the armature, `KEY_STEP_FRAMES` frames apart, and return its action.
 
     Args:
-        scene_rig: the rig.
         channels: the channels of the poses, without controls; empty for the sampled channels of the rig.
     """
     armature_object = scene_rig.armature_object

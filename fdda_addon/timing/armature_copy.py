@@ -21,7 +21,6 @@ def armature_copy(
     The copy depends on itself where the original depends on itself, and plays the same action.
 
     Args:
-        armature_object: the armature object.
         removed: constraints of its bones, and drivers of it and of its armature, that the copy lacks.
     """
     constraint_names: dict[str, set[str]] = {}

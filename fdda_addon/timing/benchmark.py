@@ -137,7 +137,6 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Job[Bench
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
 
     Args:
-        scene_rig: the rig.
         model: path of the model; None for the bound model.
         frames: number of frames to time for each variant.
 
@@ -199,7 +198,6 @@ def time_frames(animation_frames: range, first_index: int, count: int) -> list[f
     """Time frames of an animation after some warm-up frames.
 
     Args:
-        animation_frames: frames of the animation.
         first_index: index of the first timed frame in the animation. After its end the animation starts again.
         count: number of frames to time.
 

@@ -69,7 +69,6 @@ def find_expensive_groups(armature_object: bpy.types.Object, frames: range) -> J
     """Find the bones of an armature whose constraints and drivers take the most time.
 
     Args:
-        armature_object: the armature object.
         frames: frames of its animation.
 
     Yields:

@@ -40,7 +40,6 @@ def find_open_seams(rig: Rig, residuals: Iterable[np.ndarray]) -> list[Recording
     Gaps that are the same in all poses can be learned, so they do not count.
 
     Args:
-        rig: the rig.
         residuals: (V, 3) of each pose, axes of the main joint, mesh units. A mesh without cuts needs none of them.
     """
     pairs = _seam_pairs(rig)

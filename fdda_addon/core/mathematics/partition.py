@@ -65,7 +65,6 @@ def make_partitions(
     """Partition the mesh by main joint, in ascending order of the joints.
 
     Args:
-        rig: the rig.
         influencing: influencing joints of each partition, by main joint; None where no partition has any.
         controls: influencing controls of each partition, by main joint; None where no partition has any.
         merged: by main joint of a merged partition, the main joint of the partition into which it is merged.
@@ -101,7 +100,6 @@ def small_partition_merges(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES)
     the last partition is never merged.
 
     Args:
-        rig: the rig.
         min_vertices: partitions with fewer vertices are small; 0 merges none.
 
     Returns:
@@ -138,7 +136,6 @@ def _choose_merge_joint(rig: Rig, joint: int, weights: dict[int, np.ndarray]) ->
     """Choose the partition into which a small partition is merged, and return its main joint; None where there is none.
 
     Args:
-        rig: the rig.
         joint: main joint of the small partition.
         weights: for each partition, by main joint, the sum of the skin weights of each joint over its vertices.
     """
@@ -172,7 +169,6 @@ def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tup
     joints from the main joint up to mesh-object space are included.
 
     Args:
-        rig: the rig.
         partitions: of the rig; their influences are ignored.
     """
     has_weight = joints_with_weight(rig.skin_joints, rig.skin_weights, len(rig.joints))
