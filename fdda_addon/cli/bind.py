@@ -5,16 +5,25 @@ import argparse
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from ..scene.scene_rig import SceneRig
+import bpy
+
+from ..core.errors import ModelError, OutputError
+from ..core.files.file_kind import BLEND
+from ..core.files.open_files import remove_file
+from ..core.files.output import atomic_write, check_outputs
+from ..models.entries import bound_entry
+from ..models.model_list import add_bound_model
+from ..runtime.binding import bind
+from ..scene.blend_file import save_copy
+from ..scene.scene_rig import SceneRig
+from ..scene.stored_paths import stored_path
+from .files import add_rig_options
+from .folders import open_rigs
+from .outputs import add_overwrite_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .files import add_rig_options
-    from .outputs import add_overwrite_option
-
     add_rig_options(parser)
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, with the bound model")
@@ -25,12 +34,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.files.file_kind import BLEND
-    from ..core.files.open_files import remove_file
-    from ..core.files.output import check_outputs
-    from ..scene.blend_file import save_copy
-    from .folders import open_rigs
-
     check_outputs({options.out: BLEND}, (options.rig, options.model), options.overwrite)
     rigs_and_models = list(open_rigs(options).values())
     for scene_rig, model in rigs_and_models:
@@ -53,12 +56,7 @@ def run(options: argparse.Namespace) -> None:
         print(f"{options.out}: '{scene_rig.mesh_object.name}' plays {model.name}")
 
 
-def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
-    import bpy
-
-    from ..core.errors import ModelError
-    from ..runtime.binding import bind
-
+def _bind(scene_rig: SceneRig, model: Path, use_in_render: bool) -> None:
     if note := bind(scene_rig, model, use_in_render):
         print(note)
     # Evaluate now, so that a model that cannot play raises an error here.
@@ -67,13 +65,8 @@ def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
         raise ModelError(scene_rig.mesh_object.fdda.status)
 
 
-def _copy_model_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
+def _copy_model_beside(scene_rig: SceneRig, model: Path, out: Path) -> Path:
     """Copy the model next to the bound file if needed, store its path in the file, and return the path."""
-    from ..core.files.output import atomic_write
-    from ..models.entries import bound_entry
-    from ..models.model_list import add_bound_model
-    from ..scene.stored_paths import stored_path
-
     model_path = bound_model_path(model, out)
     binding = scene_rig.mesh_object.fdda
     add_bound_model(scene_rig.mesh_object)
@@ -96,8 +89,6 @@ def bound_model_path(model: Path, out: Path) -> Path:
     Raises:
         OutputError: another file with that name exists.
     """
-    from ..core.errors import OutputError
-
     if model.resolve().is_relative_to(out.resolve().parent):
         return model
     copy_path = out.parent / model.name

@@ -4,10 +4,17 @@
 import argparse
 from pathlib import Path
 
+import bpy
+
+from ..arm.rig import build_arm
+from ..core.files.file_kind import BLEND
+from ..core.files.output import check_outputs
+from ..scene.blend_file import save_copy
+from ..scene.viewport import frame_objects
+from .outputs import add_overwrite_option
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .outputs import add_overwrite_option
-
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save the rig to")
     parser.add_argument(
         "--density", type=int, choices=(1, 2, 3), default=1, help="about 1,450, 10,000 or 50,000 vertices (default 1)"
@@ -16,14 +23,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    import bpy
-
-    from ..arm.rig import build_arm
-    from ..core.files.file_kind import BLEND
-    from ..core.files.output import check_outputs
-    from ..scene.blend_file import save_copy
-    from ..scene.viewport import frame_objects
-
     check_outputs({options.out: BLEND}, overwrite=options.overwrite)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, _ = build_arm(options.density)

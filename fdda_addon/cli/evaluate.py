@@ -4,18 +4,25 @@
 import argparse
 from pathlib import Path
 
+import bpy
+
 from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED, FILM_TIMED_FRAMES
 from ..core.errors import WrongUsageError
 from ..core.files.file_kind import EVALUATION, PICTURE, VIDEO
 from ..core.files.output import atomic_write_all, check_outputs, to_json_text
 from ..core.sentences.assessment import farther_than_skinning_sentence
 from ..core.sentences.counts import format_count
+from ..evaluation.film import FDDA, LABELS, LINEAR, RIG, FilmSettings, film
+from ..evaluation.pictures import draw_comparison, representative_poses
 from ..evaluation.results import Evaluation
 from ..evaluation.run import evaluate
 from ..evaluation.settings import EvaluationSettings
+from ..evaluation.video import check_video_path
 from ..poses.clip import find_clips
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
+from ..scene.time_stretching import time_ratio
+from ..timing.benchmark import benchmark
 from .files import add_rig_options
 from .folders import open_rigs, to_json_by_object, with_heading
 from .outputs import add_overwrite_option
@@ -86,8 +93,6 @@ def run(options: argparse.Namespace) -> None:
     target = target_settings(options)
     outputs = [(options.json, EVALUATION), *([(options.heatmap, PICTURE)] if options.heatmap else [])]
     if options.video:
-        from ..evaluation.video import check_video_path
-
         check_video_path(options.video)
         check_outputs([*outputs, (options.video, VIDEO)], (options.rig, options.model), options.overwrite)
     check_outputs(outputs, (options.rig, options.model), options.overwrite)
@@ -110,8 +115,6 @@ def run(options: argparse.Namespace) -> None:
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
     with atomic_write_all(*(path for path, _ in outputs)) as (errors, *pictures):
         for picture in pictures:
-            from ..evaluation.pictures import draw_comparison, representative_poses
-
             ((name, (scene_rig, model)),) = rigs.items()
             reference_name = f"target '{options.target}'" if options.target else "true rig"
             poses = representative_poses(evaluations[name].held_out)
@@ -127,12 +130,6 @@ def run(options: argparse.Namespace) -> None:
 
 def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, options: argparse.Namespace) -> None:
     """Time the rig and the model, write the film of the first action, and print the progress to stderr."""
-    import bpy
-
-    from ..evaluation.film import FDDA, LABELS, LINEAR, RIG, FilmSettings, film
-    from ..scene.time_stretching import time_ratio
-    from ..timing.benchmark import benchmark
-
     clip = find_clips([scene_rig], options.action, options.strip)[0]
     with ProgressPrinter() as progress:
         times = progress.run(benchmark(scene_rig, model, FILM_TIMED_FRAMES)).frame_times("")

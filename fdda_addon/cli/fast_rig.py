@@ -3,21 +3,24 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from ..core.errors import OutputError, WrongUsageError
+from ..core.files.file_kind import BLEND
+from ..core.files.output import check_outputs
 from ..core.sentences.counts import format_count
-
-if TYPE_CHECKING:
-    from ..fast_rig.run import FastRig
+from ..fast_rig.controls import check_choices
+from ..fast_rig.frame_times import measure_frames
+from ..fast_rig.run import FastRig, make_fast_rig
+from .files import add_rig_options
+from .folders import open_rigs
+from .outputs import add_overwrite_option
+from .progress import ProgressPrinter
 
 MAX_LISTED = 10
 DEFAULT_CONTROLS = ("visible", "keyed")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .files import add_rig_options
-    from .outputs import add_overwrite_option
-
     add_rig_options(parser)
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, with the fast rig")
@@ -39,15 +42,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.errors import WrongUsageError
-    from ..core.files.file_kind import BLEND
-    from ..core.files.output import check_outputs
-    from ..fast_rig.controls import check_choices
-    from ..fast_rig.frame_times import measure_frames
-    from ..fast_rig.run import make_fast_rig
-    from .folders import open_rigs
-    from .progress import ProgressPrinter
-
     if options.frames < 0:
         raise WrongUsageError("--frames must be 0 or more.")
     check_choices(options.controls)
@@ -67,13 +61,11 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check_other_file(out: Path, rig: Path) -> None:
-    from ..core.errors import OutputError
-
     if out.exists() and rig.exists() and out.samefile(rig):
         raise OutputError(f"'{out}' is the full rig, which renders need; give the fast rig another name.")
 
 
-def _summary(fast_rig: "FastRig") -> str:
+def _summary(fast_rig: FastRig) -> str:
     """Return what was removed and compared, a line each."""
     lines = [
         f"'{fast_rig.armature_name}' has {fast_rig.bones_after:,} of {fast_rig.bones_before:,} bones; the model reads "

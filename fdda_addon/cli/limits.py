@@ -5,14 +5,19 @@ import argparse
 import math
 from pathlib import Path
 
+from ..core.errors import WrongUsageError
+from ..core.files.file_kind import BLEND
+from ..core.files.output import check_outputs
 from ..core.sentences.counts import format_count
+from ..poses.action_range import measured_ranges
+from ..poses.clip import find_action
+from ..poses.measured_limits import DEFAULT_MARGIN, describe_limits, set_limits_from_actions
+from ..scene.blend_file import save_copy
+from .files import add_rig_options, open_rig
+from .outputs import add_overwrite_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from ..poses.measured_limits import DEFAULT_MARGIN
-    from .files import add_rig_options
-    from .outputs import add_overwrite_option
-
     add_rig_options(parser)
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save the rig with the limits to")
     parser.add_argument(
@@ -32,15 +37,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.errors import WrongUsageError
-    from ..core.files.file_kind import BLEND
-    from ..core.files.output import check_outputs
-    from ..poses.action_range import measured_ranges
-    from ..poses.clip import find_action
-    from ..poses.measured_limits import describe_limits, set_limits_from_actions
-    from ..scene.blend_file import save_copy
-    from .files import open_rig
-
     if not 0 <= options.margin <= 10 or math.isnan(options.margin):
         raise WrongUsageError("--margin must be 0 to 10.")
     check_outputs({options.out: BLEND}, (options.rig,), options.overwrite)
