@@ -13,24 +13,19 @@ from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
 from ..core.mathematics.key_joints import select_joints
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig
-from ..poses.sampling import model_channels, sampled_channels
 from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
 from ..scene.control_reader import ControlReader
 from ..scene.scene_rig import (
     MIN_VOLUME,
-    MODIFIER_NAME,
     SceneRig,
     armature_modifier,
-    armature_of,
-    find_rig,
     is_flat,
 )
 from ..scene.skin import read_skin
 from ..scene.unit import metres_per_unit
 from .deformation import read_deformation
 from .joints import choose_joints
-from .modifier_stack import check_evaluable, deforming_modifiers
 from .target import Target
 from .unread_bones import find_unread_bones, read_unread_bones
 
@@ -258,22 +253,3 @@ class PoseEvaluator:
             positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
         controls = self._controls.read(self._scene_rig, depsgraph)
         return self._reader.read(mesh_object, armature_object), positions, controls
-
-
-__all__ = [
-    "MODIFIER_NAME",
-    "PoseEvaluator",
-    "PoseReader",
-    "SceneRig",
-    "armature_modifier",
-    "armature_of",
-    "armature_to_mesh_matrix",
-    "check_evaluable",
-    "deforming_modifiers",
-    "find_rig",
-    "is_flat",
-    "model_channels",
-    "read_model_rig",
-    "read_rig",
-    "sampled_channels",
-]  # fmt: skip
