@@ -2,23 +2,98 @@
 """Finds the keyframes, drivers and modifiers that change a surface with time, besides the pose and the controls."""
 
 import ast
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import bpy
 
+from ..core.checks.warning import format_with_noun
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.animation import changes_value, curves_with_actions, value_range
-from ..scene.controls import canonical_path, fcurve_target, owner_of
+from ..scene.controls import canonical_path, fcurve_target, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
-from .independent_objects import describe_independent_objects
-from .missing_ranges import describe_missing_ranges
 from .modifier_effects import time_dependence
 from .modifier_stack import ModifierStack, is_fdda_modifier
 from .other_armatures import check_other_armatures
-from .sources import OwnedCurve, Sources
+from .sources import TRANSFORM_PREFIXES, OwnedCurve, Sources, constraint_targets
+
+
+def describe_missing_ranges(
+    scene_rig: SceneRig, sources: Sources, controls: Collection[tuple[bpy.types.ID, str, int]]
+) -> str:
+    """Describe the numbers that the drivers of a mesh read, and that no control and no driver sets.
+
+    Args:
+        sources: everything on which its mesh depends.
+        controls: the controls of the model, in the form that `scene.controls.fcurve_target` returns.
+
+    Returns:
+        Sentences for the user; empty if there are no such numbers.
+    """
+    named, nameless = [], []
+    for datablock, path in dict.fromkeys((*sources.numbers, *(read[1:] for read in sources.scene_reads))):
+        # The places of objects on which the mesh depends are described by `describe_independent_objects`.
+        is_place = datablock in sources.objects and path.startswith(TRANSFORM_PREFIXES)
+        is_input = fcurve_target(datablock, path) in controls
+        if is_place or is_input or not is_number(datablock, path) or is_driven(datablock, path):
+            continue
+        if name := sources.control_name(datablock, path):
+            named.append(name)
+        else:
+            nameless.append(f"{path} of {datablock.name}")
+    mesh_name, sentences = scene_rig.mesh_object.name, []
+    if named:
+        sentences.append(
+            f"The surface of '{mesh_name}' depends on {format_with_noun(named, 'number')} without a range, so the "
+            "model keeps the value in the recording. Make it an input with a range: --control "
+            f"'{named[0]}=LOW:HIGH', or Soft Min and Soft Max in the settings of the property."
+        )
+    if nameless:
+        sentences.append(
+            f"The surface of '{mesh_name}' depends on {format_with_noun(nameless, 'number')}, which cannot be an "
+            "input, so the model keeps the value in the recording. Let the driver read a property of "
+            f"'{scene_rig.armature_object.name}'."
+        )
+    return " ".join(sentences)
+
+
+def describe_independent_objects(
+    scene_rig: SceneRig, sources: Sources, controls: Iterable[tuple[bpy.types.ID, str, int]]
+) -> str:
+    """Describe the objects whose place deforms a mesh, although neither its rig nor a control or a driver moves them.
+
+    Args:
+        sources: everything on which its mesh depends.
+        controls: the controls of the model, in the form that `scene.controls.fcurve_target` returns.
+
+    Returns:
+        A sentence for the user; empty if there are no such objects.
+    """
+    moved_by_inputs = {owner for owner, path, _ in (*controls, *sources.drivers) if path.startswith(TRANSFORM_PREFIXES)}
+    followed = {scene_rig.mesh_object, *sources.carriers, *moved_by_inputs}
+    names = [o.name for o in list(sources.objects)[1:] if not _follows(o, followed)]
+    if not names:
+        return ""
+    return (
+        f"The surface of '{scene_rig.mesh_object.name}' depends on the place of {format_with_noun(names, 'object')}, "
+        f"which no parent or constraint attaches to '{scene_rig.armature_object.name}': the model keeps the place in "
+        "the recording. If one has to move with the character, parent it to the armature or a bone; if something else "
+        "moves it, make that an extra input (--control)."
+    )
+
+
+def _follows(scene_object: bpy.types.Object, followed: set[bpy.types.Object]) -> bool:
+    """Return whether an object is one of others, or follows one by parents and constraints."""
+    chain = [scene_object]
+    for link in chain:
+        if link in followed:
+            return True
+        targets = [target for c in link.constraints if not c.mute for target, _ in constraint_targets(c)]
+        chain += [o for o in (link.parent, *targets) if o is not None and o not in chain]
+    return False
+
 
 _FRAME_PROPERTIES = {"frame", "frame_current", "frame_current_final", "frame_float", "frame_subframe"}
 _TIME_CONSTRAINTS = {"FOLLOW_TRACK", "CAMERA_SOLVER", "OBJECT_SOLVER", "TRANSFORM_CACHE"}
