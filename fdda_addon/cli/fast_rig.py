@@ -47,7 +47,9 @@ def run(options: argparse.Namespace) -> None:
     check_choices(options.controls)
     # The source is the full rig that renders need, so it is never overwritten.
     check_outputs({options.out: BLEND}, (options.rig, options.model), options.overwrite)
-    _check_other_file(options.out, options.rig)
+    out = options.out
+    if out.exists() and options.rig.exists() and out.samefile(options.rig):
+        raise OutputError(f"'{out}' is the full rig, which renders need; give the fast rig another name.")
     rigs_and_models = list(open_rigs(options).values())
     object_name = rigs_and_models[0][0].mesh_object.name
     with ProgressPrinter() as progress:
@@ -58,11 +60,6 @@ def run(options: argparse.Namespace) -> None:
             times = progress.run(measure_frames(options.rig, options.out, object_name, controls, options.frames, size))
     if options.frames:
         print(f"{options.out}: {times.sentence}")
-
-
-def _check_other_file(out: Path, rig: Path) -> None:
-    if out.exists() and rig.exists() and out.samefile(rig):
-        raise OutputError(f"'{out}' is the full rig, which renders need; give the fast rig another name.")
 
 
 def _summary(fast_rig: FastRig) -> str:

@@ -65,7 +65,32 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
         layout.label(text="Training needs PyTorch, in a Python of its own. Everything else works without it.")
-        draw_own_environment(layout, self)
+        # Draw the state of the training environment, its buttons, and the progress of its job.
+        state = session.environment_state()
+        name_part, value_part = _split_row(layout)
+        name_part.label(text="Training Environment")
+        value_part.label(
+            text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.INCOMPLETE, FolderState.BROKEN) else "NONE"
+        )
+        if not self.trainer_python and (named := os.environ.get(choice.PYTHON_VARIABLE)):
+            draw_lines(layout, f"{choice.PYTHON_VARIABLE} is set: {named}", "INFO")
+        if (job := current(ENVIRONMENT)) is not None:
+            draw_job(layout, job)
+        else:
+            _, row = _split_row(layout)
+            row = row.row(align=True)
+            reason = creation_obstacle(self.wheels_folder)
+            is_installed = state is not FolderState.MISSING
+            install_button = row.row()
+            install_button.enabled = not reason
+            text = "Reinstall" if is_installed else "Install Training Environment (3 GB)"
+            install_button.operator("fdda.create_trainer_environment", text=text, icon="IMPORT")
+            if is_installed:
+                row.operator("fdda.remove_trainer_environment", text="", icon="TRASH")
+            row.operator("fdda.open_trainer_log", text="", icon="TEXT")
+            if reason:
+                draw_lines(layout, f"{reason}.", "INFO")
+            draw_check_result(layout, session.notice)
         _, right = _split_row(layout)
         right.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
         if current(ENVIRONMENT) is None:
@@ -115,35 +140,6 @@ def wheels_folder() -> str:
     """Return the folder in the field Offline Packages; empty if none is chosen."""
     settings = preferences()
     return settings.wheels_folder if settings else ""
-
-
-def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
-    """Draw the state of the training environment, its buttons, and the progress of its job."""
-    state = session.environment_state()
-    name_part, value_part = _split_row(layout)
-    name_part.label(text="Training Environment")
-    value_part.label(
-        text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.INCOMPLETE, FolderState.BROKEN) else "NONE"
-    )
-    if not settings.trainer_python and (named := os.environ.get(choice.PYTHON_VARIABLE)):
-        draw_lines(layout, f"{choice.PYTHON_VARIABLE} is set: {named}", "INFO")
-    if (job := current(ENVIRONMENT)) is not None:
-        draw_job(layout, job)
-    else:
-        _, row = _split_row(layout)
-        row = row.row(align=True)
-        reason = creation_obstacle(settings.wheels_folder)
-        is_installed = state is not FolderState.MISSING
-        install_button = row.row()
-        install_button.enabled = not reason
-        text = "Reinstall" if is_installed else "Install Training Environment (3 GB)"
-        install_button.operator("fdda.create_trainer_environment", text=text, icon="IMPORT")
-        if is_installed:
-            row.operator("fdda.remove_trainer_environment", text="", icon="TRASH")
-        row.operator("fdda.open_trainer_log", text="", icon="TEXT")
-        if reason:
-            draw_lines(layout, f"{reason}.", "INFO")
-        draw_check_result(layout, session.notice)
 
 
 def _split_row(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:
