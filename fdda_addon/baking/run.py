@@ -27,7 +27,7 @@ from ..scene.blend_file import save_copy
 from ..scene.control_reader import ControlReader
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
-from ..scene.temporary_state import temporary_attributes, temporary_pose, temporary_visibility
+from ..scene.temporary_state import deformation_disabled, temporary_attributes, temporary_pose, temporary_visibility
 from ..scene.time_stretching import frames_covering
 from .baked_mesh import check_local, play_point_cache, play_shape_keys, temporary_copy
 
@@ -236,7 +236,9 @@ def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Pr
     batch_size = max(1, min(MAX_BATCH_FRAMES, MAX_BATCH_BYTES // bytes_per_frame))
     scene_rig = reader.scene_rig
     visible_objects = temporary_visibility((scene_rig.mesh_object, scene_rig.armature_object))
-    with open(path, "wb") as file, visible_objects, _deformation_disabled(scene_rig.mesh_object):
+    # Only the pose is read.
+    deformation = deformation_disabled(scene_rig.mesh_object, scene_rig.mesh_object.modifiers)
+    with open(path, "wb") as file, visible_objects, deformation:
         writer = PointCacheWriter(file, vertex_count, frames.start, len(frames))
         batch_inputs = []
         for frame_count, frame in enumerate(frames, 1):
@@ -247,20 +249,6 @@ def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Pr
             yield Progress("frames", frame_count, len(frames))
         writer.finish()
     scene.frame_set(original_frame, subframe=original_subframe)
-
-
-@contextmanager
-def _deformation_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Switch the deformation of a mesh off in the block, to save its time where only the pose is read."""
-    with ExitStack() as exit_stack:
-        for modifier in mesh_object.modifiers:
-            exit_stack.enter_context(temporary_attributes(modifier, show_viewport=False))
-        if mesh_object.data.shape_keys is not None:
-            # Blender copies a pinned shape key instead of mixing all shape keys.
-            exit_stack.enter_context(
-                temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0)
-            )
-        yield
 
 
 @contextmanager

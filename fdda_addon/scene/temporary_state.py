@@ -76,6 +76,18 @@ def temporary_attributes(owner: object, **values: object) -> Iterator[None]:
 
 
 @contextmanager
+def deformation_disabled(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[None]:
+    """Disable modifiers and all shape keys of a mesh object in the block."""
+    with ExitStack() as stack:
+        for modifier in modifiers:
+            stack.enter_context(temporary_attributes(modifier, show_viewport=False))
+        if mesh_object.data.shape_keys is not None:
+            # Blender copies a pinned shape key instead of mixing all shape keys.
+            stack.enter_context(temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
+        yield
+
+
+@contextmanager
 def temporary_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
     """Show objects that animation hides in some frames: Blender does not evaluate the pose of a hidden object.
 

@@ -8,7 +8,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from ..runtime import model_files, playback
 from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import open_model
 from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
-from ..scene.temporary_state import temporary_attributes
+from ..scene.temporary_state import deformation_disabled, temporary_attributes
 from .animation import temporary_animation
 from .frame_times import FrameTimes, compare_times
 
@@ -229,16 +229,11 @@ def skinning_only(mesh_object: bpy.types.Object) -> Iterator[None]:
     skin_modifier = armature_modifier(mesh_object)
     if skin_modifier is None:
         raise RigError(f"'{mesh_object.name}' has no Armature modifier: there is no linear skinning to time.")
-    with model_disabled(mesh_object), ExitStack() as exit_stack:
-        for modifier in deforming_modifiers(mesh_object):
-            if modifier != skin_modifier:
-                exit_stack.enter_context(temporary_attributes(modifier, show_viewport=False))
-        exit_stack.enter_context(temporary_attributes(skin_modifier, use_deform_preserve_volume=False))
-        if mesh_object.data.shape_keys:
-            exit_stack.enter_context(
-                temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0)
-            )
-        yield
+    with model_disabled(mesh_object):
+        other_modifiers = [modifier for modifier in deforming_modifiers(mesh_object) if modifier != skin_modifier]
+        linear = temporary_attributes(skin_modifier, use_deform_preserve_volume=False)
+        with deformation_disabled(mesh_object, other_modifiers), linear:
+            yield
 
 
 @contextmanager
