@@ -17,7 +17,6 @@ from fdda_addon.cli.progress import ProgressPrinter
 from fdda_addon.core.errors import TRY_AGAIN, OutputError
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.runtime.session import session
-from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
 
 from ..conftest import assert_plays, evaluated_positions, pose, run
@@ -211,7 +210,7 @@ def test_a_bound_file_that_cannot_be_saved_leaves_no_copy_of_the_model(elbow_fil
     def fail(_path: object) -> None:
         raise OutputError("There is no room.")
 
-    monkeypatch.setattr(blend_file, "save_copy", fail)
+    monkeypatch.setattr("fdda_addon.cli.bind.save_copy", fail)
     assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 1
     assert file_contents(tmp_path) == {}
 
