@@ -180,6 +180,16 @@ def rig(elbow_files: ElbowFiles) -> SceneRig:
 
 
 @pytest.fixture
+def unusual_rig() -> SceneRig:
+    """Build an elbow whose animation, pose and selection differ from all defaults."""
+    from .scene_state import fresh_elbow, set_unusual_state
+
+    rig = fresh_elbow()
+    set_unusual_state(rig)
+    return rig
+
+
+@pytest.fixture
 def saved(rig: SceneRig, tmp_path: Path) -> SceneRig:
     """The elbow, active, in a .blend file of its own."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elbow.blend"))
@@ -192,6 +202,13 @@ def bound_elbow(elbow_files: ElbowFiles) -> bpy.types.Object:
     """Open the file of the bound elbow, and return its mesh object."""
     bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
     return bpy.data.objects[ELBOW]
+
+
+@pytest.fixture
+def active(bound_elbow: bpy.types.Object) -> bpy.types.Object:
+    """The mesh object of the bound elbow, which is active."""
+    bpy.context.view_layer.objects.active = bound_elbow
+    return bound_elbow
 
 
 @pytest.fixture

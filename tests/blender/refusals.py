@@ -65,3 +65,11 @@ def limited_file_size(limit: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def refused(call, *words: str) -> None:
+    """Assert that an operator is canceled and that its report contains the words."""
+    with pytest.raises(RuntimeError) as error:
+        call()
+    for word in words:
+        assert word in str(error.value)

@@ -122,3 +122,25 @@ def change_weight():
 def set_armature_modifier(**settings: object) -> None:
     for name, value in settings.items():
         setattr(bpy.data.objects[ELBOW].modifiers["Armature"], name, value)
+
+
+def trigger_check(update: str) -> None:
+    if update == "frame":
+        bpy.context.scene.frame_set(7)
+    else:
+        bpy.context.view_layer.update()
+
+
+def drive_b_bone() -> None:
+    """Drive a setting of the armature data by a bone, as Rigify does: Blender reports the data in every frame."""
+    driver = bpy.data.objects[ELBOW_RIG].data.driver_add('bones["lower"].bbone_easein').driver
+    variable = driver.variables.new()
+    variable.type, variable.targets[0].id = "TRANSFORMS", bpy.data.objects[ELBOW_RIG]
+    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
+    driver.type = "SUM"
+    bpy.context.view_layer.update()
+
+
+def paint_weight() -> None:
+    bpy.data.objects[ELBOW].vertex_groups["upper"].add([0], 0.37, "REPLACE")
+    bpy.data.objects[ELBOW].vertex_groups["lower"].add([0], 0.63, "REPLACE")

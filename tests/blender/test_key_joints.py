@@ -33,8 +33,7 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import assert_plays, run, train
 from .resuming import check_resuming
-from .rig_changes import change_in_edit_mode
-from .runtime.test_changed_rigs import trigger_check
+from .rig_changes import change_in_edit_mode, trigger_check
 from .scene_state import assert_same_state, drain, scene_state
 from .waves import wave
 

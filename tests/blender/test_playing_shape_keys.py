@@ -5,7 +5,7 @@ import bpy
 import numpy as np
 
 from .conftest import assert_plays, evaluated_positions, pose, rig_positions
-from .runtime.test_evaluations import add_shape_key
+from .evaluations import add_shape_key
 
 
 def test_shape_keys_are_restored_with_the_rig(bound_elbow, elbow_files):

@@ -11,7 +11,7 @@ from fdda_addon.scene.scene_rig import find_rig
 from ..baked_files import POSITION_TOLERANCE, predicted_in_frames, predicted_wave, read_pc2
 from ..conftest import ELBOW, ELBOW_RIG, evaluated_positions, run
 from ..refusals import file_contents, save_elbow
-from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state, set_unusual_state
+from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 
 @pytest.fixture(scope="module")
@@ -109,12 +109,6 @@ def test_a_baked_bound_file_is_not_bound(elbow_files, wave_positions, tmp_path):
 
 
 class TestSceneRestoration:
-    @pytest.fixture
-    def unusual_rig(self):
-        rig = fresh_elbow()
-        set_unusual_state(rig)
-        return rig
-
     @pytest.mark.parametrize("out", ["a.pc2", "a.blend", "keys.blend"])
     @pytest.mark.parametrize("action", ["elbow_wave", ""], ids=["action", "scene"])
     def test_baking_restores_the_scene(self, unusual_rig, elbow_files, tmp_path, out, action):

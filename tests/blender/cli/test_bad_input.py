@@ -56,14 +56,10 @@ def add_second_mesh(rig) -> None:
 
 def test_a_scene_with_two_skinned_meshes_needs_the_option_object(refusal, verb, tmp_path):
     path = save_elbow(tmp_path / "rig.blend", add_second_mesh)
-    assert refusal(*verb(path)) == ("2 meshes have an Armature modifier ('elbow', 'sleeve'); choose one with --object.")
-
-
-def test_a_missing_object_is_refused(refusal, verb, tmp_path):
-    path = save_elbow(tmp_path / "rig.blend", add_second_mesh)
     assert refusal(*verb(path, "--object", "glove")) == (
         "The scene has no mesh object 'glove'; its mesh objects: 'elbow', 'sleeve'."
     )
+    assert refusal(*verb(path)) == ("2 meshes have an Armature modifier ('elbow', 'sleeve'); choose one with --object.")
 
 
 def test_a_mesh_without_an_armature_modifier_is_refused(refusal, verb, tmp_path):
@@ -173,14 +169,13 @@ def writing_verb(request, elbow_files, tmp_path_factory):
     }[request.param]
 
 
-def test_an_output_below_a_file_is_refused(refusal, writing_verb, tmp_path):
+def test_an_output_that_cannot_be_written_is_refused(refusal, writing_verb, tmp_path):
     (tmp_path / "file").write_text("old")
-    text = refusal(*writing_verb(tmp_path / "file" / "out"))
-    assert text.startswith("Cannot write")
-
-
-def test_an_output_in_an_unwritable_folder_is_refused(refusal, writing_verb):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "letter.txt").write_text("dear")
+    assert refusal(*writing_verb(tmp_path / "file" / "out")).startswith("Cannot write")
     assert refusal(*writing_verb(systems.UNWRITABLE)).startswith("Cannot write")
+    assert refusal(*writing_verb(tmp_path / "folder")).startswith("Cannot ")
 
 
 def test_an_output_in_a_missing_folder_is_refused(refusal, writing_verb, tmp_path):
@@ -209,25 +204,19 @@ def test_a_rig_path_that_is_too_long_for_blender_is_refused(refusal, verb, elbow
     assert text.startswith("Blender cannot open or write") and "bytes, and Blender takes 1,023; choose a sh" in text
 
 
-def test_an_output_that_is_a_folder_is_refused(refusal, writing_verb, tmp_path):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "folder" / "letter.txt").write_text("dear")
-    assert refusal(*writing_verb(tmp_path / "folder")).startswith("Cannot ")
-
-
-def test_an_output_on_a_full_disk_is_refused(refusal_on_a_full_disk, writing_verb, tmp_path):
+@pytest.mark.parametrize("is_present", [False, True])
+def test_an_output_on_a_full_disk_is_refused_and_an_old_file_stays(
+    refusal_on_a_full_disk, writing_verb, tmp_path, is_present
+):
+    if is_present and writing_verb("")[0] == "record":
+        pytest.skip("record replaces nothing")
+    if is_present:
+        (tmp_path / "out").write_text("old")
     with limited_file_size(100):
         text = refusal_on_a_full_disk(*writing_verb(tmp_path / "out"))
     assert text.startswith("Cannot write"), text
-
-
-def test_a_full_disk_leaves_the_old_file(refusal_on_a_full_disk, writing_verb, tmp_path):
-    if writing_verb("")[0] == "record":
-        pytest.skip("record replaces nothing")
-    (tmp_path / "out").write_text("old")
-    with limited_file_size(100):
-        refusal_on_a_full_disk(*writing_verb(tmp_path / "out"))
-    assert file_contents(tmp_path) == {"out": b"old"}
+    if is_present:
+        assert file_contents(tmp_path) == {"out": b"old"}
 
 
 def test_a_model_that_cannot_be_copied_beside_the_bound_file_is_refused(refusal, elbow_files, tmp_path):

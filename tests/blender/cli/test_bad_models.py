@@ -17,6 +17,7 @@ from fdda_addon.scene.scene_rig import find_rig
 from ... import systems
 from ..conftest import run, write_edited
 from ..refusals import save_elbow
+from ..rig_changes import change_in_edit_mode
 
 
 @pytest.fixture(params=["bind", "evaluate", "benchmark"])
@@ -31,21 +32,11 @@ def verb(request, tmp_path):
 
 
 def subdivide_mesh(rig) -> None:
-    bpy.context.view_layer.objects.active = rig.mesh_object
-    bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.mesh.select_all(action="SELECT")
-    bpy.ops.mesh.subdivide()
-    bpy.ops.object.mode_set(mode="OBJECT")
+    change_in_edit_mode(rig.mesh_object, lambda: (bpy.ops.mesh.select_all(action="SELECT"), bpy.ops.mesh.subdivide()))
 
 
 def bone_editor(change):
-    def edit(rig):
-        bpy.context.view_layer.objects.active = rig.armature_object
-        bpy.ops.object.mode_set(mode="EDIT")
-        change(rig.armature_object.data.edit_bones)
-        bpy.ops.object.mode_set(mode="OBJECT")
-
-    return edit
+    return lambda rig: change_in_edit_mode(rig.armature_object, lambda: change(rig.armature_object.data.edit_bones))
 
 
 def rename_bone(bones) -> None:

@@ -227,18 +227,13 @@ def test_a_model_below_the_folder_is_not_copied(elbow_files, tmp_path, monkeypat
     assert_plays(mesh_object, elbow_files.model)
 
 
-def test_an_identical_model_in_the_folder_is_not_written_again(elbow_files, tmp_path):
+def test_binding_does_not_write_rig_and_model_nor_an_identical_model_in_the_folder(elbow_files, tmp_path):
     shutil.copy2(elbow_files.model, tmp_path / elbow_files.model.name)
-    before = (tmp_path / elbow_files.model.name).stat()
+    before = (tmp_path / elbow_files.model.name).stat(), elbow_files.rig.read_bytes(), elbow_files.model.read_bytes()
     assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 0
     after = (tmp_path / elbow_files.model.name).stat()
-    assert (before.st_mtime_ns, before.st_ino) == (after.st_mtime_ns, after.st_ino)
-
-
-def test_binding_does_not_change_rig_and_model(elbow_files, tmp_path):
-    before = elbow_files.rig.read_bytes(), elbow_files.model.read_bytes()
-    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 0
-    assert (elbow_files.rig.read_bytes(), elbow_files.model.read_bytes()) == before
+    assert (before[0].st_mtime_ns, before[0].st_ino) == (after.st_mtime_ns, after.st_ino)
+    assert (elbow_files.rig.read_bytes(), elbow_files.model.read_bytes()) == before[1:]
 
 
 def test_binding_can_overwrite_the_rig_s_file(elbow_files, tmp_path):
@@ -255,25 +250,19 @@ def test_binding_a_bound_file_again_keeps_one_modifier(elbow_files, tmp_path):
     assert_plays(mesh_object, elbow_files.model)
 
 
-def test_bind_sets_use_in_render(elbow_files, tmp_path):
-    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend", "--use-in-render") == 0
+@pytest.mark.parametrize("options", [(), ("--use-in-render",)])
+def test_bind_sets_use_in_render_and_without_the_add_on_the_file_shows_the_rig(elbow_files, tmp_path, options):
+    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend", *options) == 0
+    rig_shape = evaluated_positions(open_in_new_session(elbow_files.rig))
     mesh_object = open_in_new_session(tmp_path / "b.blend")
-    assert mesh_object.fdda.use_in_render
-    assert [m.show_render for m in mesh_object.modifiers] == [False, False, True, True]
-
-
-def test_a_bound_file_shows_the_rig_without_the_add_on(elbow_files, tmp_path):
-    assert run("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend") == 0
-    model_shape, rig_shape = (
-        evaluated_positions(open_in_new_session(path)) for path in (tmp_path / "b.blend", elbow_files.rig)
-    )
+    model_shape = evaluated_positions(mesh_object)
+    assert mesh_object.fdda.use_in_render == bool(options)
+    if options:
+        assert [m.show_render for m in mesh_object.modifiers] == [False, False, True, True]
     fdda_addon.unregister()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
-    assert (
-        abs(evaluated_positions(bpy.data.objects["elbow"]) - rig_shape).max()
-        < 1e-6
-        < abs(model_shape - rig_shape).max()
-    )
+    error = abs(evaluated_positions(bpy.data.objects["elbow"]) - rig_shape).max()
+    assert error < 1e-6 < abs(model_shape - rig_shape).max()
 
 
 def test_recording_a_bound_file_records_the_rig(elbow_files, tmp_path):

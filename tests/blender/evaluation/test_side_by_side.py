@@ -11,7 +11,7 @@ from fdda_addon.scene.comparison import comparison_objects, hidden_comparison_ob
 from fdda_addon.scene.scene_rig import armature_of, find_rig, find_rigs
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
-from ..operators.test_playback import refused
+from ..refusals import refused
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from fdda_addon.properties.preferences import FDDA_AP_preferences, trusted_folde
 from fdda_addon.training.environment import folder
 
 from ..drawing import Context, Layout, texts_of
-from ..operators.test_playback import refused
+from ..refusals import refused
 
 
 def test_trusted_folders_are_drawn_with_a_button_to_remove_each(preferences, monkeypatch: pytest.MonkeyPatch):

@@ -61,8 +61,7 @@ def test_a_joint_keeps_the_bones_that_it_depends_on(name):
     assert differing_bones(poses, full, broken, 1e-3).keys() == {"lower"}
 
 
-def test_a_bone_keeps_the_bone_at_which_its_custom_shape_is_drawn():
-    scene_rig = SceneRig(*studio_arm())
+def test_a_bone_keeps_the_bone_at_which_its_custom_shape_is_drawn(scene_rig):
     armature_object = scene_rig.armature_object
     bone = armature_object.pose.bones["control"]
     bone.custom_shape, bone.custom_shape_transform = scene_rig.mesh_object, armature_object.pose.bones[UNUSED]
@@ -117,9 +116,8 @@ def drive(curve: bpy.types.FCurve, target_id: bpy.types.ID, path: str) -> None:
     target.id, target.data_path = target_id, path
 
 
-def test_the_drivers_of_the_world_keep_their_bones():
+def test_the_drivers_of_the_world_keep_their_bones(scene_rig):
     """A fast rig may be rendered from its own file, too."""
-    scene_rig = SceneRig(*studio_arm())
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
     drive(world.driver_add("color", 0), scene_rig.armature_object, f'pose.bones["{UNUSED}"].location[0]')
     removed = remove_unneeded([scene_rig], ["lower"], ["control"])
@@ -127,9 +125,8 @@ def test_the_drivers_of_the_world_keep_their_bones():
 
 
 @pytest.mark.parametrize("expression", ['self.id_data["bend"]', 'self["bend"]'])
-def test_an_expression_with_self_keeps_the_drivers_of_what_it_reads(expression):
+def test_an_expression_with_self_keeps_the_drivers_of_what_it_reads(expression, scene_rig):
     """`self` is a bone or the armature object, whose custom property another bone drives."""
-    scene_rig = SceneRig(*studio_arm())
     armature_object = scene_rig.armature_object
     armature_object["bend"] = 0.0
     drive(armature_object.driver_add('["bend"]'), armature_object, f'pose.bones["{UNUSED}"].location[0]')
@@ -219,8 +216,7 @@ def test_the_curve_of_a_bone_that_deforms_strokes_stays(bendy_arm):
 
 @pytest.mark.skipif(not hasattr(bpy.types, BONE_NODE), reason="this Blender has no node Bone Info")
 @pytest.mark.parametrize("is_linked", [False, True])
-def test_a_node_keeps_the_bones_that_it_may_read(is_linked):
-    scene_rig = SceneRig(*studio_arm())
+def test_a_node_keeps_the_bones_that_it_may_read(is_linked, scene_rig):
     armature_object = scene_rig.armature_object
     tree = bpy.data.node_groups.new("bones", "GeometryNodeTree")
     node = tree.nodes.new(BONE_NODE)

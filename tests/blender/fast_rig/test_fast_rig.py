@@ -22,7 +22,7 @@ from fdda_addon.timing.benchmark import time_calls
 
 from ..command_output import output_of
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, run, train
-from ..runtime.test_renders import set_camera, still
+from ..rendering import set_camera, still
 from ..waves import ACTION, wave
 
 CHARACTER = "Character"

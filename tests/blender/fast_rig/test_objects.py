@@ -5,7 +5,7 @@ import bpy
 import pytest
 
 from blend_fixtures.characters.base import link
-from blend_fixtures.characters.dependencies import UNUSED, studio_arm
+from blend_fixtures.characters.dependencies import UNUSED
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.progress import run_job
 from fdda_addon.fast_rig.compared_poses import ComparedPoses, evaluate_poses
@@ -34,8 +34,7 @@ def remove(scene_rig: SceneRig) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("is_driven", [False, True])
-def test_objects_that_renders_show_in_some_frames_stay(is_driven):
-    scene_rig = SceneRig(*studio_arm())
+def test_objects_that_renders_show_in_some_frames_stay(is_driven, scene_rig):
     prop = add_mesh_object("prop", is_rendered=False)
     add_mesh_object("never shown", is_rendered=False)
     if is_driven:
@@ -46,8 +45,7 @@ def test_objects_that_renders_show_in_some_frames_stay(is_driven):
 
 
 @pytest.mark.parametrize("surface", ["none", "bevel", "extrusion", "fill", "NODES", "SCREW"])
-def test_a_curve_that_deforms_the_mesh_stays_if_renders_show_it(surface):
-    scene_rig = SceneRig(*studio_arm())
+def test_a_curve_that_deforms_the_mesh_stays_if_renders_show_it(surface, scene_rig):
     data = bpy.data.curves.new("path", "CURVE")
     data.dimensions, data.fill_mode = ("2D", "BOTH") if surface == "fill" else ("3D", "FULL")
     spline = data.splines.new("POLY")
@@ -62,8 +60,7 @@ def test_a_curve_that_deforms_the_mesh_stays_if_renders_show_it(surface):
 
 
 @pytest.mark.parametrize("modifier", ["CLOTH", "SOFT_BODY", "PARTICLE_SYSTEM"])
-def test_what_simulations_collide_with_stays(modifier):
-    scene_rig = SceneRig(*studio_arm())
+def test_what_simulations_collide_with_stays(modifier, scene_rig):
     simulated, collider = add_mesh_object("simulated"), add_mesh_object("collider", is_rendered=False)
     simulated.modifiers.new("Simulation", modifier)
     collider.modifiers.new("Collision", "COLLISION")
@@ -77,8 +74,7 @@ def test_what_simulations_collide_with_stays(modifier):
     assert set(remove(scene_rig)) == {"collider", "wind"}
 
 
-def test_rigid_bodies_and_their_constraints_stay_with_a_shown_one():
-    scene_rig = SceneRig(*studio_arm())
+def test_rigid_bodies_and_their_constraints_stay_with_a_shown_one(scene_rig):
     bpy.ops.rigidbody.world_add()
     bodies = {name: add_mesh_object(name, is_rendered=name == "falling") for name in ("falling", "floor", "weight")}
     for body in bodies.values():
@@ -95,8 +91,7 @@ def test_rigid_bodies_and_their_constraints_stay_with_a_shown_one():
     assert set(remove(scene_rig)) == {"falling", "floor", "weight", "rope"}
 
 
-def test_actions_that_only_removed_objects_use_are_saved(tmp_path):
-    scene_rig = SceneRig(*studio_arm())
+def test_actions_that_only_removed_objects_use_are_saved(tmp_path, scene_rig):
     cage = bpy.data.objects["cage"]
     cage.keyframe_insert("location", frame=1)
     cage.animation_data.action.name = "of the cage"
@@ -138,8 +133,7 @@ class NamedBone(bpy.types.PropertyGroup):
         ("property of an add-on", "rig", "bone"),
     ],
 )
-def test_bones_that_properties_of_shown_objects_name_stay(kind, object_property, bone_property):
-    scene_rig = SceneRig(*studio_arm())
+def test_bones_that_properties_of_shown_objects_name_stay(kind, object_property, bone_property, scene_rig):
     prop = add_mesh_object("prop")
     if kind == "camera":
         struct = bpy.data.cameras.new("camera").dof
@@ -167,8 +161,7 @@ def test_bones_that_properties_of_shown_objects_name_stay(kind, object_property,
 
 
 @pytest.mark.parametrize("reader", ["object", "material"])
-def test_custom_properties_that_shaders_may_read_keep_their_drivers(reader):
-    scene_rig = SceneRig(*studio_arm())
+def test_custom_properties_that_shaders_may_read_keep_their_drivers(reader, scene_rig):
     prop = add_mesh_object("prop")
     material = bpy.data.materials.new("material")
     prop.data.materials.append(material)
@@ -179,8 +172,7 @@ def test_custom_properties_that_shaders_may_read_keep_their_drivers(reader):
     assert len(owner.animation_data.drivers) == 1
 
 
-def test_objects_that_another_view_layer_renders_stay():
-    scene_rig = SceneRig(*studio_arm())
+def test_objects_that_another_view_layer_renders_stay(scene_rig):
     collection = bpy.data.collections.new("second pass")
     bpy.context.scene.collection.children.link(collection)
     prop = add_mesh_object("prop")
@@ -192,9 +184,8 @@ def test_objects_that_another_view_layer_renders_stay():
 
 
 @pytest.mark.parametrize("name", ["prop", "another"])
-def test_objects_that_an_action_shows_stay_if_it_may_be_theirs(name):
+def test_objects_that_an_action_shows_stay_if_it_may_be_theirs(name, scene_rig):
     """The action is not assigned now."""
-    scene_rig = SceneRig(*studio_arm())
     prop = add_mesh_object("prop", is_rendered=False)
     another = add_mesh_object("another", is_rendered=False)
     another.keyframe_insert("location", frame=1)
@@ -206,9 +197,8 @@ def test_objects_that_an_action_shows_stay_if_it_may_be_theirs(name):
     assert set(remove(scene_rig)) == {"cage", "prop", "another"} - {name}
 
 
-def test_a_constraint_that_an_action_unmutes_counts():
+def test_a_constraint_that_an_action_unmutes_counts(scene_rig):
     """The action is not assigned now."""
-    scene_rig = SceneRig(*studio_arm())
     armature_object = scene_rig.armature_object
     armature_object.animation_data_create().action = wave(armature_object, "control")
     constraint = armature_object.pose.bones["control"].constraints.new("COPY_ROTATION")
@@ -218,9 +208,8 @@ def test_a_constraint_that_an_action_unmutes_counts():
     assert remove_unneeded([scene_rig], ["lower"], ["control"]).bones == {f"{UNUSED}_child"}
 
 
-def test_paths_with_numbers_lead_to_the_same_elements_afterwards():
+def test_paths_with_numbers_lead_to_the_same_elements_afterwards(scene_rig):
     """Removing bones and constraints changes the numbers of others."""
-    scene_rig = SceneRig(*studio_arm())
     armature_object = scene_rig.armature_object
     bones = armature_object.pose.bones
     action = wave(armature_object, UNUSED)
@@ -246,8 +235,7 @@ def test_paths_with_numbers_lead_to_the_same_elements_afterwards():
     assert prop.location.x == pytest.approx(0.3)
 
 
-def test_modifiers_whose_settings_drivers_read_stay_and_are_read():
-    scene_rig = SceneRig(*studio_arm())
+def test_modifiers_whose_settings_drivers_read_stay_and_are_read(scene_rig):
     mesh_object, prop = scene_rig.mesh_object, add_mesh_object("prop")
     mesh_object.modifiers["Mush"].factor = 0.7
     drive(prop, "location", mesh_object, 'modifiers["Mush"].factor')
@@ -256,9 +244,8 @@ def test_modifiers_whose_settings_drivers_read_stay_and_are_read():
     assert prop.location.x == pytest.approx(0.7)
 
 
-def test_a_driver_that_reads_if_a_replaced_modifier_is_on_is_refused():
+def test_a_driver_that_reads_if_a_replaced_modifier_is_on_is_refused(scene_rig):
     """A model turns it off, so the object would be somewhere else."""
-    scene_rig = SceneRig(*studio_arm())
     drive(add_mesh_object("prop"), "location", scene_rig.mesh_object, 'modifiers["Mush"].show_viewport')
     with pytest.raises(RigError, match="A driver reads if the modifier 'Mush' of 'elbow' is on, but a model turns it"):
         remove(scene_rig)
@@ -316,9 +303,8 @@ def add_readers_of_unused(armature_object: bpy.types.Object) -> set[str]:
     return {*(f"object '{name}'" for name in objects), *data, "world 'sky'"}
 
 
-def test_the_comparison_finds_all_that_renders_show_differently():
+def test_the_comparison_finds_all_that_renders_show_differently(scene_rig):
     """An action that is not assigned moves the bone."""
-    scene_rig = SceneRig(*studio_arm())
     armature_object = scene_rig.armature_object
     action = wave(armature_object, UNUSED)
     expected = add_readers_of_unused(armature_object)

@@ -9,9 +9,8 @@ from fdda_addon.scene.scene_rig import find_rig
 
 from ..baked_files import POSITION_TOLERANCE, predicted_wave, read_pc2, shown_without_add_on
 from ..conftest import ELBOW, assert_plays, evaluated_positions, pose
-from ..refusals import file_contents
+from ..refusals import file_contents, refused
 from ..scene_state import assert_same_state, scene_state
-from .test_playback import refused
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +19,6 @@ def wave(elbow_files) -> np.ndarray:
 
 
 class TestOperator:
-    @pytest.fixture
-    def active(self, bound_elbow):
-        bpy.context.view_layer.objects.active = bound_elbow
-        return bound_elbow
-
     @pytest.mark.parametrize("action", ["elbow_wave", ""])
     def test_the_bound_model_is_baked_and_stays_bound(self, active, elbow_files, wave, tmp_path, action):
         before = scene_state(find_rig())

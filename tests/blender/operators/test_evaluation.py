@@ -18,14 +18,8 @@ from fdda_addon.runtime.model_files import allow_path
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW_RIG, pose
+from ..refusals import refused
 from ..scene_state import assert_same_state, drain, scene_state
-from .test_playback import refused
-
-
-@pytest.fixture
-def active(bound_elbow):
-    bpy.context.view_layer.objects.active = bound_elbow
-    return bound_elbow
 
 
 @pytest.fixture

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operators that add and remove extra inputs, and the ranges of extra inputs."""
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
 
-from blend_fixtures.characters import control_rigs, controls
+from blend_fixtures.characters import controls
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.panels import checks
 from fdda_addon.panels.sampling import describe_channels
@@ -15,23 +13,8 @@ from fdda_addon.properties.character import recording_folder
 from fdda_addon.properties.recording_options import recording_settings
 from fdda_addon.recording.plan import read_sampled_rig
 from fdda_addon.scene.control_names import control_default, suggested_controls
-from fdda_addon.scene.scene_rig import SceneRig
 
-from .test_sampling import IK, recorded, saved
-
-
-@pytest.fixture
-def arm(tmp_path: Path) -> SceneRig:
-    """An arm with an IK and an FK chain, and a property that blends them."""
-    control_rigs.ik_fk()
-    return saved(tmp_path)
-
-
-@pytest.fixture
-def face(tmp_path: Path) -> SceneRig:
-    """Two shape keys that an animator sets by hand."""
-    controls.free_shape_keys()
-    return saved(tmp_path)
+from ..arm_and_face import IK, recorded, saved
 
 
 def test_shape_keys_are_recorded_in_the_given_or_default_range(face):

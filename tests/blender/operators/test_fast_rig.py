@@ -17,7 +17,7 @@ from fdda_addon.jobs import job
 from fdda_addon.operators.fast_rig import FDDA_OT_fast_rig, _write_models
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose
-from .test_playback import refused
+from ..refusals import refused
 
 
 @pytest.fixture

@@ -14,7 +14,8 @@ from fdda_addon.timing import frame_times
 
 from ... import systems
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose, write_edited
-from .test_playback import refused
+from ..refusals import refused
+from ..rig_changes import paint_weight
 
 
 @pytest.fixture
@@ -60,8 +61,7 @@ def test_a_model_of_another_rig_is_not_added(rig, elbow_files):
     assert not rig.mesh_object.fdda.models
 
 
-def test_an_index_outside_the_list_is_refused(bound_elbow):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_an_index_outside_the_list_is_refused(active):
     refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 model and none with index 3")
 
 
@@ -72,11 +72,6 @@ def move_vertex() -> None:
 def add_vertex() -> None:
     bpy.data.objects[ELBOW].data.vertices.add(1)
     bpy.data.objects[ELBOW].vertex_groups["lower"].add([len(bpy.data.objects[ELBOW].data.vertices) - 1], 1.0, "REPLACE")
-
-
-def paint_weight() -> None:
-    bpy.data.objects[ELBOW].vertex_groups["upper"].add([0], 0.37, "REPLACE")
-    bpy.data.objects[ELBOW].vertex_groups["lower"].add([0], 0.63, "REPLACE")
 
 
 def rename_bone() -> None:
@@ -92,59 +87,55 @@ def rename_bone() -> None:
         (rename_bone, "lacks the joint 'lower'"),
     ],
 )
-def test_the_check_of_an_outdated_model_names_the_change(bound_elbow, change, words):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_the_check_of_an_outdated_model_names_the_change(active, change, words):
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
-    bound_elbow.fdda.mode = "RIG"
+    active.fdda.mode = "RIG"
     change()
     refused(
         bpy.ops.fdda.check_model, "elbow was trained for an earlier state of this rig", words, "record and train again"
     )
 
 
-def test_a_changed_range_of_motion_is_reported_and_does_not_prevent_playback(bound_elbow, elbow_files):
+def test_a_changed_range_of_motion_is_reported_and_does_not_prevent_playback(active, elbow_files):
     from fdda_addon.models.changes import find_changes
     from fdda_addon.scene.scene_rig import find_rig
 
-    bpy.context.view_layer.objects.active = bound_elbow
-    assert not find_changes(find_rig(), bound_elbow.fdda.models[0]).sentence
+    assert not find_changes(find_rig(), active.fdda.models[0]).sentence
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
-    found = find_changes(find_rig(), bound_elbow.fdda.models[0])
+    found = find_changes(find_rig(), active.fdda.models[0])
     assert found.bones_with_changed_range == ("lower",) and not found.prevents_playback
     assert "The range of motion of 'lower' has changed since elbow was trained" in found.sentence
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
     pose(angle=0.1)
-    assert_plays(bound_elbow, elbow_files.model)
+    assert_plays(active, elbow_files.model)
 
 
-def test_a_listed_model_outside_the_folder_of_the_file_is_refused(bound_elbow, elbow_files, second):
-    bpy.context.view_layer.objects.active = bound_elbow
-    entry = bound_elbow.fdda.models.add()
+def test_a_listed_model_outside_the_folder_of_the_file_is_refused(active, elbow_files, second):
+    entry = active.fdda.models.add()
     entry.name, entry.path = "second", str(second)
-    bound_elbow.fdda.model_index = 1
+    active.fdda.model_index = 1
     refused(bpy.ops.fdda.bind, "lies outside the folder of 'bound.blend'")
     refused(bpy.ops.fdda.pack_model, "lies outside the folder")
     refused(bpy.ops.fdda.check_model, "lies outside the folder")
-    assert bound_entry(bound_elbow).name == "elbow"
+    assert bound_entry(active).name == "elbow"
     bpy.ops.fdda.bind(filepath=str(second))
-    assert bound_entry(bound_elbow).name == "second" and len(bound_elbow.fdda.models) == 2
+    assert bound_entry(active).name == "second" and len(active.fdda.models) == 2
 
 
-def test_a_model_file_that_is_replaced_is_reloaded(bound_elbow, elbow_files, second, tmp_path):
+def test_a_model_file_that_is_replaced_is_reloaded(active, elbow_files, second, tmp_path):
     """Training again replaces the file of a bound model."""
     import onnx
 
     from fdda_addon.evaluation import last_evaluation
     from fdda_addon.models import model_list
 
-    bpy.context.view_layer.objects.active = bound_elbow
     path = tmp_path / "second.onnx"
     bpy.ops.fdda.bind(filepath=str(path))
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
     bpy.ops.fdda.measure_model(frames=5)
-    assert frame_times.get(bound_elbow) is not None
+    assert frame_times.get(active) is not None
     pose(angle=1.3)
-    before = assert_plays(bound_elbow, path)
+    before = assert_plays(active, path)
 
     def double(proto: onnx.ModelProto) -> None:
         node = next(node for node in proto.graph.node if "positions" in node.output)
@@ -152,29 +143,28 @@ def test_a_model_file_that_is_replaced_is_reloaded(bound_elbow, elbow_files, sec
         proto.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
 
     write_edited(path, path, double)
-    model_list.add_model(bound_elbow, path)
+    model_list.add_model(active, path)
     bpy.context.view_layer.update()
-    after = assert_plays(bound_elbow, path)
+    after = assert_plays(active, path)
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
-    assert last_evaluation.get(bound_elbow) is None and frame_times.get(bound_elbow) is None
-    assert len(bound_elbow.fdda.models) == 2
+    assert last_evaluation.get(active) is None and frame_times.get(active) is None
+    assert len(active.fdda.models) == 2
 
 
-def test_the_section_describes_the_problems_of_models(bound_elbow, elbow_files):
+def test_the_section_describes_the_problems_of_models(active, elbow_files):
     from fdda_addon.panels import checks
     from fdda_addon.panels import models as section
     from fdda_addon.panels.timed_value import timed_values
     from fdda_addon.scene.scene_rig import find_rig
 
-    bpy.context.view_layer.objects.active = bound_elbow
     checks.check_now(find_rig())
-    assert timed_values.compute_now(section._find_problems, bound_elbow) == {}
+    assert timed_values.compute_now(section._find_problems, active) == {}
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
     checks.check_now(find_rig())
-    ((icon, sentence),) = timed_values.compute_now(section._find_problems, bound_elbow).values()
+    ((icon, sentence),) = timed_values.compute_now(section._find_problems, active).values()
     assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
-    bound_elbow.fdda.models[0].path = "//away.onnx"
-    ((icon, sentence),) = timed_values.compute_now(section._find_problems, bound_elbow).values()
+    active.fdda.models[0].path = "//away.onnx"
+    ((icon, sentence),) = timed_values.compute_now(section._find_problems, active).values()
     assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 

@@ -12,8 +12,8 @@ from fdda_addon.models.entries import bound_entry
 from fdda_addon.runtime import packed_model
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose
-from .test_models import paint_weight
-from .test_playback import refused
+from ..refusals import refused
+from ..rig_changes import paint_weight
 
 
 @pytest.fixture

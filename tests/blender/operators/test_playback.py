@@ -11,14 +11,7 @@ from fdda_addon.runtime import confidence, model_files, playback_modifier
 from fdda_addon.timing import frame_times
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
-
-
-def refused(call, *words: str) -> None:
-    """Assert that an operator is canceled and that its report contains the words."""
-    with pytest.raises(RuntimeError) as error:
-        call()
-    for word in words:
-        assert word in str(error.value)
+from ..refusals import refused
 
 
 def modifiers(mesh_object: bpy.types.Object) -> list[tuple]:
@@ -28,13 +21,13 @@ def modifiers(mesh_object: bpy.types.Object) -> list[tuple]:
 def test_bind_plays_and_unbind_restores(rig, elbow_files):
     mesh_object = rig.mesh_object
     mesh_object.modifiers["CorrectiveSmooth"].show_render = False
-    before, datablocks = modifiers(mesh_object), len(bpy.data.objects)
+    before, datablocks = modifiers(mesh_object), (len(bpy.data.objects), len(bpy.data.meshes))
     assert bpy.ops.fdda.bind(filepath=str(elbow_files.model)) == {"FINISHED"}
     pose(angle=1.0)
     assert_plays(mesh_object, elbow_files.model)
     assert [(entry.name, entry.path) for entry in mesh_object.fdda.models] == [("elbow", "//elbow.onnx")]
     assert bpy.ops.fdda.unbind() == {"FINISHED"}
-    assert modifiers(mesh_object) == before and len(bpy.data.objects) == datablocks
+    assert modifiers(mesh_object) == before and (len(bpy.data.objects), len(bpy.data.meshes)) == datablocks
     assert len(mesh_object.fdda.models) == 1
 
 
@@ -67,16 +60,11 @@ def test_a_file_that_is_not_a_model_is_not_listed(rig, elbow_files, tmp_path):
     assert not rig.mesh_object.fdda.models and not rig.mesh_object.fdda.is_bound
 
 
-def test_a_refused_model_does_not_unbind_the_bound_model(bound_elbow, elbow_files):
-    bpy.context.view_layer.objects.active = bound_elbow
-    bound_elbow.data.vertices[0].co.x += 0.1
+def test_a_refused_model_does_not_unbind_the_bound_model(active, elbow_files):
+    active.data.vertices[0].co.x += 0.1
     refused(lambda: bpy.ops.fdda.bind(filepath=str(elbow_files.model)), "the rest pose of the mesh differs")
     # The bound model does not match the changed mesh either. It stays bound, and the rig is shown.
-    assert (
-        bound_elbow.fdda.is_bound
-        and bound_elbow.fdda.mode == "RIG"
-        and "the rest pose of the mesh" in bound_elbow.fdda.status
-    )
+    assert active.fdda.is_bound and active.fdda.mode == "RIG" and "the rest pose of the mesh" in active.fdda.status
 
 
 def test_bind_and_unbind_can_be_undone(rig, elbow_files):
@@ -90,7 +78,10 @@ def test_bind_and_unbind_can_be_undone(rig, elbow_files):
     pose(angle=1.2)
     assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
     bpy.ops.ed.undo()
-    assert modifiers(bpy.data.objects[ELBOW]) == before
+    assert modifiers(bpy.data.objects[ELBOW]) == before and not bpy.data.objects[ELBOW].fdda.is_bound
+    bpy.ops.ed.redo()
+    pose(angle=0.9)
+    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
 
 
 def test_disabled_operators_say_why(elbow_files):
@@ -100,41 +91,38 @@ def test_disabled_operators_say_why(elbow_files):
         refused(getattr(bpy.ops.fdda, name), "No model is bound; bind one first")
 
 
-def test_set_mode_changes_and_toggles_the_mode(bound_elbow, elbow_files):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_set_mode_changes_and_toggles_the_mode(active, elbow_files):
     pose(angle=1.3)
-    playing = assert_plays(bound_elbow, elbow_files.model)
+    playing = assert_plays(active, elbow_files.model)
     for mode in ("RIG", "LINEAR"):
         assert bpy.ops.fdda.set_mode(mode=mode) == {"FINISHED"}
-        assert bound_elbow.fdda.mode == mode
-        assert np.abs(evaluated_positions(bound_elbow) - playing).max() > 5e-5
+        assert active.fdda.mode == mode
+        assert np.abs(evaluated_positions(active) - playing).max() > 5e-5
     bpy.ops.fdda.set_mode(mode="RIG")
     bpy.ops.fdda.set_mode()
-    assert bound_elbow.fdda.mode == "FDDA"
+    assert active.fdda.mode == "FDDA"
     bpy.ops.fdda.set_mode()
-    assert bound_elbow.fdda.mode == "RIG"
+    assert active.fdda.mode == "RIG"
 
 
-def test_set_mode_says_why_a_model_cannot_play(bound_elbow):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_set_mode_says_why_a_model_cannot_play(active):
     bpy.ops.fdda.set_mode(mode="RIG")
-    bound_elbow.modifiers.remove(playback_modifier.find_modifier(bound_elbow))
+    active.modifiers.remove(playback_modifier.find_modifier(active))
     refused(lambda: bpy.ops.fdda.set_mode(mode="FDDA"), "was removed; bind the model again")
 
 
-def test_measuring_stores_frame_times_and_restores_the_mode(bound_elbow):
-    bpy.context.view_layer.objects.active = bound_elbow
-    bound_elbow.fdda.mode = "LINEAR"
-    assert frame_times.get(bound_elbow) is None
+def test_measuring_stores_frame_times_and_restores_the_mode(active):
+    active.fdda.mode = "LINEAR"
+    assert frame_times.get(active) is None
     assert bpy.ops.fdda.measure_model(frames=5) == {"FINISHED"}
-    times = frame_times.get(bound_elbow)
+    times = frame_times.get(active)
     assert min(times.rig, times.linear, times.fdda, times.floor, times.inference) > 0
-    assert times.constant_bytes == model_files.network_of(bound_elbow).info.constant_bytes > 0
+    assert times.constant_bytes == model_files.network_of(active).info.constant_bytes > 0
     is_faster = times.rig > times.fdda
     assert ("x faster than the rig" if is_faster else "Not worth it here") in times.sentence
-    assert bound_elbow.fdda.mode == "LINEAR" and bound_elbow.fdda.is_bound and bound_elbow.fdda.model == "//elbow.onnx"
+    assert active.fdda.mode == "LINEAR" and active.fdda.is_bound and active.fdda.model == "//elbow.onnx"
     bpy.ops.fdda.unbind()
-    assert frame_times.get(bound_elbow) is None
+    assert frame_times.get(active) is None
 
 
 def test_relink_finds_a_model_that_was_moved(elbow_files, tmp_path):

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The bones that random poses move, chosen in the sidebar, and the previewed poses."""
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
 
-from blend_fixtures.characters import control_rigs, controls
+from blend_fixtures.characters import control_rigs
 from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION
-from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.panels import checks
 from fdda_addon.panels.limits import sampled_channels_by_bone
 from fdda_addon.panels.recording import cached_content
@@ -19,37 +17,10 @@ from fdda_addon.properties.recording_options import recording_settings
 from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
+from ..arm_and_face import IK, recorded
+
 DEFORMING = ("upper", "lower")
 CONTROL_BONES = {"fk_upper", "fk_lower", "ik_hand", "ik_pole"}
-IK = 'armature_object/["ik"]'
-
-
-def saved(tmp_path: Path) -> SceneRig:
-    """Save the file, make the character active and set 6 poses to record; return its rig."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
-    rig = find_rig()
-    bpy.context.view_layer.objects.active = rig.mesh_object
-    rig.mesh_object.fdda.settings.poses = 6
-    return rig
-
-
-@pytest.fixture
-def arm(tmp_path: Path) -> SceneRig:
-    """An arm that is posed by an IK and an FK chain, which its deforming bones copy."""
-    control_rigs.ik_fk()
-    return saved(tmp_path)
-
-
-@pytest.fixture
-def face(tmp_path: Path) -> SceneRig:
-    """Two shape keys that an animator sets by hand."""
-    controls.free_shape_keys()
-    return saved(tmp_path)
-
-
-def recorded(rig: SceneRig) -> Recording:
-    assert bpy.ops.fdda.record() == {"FINISHED"}
-    return read_recording(recording_folder(rig.mesh_object))
 
 
 def sampled_bones(recording: Recording) -> set[str]:

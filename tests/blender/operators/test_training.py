@@ -100,10 +100,7 @@ def test_refining_adds_poses_and_training_continues_from_the_checkpoint(saved, e
     assert bpy.ops.fdda.refine(poses=6) == {"FINISHED"}
     assert job.state_of("refine").outcome == "Added 6 poses to 'elbow_recording'; press Continue Training."
     assert_same_state(before, scene_state(saved))
-    assert [s.kind for s in read_recording(recorded_folder(tmp_path)).info.sampling.sources] == [
-        "random",
-        "refined",
-    ]
+    assert [s.kind for s in read_recording(recorded_folder(tmp_path)).info.sampling.sources] == ["random", "refined"]
     assert not (recorded_folder(tmp_path) / LOCK_NAME).exists()
     assert bpy.ops.fdda.train(warm_start=True) == {"FINISHED"}
     model = model_file(saved.mesh_object)

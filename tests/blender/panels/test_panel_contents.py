@@ -2,7 +2,6 @@
 """The content of the sections from Rig to Training, computed without a window."""
 
 import json
-import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,8 +27,6 @@ from fdda_addon.timing.rig_cost import RigCost, estimate_playback_ms
 
 from ..conftest import ELBOW
 from ..scene_state import fresh_elbow
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -234,24 +231,12 @@ class TestTraining:
         assert not (tmp_path / "m.onnx").exists()
 
 
-def documented_frame_times() -> list[tuple[int, float, float, float]]:
-    """Read the table "Frame times" of docs/benchmarks.md.
-
-    Returns:
-        For each rig its number of vertices, and the times of a frame with the rig, with the Armature modifier alone
-        and with FDDA, ms.
-    """
-    lines = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8").split("## Frame times")[1].splitlines()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    vertex_counts = [int(re.search(r", ([\d,]+)", heading)[1].replace(",", "")) for heading in rows[0][1:]]
-    cells_by_label = {label: cells for label, *cells in rows}
-    labels = ("rig, ms", "Armature modifier alone, ms", "FDDA, ms")
-    return list(zip(vertex_counts, *([float(cell) for cell in cells_by_label[label]] for label in labels), strict=True))
-
-
 class TestRigCost:
-    @pytest.mark.parametrize("vertex_count, rig_ms, armature_ms, fdda_ms", documented_frame_times())
-    def test_estimate_is_close_to_the_documented_benchmark(self, vertex_count, rig_ms, armature_ms, fdda_ms):
+    @pytest.mark.parametrize(
+        "vertex_count, rig_ms, armature_ms, fdda_ms",
+        [(1476, 0.56, 0.09, 0.35), (9960, 5.18, 0.55, 0.69), (50618, 28.7, 0.74, 1.22), (13380, 4.54, 0.38, 0.88)],
+    )
+    def test_estimate_is_close_to_a_benchmark(self, vertex_count, rig_ms, armature_ms, fdda_ms):
         assert estimate_playback_ms(vertex_count) == pytest.approx(fdda_ms - armature_ms, abs=0.2)
         cost = RigCost(vertex_count, rig_ms, armature_ms)
         assert rig_ms / cost.model == pytest.approx(rig_ms / fdda_ms, rel=0.3)

@@ -75,93 +75,87 @@ def test_missing_limits_are_named_beside_the_button_that_records(rig: SceneRig, 
         ("models", "Matches this rig"),
     ],
 )
-def test_a_section_of_a_bound_model_draws(bound_elbow: bpy.types.Object, name: str, text: str):
-    bpy.context.view_layer.objects.active = bound_elbow
-    checks.check_now(SceneRig(bound_elbow, bpy.data.objects[ELBOW_RIG]))
+def test_a_section_of_a_bound_model_draws(active: bpy.types.Object, name: str, text: str):
+    checks.check_now(SceneRig(active, bpy.data.objects[ELBOW_RIG]))
     bpy.ops.fdda.evaluate()
     bpy.ops.fdda.measure_model(frames=5)
     bpy.ops.fdda.color_mesh(colors="ERRORS")
-    timed_values.compute_now(playback._read_confidence, bound_elbow)
-    timed_values.compute_now(models._find_problems, bound_elbow)
+    timed_values.compute_now(playback._read_confidence, active)
+    timed_values.compute_now(models._find_problems, active)
     assert text in texts_of(draw_section(name))
 
 
-def test_a_fast_rig_offers_no_comparison_with_the_rig(bound_elbow: bpy.types.Object):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_a_fast_rig_offers_no_comparison_with_the_rig(active: bpy.types.Object):
     sections = ("rig", "playback", "evaluation")
     compared = {"Record, Train & Bind", "Measure Speed", "Frame Profile", "Rig", "Evaluate", "Beside"}
     full_texts = {text for name in sections for text in texts_of(draw_section(name))}
     assert compared <= full_texts
-    bound_elbow.fdda.is_fast_rig = True
+    active.fdda.is_fast_rig = True
     fast_texts = {text for name in sections for text in texts_of(draw_section(name))}
     assert not compared & fast_texts and {"Skinning", "Model", "Unbind"} <= fast_texts
     assert "This is a fast rig: compare the model in the file of the full rig." in fast_texts
 
 
-def test_a_fast_rig_in_which_no_model_plays_says_so(bound_elbow: bpy.types.Object):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_a_fast_rig_in_which_no_model_plays_says_so(active: bpy.types.Object):
     note = "'elbow' belongs to a fast rig: without a model, only what is left of its bones and modifiers deforms it."
 
     def says_so() -> bool:
         return any(text.startswith(note) for text in texts_of(draw_section("playback")))
 
-    bound_elbow.fdda.is_fast_rig = bound_elbow.fdda.use_in_render = True
+    active.fdda.is_fast_rig = active.fdda.use_in_render = True
     assert not says_so()
     # The user hides the modifier, which shows the rig in a full rig.
-    bound_elbow.modifiers["FDDA"].show_viewport = False
+    active.modifiers["FDDA"].show_viewport = False
     bpy.context.view_layer.update()
-    assert bound_elbow.fdda.mode == "RIG" and says_so()
+    assert active.fdda.mode == "RIG" and says_so()
     bpy.ops.fdda.unbind()
     assert says_so()
-    bound_elbow.fdda.is_fast_rig = False
+    active.fdda.is_fast_rig = False
     assert not says_so()
 
 
-def test_a_fast_rig_says_where_no_model_plays(bound_elbow: bpy.types.Object):
+def test_a_fast_rig_says_where_no_model_plays(active: bpy.types.Object):
     """In some frames, or in renders, while the viewport shows the model."""
-    bpy.context.view_layer.objects.active = bound_elbow
 
     def notes() -> list[str]:
         return [text for text in texts_of(draw_section("playback")) if "belongs to a fast rig" in text]
 
-    bound_elbow.fdda.is_fast_rig, bound_elbow.fdda.use_in_render = True, False
+    active.fdda.is_fast_rig, active.fdda.use_in_render = True, False
     left = "only what is left of its bones and modifiers deforms it."
     assert notes() == [
         f"'elbow' belongs to a fast rig: in renders, where the model is off, {left} Switch Use in Render on, or open "
         "the file of the full rig."
     ]
-    bound_elbow.fdda.use_in_render = True
+    active.fdda.use_in_render = True
     assert notes() == []
     keyed = f"'elbow' belongs to a fast rig: where its keyed or driven mode is Rig, {left} Remove these keys or the "
-    bound_elbow.keyframe_insert("fdda.mode", frame=1)
+    active.keyframe_insert("fdda.mode", frame=1)
     assert len(notes()) == 1 and notes()[0].startswith(keyed)
-    bound_elbow.animation_data_clear()
+    active.animation_data_clear()
     assert notes() == []
-    bound_elbow.driver_add("fdda.mode")
+    active.driver_add("fdda.mode")
     assert len(notes()) == 1 and notes()[0].startswith(keyed)
-    bound_elbow.fdda.is_fast_rig = False
+    active.fdda.is_fast_rig = False
     assert notes() == []
 
 
-def test_a_removed_modifier_can_be_bound_again(bound_elbow: bpy.types.Object):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_a_removed_modifier_can_be_bound_again(active: bpy.types.Object):
     bpy.context.view_layer.update()
-    bound_elbow.modifiers.remove(bound_elbow.modifiers["FDDA"])
+    active.modifiers.remove(active.modifiers["FDDA"])
     bpy.context.view_layer.update()
-    assert "was removed; bind the model again" in bound_elbow.fdda.status
+    assert "was removed; bind the model again" in active.fdda.status
     texts = texts_of(draw_section("playback"))
     assert "Bind Again" in texts and "Try Again" not in texts
-    assert bpy.ops.fdda.bind(object=bound_elbow.name) == {"FINISHED"}
-    assert bound_elbow.fdda.mode == "FDDA" and not bound_elbow.fdda.status
-    bound_elbow.modifiers["FDDA"].show_viewport = False
+    assert bpy.ops.fdda.bind(object=active.name) == {"FINISHED"}
+    assert active.fdda.mode == "FDDA" and not active.fdda.status
+    active.modifiers["FDDA"].show_viewport = False
     bpy.context.view_layer.update()
     assert "Try Again" in texts_of(draw_section("playback"))
 
 
-def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(bound_elbow: bpy.types.Object, capfd):
-    bpy.context.view_layer.objects.active = bound_elbow
+def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(active: bpy.types.Object, capfd):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=3)
-    index, error_mm = last_evaluation.get(bound_elbow).worst_poses(1)[0]
+    index, error_mm = last_evaluation.get(active).worst_poses(1)[0]
     assert f"Pose {index + 1}: {error_mm:.2f} mm" in texts_of(draw_section("evaluation"))
     bpy.ops.fdda.jump_to_worst()
     assert f"Random pose {index + 1}: max error {error_mm:.2f} mm." in capfd.readouterr().out
@@ -184,9 +178,8 @@ def test_a_section_without_a_rig_draws(name: str):
         assert "Add Sample Arm" in texts
 
 
-def test_lists_draw_their_items(bound_elbow: bpy.types.Object):
-    bpy.context.view_layer.objects.active = bound_elbow
-    control = bound_elbow.fdda.settings.controls.add()
+def test_lists_draw_their_items(active: bpy.types.Object):
+    control = active.fdda.settings.controls.add()
     control.name, control.has_range = "flex", True
     assert list_items("poses") == [
         "Record elbow_wave 1…30",

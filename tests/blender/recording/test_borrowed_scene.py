@@ -11,18 +11,10 @@ from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.runtime.binding import model_disabled
-from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.timing.benchmark import benchmark
 
-from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state, set_unusual_state
-
-
-@pytest.fixture
-def unusual_rig() -> SceneRig:
-    """Build an elbow whose animation, pose and selection differ from all defaults."""
-    rig = fresh_elbow()
-    set_unusual_state(rig)
-    return rig
+from ..scene_state import assert_same_state, drain, scene_state, set_unusual_state
 
 
 @pytest.fixture
@@ -75,29 +67,20 @@ def test_recording_a_missing_action_restores_the_scene(unusual_rig, before, tmp_
     assert_same_state(before, scene_state(unusual_rig))
 
 
-def test_recording_adds_no_animation_data(tmp_path):
-    rig = fresh_elbow()
-    rig.armature_object.animation_data_clear()
-    before = scene_state(rig)
-    drain(record(rig, tmp_path / "r", RECORDING_SETTINGS))
-    assert rig.armature_object.animation_data is None
-    assert_same_state(before, scene_state(rig))
-
-
-def test_recording_assigns_no_action(tmp_path):
-    rig = fresh_elbow()
-    rig.armature_object.animation_data.action = None
-    before = scene_state(rig)
-    drain(record(rig, tmp_path / "r", RECORDING_SETTINGS))
-    assert_same_state(before, scene_state(rig))
-
-
-@pytest.mark.skipif(bpy.app.version < (4, 4, 0), reason="actions have no slots")
-def test_recording_assigns_no_slot(unusual_rig, tmp_path):
-    unusual_rig.armature_object.animation_data.action_slot = None
+@pytest.mark.parametrize("missing", ["animation data", "action", "slot"])
+def test_recording_assigns_no_animation(unusual_rig, tmp_path, missing):
+    armature_object = unusual_rig.armature_object
+    if missing == "animation data":
+        armature_object.animation_data_clear()
+    elif missing == "action":
+        armature_object.animation_data.action = None
+    else:
+        armature_object.animation_data.action_slot = None
     before = scene_state(unusual_rig)
     drain(record(unusual_rig, tmp_path / "r", RECORDING_SETTINGS))
-    assert unusual_rig.armature_object.animation_data.action_slot is None
+    animation = armature_object.animation_data
+    assert (animation is None) == (missing == "animation data")
+    assert animation is None or animation.action_slot is None
     assert_same_state(before, scene_state(unusual_rig))
 
 

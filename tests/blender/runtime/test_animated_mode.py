@@ -15,9 +15,9 @@ from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
+from ..evaluations import shown_in
+from ..rendering import FRAME, animation, set_camera
 from ..rig_changes import change_in_edit_mode
-from .test_evaluations import shown_in
-from .test_renders import FRAME, animation, set_camera
 
 
 def key_mode(mesh_object: bpy.types.Object, modes: dict[int, str]) -> None:

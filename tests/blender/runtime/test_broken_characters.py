@@ -3,7 +3,6 @@
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import bpy
@@ -19,20 +18,8 @@ from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, write_edited
-from .test_player_batch import crowd_of
-
-
-def edit_mesh(mesh_object: bpy.types.Object, change: Callable[[], object]) -> None:
-    bpy.context.view_layer.objects.active = mesh_object
-    bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.mesh.select_all(action="SELECT")
-    change()
-    bpy.ops.object.mode_set(mode="OBJECT")
-
-
-def delete_vertices(mesh_object: bpy.types.Object) -> None:
-    mesh_object.data = mesh_object.data.copy()
-    edit_mesh(mesh_object, lambda: bpy.ops.mesh.delete(type="VERT"))
+from ..crowds import crowd_of
+from ..rig_changes import change_in_edit_mode
 
 
 @pytest.mark.parametrize("count", [3, 5], ids=["single", "batched"])
@@ -40,7 +27,8 @@ def test_a_character_without_vertices_shows_an_error(bound_elbow, elbow_files, c
     crowd = crowd_of(bound_elbow, count)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
-    delete_vertices(crowd[1])
+    crowd[1].data = crowd[1].data.copy()
+    change_in_edit_mode(crowd[1], lambda: (bpy.ops.mesh.select_all(action="SELECT"), bpy.ops.mesh.delete(type="VERT")))
     for frame in (4, 9):
         bpy.context.scene.frame_set(frame)
         for mesh_object in [o for o in crowd if o != crowd[1]]:

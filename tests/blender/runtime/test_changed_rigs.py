@@ -11,6 +11,8 @@ from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
+from ..crowds import crowd_of
+from ..evaluations import add_shape_key
 from ..rig_changes import (
     EDIT_MODE_CHANGES,
     REST_POSE_OF,
@@ -19,13 +21,13 @@ from ..rig_changes import (
     add_bone,
     change_bone_roll,
     change_in_edit_mode,
+    drive_b_bone,
     edit_bones,
     flip_faces,
     move_reference_key,
+    trigger_check,
     vertex_groups,
 )
-from .test_evaluations import add_shape_key
-from .test_player_batch import crowd_of
 
 
 def assert_rig_shown(mesh_object: bpy.types.Object, clause: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,45 +42,19 @@ def assert_rig_shown(mesh_object: bpy.types.Object, clause: str, capsys: pytest.
     assert np.array_equal(evaluated_positions(mesh_object), shown)
 
 
-def trigger_check(update: str) -> None:
-    if update == "frame":
-        bpy.context.scene.frame_set(7)
+@pytest.mark.parametrize("is_driven", [False, True])
+@pytest.mark.parametrize("update", ["view layer", "frame"])
+@pytest.mark.parametrize("change_name", [*EDIT_MODE_CHANGES, *SCRIPT_CHANGES])
+def test_a_change_of_the_rig_shows_the_rig(bound_elbow, change_name, update, is_driven, capsys):
+    if is_driven:
+        drive_b_bone()
+    pose(angle=1.0)
+    if change_name in EDIT_MODE_CHANGES:
+        object_name, change, clause = EDIT_MODE_CHANGES[change_name]
+        change_in_edit_mode(bpy.data.objects[object_name], change)
     else:
-        bpy.context.view_layer.update()
-
-
-def drive_b_bone() -> None:
-    """Drive a setting of the armature data by a bone, as Rigify does: Blender reports the data in every frame."""
-    driver = bpy.data.objects[ELBOW_RIG].data.driver_add('bones["lower"].bbone_easein').driver
-    variable = driver.variables.new()
-    variable.type, variable.targets[0].id = "TRANSFORMS", bpy.data.objects[ELBOW_RIG]
-    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
-    driver.type = "SUM"
-    bpy.context.view_layer.update()
-
-
-@pytest.mark.parametrize("is_driven", [False, True])
-@pytest.mark.parametrize("update", ["view layer", "frame"])
-@pytest.mark.parametrize("change_name", EDIT_MODE_CHANGES)
-def test_a_change_in_edit_mode_shows_the_rig(bound_elbow, change_name, update, is_driven, capsys):
-    name, change, clause = EDIT_MODE_CHANGES[change_name]
-    if is_driven:
-        drive_b_bone()
-    pose(angle=1.0)
-    change_in_edit_mode(bpy.data.objects[name], change)
-    trigger_check(update)
-    assert_rig_shown(bound_elbow, clause, capsys)
-
-
-@pytest.mark.parametrize("is_driven", [False, True])
-@pytest.mark.parametrize("update", ["view layer", "frame"])
-@pytest.mark.parametrize("change_name", SCRIPT_CHANGES)
-def test_a_change_by_a_script_shows_the_rig(bound_elbow, change_name, update, is_driven, capsys):
-    change, clause = SCRIPT_CHANGES[change_name]
-    if is_driven:
-        drive_b_bone()
-    pose(angle=1.0)
-    change()
+        change, clause = SCRIPT_CHANGES[change_name]
+        change()
     trigger_check(update)
     assert_rig_shown(bound_elbow, clause, capsys)
 

@@ -1,48 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Every evaluation shows the model's output: subframes, exports, motion blur, view layers, scenes, other add-ons."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.depsgraph_changes import seen_mode
-from fdda_addon.runtime.model_files import model_path
 from fdda_addon.runtime.session import session
-from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
-from ..conftest import (
-    ELBOW,
-    ELBOW_RIG,
-    assert_plays,
-    evaluated_positions,
-    pose,
-    predicted_positions,
-    without_deformation,
-)
-from .test_renders import rig_pixels, set_camera, still
+from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, predicted_positions
+from ..evaluations import add_shape_key, handler, shown_in
+from ..rendering import rig_pixels, set_camera, still
 
 FRAMES = (4, 11, 20)
-
-
-@contextmanager
-def handler(name: str, function) -> Iterator[None]:
-    """Register a handler, as another add-on does, while the `with` block runs."""
-    handlers = getattr(bpy.app.handlers, name)
-    handlers.append(function)
-    try:
-        yield
-    finally:
-        handlers.remove(function)
-
-
-def shown_in(graph: bpy.types.Depsgraph, mesh_object: bpy.types.Object) -> np.ndarray:
-    mesh = mesh_object.evaluated_get(graph).data
-    return np.array([vertex.co[:] for vertex in mesh.vertices], np.float32)
 
 
 @pytest.mark.parametrize("subframe", [0.25, 0.5, 0.999])
@@ -51,20 +23,6 @@ def test_subframes_show_the_model(bound_elbow, elbow_files, subframe):
     frame_positions = assert_plays(bound_elbow, elbow_files.model)
     bpy.context.scene.frame_set(10, subframe=subframe)
     assert np.abs(assert_plays(bound_elbow, elbow_files.model) - frame_positions).max() > 1e-4
-
-
-def add_shape_key(bound_elbow: bpy.types.Object) -> bpy.types.Object:
-    """Add a shape key that the model was not trained with to the bound elbow, and return the elbow."""
-    bind(SceneRig(bound_elbow, armature_of(bound_elbow)), without_deformation(model_path(bound_elbow)))
-    bound_elbow.fdda.mode = "RIG"
-    bound_elbow.shape_key_add(name="Basis")
-    key = bound_elbow.shape_key_add(name="bulge")
-    for point in key.data:
-        point.co.z *= 1.2
-    key.value = 1.0
-    bound_elbow.fdda.mode = "FDDA"
-    bpy.context.view_layer.update()
-    return bound_elbow
 
 
 def export_alembic(path: Path, mode: str) -> None:

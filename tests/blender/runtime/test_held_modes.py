@@ -13,8 +13,8 @@ from fdda_addon.runtime.player import Player
 from fdda_addon.scene.blend_file import save_copy
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, run
-from .test_evaluations import handler
-from .test_renders import FRAME, animation, rig_pixels, set_camera, still
+from ..evaluations import handler
+from ..rendering import FRAME, animation, rig_pixels, set_camera, still
 
 
 def key_mode(mesh_object: bpy.types.Object) -> None:

@@ -8,6 +8,7 @@ import pytest
 from fdda_addon.runtime import playback_modifier
 
 from ..conftest import assert_plays, predicted_positions
+from ..crowds import animate, count_calls
 from ..linked import (
     ANGLES,
     COLLECTION,
@@ -22,8 +23,7 @@ from ..linked import (
     save_and_reopen_shot,
     shot_path,
 )
-from . import test_player_batch as crowd_tests
-from .test_renders import render_positions, rig_pixels, set_camera, still
+from ..rendering import render_positions, rig_pixels, set_camera, still
 
 CROWD_SIZE = 20
 
@@ -176,8 +176,8 @@ def test_a_duplicated_override_has_its_own_positions(pair, library, tmp_path):
 def test_many_overrides_play_in_one_batch(library, monkeypatch):
     collection = link_character(library.path)
     crowd = [override_character(collection, 1.2 * index / CROWD_SIZE) for index in range(CROWD_SIZE)]
-    crowd_tests.animate(crowd)
-    calls = crowd_tests.count_calls(monkeypatch)
+    animate(crowd)
+    calls = count_calls(monkeypatch)
     for frame in (1, 2, 3, 4):
         bpy.context.scene.frame_set(frame)
     assert calls[-1] == CROWD_SIZE

@@ -18,8 +18,8 @@ from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from ..baked_files import read_pc2
 from ..conftest import ELBOW, assert_plays, evaluated_positions, pose
+from ..crowds import animate, crowd_of
 from ..scene_state import drain
-from .test_player_batch import animate, crowd_of
 
 GROUP = "learned"
 
@@ -75,27 +75,22 @@ def test_the_weight_blends_the_model_with_linear_skinning(masked):
     assert np.abs(model - linear).max() > 1e-3, "the pose tells the two apart"
 
 
-def test_an_inverted_mask_leaves_the_group_out(masked):
+def test_the_blend_follows_inversion_strength_and_painted_weights(masked):
     linear, model = both(masked)
+    weights = ramp(masked)[:, None]
+
+    def assert_blended(expected_weights: np.ndarray) -> None:
+        bpy.context.view_layer.update()
+        expected = linear + expected_weights * (model - linear)
+        assert np.abs(evaluated_positions(masked) - expected).max() < 1e-6
+
     masked.fdda.invert_mask = True
-    bpy.context.view_layer.update()
-    weights = 1 - ramp(masked)[:, None]
-    assert np.abs(evaluated_positions(masked) - (linear + weights * (model - linear))).max() < 1e-6
-
-
-def test_strength_and_weight_are_multiplied(masked):
-    linear, model = both(masked)
-    masked.fdda.strength = 0.5
-    bpy.context.view_layer.update()
-    expected = linear + 0.5 * ramp(masked)[:, None] * (model - linear)
-    assert np.abs(evaluated_positions(masked) - expected).max() < 1e-6
-
-
-def test_weights_painted_during_playback_take_effect(masked):
-    linear, model = both(masked)
-    weights = 1 - ramp(masked)
-    paint(masked, weights)
-    assert np.abs(evaluated_positions(masked) - (linear + weights[:, None] * (model - linear))).max() < 1e-6
+    assert_blended(1 - weights)
+    masked.fdda.invert_mask, masked.fdda.strength = False, 0.5
+    assert_blended(0.5 * weights)
+    masked.fdda.strength = 1.0
+    paint(masked, 1 - ramp(masked))
+    assert_blended(1 - weights)
     assert not masked.fdda.status
 
 

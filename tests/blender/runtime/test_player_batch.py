@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from fdda_addon.runtime.binding import bind, unbind
-from fdda_addon.runtime.network import Execution
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
 from ..conftest import ELBOW, assert_plays, evaluated_positions, predicted_positions, run, train
+from ..crowds import animate, count_calls, crowd_of
 
 ROOT = Path(__file__).resolve().parents[3]
 CROWD = 20
@@ -22,49 +22,10 @@ COLD_START_PROCESSOR_SECONDS = 0.5
 """About 0.17 on an idle machine. The time on the clock depends on what else the machine does."""
 
 
-def crowd_of(first: bpy.types.Object, count: int) -> list[bpy.types.Object]:
-    """Return a bound object and copies of it, each with a separate armature in a different pose."""
-    crowd = [first]
-    for _ in range(count - 1):
-        mesh_copy, armature_copy = first.copy(), armature_modifier(first).object.copy()
-        for copy in (mesh_copy, armature_copy):
-            bpy.context.scene.collection.objects.link(copy)
-        armature_modifier(mesh_copy).object = armature_copy
-        mesh_copy.parent = armature_copy if first.parent else None
-        crowd.append(mesh_copy)
-    bpy.context.view_layer.update()
-    for number, mesh_object in enumerate(crowd):
-        armature_modifier(mesh_object).object.pose.bones["lower"].rotation_euler[0] = 0.1 + 1.2 * number / count
-    return crowd
-
-
 @pytest.fixture
 def calls(monkeypatch) -> list[int]:
     """The number of poses of each network call."""
     return count_calls(monkeypatch)
-
-
-def count_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    counted, real = [], Execution.run
-
-    def run(execution: Execution) -> np.ndarray:
-        counted.append(len(execution.poses))
-        return real(execution)
-
-    monkeypatch.setattr(Execution, "run", run)
-    return counted
-
-
-def animate(crowd: list[bpy.types.Object]) -> None:
-    """Animate the elbow of each character, starting from its current angle."""
-    for mesh_object in crowd:
-        armature_object = armature_modifier(mesh_object).object
-        armature_object.animation_data_clear()
-        bone = armature_object.pose.bones["lower"]
-        start = bone.rotation_euler[0]
-        for frame, angle in ((1, start), (60, start + 0.5)):
-            bone.rotation_euler[0] = angle
-            bone.keyframe_insert("rotation_euler", index=0, frame=frame)
 
 
 def test_one_frame_of_a_crowd_is_one_network_call(bound_elbow, elbow_files, calls):

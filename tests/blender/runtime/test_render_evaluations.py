@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose
-from .test_evaluations import add_shape_key, handler
-from .test_renders import FRAME, animation, set_camera, still
+from ..evaluations import add_shape_key, handler
+from ..rendering import FRAME, animation, set_camera, still
 
 OBJ_DIGITS = 2e-6
 """Tolerance in meters, because an OBJ file stores six digits."""

@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Renders show the true rig, or the model where the user asks for it: compared pixel by pixel."""
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
 
 from ..conftest import ELBOW_RIG, assert_plays, predicted_positions
-
-FRAME = 22
-"""Frame of the action in which the elbow is strongly bent."""
+from ..rendering import FRAME, animation, render_positions, rig_pixels, set_camera, still
 
 
 @pytest.fixture
@@ -18,97 +14,32 @@ def camera(bound_elbow):
     return set_camera()
 
 
-def set_camera() -> bpy.types.Object:
-    """Add a camera that shows the elbow, and set the frame."""
-    scene = bpy.context.scene
-    scene.render.engine = "BLENDER_WORKBENCH"
-    scene.render.resolution_x, scene.render.resolution_y = 160, 120
-    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-    camera.data.type, camera.data.ortho_scale = "ORTHO", 0.9
-    camera.location, camera.rotation_euler = (0.25, -2, 0), (np.pi / 2, 0, 0)
-    scene.collection.objects.link(camera)
-    scene.camera = camera
-    scene.frame_set(FRAME)
-    return camera
-
-
-def still(path: Path) -> np.ndarray:
-    bpy.context.scene.render.filepath = str(path)
-    bpy.ops.render.render(write_still=True)
-    return pixels(path)
-
-
-def animation(folder: Path) -> dict[int, np.ndarray]:
-    scene = bpy.context.scene
-    scene.frame_start, scene.frame_end = FRAME - 1, FRAME + 1
-    scene.render.filepath = str(folder / "frame_")
-    bpy.ops.render.render(animation=True)
-    return {f: pixels(folder / f"frame_{f:04}.png") for f in range(scene.frame_start, scene.frame_end + 1)}
-
-
-def pixels(path: Path) -> np.ndarray:
-    image = bpy.data.images.load(str(path))
-    values = np.array(image.pixels[:], np.float32)
-    bpy.data.images.remove(image)
-    return values
-
-
-def render_positions(bound_elbow: bpy.types.Object, positions: np.ndarray, path: Path) -> np.ndarray:
-    """Render a plain mesh of these positions in place of the bound object."""
-    mesh = bound_elbow.data.copy()
-    mesh.attributes["position"].data.foreach_set("vector", positions.reshape(-1))
-    mesh.update()
-    plain = bpy.data.objects.new("plain", mesh)
-    plain.matrix_world = bound_elbow.matrix_world
-    bpy.context.scene.collection.objects.link(plain)
-    bound_elbow.hide_render = True
-    try:
-        return still(path)
-    finally:
-        bound_elbow.hide_render = False
-        bpy.data.objects.remove(plain)
-
-
-def rig_pixels(bound_elbow: bpy.types.Object, tmp_path: Path) -> np.ndarray:
-    bound_elbow.fdda.mode = "RIG"
-    rendered = still(tmp_path / "rig.png")
-    bound_elbow.fdda.mode = "FDDA"
-    return rendered
-
-
-def test_still_shows_the_rig(bound_elbow, camera, tmp_path, elbow_files):
-    assert np.array_equal(still(tmp_path / "still.png"), rig_pixels(bound_elbow, tmp_path))
+@pytest.mark.parametrize("use_in_render", [False, True])
+def test_a_still_shows_the_rig_or_the_model(bound_elbow, camera, tmp_path, elbow_files, use_in_render):
+    bound_elbow.fdda.use_in_render = use_in_render
+    rendered, rig = still(tmp_path / "still.png"), rig_pixels(bound_elbow, tmp_path)
     assert_plays(bound_elbow, elbow_files.model)
-
-
-def test_still_shows_the_model_when_asked(bound_elbow, camera, tmp_path, elbow_files):
-    bound_elbow.fdda.use_in_render = True
     model = render_positions(bound_elbow, predicted_positions(bound_elbow, elbow_files.model), tmp_path / "plain.png")
-    assert np.array_equal(still(tmp_path / "still.png"), model)
-    assert not np.array_equal(model, rig_pixels(bound_elbow, tmp_path))
+    expected, other = (model, rig) if use_in_render else (rig, model)
+    assert np.array_equal(rendered, expected) and not np.array_equal(rendered, other)
 
 
-def test_animation_shows_the_rig(bound_elbow, camera, tmp_path, elbow_files):
-    frames = animation(tmp_path)
-    bpy.context.view_layer.update()
-    assert_plays(bound_elbow, elbow_files.model)
-    for frame, rendered in frames.items():
-        bpy.context.scene.frame_set(frame)
-        assert np.array_equal(rendered, rig_pixels(bound_elbow, tmp_path)), frame
-
-
-def test_animation_shows_the_model_when_asked(bound_elbow, camera, tmp_path, elbow_files):
-    bound_elbow.fdda.use_in_render = True
+@pytest.mark.parametrize("use_in_render", [False, True])
+def test_an_animation_shows_the_rig_or_the_model(bound_elbow, camera, tmp_path, elbow_files, use_in_render):
+    bound_elbow.fdda.use_in_render = use_in_render
     frames = animation(tmp_path)
     assert bpy.context.scene.frame_current == FRAME
     bpy.context.view_layer.update()
     assert_plays(bound_elbow, elbow_files.model)
     for frame, rendered in frames.items():
         bpy.context.scene.frame_set(frame)
-        model = render_positions(
-            bound_elbow, predicted_positions(bound_elbow, elbow_files.model), tmp_path / "plain.png"
+        model = predicted_positions(bound_elbow, elbow_files.model)
+        expected = (
+            render_positions(bound_elbow, model, tmp_path / "plain.png")
+            if use_in_render
+            else rig_pixels(bound_elbow, tmp_path)
         )
-        assert np.array_equal(rendered, model), frame
+        assert np.array_equal(rendered, expected), frame
     assert not np.array_equal(frames[FRAME - 1], frames[FRAME + 1])
 
 

@@ -15,7 +15,7 @@ from fdda_addon.scene.compatibility import node_input_settings
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, with_deformation
-from .test_changed_rigs import drive_b_bone, trigger_check
+from ..rig_changes import drive_b_bone, trigger_check
 
 
 def add(kind: str, place: int | None, **settings: object) -> Callable[[bpy.types.Object], None]:
@@ -164,14 +164,12 @@ def test_binding_again_keeps_modifiers_after_the_playback_modifier(bound_elbow, 
     add("SMOOTH", None, iterations=5)(bound_elbow)
     bind(find_rig(), elbow_files.model)
     bpy.context.view_layer.update()
-    assert [m.name for m in bound_elbow.modifiers] == [
-        "Armature",
-        "CorrectiveSmooth",
-        "FDDA",
-        "FDDA Undeformed",
-        "Smooth",
-    ]
+    names = ["Armature", "CorrectiveSmooth", "FDDA", "FDDA Undeformed", "Smooth"]
+    assert [m.name for m in bound_elbow.modifiers] == names
     assert not bound_elbow.fdda.status
+    bound_elbow.modifiers["Smooth"].show_viewport = False
+    pose(angle=1.0)
+    assert_plays(bound_elbow, elbow_files.model)
 
 
 def drive_key(mesh_object: bpy.types.Object) -> bpy.types.Driver:

@@ -16,10 +16,10 @@ from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
 from ..conftest import ELBOW_RIG, assert_plays, pose
-from ..rig_changes import add_bone, change_in_edit_mode, edit_bones
-from .test_changed_rigs import assert_rig_shown, drive_b_bone
-from .test_evaluations import add_shape_key
-from .test_player_batch import crowd_of
+from ..crowds import crowd_of
+from ..evaluations import add_shape_key
+from ..rig_changes import add_bone, change_in_edit_mode, drive_b_bone, edit_bones
+from .test_changed_rigs import assert_rig_shown
 
 
 def test_playback_and_posing_do_not_check_the_rig(bound_elbow, elbow_files, monkeypatch):

@@ -17,7 +17,7 @@ from fdda_addon.core.mathematics.poses import Channel
 
 from ... import systems
 from ..limb import make_rig
-from ..tiny_model import in_subgraph, tiny_info, tiny_model, with_external_data, zeros_tensor
+from ..tiny_model import tiny_info, tiny_model
 
 
 def save_model(tmp_path, model) -> os.PathLike:
@@ -103,20 +103,6 @@ def test_a_file_of_another_kind_is_refused(tmp_path, data):
 
 def test_an_onnx_file_without_metadata_is_refused(tmp_path):
     assert_refused(save_model(tmp_path, tiny_model(metadata=None)), "is an ONNX file but not a model of this add-on")
-
-
-def test_external_data_is_refused(tmp_path):
-    assert_refused(
-        save_model(tmp_path, tiny_model(initializers=[with_external_data(zeros_tensor("w"))])),
-        "it has data in other files",
-    )
-
-
-def test_custom_operators_are_refused(tmp_path):
-    node = in_subgraph(helper.make_node("Run", [], ["y"], domain="com.example"))
-    assert_refused(
-        save_model(tmp_path, tiny_model(nodes=[node])), "it has graphs inside of nodes, which train does not write"
-    )
 
 
 def test_unknown_inputs_are_refused(tmp_path):
