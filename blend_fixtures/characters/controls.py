@@ -49,8 +49,7 @@ def modifier_strength() -> None:
 def undriven_strength() -> None:
     """Build a tube with a modifier whose strength an animator sets by hand."""
     mesh_object, _ = tube()
-    modifier = mesh_object.modifiers.new("Cast", "CAST")
-    modifier.use_radius_as_size, modifier.size, modifier.factor = False, 0.3, 0.0
+    add_cast(mesh_object)
 
 
 def lattice_shape_key() -> None:
@@ -82,6 +81,13 @@ CONTROLS: tuple[Callable[[], None], ...] = (
     custom_property, free_shape_keys, constraint_influence, modifier_strength, undriven_strength, lattice_shape_key,
     dial,
 )  # fmt: skip
+
+
+def add_cast(mesh_object: bpy.types.Object) -> bpy.types.CastModifier:
+    """Add a Cast modifier with strength 0."""
+    modifier = mesh_object.modifiers.new("Cast", "CAST")
+    modifier.use_radius_as_size, modifier.size, modifier.factor = False, 0.3, 0.0
+    return modifier
 
 
 def add_property(owner: bpy.types.ID, name: str) -> None:

@@ -224,8 +224,8 @@ def bones_that_move_with_time() -> None:
 
 REFUSED: tuple[Callable[[], None], ...] = (
     keyed_strength, strength_in_the_nla, driven_by_frame, driven_by_the_scene, driven_by_the_context,
-    through_a_property, keyed_property_without_a_range, property_of_the_scene, shape_driven_by_frame,
-    keyed_evaluation_time, keyed_lattice, hook_on_a_moving_parent, hook_that_copies_what_moves, waving_cage,
+    through_a_property, keyed_property_without_a_range, property_of_the_scene,
+    keyed_lattice, hook_on_a_moving_parent, hook_that_copies_what_moves, waving_cage,
     keyed_texture, keyed_nodes, nodes_that_read_a_mover, second_armature_whose_rotation_is_driven,
 )  # fmt: skip
 TOLD: tuple[Callable[[], None], ...] = (

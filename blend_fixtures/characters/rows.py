@@ -136,7 +136,7 @@ ROWS: tuple[Row, ...] = (
         INPUTS,
         controls.free_shape_keys,
         "shape keys set by hand",
-        recording=_recording_settings(controls=("shape_keys",)),
+        recording=_recording_settings(),
     ),
     _tube_row(INPUTS, controls.constraint_influence, "a constraint's influence, which also drives a shape key"),
     _tube_row(INPUTS, controls.modifier_strength, "a custom property that drives a modifier's strength"),
@@ -163,7 +163,7 @@ ROWS: tuple[Row, ...] = (
         INPUTS,
         "a face of 22 bones and 22 shape keys set by hand, with 12 correctives",
         face.face,
-        _recording_settings(poses=200, spread=10, controls=("shape_keys",)),
+        _recording_settings(poses=200, spread=10),
         meshes=(face.MESH,),
     ),
     Row(

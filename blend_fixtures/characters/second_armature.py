@@ -10,9 +10,9 @@ from collections.abc import Callable
 import bpy
 
 from . import stacks
-from .base import bulge, link, tube
+from .base import link, tube
 from .bones import NewBone, add_bones, limit
-from .controls import add_key
+from .controls import add_cast
 from .skinning import two_armatures
 
 ARMATURE, BONE = "muscle_rig", "muscle"
@@ -81,15 +81,15 @@ def lattice_on_a_bone() -> None:
 
 
 def driver_of_a_bone() -> None:
-    """A driver of a shape key reads the rotation of a bone."""
+    """A driver of a modifier reads the rotation of a bone."""
     _drive_by_bone_transform("ROT_X")
 
 
 def driver_of_a_channel() -> None:
-    """A driver of a shape key reads a component of a bone's quaternion."""
+    """A driver of a modifier reads a component of a bone's quaternion."""
     mesh_object, _ = tube()
     armature_object = _add_unlocked_armature()
-    driver = add_key(mesh_object, "flexed", bulge).driver_add("value").driver
+    driver = add_cast(mesh_object).driver_add("factor").driver
     variable = driver.variables.new()
     variable.name, variable.targets[0].id = "x", armature_object
     variable.targets[0].data_path = f'pose.bones["{BONE}"].rotation_quaternion[1]'
@@ -134,7 +134,7 @@ def _unlock(pose_bone: bpy.types.PoseBone) -> None:
 
 def _drive_by_bone_transform(channel: str) -> None:
     mesh_object, _ = tube()
-    driver = add_key(mesh_object, "flexed", bulge).driver_add("value").driver
+    driver = add_cast(mesh_object).driver_add("factor").driver
     variable = driver.variables.new()
     variable.name, variable.type = "transform", "TRANSFORMS"
     target = variable.targets[0]

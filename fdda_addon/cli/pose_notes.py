@@ -2,15 +2,12 @@
 """Prints what the user should know about the poses of a recording before it begins."""
 
 import argparse
-from collections.abc import Iterable
 
 import bpy
 
-from ..core.controls import SHAPE_KEYS
 from ..poses.action_range import measured_ranges
 from ..poses.control_bones import describe_control_bones, split_control_bones
 from ..recording.plan import RecordingSettings, listed_controls
-from ..scene.controls import parse_controls
 from ..scene.scene_rig import SceneRig
 from .target import requested_poses
 
@@ -28,13 +25,6 @@ def print_control_bones(scene_rig: SceneRig, options: argparse.Namespace) -> Non
             controls=tuple(options.control), sample=tuple(options.sample), actions=tuple(options.action)
         )
         print(describe_control_bones(scene_rig.armature_object, names, listed_controls(scene_rig, settings)))
-
-
-def print_unused_shape_keys(rigs: Iterable[SceneRig], options: argparse.Namespace) -> None:
-    """Print that `shape_keys` adds no input if no mesh has a shape key that it stands for."""
-    is_given = SHAPE_KEYS in {text.partition("=")[0] for text in options.control}
-    if is_given and not any(parse_controls(scene_rig, [SHAPE_KEYS]) for scene_rig in rigs):
-        print(f"--control {SHAPE_KEYS} adds no input: no recorded mesh has a shape key without a driver.")
 
 
 def print_remix_hint(scene_rig: SceneRig, options: argparse.Namespace) -> None:

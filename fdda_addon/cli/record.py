@@ -28,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..runtime.binding import model_disabled
     from .files import open_file
-    from .pose_notes import print_control_bones, print_remix_hint, print_unused_shape_keys
+    from .pose_notes import print_control_bones, print_remix_hint
     from .progress import ProgressPrinter
     from .record_options import check_options
 
@@ -37,7 +37,6 @@ def run(options: argparse.Namespace) -> None:
     rigs = _find_rigs(options)
     if not options.refine:
         print_control_bones(rigs[0][0], options)
-        print_unused_shape_keys([scene_rig for scene_rig, _ in rigs], options)
         print_remix_hint(rigs[0][0], options)
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:

@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Controls: inputs of a model beside the joints, such as values of shape keys."""
 
+import re
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS = "armature_object", "armature", "mesh_object", "shape_keys"
 OWNERS = (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS)
+SHAPE_KEY_PATH = re.compile(r'key_blocks\["(?P<name>(?:[^"\\]|\\.)*)"\]\.value', re.DOTALL)
+"""Path of the value of a shape key; `name` is escaped."""
+EVALUATION_TIME = "eval_time"
+"""Path of the evaluation time of absolute shape keys."""
 OTHER_OBJECT = "object:"
 """Prefix of the owner of a control on another object; the name of the object follows."""
 MAX_TEXT_LENGTH = 1000
@@ -29,6 +34,11 @@ class Control:
     path: str
     low: float
     high: float
+
+    @property
+    def is_shape_key(self) -> bool:
+        """Whether the control is the value of a shape key of the mesh."""
+        return self.owner == SHAPE_KEYS and bool(SHAPE_KEY_PATH.fullmatch(self.path))
 
     @property
     def name(self) -> str:

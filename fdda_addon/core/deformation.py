@@ -91,7 +91,7 @@ def deformation_differences(recorded: dict, current: dict, controls: Iterable[Co
 
 
 def _driver_differences(recorded: dict, current: dict, control_paths: set[tuple[str, str]]) -> list[str]:
-    """List other drivers, except those of controls, which the model reads, and those that only shape keys have lost."""
+    """List other drivers, except those of controls, which the model reads."""
     clauses = []
     for name in sorted({*recorded, *current}):
         owner, _, path = name.rpartition("[")[0].partition("/")
@@ -105,30 +105,9 @@ def _driver_differences(recorded: dict, current: dict, control_paths: set[tuple[
             clauses.append(f"it was recorded without the driver of '{path}'")
         elif name in current:
             clauses.append(f"the driver of '{path}' differs")
-        elif owner != SHAPE_KEYS:
+        else:
             clauses.append(f"the driver of '{path}' is muted or gone")
     return clauses
-
-
-def lost_driver_note(recorded: dict, current: dict, controls: Iterable[Control], object_name: str) -> str:
-    """Say that drivers of shape keys are muted or gone; empty if none is.
-
-    A model reads what these drivers read, so it does what they did.
-
-    Args:
-        recorded, current, controls: as for `deformation_differences`.
-    """
-    control_paths = {control.path for control in controls if control.owner == SHAPE_KEYS}
-    names = sorted(recorded.get("drivers", {}).keys() - current.get("drivers", {}).keys())
-    paths = [name.rpartition("[")[0].removeprefix(f"{SHAPE_KEYS}/") for name in names if name.startswith(SHAPE_KEYS)]
-    paths = [path for path in paths if path not in control_paths]
-    if not paths:
-        return ""
-    others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-    return (
-        f"The driver of '{paths[0]}' of '{object_name}'{others} is muted or gone, but the model does what it did; "
-        "restore it, or record and train this rig."
-    )
 
 
 def _modifier_differences(recorded: list[dict], current: list[dict], control_paths: set[tuple[str, str]]) -> list[str]:

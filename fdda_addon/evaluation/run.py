@@ -26,6 +26,7 @@ from ..rig.pose_setter import (
     blend_from_rest,
 )
 from ..rig.reading import PoseEvaluator
+from ..rig.shape_keys import set_keys_undriven
 from ..rig.target_poses import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
@@ -134,7 +135,7 @@ def _random_poses(
     count: int,
 ) -> Iterator[None]:
     poser = Poser(scene_rig, channels)
-    with pose_setter.prepared():
+    with pose_setter.prepared(), set_keys_undriven(scene_rig, channels):
         for index in range(first_index, first_index + count):
             values = sample_pose(channels, seed, index)
             pose_setter.set_pose(blend_from_rest(poser.set, channels, values))

@@ -6,7 +6,7 @@ import math
 import bpy
 
 from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
-from ..properties.recording_options import ALL_SHAPE_KEYS, recorded_actions
+from ..properties.recording_options import recorded_actions
 from ..recording.rig_check import RigCheck
 from ..scene.scene_rig import SceneRig
 from . import checks
@@ -28,7 +28,7 @@ class FDDA_UL_controls(bpy.types.UIList):
             kind, _, name = control.name.partition(":")
             row.label(text=name, icon=BONE_ICONS[f"{kind}:"])
             return
-        text = "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name.rpartition("/")[2] or "(unnamed)"
+        text = control.name.rpartition("/")[2] or "(unnamed)"
         row.label(text=text, icon="SHAPEKEY_DATA" if "/" not in control.name else "DRIVER")
         right_part = row.row()
         right_part.alignment = "RIGHT"
@@ -117,12 +117,12 @@ def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
             fields.prop(control, "low", text="")
             fields.prop(control, "high", text="")
     body.operator("fdda.add_control_bones", icon="BONE_DATA").object = rig.mesh_object.name
-    if rig.mesh_object.data.shape_keys and ALL_SHAPE_KEYS not in settings.controls:
-        properties = body.operator("fdda.add_control", text="All Shape Keys", icon="SHAPEKEY_DATA")
-        properties.object, properties.name = rig.mesh_object.name, ALL_SHAPE_KEYS
     if detected:
         column = body.column(align=True)
         column.label(text="Detected automatically")
+        if key_count := sum(control.is_shape_key for control in detected):
+            column.label(text=_count_text(key_count, "shape key"), icon="SHAPEKEY_DATA")
+        detected = [control for control in detected if not control.is_shape_key]
         for control in detected[:MAX_SHOWN_CONTROLS]:
             column.label(text=f"{control.name} {control.low:g}…{control.high:g}", icon="DOT")
         if len(detected) > MAX_SHOWN_CONTROLS:

@@ -35,6 +35,7 @@ class SampleSelection:
         constant_channels: numbers that the actions key at a single value which differs from the current one.
         control_bones: names of the bones whose channels are controls; they are sampled besides the default bones. They
             are among the selected bones, if there are any.
+        key_bones: bones that act through shape keys alone. They are sampled, but are no joints.
     """
 
     bones: frozenset[str] | None = None
@@ -44,6 +45,7 @@ class SampleSelection:
     constant_channels: tuple[Channel, ...] = ()
     control_bones: frozenset[str] = frozenset()
     remix: Remix | None = None
+    key_bones: frozenset[str] = frozenset()
 
 
 DEFAULT_SELECTION = SampleSelection()

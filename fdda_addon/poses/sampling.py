@@ -21,7 +21,7 @@ from ..core.mathematics.poses import (
 )
 from ..core.mathematics.remix import replace_bone_channels
 from ..core.rig import Rig
-from ..scene.controls import can_be_set, is_driven, is_number, owner_of
+from ..scene.controls import can_be_set, driven_numbers, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_range import ChannelRanges, has_width
 from .bone_channels import control_name, is_moved_by_constraints, ranges_by_control
@@ -93,17 +93,20 @@ def sampled_channels(
     armature_object = scene_rig.armature_object
     controls = {control.name: (control.low, control.high) for control in selection.controls}
     channels = []
-    for channel in _bone_channels(armature_object, selection, set(rig.joint_names)):
+    for channel in _bone_channels(armature_object, selection, {*rig.joint_names, *selection.key_bones}):
         # A control that is a number of a bone is set with the bone, in the range of the control.
         bounds = controls.pop(control_name(armature_object, channel), (channel.low, channel.high))
         channels.append(replace(channel, low=bounds[0], high=bounds[1]))
-    channels += [
-        Channel(control.name, CONTROL, 0, control.low, control.high)
-        for control in selection.controls
-        if control.name in controls
-        and can_be_set(control.name)
-        and not is_driven(owner_of(scene_rig, control.owner), control.path)
-    ]
+    driven_keys = driven_numbers(scene_rig.mesh_object.data.shape_keys)
+    for control in selection.controls:
+        # There may be hundreds of shape keys.
+        is_set = (
+            (control.path, 0) in driven_keys
+            if control.is_shape_key
+            else is_driven(owner_of(scene_rig, control.owner), control.path)
+        )
+        if control.name in controls and can_be_set(control.name) and not is_set:
+            channels.append(Channel(control.name, CONTROL, 0, control.low, control.high))
     control_names = {control.name for control in selection.controls}
     channels += [channel for channel in selection.constant_channels if channel.name not in control_names]
     if not channels:

@@ -13,9 +13,6 @@ from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from .character import FDDA_PG_character
 
-ALL_SHAPE_KEYS = "shape_keys"
-"""Name of an extra input that stands for all shape keys without drivers (`scene.controls.parse_controls`)."""
-
 
 def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
     """Return the settings of a recording of a character.

@@ -48,6 +48,7 @@ class InfluenceSearch:
         draw_values: returns random values of the channels, (C,), for an index from 0.
         show_pose: sets a recorded pose for an index from 0; used without channels.
         stop_playback: ends the playback of `show_pose`.
+        has_target: the surface is that of a target.
         has_other_bones: bones other than the joints may deform the surface, because it is that of a target, or because
             the joints are key joints.
         poses: number of base poses, from each of which every joint is moved: the rest pose, then random poses.
@@ -61,6 +62,7 @@ class InfluenceSearch:
     stop_playback: Callable[[], None]
     poses: int = INFLUENCE_POSES
     tolerance: float = INFLUENCE_TOLERANCE
+    has_target: bool = False
     has_other_bones: bool = False
 
     @property
@@ -107,10 +109,14 @@ def follows_control_bones(scene_rig: SceneRig, rig: Rig, channels: tuple[Channel
     drivers = animation.drivers if animation else ()
     driven_bones = {split_bone_path(scene_rig.armature_object, curve.data_path)[0] for curve in drivers}
     unsampled_joints = [name for name in rig.joint_names if name not in sampled_names and name != STATIC_JOINT]
-    if any(name not in rig.joint_names for name in sampled_names if name in bones):
+    # Bones that only drive shape keys move no joint.
+    other_bones = {name for name in sampled_names if name in bones} - set(rig.joint_names)
+    joint_names = [name for name in rig.joint_names if name != STATIC_JOINT]
+    if any(parent.name in other_bones for name in joint_names for parent in bones[name].bone.parent_recursive):
         return True
     return not sampled_names or any(
-        is_moved_by_constraints(bones[name]) or name in driven_bones for name in unsampled_joints
+        is_moved_by_constraints(bones[name]) or name in driven_bones
+        for name in (joint_names if other_bones else unsampled_joints)
     )
 
 
@@ -122,7 +128,7 @@ class _ChannelTrials:
         self.undetectable_controls = frozenset()
         self._search, self._poser = search, Poser(scene_rig, channels)
         joints = {name: index for index, name in enumerate(rig.joint_names)}
-        controls = {control.name: index for index, control in enumerate(rig.controls)}
+        controls = {c.name: index for index, c in enumerate(rig.controls) if not c.is_shape_key}
         moved_bones = controls_by_bone(rig.controls)
         channel_indices: dict[tuple[str, int], list[int]] = {}
         for channel_index, channel in enumerate(channels):
@@ -169,7 +175,13 @@ class _OverrideTrials:
         changes[..., :3, 3] *= rig.metres_per_unit
         moving_joints = np.flatnonzero(changes.max(axis=(0, 2, 3)) > MIN_TRANSFORM_CHANGE).tolist()
         bones, joint_names = controls_by_bone(rig.controls), set(rig.joint_names)
-        driven_controls = {n for n, c in enumerate(rig.controls) if is_driven(owner_of(scene_rig, c.owner), c.path)}
+        shape_keys = {index for index, control in enumerate(rig.controls) if control.is_shape_key}
+        other_controls = set(range(len(rig.controls))) - shape_keys
+        driven_controls = {
+            index
+            for index in other_controls
+            if is_driven(owner_of(scene_rig, rig.controls[index].owner), rig.controls[index].path)
+        }
         # The transform of a joint is set with the joint.
         self._movable_bones = {
             name: indices
@@ -178,9 +190,9 @@ class _OverrideTrials:
         }
         bone_controls = {index for indices in bones.values() for index in indices}
         movable_bone_controls = {index for indices in self._movable_bones.values() for index in indices}
-        self._movable_controls = sorted(set(range(len(rig.controls))) - bone_controls - driven_controls)
+        self._movable_controls = sorted(other_controls - bone_controls - driven_controls)
         self._bone_of_control = {indices[0]: name for name, indices in self._movable_bones.items()}
-        self.undetectable_controls = frozenset(range(len(rig.controls))) - movable_bone_controls
+        self.undetectable_controls = frozenset(other_controls) - movable_bone_controls
         self.undetectable_controls -= frozenset(self._movable_controls)
         self.inputs = [(JOINT, index) for index in moving_joints]
         self.inputs += [(CONTROL, index) for index in sorted([*self._movable_controls, *self._bone_of_control])]

@@ -16,6 +16,7 @@ from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.rig import Rig
 from ..rig.reading import PoseEvaluator
+from ..rig.shape_keys import control_distances, muted_key_drivers
 from ..scene.bone_transform import controls_by_bone
 from ..scene.scene_rig import SceneRig
 from .influence_trials import JOINT, InfluenceSearch, prepared_trials
@@ -43,7 +44,8 @@ def detect_influences(
     threshold = max(search.tolerance * rig.size, 2 * rounding)
     batch_size = max(1, BATCH_BYTES // (12 * rig.vertex_count))
     infinite_tests = []
-    with prepared_trials(scene_rig, rig, search) as trials:
+    # The effect of shape keys is that of their values, not of the joints that drive these.
+    with muted_key_drivers(scene_rig.mesh_object), prepared_trials(scene_rig, rig, search) as trials:
         inputs = trials.inputs
         influences = np.zeros((len(inputs), len(partitions)), bool)
         done, total = 0, search.poses * (len(inputs) + 1) if inputs else 1
@@ -77,6 +79,7 @@ def detect_influences(
             "counts as an influence. Look for a constraint, driver or modifier that fails in extreme poses."
         )
         yield Progress("influences", done, total, note)
+    key_distances = control_distances(scene_rig.mesh_object)
     # The first control of a bone stands for all controls of its transform.
     controls_of_bones = {indices[0]: indices for indices in controls_by_bone(rig.controls).values()}
     by_kind: dict[str, dict[int, tuple[int, ...]]] = {JOINT: {}, CONTROL: {}}
@@ -85,6 +88,12 @@ def detect_influences(
         controls = {index for kind, index in partition_inputs if kind == CONTROL} & controls_of_bones.keys()
         partition_inputs |= {(CONTROL, index) for control in controls for index in controls_of_bones[control]}
         partition_inputs |= {(CONTROL, control) for control in undetectable_controls}
+        partition_inputs |= {
+            (CONTROL, index)
+            for index, control in enumerate(rig.controls)
+            if control.is_shape_key
+            and (search.has_target or (key_distances[control.path][partition.vertices] > threshold).any())
+        }
         for kind, by_joint in by_kind.items():
             by_joint[partition.joint] = tuple(sorted(index for each, index in partition_inputs if each == kind))
     main_joints_of_merged = {joint: partition.joint for partition in partitions for joint in partition.merged}

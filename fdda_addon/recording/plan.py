@@ -10,7 +10,7 @@ from ..core.controls import Control
 from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD
 from ..core.joint_option import ALL
 from ..core.mathematics.partition import INFLUENCE_TOLERANCE
-from ..core.mathematics.poses import Channel, Margin, make_margin
+from ..core.mathematics.poses import CONTROL, Channel, Margin, make_margin
 from ..core.mathematics.remix import PoseSampler
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
@@ -22,6 +22,7 @@ from ..poses.sample_selection import REMIX, SampleSelection, select_bones
 from ..poses.sampling import (
     ControlRanges,
     controls_of_bones,
+    default_channels,
     locked_channels,
     parse_sample_selection,
     sampled_channels,
@@ -30,6 +31,7 @@ from ..poses.sampling import (
 from ..rig.dependencies import read_dependencies
 from ..rig.pose_setter import NO_TARGET, TargetSettings
 from ..rig.reading import read_rig
+from ..rig.shape_keys import control_distances, find_unposed_keys
 from ..rig.target import find_target
 from ..scene.controls import parse_controls
 from ..scene.scene_rig import SceneRig
@@ -88,12 +90,25 @@ class RecordingSettings:
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
     """Read the rig with the controls of the settings, and find the channels of its random poses.
 
+    A driven shape key that bones and numbers of random poses do not move has a channel of its own. It is set without
+    its driver (`shape_keys.set_keys_undriven`).
+
     Raises:
         RigError: the rig cannot be read, or has nothing to sample.
     """
     selection, extra_joints = read_sample_selection(scene_rig, settings)
+    distances = control_distances(scene_rig.mesh_object)
+    # A shape key that moves no vertex is no input.
+    controls = tuple(c for c in selection.controls if not c.is_shape_key or distances[c.path].any())
+    selection = replace(selection, controls=controls)
     rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings, selection.controls))
     channels = sampled_channels(scene_rig, rig, selection) if settings.poses else ()
+    unposed_keys = find_unposed_keys(scene_rig, channels) if settings.poses else ()
+    channels += tuple(
+        Channel(control.name, CONTROL, 0, control.low, control.high)
+        for control in controls
+        if control.is_shape_key and control.path in unposed_keys
+    )
     return replace(rig, controls=selection.controls), channels
 
 
@@ -121,25 +136,42 @@ def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings, controls: 
 
 def read_sample_selection(
     scene_rig: SceneRig, settings: RecordingSettings
-) -> tuple[SampleSelection, frozenset[str] | None]:
+) -> tuple[SampleSelection, tuple[str, ...] | None]:
     """Read the sample selection of the settings, and the extra joints of the rig (`read_rig`).
 
     If control bones are sampled, the joints are the weighted bones and other bones on which the mesh depends. The
-    inputs of a model are the bones that follow control bones, not the control bones themselves.
+    inputs of a model are the bones that follow control bones, not the control bones themselves. A target may depend on
+    every bone that has a range of motion.
 
     Raises:
         RigError: the rig lacks a bone, control, collection or action of the settings.
     """
-    dependencies = read_dependencies(scene_rig, find_actions(settings))
+    actions = find_actions(settings)
+    dependencies = read_dependencies(scene_rig, actions, has_random_poses=settings.poses > 0)
     control_bones, number_texts = split_control_bones(scene_rig, settings.controls)
+
+    listed_names = set()
 
     def find_controls(sampled_ranges: ControlRanges) -> Iterator[Control]:
         yield from dependencies.controls
-        yield from parse_controls(scene_rig, number_texts, sampled_ranges)
+        for control in parse_controls(scene_rig, number_texts, sampled_ranges):
+            listed_names.add(control.name)
+            yield control
 
-    selection = parse_sample_selection(scene_rig, settings.sample, find_controls, control_bones, find_actions(settings))
-    has_control_bones = selection.bones is not None or selection.control_bones
-    return selection, dependencies.bones if has_control_bones else None
+    selection = parse_sample_selection(scene_rig, settings.sample, find_controls, control_bones, actions)
+    # The selected actions may key numbers that act through shape keys alone.
+    unlisted_names = dependencies.key_numbers - listed_names
+    controls = tuple(control for control in selection.controls if control.name not in unlisted_names)
+    selection = replace(selection, controls=controls, key_bones=dependencies.key_bones)
+    bones, names = scene_rig.armature_object.data.bones, set(dependencies.bones)
+    if selection.bones is None and not selection.control_bones:
+        if not settings.target.name:
+            return selection, None
+        # Any bone that moves may move the target.
+        names |= dependencies.key_bones
+        names |= {channel.name for channel in default_channels(scene_rig.armature_object, set())}
+        names |= {parent.name for name in names for parent in bones[name].parent_recursive}
+    return selection, tuple(bone.name for bone in bones if bone.name in names)
 
 
 def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Control, ...]:

@@ -2,6 +2,7 @@
 """Plans and sets the poses of one or several recordings: random poses, then the frames of clips."""
 
 from collections.abc import Callable, Collection, Container, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits
 from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest
+from ..rig.shape_keys import set_keys_undriven
 from ..rig.simulated_poses import reversible_frames
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
@@ -76,7 +78,7 @@ class PosePlan:
         Limit constraints are disabled while a pose of the margin is set.
         """
         random_count, margin = self.random_count, self._margin
-        with self.pose_setter.prepared():
+        with self._random_poses_prepared():
             set_pose = self._make_setter(self._channels)
             for index in range(self.in_range_count):
                 if index in pose_indices:
@@ -101,6 +103,14 @@ class PosePlan:
                 yield clip_start + index
             clip_start += len(clip.frames)
 
+    @contextmanager
+    def _random_poses_prepared(self) -> Iterator[None]:
+        with ExitStack() as stack:
+            stack.enter_context(self.pose_setter.prepared())
+            for mesh_index, scene_rig in enumerate(self._rigs):
+                stack.enter_context(set_keys_undriven(scene_rig, self.channels_of_mesh(mesh_index)))
+            yield
+
     @property
     def repeatable_poses(self) -> list[int]:
         """Return the ascending indices of the poses that `show_poses_again` can set, without poses of the margin."""
@@ -122,7 +132,7 @@ class PosePlan:
         """
         if self.pose_setter.is_settling:
             set_pose = self._make_setter(self._channels)
-            with self.pose_setter.prepared():
+            with self._random_poses_prepared():
                 for index in sorted(pose_indices):
                     sample_indices = (index, REPEATABILITY_INDEX_OFFSET + index)
                     self.pose_setter.set_pose(

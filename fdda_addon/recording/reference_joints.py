@@ -62,7 +62,7 @@ def find_references(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> R
 def _bones_read_by_drivers(scene_rig: SceneRig) -> Iterator[bpy.types.PoseBone]:
     """Yield the bones of the rig whose channels or transforms the drivers of its mesh read."""
     armature_object = scene_rig.armature_object
-    for _, curve in Sources(scene_rig, scene_rig.mesh_object).drivers.values():
+    for _, curve in Sources(scene_rig, scene_rig.mesh_object, follows_shape_keys=False).drivers.values():
         for variable in curve.driver.variables:
             for target in variable.targets:
                 name = target.bone_target if variable.type == "TRANSFORMS" else ""

@@ -25,6 +25,7 @@ from ..core.rig import Rig, rig_differences
 from ..poses.sampling import model_channels, rig_allows_ranges
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator
+from ..rig.shape_keys import set_keys_undriven
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
 from ..runtime.network import Network
@@ -90,7 +91,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         yield Progress("poses", settings.poses, settings.poses)
         return
     recorded_count = len(recording.pose_matrices) - added_count
-    with temporary_rig_state(scene_rig, rig, channels):
+    with temporary_rig_state(scene_rig, rig, channels), set_keys_undriven(scene_rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
         probe_poses = np.stack(
             [

@@ -7,7 +7,7 @@ from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import Channel
 from ..core.rig import Rig
-from ..poses.sampling import default_channels, sampled_channels
+from ..poses.sampling import sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.time_inputs import check_time_inputs
@@ -29,7 +29,6 @@ class RigCheck:
         automatic_controls: controls that are not listed in the settings: drivers of the mesh read them, or sampled
             actions key them.
         extra_joints, include_static_joint: arguments of `read_rig`.
-        ranged_bones: names of the bones without weights that have a range of motion, which are joints too.
     """
 
     problems: tuple[str, ...]
@@ -37,9 +36,8 @@ class RigCheck:
     channels: tuple[Channel, ...]
     replaced_modifiers: tuple[str, ...] = ()
     automatic_controls: tuple[Control, ...] = ()
-    extra_joints: frozenset[str] | None = None
+    extra_joints: tuple[str, ...] | None = None
     include_static_joint: bool = False
-    ranged_bones: frozenset[str] = frozenset()
 
     def recheck(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> "RigCheck":
         """Check again without reading the mesh, after changes of modifiers, modes, ranges of motion and settings."""
@@ -73,15 +71,11 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: Rig
             except RigError as error:
                 problems.append(str(error))
         include_static_joint = depends_on_time(scene_rig, settings, selection.controls)
-        # Bones with weights are joints in any case.
-        group_names = {group.name for group in scene_rig.mesh_object.vertex_groups}
-        ranged_channels = default_channels(scene_rig.armature_object, set())
-        ranged_bones = frozenset(channel.name for channel in ranged_channels if channel.name not in group_names)
         if (
             previous_check is not None
             and previous_check.rig is not None
-            and (previous_check.extra_joints, previous_check.include_static_joint, previous_check.ranged_bones)
-            == (extra_joints, include_static_joint, ranged_bones)
+            and (previous_check.extra_joints, previous_check.include_static_joint)
+            == (extra_joints, include_static_joint)
         ):
             rig = previous_check.rig
         else:
@@ -96,7 +90,6 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: Rig
             automatic_controls=automatic_controls,
             extra_joints=extra_joints,
             include_static_joint=include_static_joint,
-            ranged_bones=ranged_bones,
         )
         result = replace(result, channels=sampled_channels(scene_rig, rig, selection))
     except RigError as error:

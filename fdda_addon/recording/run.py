@@ -203,6 +203,7 @@ class RecordingSession:
             player.stop,
             self.settings.influence_poses,
             self.settings.influence_tolerance,
+            mesh.target is not None,
             mesh.target is not None or mesh.needed_inputs is not None,
         )
         return (yield from detect_influences(mesh.scene_rig, mesh.rig, partitions, mesh.evaluator, search))

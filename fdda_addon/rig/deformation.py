@@ -9,7 +9,6 @@ import bpy
 
 from ..core.deformation import versionless_path
 from ..core.rig import Fingerprint
-from ..scene.arrays import COORDINATE_ELEMENT, read
 from ..scene.compatibility import node_input_settings
 from ..scene.controls import owner_name
 from ..scene.mesh import vertex_layers
@@ -18,6 +17,8 @@ from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
 from .modifier_effects import BIND_PROPERTIES
 from .modifier_stack import is_fdda_modifier, recorded_modifiers
+from .shape_keys import key_positions
+from .sources import is_shape_key_value
 
 _COMMON_PROPERTIES = frozenset(bpy.types.Modifier.bl_rna.properties.keys())
 """Properties that all modifiers have; none of them changes the effect on the mesh."""
@@ -139,21 +140,22 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
     key_datablock = mesh_object.data.shape_keys
     if key_datablock is None:
         return {}
-    animated, relative_positions, shape_keys = animated_paths(key_datablock), {}, {}
-    for block in key_datablock.key_blocks:
-        if block == key_datablock.reference_key:
-            continue
-        positions = read(block.data, COORDINATE_ELEMENT)
-        relative_key = block.relative_key
-        if relative_key.name not in relative_positions:
-            relative_positions[relative_key.name] = read(relative_key.data, COORDINATE_ELEMENT)
-        if (positions == relative_positions[relative_key.name]).all():
+    animated, shape_keys = animated_paths(key_datablock), {}
+    for block, positions, relative_positions in key_positions(key_datablock):
+        if (positions == relative_positions).all():
             # The key moves no vertex.
             continue
         settings = {name: json_value(None, getattr(block, name)) for name in _SHAPE_KEY_PROPERTIES}
         for name in settings:
             if f"{block.path_from_id()}.{name}" in animated:
                 settings[name] = None
+        settings |= {
+            "relative_key": block.relative_key.name,
+            "use_relative": key_datablock.use_relative,
+            "show_only_shape_key": mesh_object.show_only_shape_key,
+        }
+        if not key_datablock.use_relative:
+            settings["frame"] = rounded(block.frame)
         if mesh_object.show_only_shape_key:
             settings["value"] = float(block == mesh_object.active_shape_key)
         shape_keys[block.name] = settings | {"shape": Fingerprint.digest(positions)}
@@ -161,12 +163,15 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
 
 
 def read_drivers(scene_rig: SceneRig) -> dict[str, str]:
-    """Read digests of the drivers of the mesh, its shape keys and its modifiers that are not muted, by OWNER/PATH."""
+    """Read digests of the drivers of the mesh, its shape keys and its modifiers that are not muted, by OWNER/PATH.
+
+    A model reads the values of shape keys, so whatever drives these may change.
+    """
     mesh_object, drivers = scene_rig.mesh_object, {}
     for owner in (mesh_object, mesh_object.data, mesh_object.data.shape_keys):
         for curve in owner.animation_data.drivers if owner is not None and owner.animation_data else ():
             is_rig = owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path)
-            if is_rig and not curve.mute:
+            if is_rig and not curve.mute and not is_shape_key_value(mesh_object, owner, curve.data_path):
                 name = (
                     f"{owner_name(scene_rig, owner) or 'mesh'}/{versionless_path(curve.data_path)}[{curve.array_index}]"
                 )

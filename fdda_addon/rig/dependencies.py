@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the bones and numbers that drivers and modifiers of a mesh read, so that the mesh depends on them."""
+"""Finds the bones and numbers that drivers and modifiers of a mesh read, so that the mesh depends on them.
+
+The values of its shape keys are inputs of a model, so bones and numbers that act through these alone are no inputs.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import bpy
 
-from ..core.controls import Control
+from ..core.controls import EVALUATION_TIME, SHAPE_KEYS, Control
 from ..core.errors import RigError
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.animation import changes_value, curves_with_actions
-from ..scene.controls import canonical_path, make_control
+from ..scene.controls import canonical_path, driven_numbers, make_control
 from ..scene.scene_rig import SceneRig
 from .other_armatures import controls_of_other_armatures
 from .sources import Sources
@@ -22,32 +26,65 @@ class Dependencies:
 
     Attributes:
         bones: names of bones of its armature that its drivers read, or that move objects that its modifiers read.
-        controls: numbers that its drivers read, and keyed shape keys, with the ranges of their properties.
+        controls: values of its shape keys, numbers that other drivers read, and keyed shape keys of other objects, with
+            the ranges of their properties.
+        key_bones, key_numbers: names of bones, and of controls, that act through the shape keys of the mesh alone.
     """
 
     bones: frozenset[str]
     controls: tuple[Control, ...]
+    key_bones: frozenset[str] = frozenset()
+    key_numbers: frozenset[str] = frozenset()
 
 
-def read_dependencies(scene_rig: SceneRig, actions: Iterable[bpy.types.Action] = ()) -> Dependencies:
+def read_dependencies(
+    scene_rig: SceneRig, actions: Iterable[bpy.types.Action] = (), *, has_random_poses: bool = True
+) -> Dependencies:
     """Find the bones and controls on which a mesh depends, except numbers without a range, which a user can list.
 
     Args:
         scene_rig: the rig.
         actions: further actions that may be played.
+        has_random_poses: random poses set the values of shape keys that have no driver. Without these, a value that no
+            action keys never changes.
     """
-    sources = Sources(scene_rig, scene_rig.mesh_object)
+    sources, all_sources = (
+        Sources(scene_rig, scene_rig.mesh_object, follows_shape_keys=follows) for follows in (False, True)
+    )
     curves_by_action = curves_of_actions(actions, scene_rig.mesh_object, scene_rig.armature_object)
+    key_values = list(_key_values(scene_rig.mesh_object, curves_by_action, has_random_poses))
+    other_names = *_driver_inputs(sources), *_keyed_shape_keys(sources, curves_by_action)
     controls = {control.name: control for control in controls_of_other_armatures(scene_rig, sources)}
-    for name in (*_driver_inputs(sources), *_keyed_shape_keys(sources, curves_by_action)):
+    for name in (*key_values, *other_names):
         owner, _, path = name.partition("/")
-        try:
+        with suppress(RigError):
             control = make_control(scene_rig, owner, path)
-        except RigError:
-            continue
-        controls.setdefault(control.name, control)
-    bones = scene_rig.armature_object.data.bones
-    return Dependencies(frozenset(name for name in sources.rig_bones if name in bones), tuple(controls.values()))
+            controls.setdefault(control.name, control)
+    key_numbers = {*_driver_inputs(all_sources), *(c.name for c in controls_of_other_armatures(scene_rig, all_sources))}
+    bones, all_bones = (
+        frozenset(each.rig_bones).intersection(scene_rig.armature_object.data.bones.keys())
+        for each in (sources, all_sources)
+    )
+    return Dependencies(bones, tuple(controls.values()), all_bones - bones, frozenset(key_numbers - controls.keys()))
+
+
+def _key_values(
+    mesh_object: bpy.types.Object, curves_by_action: Sequence[CurvesByDatablock], has_random_poses: bool
+) -> Iterator[str]:
+    """Yield the names of the controls that are values of the shape keys of a mesh, or their evaluation time."""
+    shape_keys = mesh_object.data.shape_keys
+    # While one key is shown alone, the values have no effect.
+    if shape_keys is None or mesh_object.show_only_shape_key:
+        return
+    keyed_curves = curves_with_actions(shape_keys, curves_by_action)
+    changing_paths = {canonical_path(shape_keys, curve.data_path) for curve in keyed_curves if changes_value(curve)}
+    changing_paths |= {path for path, _ in driven_numbers(shape_keys)}
+    if shape_keys.use_relative:
+        blocks = [block for block in shape_keys.key_blocks if block != shape_keys.reference_key and not block.mute]
+        paths = [f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value' for block in blocks]
+    else:
+        paths = [EVALUATION_TIME]
+    yield from (f"{SHAPE_KEYS}/{path}" for path in paths if has_random_poses or path in changing_paths)
 
 
 def deforming_mesh_objects(scene_rig: SceneRig) -> list[bpy.types.Object]:
@@ -68,8 +105,10 @@ def _driver_inputs(sources: Sources) -> Iterator[str]:
 
 
 def _keyed_shape_keys(sources: Sources, curves_by_action: Sequence[CurvesByDatablock]) -> Iterator[str]:
-    """Yield the names of the controls that are values of keyed shape keys."""
-    for shape_keys in (datablock for datablock in sources.datablocks if isinstance(datablock, bpy.types.Key)):
+    """Yield the names of the controls that are values of keyed shape keys of other objects, such as a lattice."""
+    for shape_keys, prefix in sources.datablocks.items():
+        if not isinstance(shape_keys, bpy.types.Key) or prefix == f"{SHAPE_KEYS}/":
+            continue
         keyed_curves = curves_with_actions(shape_keys, curves_by_action)
         keyed_paths = {canonical_path(shape_keys, curve.data_path) for curve in keyed_curves if changes_value(curve)}
         for block in shape_keys.key_blocks:

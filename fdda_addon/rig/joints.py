@@ -7,7 +7,6 @@ import bpy
 import numpy as np
 
 from ..core.rig import STATIC_JOINT, Joint
-from ..poses.sampling import default_channels
 from ..scene.scene_rig import SceneRig
 from .dependencies import read_dependencies
 
@@ -27,8 +26,8 @@ def choose_joints(
         scene_rig: the rig.
         weighted_bones: names of the bones that have weights, `STATIC_JOINT` among them; if empty, all deforming bones.
         extra_joints: names of further joints; names that the armature lacks are ignored. If they include all joints,
-            they define the order. By default: the bones that have a range of motion, the bones on which the mesh
-            depends in other ways, and all ancestors of joints.
+            they define the order. By default: the bones on which the mesh depends in other ways, and all ancestors
+            of joints.
     """
     armature_object = scene_rig.armature_object
     bones = armature_object.data.bones
@@ -39,7 +38,6 @@ def choose_joints(
     if extra_joints is not None:
         names |= {name for name in extra_joints if name in bones or name == STATIC_JOINT}
     else:
-        names |= {channel.name for channel in default_channels(armature_object, set())}
         names |= read_dependencies(scene_rig).bones
         names |= {ancestor.name for name in names - {STATIC_JOINT} for ancestor in bones[name].parent_recursive}
     joint_bones = [bone for bone in bones if bone.name in names]

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import bpy
 
+from ..core.controls import EVALUATION_TIME, SHAPE_KEY_PATH
 from ..scene.compatibility import node_input
 from ..scene.controls import canonical_path, fcurve_target, owner_name
 from ..scene.scene_rig import SceneRig
@@ -46,15 +47,25 @@ class Sources:
         carriers: the armature object of the rig, and the carriers of the rig.
     """
 
-    def __init__(self, scene_rig: SceneRig, root: bpy.types.Object, modifiers: Iterable[str] | None = None):
+    def __init__(
+        self,
+        scene_rig: SceneRig,
+        root: bpy.types.Object,
+        modifiers: Iterable[str] | None = None,
+        *,
+        follows_shape_keys: bool = True,
+    ):
         """Find everything on which the surface of an object depends.
 
         Args:
             root: its mesh object, or a target.
             modifiers: names of the modifiers of `root` to follow. If they are given, only modifiers that are on and
                 drivers that can move the surface are followed. None to follow everything.
+            follows_shape_keys: follow the drivers of the shape keys of the rig's mesh. Their values are inputs of a
+                model.
         """
         self._rig, self._root = scene_rig, root
+        self._follows_shape_keys = follows_shape_keys
         self._only_active, self._modifiers = modifiers is not None, frozenset(modifiers or ())
         carriers = [scene_rig.mesh_object, scene_rig.armature_object]
         for scene_object in carriers:
@@ -236,7 +247,8 @@ class Sources:
 
     def _add_driver(self, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> None:
         driven_property = (datablock, curve.data_path, curve.array_index)
-        if driven_property in self.drivers:
+        is_input = is_shape_key_value(self._rig.mesh_object, datablock, curve.data_path)
+        if driven_property in self.drivers or (is_input and not self._follows_shape_keys):
             return
         self.drivers[driven_property] = datablock, curve
         for variable in curve.driver.variables:
@@ -274,6 +286,14 @@ class Sources:
             self._add_object(target.id, uses_geometry=False)
             if variable.type == "TRANSFORMS" and (path := _CHANNEL_PATHS.get(target.transform_type)):
                 self.numbers[target.id, path] = None
+
+
+def is_shape_key_value(mesh_object: bpy.types.Object, datablock: bpy.types.ID, path: str) -> bool:
+    """Return whether a path of a datablock leads to a shape key's value, or the evaluation time, of a mesh object."""
+    if datablock != mesh_object.data.shape_keys:
+        return False
+    path = canonical_path(datablock, path)
+    return path == EVALUATION_TIME or SHAPE_KEY_PATH.fullmatch(path) is not None
 
 
 def constraint_targets(constraint: bpy.types.Constraint) -> Iterator[tuple[bpy.types.Object, str]]:

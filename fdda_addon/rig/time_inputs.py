@@ -141,7 +141,8 @@ def check_time_inputs(
     followed_modifiers = [modifier.name for modifier in mesh_object.modifiers if not is_fdda_modifier(modifier)][
         : stack.insert_index
     ]
-    sources = Sources(scene_rig, mesh_object, followed_modifiers)
+    # The values of shape keys are inputs of a model, so their drivers may read the time.
+    sources = Sources(scene_rig, mesh_object, followed_modifiers, follows_shape_keys=False)
     keys = control_keys(scene_rig, controls)
     curves_by_action = curves_of_actions(actions, mesh_object, scene_rig.armature_object)
     for time_input in (*_time_modifiers(sources), *time_inputs(sources, keys, curves_by_action)):

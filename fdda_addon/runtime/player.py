@@ -10,12 +10,10 @@ from typing import NamedTuple
 import bpy
 import numpy as np
 
-from ..core.deformation import lost_driver_note
 from ..core.errors import FDDAError, ModelError, RigError
 from ..core.formats.pose_repair import repair_pose
 from ..core.mathematics.mask import SkinningBlend
 from ..core.rig import STATIC_JOINT
-from ..rig.deformation import read_drivers
 from ..rig.modifier_stack import check_shape_readers, find_shape_readers, replaced_range
 from ..rig.reading import PoseReader, read_model_rig
 from ..scene.control_reader import ControlReader
@@ -90,9 +88,6 @@ class Player:
             mesh_object.data.shape_keys.update_tag()
         self.signature = self._read_signature(scene_rig, rig_signature.PARTS)
         rig_signature.check(scene_rig, self.network, self.signature)
-        current = {} if mesh_object.fdda.is_fast_rig else {"drivers": read_drivers(scene_rig)}
-        recorded = info.fingerprint.deformation if current else {}
-        self._note = lost_driver_note(recorded, current, info.controls, mesh_object.name)
         self._pose_reader = self._create_pose_reader(scene_rig)
         self._control_reader = ControlReader(scene_rig, info.controls)
         self.pose_input_count = 3 + len(self._control_reader.sources)
@@ -106,7 +101,7 @@ class Player:
         self.lock = threading.Lock()
         self._shown_inputs: tuple | None = None
         self._positions: np.ndarray | None = None
-        self.warning, self.reported_warning = self._note, ""
+        self.warning, self.reported_warning = "", ""
         self._execution.poses[0] = info.rest_matrices
         self._check_finite(self._execution.run())  # The first pose is played after the handlers have run.
         self.update_driver(mesh_object, buffer)
@@ -227,7 +222,7 @@ class Player:
         strength = 0.0 if (session.overriding_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
         inputs = pose_matrices.tobytes(), controls.tobytes(), strength, self._control_reader.warning
         if inputs != self._shown_inputs and not (session.skips_models and self._positions is not None):
-            self.warning = self._control_reader.warning or self._note
+            self.warning = self._control_reader.warning
             if not np.isfinite(pose_matrices).all():
                 pose_matrices, first_name = repair_pose(pose_matrices, self.network.info)
                 self.warning = (

@@ -36,6 +36,8 @@ VECTOR_ELEMENT = ElementProperty("vector", np.float32, (3,))
 """Value of a vector attribute, or a vertex normal."""
 COLOR_ELEMENT = ElementProperty("color", np.float32, (4,))
 """Value of a color attribute: linear RGBA."""
+KEY_VALUE_ELEMENT = ElementProperty("value", np.float32)
+"""Value of a shape key."""
 MUTE_ELEMENT = ElementProperty("mute", np.bool_)
 """Whether a shape key is muted."""
 LOOP_START_ELEMENT = ElementProperty("loop_start", np.int32)

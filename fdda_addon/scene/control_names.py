@@ -5,14 +5,13 @@ import re
 
 import bpy
 
-from ..core.controls import ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS
+from ..core.controls import ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEY_PATH, SHAPE_KEYS
 from .bone_transform import bone_transform
 from .controls import (
     custom_properties,
     custom_property_key,
     fcurve_target,
     is_custom_property,
-    is_driven,
     is_number,
     owner_name,
     owner_of,
@@ -21,7 +20,6 @@ from .controls import (
 from .scene_rig import SceneRig
 
 _FULL_DATA_PATH = re.compile(r'bpy\.data\.(?P<collection>\w+)\["(?P<name>(?:[^"\\]|\\.)*)"\]\.?(?P<path>.+)', re.DOTALL)
-_SHAPE_KEY = re.compile(r'key_blocks\["(?P<name>(?:[^"\\]|\\.)*)"\]\.value')
 
 
 def control_at(scene_rig: SceneRig, full_data_path: str) -> str:
@@ -43,20 +41,16 @@ def control_at(scene_rig: SceneRig, full_data_path: str) -> str:
     struct_owner, path, _ = fcurve_target(datablock, match["path"])
     index = parent_and_name(datablock, match["path"])[2]
     owner = owner_name(scene_rig, struct_owner)
-    shape_key = _SHAPE_KEY.fullmatch(path) if owner == SHAPE_KEYS else None
+    shape_key = SHAPE_KEY_PATH.fullmatch(path) if owner == SHAPE_KEYS else None
     if shape_key:
         return bpy.utils.unescape_identifier(shape_key["name"])
     return f"{owner}/{path}{'' if index is None else f'[{index}]'}" if owner else full_data_path
 
 
 def suggested_controls(scene_rig: SceneRig) -> list[str]:
-    """Suggest the shape keys and custom properties that no driver sets, and bone collections, as users list them."""
+    """Suggest the custom properties that no driver sets, and bone collections, as users list them."""
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     names = []
-    if shape_keys := mesh_object.data.shape_keys:
-        key_blocks = [block for block in shape_keys.key_blocks if block != shape_keys.reference_key]
-        undriven_names = [block.name for block in key_blocks if not is_driven(shape_keys, block.path_from_id("value"))]
-        names += [SHAPE_KEYS, *undriven_names] if undriven_names else []
     for owner, datablock in ((ARMATURE_OBJECT, armature_object), (MESH_OBJECT, mesh_object)):
         names += [f"{owner}/{path}" for path in custom_properties(datablock, "")]
     for bone in armature_object.pose.bones:

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 import bpy
 import numpy as np
 
-from ..core.controls import Control
+from ..core.controls import SHAPE_KEY_PATH, SHAPE_KEYS, Control
 from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT
 from .armature import PoseMatrixReader, rest_matrices
-from .arrays import POSE_CHANNELS, PropertyReader
+from .arrays import KEY_VALUE_ELEMENT, POSE_CHANNELS, PropertyReader
 from .bone_transform import BoneTransform, bone_transform
 from .controls import canonical_path, number_at, owner_of
 from .scene_rig import MIN_VOLUME, SceneRig
@@ -24,10 +24,11 @@ class ControlReader:
 
     The locations, rotations and scales of one bone are read together, as one matrix, because a face has hundreds of
     them. It includes the constraints of the bone, because what follows the bone sees them. Only drivers that read the
-    channels of a bone do not; then the channels are read.
+    channels of a bone do not; then the channels are read. The values of all shape keys of the mesh are read with one
+    call.
 
     Attributes:
-        sources: one control of each struct that is read. Whoever depends on them depends on all controls.
+        sources: one number of each struct that is read. Whoever depends on them depends on all controls.
         warning: names a bone that constraints have moved along an axis that is no control; empty for none.
     """
 
@@ -50,7 +51,12 @@ class ControlReader:
 
         bone_elements: dict[tuple[str, str], list[tuple[int, BoneTransform]]] = {}
         self._single_controls: list[int] = []
+        key_blocks: list[tuple[int, str]] = []
         for index, control in enumerate(controls):
+            if control.is_shape_key:
+                name = SHAPE_KEY_PATH.fullmatch(control.path)["name"]
+                key_blocks.append((index, bpy.utils.unescape_identifier(name)))
+                continue
             transform = bone_transform(control.path)
             is_scale = transform is not None and transform.scale_axis is not None
             if transform is None or (
@@ -78,6 +84,11 @@ class ControlReader:
         self._scale_controls, self._scale_elements = np.array(scales, np.intp).reshape(-1, 2).T
         first_controls = [elements[0][0] for elements in groups] + self._single_controls
         self.sources: tuple[Control, ...] = tuple(controls[index] for index in first_controls)
+        self._key_controls, self._key_names = [index for index, _ in key_blocks], [name for _, name in key_blocks]
+        self._key_order: list[str] | None = None
+        if key_blocks:
+            # This property depends on the drivers of all keys; the value of a key only depends on its own driver.
+            self.sources += (Control(SHAPE_KEYS, "use_relative", 0.0, 1.0),)
         self.values([owner_of(scene_rig, source.owner) for source in self.sources])
 
     def read(self, scene_rig: SceneRig, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
@@ -95,6 +106,9 @@ class ControlReader:
     def values(self, owners: Sequence[bpy.types.ID | None]) -> np.ndarray:
         """Read the values as `read` does, given the owner of each of `sources`, which may be an evaluated datablock."""
         values, self.warning = np.zeros(len(self._controls), np.float32), ""
+        if self._key_controls:
+            *owners, shape_keys = owners
+            values[self._key_controls] = self._read_keys(shape_keys)
         bone_count = len(self._bone_names)
         remaining = set(range(bone_count))
         for bone_indices, bones in self._constrained_bones:
@@ -127,6 +141,20 @@ class ControlReader:
                 "a number; name it as before, or record and train this rig."
             )
         return values
+
+    def _read_keys(self, shape_keys: bpy.types.Key | None) -> np.ndarray:
+        """Read the values of the shape keys that are controls, (K,) float32; NaN for those that the mesh lacks."""
+        order = [] if shape_keys is None else shape_keys.key_blocks.keys()
+        if order != self._key_order:
+            indices = {name: index for index, name in enumerate(order)}
+            # The last element is NaN.
+            self._key_indices = np.array([indices.get(name, len(order)) for name in self._key_names])
+            self._key_values = np.full(len(order) + 1, np.nan, np.float32)
+            self._key_reader = PropertyReader(KEY_VALUE_ELEMENT, self._key_values[: len(order)])
+            self._key_order = order
+        if order:
+            self._key_reader.read(shape_keys.key_blocks)
+        return self._key_values[self._key_indices]
 
 
 class ConstrainedBones:

@@ -9,7 +9,16 @@ from types import MappingProxyType
 import bpy
 import numpy as np
 
-from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, OTHER_OBJECT, OWNERS, SHAPE_KEYS, Control
+from ..core.controls import (
+    ARMATURE,
+    ARMATURE_OBJECT,
+    EVALUATION_TIME,
+    MESH_OBJECT,
+    OTHER_OBJECT,
+    OWNERS,
+    SHAPE_KEYS,
+    Control,
+)
 from ..core.errors import RigError
 from .bone_transform import MATRIX_ELEMENT_RANGE, bone_transform
 from .scene_rig import SceneRig
@@ -87,7 +96,7 @@ def parse_controls(
     Args:
         scene_rig: the rig.
         texts: each is OWNER/PATH or the name of a shape key, with an optional =LOW:HIGH that overrides the range of the
-            property; `shape_keys` stands for all shape keys without drivers.
+            property.
         sampled_ranges: as for `make_control`.
 
     Raises:
@@ -104,23 +113,14 @@ def parse_controls(
                 raise RigError(
                     f"'{text}' has an invalid range; write it as NAME=LOW:HIGH, with two numbers."
                 ) from error
-        for owner, path in _resolve_name(scene_rig, name):
-            control = make_control(scene_rig, owner, path, bounds, sampled_ranges)
-            controls[control.name] = control
+        shape_keys = scene_rig.mesh_object.data.shape_keys
+        if shape_keys and name in shape_keys.key_blocks and name != shape_keys.reference_key.name:
+            owner, path = SHAPE_KEYS, f'key_blocks["{bpy.utils.escape_identifier(name)}"].value'
+        else:
+            owner, _, path = name.partition("/")
+        control = make_control(scene_rig, owner, path, bounds, sampled_ranges)
+        controls[control.name] = control
     return tuple(controls.values())
-
-
-def _resolve_name(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
-    """Return the owner and path of each control that a name refers to."""
-    shape_keys = scene_rig.mesh_object.data.shape_keys
-    key_blocks = [b for b in shape_keys.key_blocks if b != shape_keys.reference_key] if shape_keys else []
-    if name == SHAPE_KEYS:
-        paths = [f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value' for block in key_blocks]
-        return [(SHAPE_KEYS, path) for path in paths if not is_driven(shape_keys, path)]
-    if any(block.name == name for block in key_blocks):
-        return [(SHAPE_KEYS, f'key_blocks["{bpy.utils.escape_identifier(name)}"].value')]
-    owner, _, path = name.partition("/")
-    return [(owner, path)]
 
 
 def can_be_set(name: str) -> bool:
@@ -132,11 +132,13 @@ def can_be_set(name: str) -> bool:
 def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     """Return whether a driver sets a number."""
     owner, array_path, index = fcurve_target(datablock, path)
-    animation = owner.animation_data
-    return animation is not None and any(
-        (canonical_path(owner, curve.data_path), curve.array_index) == (array_path, index)
-        for curve in animation.drivers
-    )
+    return (array_path, index) in driven_numbers(owner)
+
+
+def driven_numbers(datablock: bpy.types.ID | None) -> set[tuple[str, int]]:
+    """Return path and array index of each number of a datablock that a driver sets."""
+    curves = datablock.animation_data.drivers if datablock is not None and datablock.animation_data else ()
+    return {(canonical_path(datablock, curve.data_path), curve.array_index) for curve in curves}
 
 
 def custom_properties(datablock: bpy.types.ID, owner_path: str) -> list[str]:
@@ -265,6 +267,9 @@ def _property_range(datablock: bpy.types.ID, path: str) -> tuple[float, float]:
         return _narrower_range(*((settings[f"{prefix}min"], settings[f"{prefix}max"]) for prefix in ("soft_", "")))
     if isinstance(struct, bpy.types.ShapeKey) and name == "value":
         return struct.slider_min, struct.slider_max
+    if isinstance(struct, bpy.types.Key) and name == EVALUATION_TIME:
+        frames = [block.frame for block in struct.key_blocks]
+        return min(frames), max(frames)
     prop = struct.bl_rna.properties[name]
     if prop.type == "BOOLEAN":
         return 0.0, 1.0

@@ -136,7 +136,7 @@ def test_rounding_far_from_the_origin_is_no_influence(fresh, tmp_path):
 
 
 def test_influences_include_distant_vertices(fresh, tmp_path):
-    """The upper bone drives a shape key of the lower half, so it influences the lower half only."""
+    """The upper bone drives a shape key of the lower half, whose value influences the lower half only."""
     mesh = fresh.mesh_object.data
     fresh.mesh_object.shape_key_add(name="Basis")
     key = fresh.mesh_object.shape_key_add(name="bump")
@@ -151,7 +151,7 @@ def test_influences_include_distant_vertices(fresh, tmp_path):
     variable.targets[0].transform_type, variable.targets[0].transform_space = "ROT_Z", "LOCAL_SPACE"
     driver.expression = "var"
     recording = recorded(fresh, tmp_path / "r", poses=3)
-    assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (0, 1))]
+    assert [(p.joint, p.influencing, p.controls) for p in recording.partitions] == [(0, (1,), ()), (1, (1,), (0,))]
 
 
 def test_an_action_is_recorded_frame_by_frame(fresh, tmp_path):

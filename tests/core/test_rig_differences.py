@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.controls import Control
-from fdda_addon.core.deformation import MAX_ENTRIES, lost_driver_note
+from fdda_addon.core.deformation import MAX_ENTRIES
 from fdda_addon.core.rig import REST_MATRIX_TOLERANCE, Fingerprint, Joint, Rig, rig_differences
 
 from .limb import JOINTS, make_rig
@@ -112,7 +112,7 @@ DEFORMATION = {
     "modifiers": MODIFIERS,
     "shape_keys": {"smile": {"value": 0.0, "mute": False, "shape": "a"}},
     "b_bones": {"tail": {"segments": 4, "curve": [0.0, 0.5]}},
-    "drivers": {'shape_keys/key_blocks["smile"].value[0]': "d", 'mesh_object/modifiers["Mush"].scale[0]': "d"},
+    "drivers": {'mesh_object/modifiers["Mush"].scale[0]': "d"},
 }
 
 
@@ -165,8 +165,7 @@ CHANGED_DEFORMATIONS = {
     ),
     "drivers": (
         {**DEFORMATION, "drivers": dict.fromkeys([*DEFORMATION["drivers"], "mesh/a[0]"], "e")},
-        ["it was recorded without the driver of 'a'", """the driver of 'modifiers["Mush"].scale' differs""",
-         """the driver of 'key_blocks["smile"].value' differs"""],
+        ["it was recorded without the driver of 'a'", """the driver of 'modifiers["Mush"].scale' differs"""],
     ),
     "no drivers": ({**DEFORMATION, "drivers": {}}, ["""the driver of 'modifiers["Mush"].scale' is muted or gone"""]),
     "the driver of a control": (
@@ -190,15 +189,6 @@ def test_other_deformations_are_named(rig, change):
         differences(recorded_rig, fingerprint=replace(rig.fingerprint, deformation=deformation), controls=controls)
         == sentences
     )
-
-
-def test_lost_drivers_of_shape_keys_are_named_unless_the_keys_are_controls():
-    smile = Control("shape_keys", 'key_blocks["smile"].value', 0.0, 1.0)
-    assert lost_driver_note(DEFORMATION, {}, (), "head").startswith(
-        """The driver of 'key_blocks["smile"].value' of 'head' is muted or gone, but the model does what it did"""
-    )
-    assert not lost_driver_note(DEFORMATION, {}, (smile,), "head")
-    assert not lost_driver_note(DEFORMATION, DEFORMATION, (), "head")
 
 
 @pytest.mark.parametrize("path", ['["Socket_2"]', ".properties.inputs.Socket_2.value"], ids=["4.5", "5.2"])

@@ -8,11 +8,16 @@ import bpy
 import numpy as np
 import pytest
 
+import fdda_addon
 from blend_fixtures.characters import face
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.control_reader import ControlReader
 from fdda_addon.scene.mesh import evaluated_positions
+from fdda_addon.scene.scene_rig import SceneRig
 
+from .. import linked
 from ..conftest import assert_plays, run, train
 
 MAX_ERROR_RATIO = 0.5
@@ -27,7 +32,7 @@ def face_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     face.face()
     face.add_speech()
     save_copy(folder / "face.blend")
-    options = ("--poses", 200, "--spread", 10, "--control", "shape_keys")
+    options = ("--poses", 200, "--spread", 10)
     assert run("record", folder / "face.blend", folder / "recording", *options) == 0
     train(folder / "recording", folder / "face.onnx", "--epochs", 60)
     return folder
@@ -40,7 +45,7 @@ def face_object(face_folder: Path) -> bpy.types.Object:
     return bpy.data.objects[face.MESH]
 
 
-def test_half_of_the_controls_are_shape_keys(face_object, face_folder):
+def test_driven_and_undriven_shape_keys_are_inputs(face_object, face_folder):
     keys = face_object.data.shape_keys
     driven_paths = {curve.data_path for curve in keys.animation_data.drivers}
     undriven_names = [
@@ -51,7 +56,8 @@ def test_half_of_the_controls_are_shape_keys(face_object, face_folder):
     assert (len(undriven_names), len(bones), len(driven_paths)) == (22, 22, 12)
     recording = read_recording(face_folder / "recording")
     controls = {control.name for control in recording.rig.controls}
-    assert controls == {f'shape_keys/key_blocks["{name}"].value' for name in undriven_names}
+    assert controls == {f'shape_keys/key_blocks["{block.name}"].value' for block in keys.key_blocks[1:]}
+    assert np.ptp(recording.controls, axis=0).min() > 0.2
 
 
 @pytest.mark.parametrize(("first", "second"), face._corrective_moves(), ids="-".join)
@@ -98,3 +104,46 @@ def test_the_bound_face_plays_the_action_and_a_shape_key(face_folder, tmp_path):
         bpy.context.view_layer.update()
         shapes.append(assert_plays(mesh_object, face_folder / "face.onnx"))
     assert np.abs(shapes[0] - shapes[1]).max() > 0.003
+
+
+def override_face(bound_path: Path, shot_path: Path) -> bpy.types.Object:
+    """Save the bound face in a collection, and return the mesh object of its library override in a shot."""
+    bpy.ops.wm.open_mainfile(filepath=str(bound_path))
+    collection = bpy.data.collections.new(linked.COLLECTION)
+    bpy.context.scene.collection.children.link(collection)
+    for name in (face.MESH, face.ARMATURE):
+        bpy.context.scene.collection.objects.unlink(bpy.data.objects[name])
+        collection.objects.link(bpy.data.objects[name])
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    fdda_addon.register()
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path))
+    return linked.override_character(linked.link_character(bound_path))
+
+
+@pytest.mark.parametrize("kind", ["local", "linked and overridden"])
+def test_the_model_runs_after_the_drivers_of_all_shape_keys(kind, face_folder, tmp_path):
+    """Bones and shape keys drive correctives; keys, actions and hands set the others."""
+    bound_path = tmp_path / "bound.blend"
+    assert run("bind", face_folder / "face.blend", face_folder / "face.onnx", bound_path) == 0
+    if kind == "local":
+        bpy.ops.wm.open_mainfile(filepath=str(bound_path))
+        mesh_object = bpy.data.objects[face.MESH]
+    else:
+        mesh_object = override_face(bound_path, tmp_path / "shot.blend")
+    armature_object = linked.armature_of(mesh_object)
+    bpy.context.view_layer.update()
+    bones, rng = armature_object.pose.bones, np.random.default_rng(1)
+    reader = ControlReader(SceneRig(mesh_object, armature_object), network_of(mesh_object).info.controls)
+    values = []
+    for _ in range(20):
+        for bone in bones:
+            bone.rotation_mode, bone.rotation_euler = "XYZ", rng.uniform(-0.4, 0.0, 3)
+        if kind == "local":
+            for block in mesh_object.data.shape_keys.key_blocks[1:]:
+                block.value = rng.uniform(0, 1)
+        bpy.context.view_layer.update()
+        assert_plays(mesh_object, face_folder / "face.onnx")
+        scene_rig, depsgraph = SceneRig(mesh_object, armature_object), bpy.context.evaluated_depsgraph_get()
+        values.append(reader.read(scene_rig, depsgraph))
+    assert (np.ptp(values, axis=0) > 0.2).sum() > (30 if kind == "local" else 1)

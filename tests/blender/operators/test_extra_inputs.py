@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import controls
+from fdda_addon.core.mathematics.poses import CONTROL
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.panels import checks
 from fdda_addon.panels.sampling import describe_channels
@@ -32,10 +33,11 @@ def test_shape_keys_are_recorded_in_the_given_or_default_range(face):
     assert np.ptp(recording.controls[:, 0]) > 0.1
 
 
-def test_all_shape_keys_are_added_at_once(face):
-    assert bpy.ops.fdda.add_control(name="shape_keys") == {"FINISHED"}
-    with pytest.raises(RuntimeError, match="'shape_keys' is already in the list"):
-        bpy.ops.fdda.add_control(name="shape_keys")
+def test_shape_keys_are_inputs_without_being_added(face):
+    keys = face.mesh_object.data.shape_keys
+    for name in ("muted", "moves nothing"):
+        face.mesh_object.shape_key_add(name=name, from_mix=False)
+    keys.key_blocks["muted"].mute, keys.key_blocks["muted"].data[0].co.x = True, 1.0
     recorded(face)
     index = read_index(recording_folder(face.mesh_object))
     assert [control["path"] for control in index["controls"]] == [
@@ -99,15 +101,11 @@ def test_controls_that_drivers_read_are_detected(tmp_path):
     controls.custom_property()
     rig = saved(tmp_path)
     check = checks.check_now(rig)
-    assert [control.name for control in check.automatic_controls] == ['armature_object/["flex"]']
+    # The property acts through the key alone: it is sampled, but no input.
+    assert [control.name for control in check.automatic_controls] == ['shape_keys/key_blocks["flexed"].value']
     _, channels = read_sampled_rig(rig, recording_settings(rig))
     assert channels == check.channels
-
-
-def test_shape_keys_are_suggested_and_driven_ones_are_not(face):
-    assert suggested_controls(face)[:3] == ["shape_keys", "flexed", "thin"]
-    face.mesh_object.data.shape_keys.key_blocks["thin"].driver_add("value")
-    assert suggested_controls(face)[:2] == ["shape_keys", "flexed"] and "thin" not in suggested_controls(face)
+    assert [channel.name for channel in channels if channel.kind == CONTROL] == ['armature_object/["flex"]']
 
 
 def test_properties_are_suggested(arm):

@@ -77,17 +77,6 @@ class TestChecks:
         again = checks.check_now(fresh)
         assert np.abs(again.rig.rest_matrices[1] - first.rig.rest_matrices[1]).max() > 0.1
 
-    def test_a_limit_makes_a_bone_without_weights_a_joint(self, fresh):
-        bpy.context.view_layer.objects.active = fresh.armature_object
-        bpy.ops.object.mode_set(mode="EDIT")
-        bone = fresh.armature_object.data.edit_bones.new("hand")
-        bone.parent = fresh.armature_object.data.edit_bones["lower"]
-        bone.head, bone.tail = bone.parent.tail, bone.parent.tail * 1.2
-        bpy.ops.object.mode_set(mode="OBJECT")
-        assert checks.check_now(fresh).rig.joint_names == ("upper", "lower")
-        bpy.ops.fdda.set_limit(bone="hand", axis="X", low=-1, high=1)
-        assert checks.check_now(fresh).rig.joint_names == ("upper", "lower", "hand")
-
     def test_a_rig_without_a_joint_to_sample_can_be_recorded_by_its_actions(self, fresh):
         for bone in fresh.armature_object.pose.bones:
             bone.lock_rotation = (True, True, True)

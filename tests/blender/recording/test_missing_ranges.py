@@ -6,8 +6,8 @@ from pathlib import Path
 import bpy
 import pytest
 
-from blend_fixtures.characters.base import bulge, tube
-from blend_fixtures.characters.controls import add_key, drive_by_property
+from blend_fixtures.characters.base import tube
+from blend_fixtures.characters.controls import add_cast, drive_by_property
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import find_rig
@@ -18,11 +18,10 @@ def notes_of_recording(folder: Path, *controls: str) -> str:
     return " ".join(step.note for step in record(find_rig("elbow"), folder / "recording", settings))
 
 
-def drive_key(owner: bpy.types.ID, path: str, expression: str = "value") -> None:
-    """Let a shape key of the tube follow an expression of the number `value` at a path."""
-    key = add_key(bpy.data.objects["elbow"], "fat", bulge)
-    drive_by_property(key, "value", owner, path)
-    bpy.data.objects["elbow"].data.shape_keys.animation_data.drivers[0].driver.expression = expression
+def drive_strength(owner: bpy.types.ID, path: str, expression: str = "value") -> None:
+    """Let the strength of a modifier of the tube follow an expression of the number `value` at a path, from 0 to 1."""
+    drive_by_property(add_cast(bpy.data.objects["elbow"]), "factor", owner, path)
+    bpy.data.objects["elbow"].animation_data.drivers[0].driver.expression = f"min(max({expression}, 0), 1)"
     bpy.context.view_layer.update()
 
 
@@ -46,7 +45,7 @@ def test_a_custom_property_is_an_input_or_is_named(
     if limits:
         armature_object.id_properties_ui("fat").update(min=limits[0], max=limits[1])
     armature_object.update_tag()
-    drive_key(armature_object, '["fat"]', expression)
+    drive_strength(armature_object, '["fat"]', expression)
     notes = notes_of_recording(tmp_path)
     assert note in notes and bool(note) == ("'elbow'" in notes)
     assert armature_object["fat"] == value
@@ -58,7 +57,7 @@ def test_other_numbers_are_named(tmp_path: Path):
     _, armature_object = tube()
     dial = bpy.data.objects.new("dial", None)
     bpy.context.scene.collection.objects.link(dial)
-    drive_key(dial, "location[0]")
+    drive_strength(dial, "location[0]")
     assert "number 'object:dial/location[0]' without a range" in notes_of_recording(tmp_path)
     # A driven number is no input; the number that its driver reads is.
     armature_object["strength"] = 0.0
@@ -66,7 +65,7 @@ def test_other_numbers_are_named(tmp_path: Path):
     variable.targets[0].id, variable.targets[0].data_path = armature_object, '["strength"]'
     notes = notes_of_recording(tmp_path / "driven")
     assert "dial" not in notes and "number 'armature_object/[\"strength\"]' without a range" in notes
-    target = bpy.data.objects["elbow"].data.shape_keys.animation_data.drivers[0].driver.variables[0].targets[0]
+    target = bpy.data.objects["elbow"].animation_data.drivers[0].driver.variables[0].targets[0]
     target.id_type, bpy.context.scene["fat"] = "SCENE", 0.0
     target.id, target.data_path = bpy.context.scene, '["fat"]'
     assert "number '[\"fat\"] of Scene', which cannot be an input" in notes_of_recording(tmp_path / "scene")

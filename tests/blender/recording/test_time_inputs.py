@@ -50,11 +50,6 @@ CASES = {
     in_time.through_a_property: ("the driver of '[\"softness\"]' of 'elbow', which reads the frame", MUTE),
     in_time.keyed_property_without_a_range: keyed('["soft"]', "elbow_rig", 'armature_object/["soft"]=0:1'),
     in_time.property_of_the_scene: keyed('["soft"]', "Scene", ""),
-    in_time.shape_driven_by_frame: (
-        "the driver of 'key_blocks[\"flexed\"].value' of 'Key', which reads the frame",
-        MUTE,
-    ),
-    in_time.keyed_evaluation_time: keyed("eval_time", "Key", "shape_keys/eval_time=0:10"),
     in_time.keyed_lattice: keyed("location", "lattice", "object:lattice/location[2]=0:0.05"),
     in_time.hook_on_a_moving_parent: keyed("location", "mover", "object:mover/location[2]=0:0.05"),
     in_time.hook_that_copies_what_moves: keyed("location", "mover", "object:mover/location[2]=0:0.3"),
@@ -122,7 +117,7 @@ THICK = 'object:lattice/data.shape_keys.key_blocks["thick"].value'
 MUSCLE = 'object:muscle_rig/pose.bones["muscle"].rotation_euler[{}]'
 NODE = 'mesh_object/modifiers["Ripple"].node_group.nodes["Vector Math.001"].inputs[3].default_value'
 PLAYED = {
-    in_time.keyed_shape: ((), {'shape_keys/key_blocks["flexed"].value'}),
+    in_time.keyed_shape: ((), {f'shape_keys/key_blocks["{name}"].value' for name in ("flexed", "thin")}),
     in_time.keyed_shape_of_a_lattice: ((), {THICK}),
     in_time.keyed_property: ((), {'mesh_object/["softness"]'}),
     in_time.second_armature_with_an_action: ((), {MUSCLE.format(0), MUSCLE.format(2)}),
@@ -130,7 +125,7 @@ PLAYED = {
         ('mesh_object/modifiers["Smooth"].factor=0:1',),
         {'mesh_object/modifiers["Smooth"].factor'},
     ),
-    in_time.keyed_evaluation_time: (("shape_keys/eval_time=0:10",), {"shape_keys/eval_time"}),
+    in_time.keyed_evaluation_time: ((), {"shape_keys/eval_time"}),
     in_time.keyed_lattice: (("object:lattice/location[2]=0:0.05",), {"object:lattice/location[2]"}),
     in_time.keyed_nodes: ((f"{NODE}=0:0.05",), {NODE}),
 }
@@ -155,6 +150,18 @@ def test_keyed_controls_are_accepted(build, tmp_path):
         bpy.context.scene.frame_set(frame)
         at_frames.append(told.read(rig, bpy.context.evaluated_depsgraph_get()))
     assert not np.array_equal(*at_frames), "the keys are played to the model"
+
+
+def test_a_shape_key_that_the_frame_drives_is_an_input(tmp_path):
+    """Random poses set its value without the driver."""
+    rig = build_rig(in_time.shape_driven_by_frame)
+    settings = RecordingSettings(poses=8, influence_poses=1)
+    assert check_recordable_rig(rig, settings).problems == ()
+    drain(record(rig, tmp_path / "recording", settings))
+    recording = read_recording(tmp_path / "recording")
+    assert [control.name for control in recording.rig.controls] == ['shape_keys/key_blocks["flexed"].value']
+    assert np.ptp(recording.controls) > 0.2
+    assert not rig.mesh_object.data.shape_keys.animation_data.drivers[0].mute
 
 
 @pytest.mark.parametrize("kind", ["action", "driver", "frame"])
