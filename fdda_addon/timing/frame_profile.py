@@ -13,7 +13,8 @@ from .fast_rig_saving import FastRigSaving
 
 ROUNDS = 5
 """Number of rounds. Each round measures every part."""
-BONES, MODIFIER, SHAPE_KEYS, REST, DRAWING = "bones", "modifier", "shape_keys", "rest", "drawing"
+BONES, MODIFIER, SHAPE_KEYS, KEY_DRIVERS = "bones", "modifier", "shape_keys", "key_drivers"
+REST, DRAWING = "rest", "drawing"
 """Kinds of the parts of a frame."""
 BAR_WIDTH = 60
 """Number of characters of the bar that `FrameProfile.table` prints."""
@@ -24,7 +25,7 @@ class FramePart:
     """A part of a frame.
 
     Attributes:
-        kind: `BONES`, `MODIFIER`, `SHAPE_KEYS`, `REST` or `DRAWING`.
+        kind: `BONES`, `MODIFIER`, `SHAPE_KEYS`, `KEY_DRIVERS` (which a model keeps), `REST` or `DRAWING`.
         object: name of the object that has the bones, the modifier or the shape keys; else empty.
         name: name of the modifier; else empty.
         duration: the time of the part.
@@ -40,6 +41,7 @@ class FramePart:
         """Return the name of the part for users."""
         titles = {
             BONES: f"Bones of {self.object}", SHAPE_KEYS: f"{self.object}: Shape Keys",
+            KEY_DRIVERS: f"{self.object}: Drivers of Shape Keys",
             MODIFIER: f"{self.object}: {self.name}", REST: "Rest of Evaluation", DRAWING: "Drawing",
         }  # fmt: skip
         return titles[self.kind]

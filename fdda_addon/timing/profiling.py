@@ -14,13 +14,14 @@ import bpy
 from ..core.errors import RigError
 from ..core.progress import Job, Progress
 from ..rig.modifier_stack import check_posable, deforming_modifiers, is_fdda_modifier
+from ..rig.shape_keys import muted_key_drivers
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
 from ..scene.temporary_state import temporary_attributes
 from .animation import temporary_animation
 from .bone_groups import find_expensive_groups
 from .durations import Duration, scene_times, temporary_armature_scene, time_redraws
-from .frame_profile import BONES, DRAWING, MODIFIER, REST, ROUNDS, SHAPE_KEYS, FramePart, FrameProfile
+from .frame_profile import BONES, DRAWING, KEY_DRIVERS, MODIFIER, REST, ROUNDS, SHAPE_KEYS, FramePart, FrameProfile
 from .rig_cost import estimate_playback_ms
 
 FRAMES_PER_ROUND = 8
@@ -172,7 +173,10 @@ def _objects_with_modifiers() -> list[bpy.types.Object]:
 
 
 def _removable_parts(scene_object: bpy.types.Object) -> list[tuple[str, str]]:
-    """Return kind and name of the parts that can be disabled: modifiers from the last to the first, then shape keys."""
+    """Return kind and name of the parts that can be disabled.
+
+    These are modifiers from the last to the first, then shape keys and their drivers.
+    """
     parts = [
         (MODIFIER, modifier.name)
         for modifier in reversed(scene_object.modifiers)
@@ -181,6 +185,9 @@ def _removable_parts(scene_object: bpy.types.Object) -> list[tuple[str, str]]:
     shape_keys = getattr(scene_object.data, "shape_keys", None)
     if shape_keys is not None and len(shape_keys.key_blocks) > 1:
         parts.append((SHAPE_KEYS, ""))
+        drivers = shape_keys.animation_data.drivers if shape_keys.animation_data else ()
+        if any(not curve.mute for curve in drivers):
+            parts.append((KEY_DRIVERS, ""))
     return parts
 
 
@@ -188,5 +195,7 @@ def _disable_part(stack: ExitStack, scene_object: bpy.types.Object, kind: str, n
     """Disable a part of `_removable_parts` until the stack is closed."""
     if kind == MODIFIER:
         stack.enter_context(temporary_attributes(scene_object.modifiers[name], show_viewport=False))
+    elif kind == KEY_DRIVERS:
+        stack.enter_context(muted_key_drivers(scene_object))
     else:
         stack.enter_context(temporary_attributes(scene_object, show_only_shape_key=True, active_shape_key_index=0))

@@ -24,7 +24,16 @@ from fdda_addon.timing.armature_copy import armature_copy
 from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, parts_by_bone
 from fdda_addon.timing.durations import ARMATURE_SCENE_NAME, Duration
 from fdda_addon.timing.fast_rig_saving import FastRigSaving
-from fdda_addon.timing.frame_profile import BONES, DRAWING, MODIFIER, REST, FramePart, FrameProfile
+from fdda_addon.timing.frame_profile import (
+    BONES,
+    DRAWING,
+    KEY_DRIVERS,
+    MODIFIER,
+    REST,
+    SHAPE_KEYS,
+    FramePart,
+    FrameProfile,
+)
 from fdda_addon.timing.profiling import profile_frame
 
 from .conftest import run
@@ -80,6 +89,21 @@ def test_the_parts_add_up_to_the_frame_and_the_slow_modifier_is_the_largest(slow
         parts[MODIFIER, "CorrectiveSmooth"] + parts[MODIFIER, "Armature"], rel=1e-6
     )
     assert profile.model_saving < profile.model_limit
+
+
+def test_shape_keys_and_their_drivers_are_parts(slow_rig):
+    slow_rig.mesh_object.shape_key_add(name="Basis")
+    driver = slow_rig.mesh_object.shape_key_add(name="bulge").driver_add("value").driver
+    target = driver.variables.new().targets[0]
+    target.id, target.data_path = slow_rig.armature_object, 'pose.bones["lower"].rotation_euler[0]'
+    before = scene_state(slow_rig)
+    profile = profile_of(slow_rig)
+    assert_same_state(before, scene_state(slow_rig))
+    parts = {part.kind: part for part in profile.parts}
+    assert parts[KEY_DRIVERS].title == "elbow: Drivers of Shape Keys" and SHAPE_KEYS in parts
+    replaced = [part for part in profile.parts if part.kind in {MODIFIER, SHAPE_KEYS}]
+    # A model keeps the drivers.
+    assert profile.model_limit == pytest.approx(sum(part.duration.median for part in replaced), abs=1e-9)
 
 
 def expensive_groups(armature_object: bpy.types.Object, frames: range) -> tuple[BoneGroup, ...]:
