@@ -114,6 +114,8 @@ def override_face(bound_path: Path, shot_path: Path) -> bpy.types.Object:
     for name in (face.MESH, face.ARMATURE):
         bpy.context.scene.collection.objects.unlink(bpy.data.objects[name])
         collection.objects.link(bpy.data.objects[name])
+    for block in bpy.data.objects[face.MESH].data.shape_keys.key_blocks[1:]:
+        block.value = 0.5
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     fdda_addon.register()
