@@ -90,9 +90,6 @@ class RecordingSettings:
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
     """Read the rig with the controls of the settings, and find the channels of its random poses.
 
-    A driven shape key that bones and numbers of random poses do not move has a channel of its own. It is set without
-    its driver (`shape_keys.set_keys_undriven`).
-
     Raises:
         RigError: the rig cannot be read, or has nothing to sample.
     """
@@ -102,14 +99,22 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
     controls = tuple(c for c in selection.controls if not c.is_shape_key or distances[c.path].any())
     selection = replace(selection, controls=controls)
     rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings, selection.controls))
-    channels = sampled_channels(scene_rig, rig, selection) if settings.poses else ()
-    unposed_keys = find_unposed_keys(scene_rig, channels) if settings.poses else ()
-    channels += tuple(
+    return replace(rig, controls=controls), random_pose_channels(scene_rig, rig, selection) if settings.poses else ()
+
+
+def random_pose_channels(scene_rig: SceneRig, rig: Rig, selection: SampleSelection) -> tuple[Channel, ...]:
+    """Find the channels of random poses, as `sampled_channels` does, with channels of driven shape keys.
+
+    A driven shape key that the other channels do not move is set without its driver (`set_keys_undriven`).
+    """
+    channels = sampled_channels(scene_rig, rig, selection)
+    unposed_keys = find_unposed_keys(scene_rig, channels)
+    key_channels = (
         Channel(control.name, CONTROL, 0, control.low, control.high)
-        for control in controls
+        for control in selection.controls
         if control.is_shape_key and control.path in unposed_keys
     )
-    return replace(rig, controls=selection.controls), channels
+    return (*channels, *key_channels)
 
 
 def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseSampler:

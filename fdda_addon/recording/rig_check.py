@@ -7,12 +7,18 @@ from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import Channel
 from ..core.rig import Rig
-from ..poses.sampling import sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig, check_full_rig
-from .plan import RecordingSettings, depends_on_time, find_actions, listed_controls, read_sample_selection
+from .plan import (
+    RecordingSettings,
+    depends_on_time,
+    find_actions,
+    listed_controls,
+    random_pose_channels,
+    read_sample_selection,
+)
 
 DEFAULT_SETTINGS = RecordingSettings()
 
@@ -91,7 +97,7 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: Rig
             extra_joints=extra_joints,
             include_static_joint=include_static_joint,
         )
-        result = replace(result, channels=sampled_channels(scene_rig, rig, selection))
+        result = replace(result, channels=random_pose_channels(scene_rig, rig, selection))
     except RigError as error:
         # A rig without channels to sample can still be recorded from actions alone.
         if str(error) not in problems and (result.rig is None or settings.poses):
