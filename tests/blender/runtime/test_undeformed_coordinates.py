@@ -42,38 +42,19 @@ def render():
     bpy.utils.unregister_class(CoordinateEngine)
 
 
-def full(_bound_elbow: bpy.types.Object) -> None:
-    pass
+CHANGES = {
+    "full": lambda _: None,
+    "strength": lambda o: setattr(o.fdda, "strength", 0.5),
+    "mask": lambda o: setattr(o.fdda, "mask", "lower"),
+    "linear": lambda o: setattr(o.fdda, "mode", "LINEAR"),
+    "rig": lambda o: setattr(o.fdda, "mode", "RIG"),
+    "subdivided": lambda o: o.modifiers.new("Subdivision", "SUBSURF"),
+    "displaced": lambda o: setattr(o.modifiers.new("Displace", "DISPLACE"), "strength", 0.02),
+    "shape key": add_shape_key,
+}
 
 
-def strength(bound_elbow: bpy.types.Object) -> None:
-    bound_elbow.fdda.strength = 0.5
-
-
-def mask(bound_elbow: bpy.types.Object) -> None:
-    bound_elbow.fdda.mask = "lower"
-
-
-def linear(bound_elbow: bpy.types.Object) -> None:
-    bound_elbow.fdda.mode = "LINEAR"
-
-
-def rig_mode(bound_elbow: bpy.types.Object) -> None:
-    bound_elbow.fdda.mode = "RIG"
-
-
-def subdivided(bound_elbow: bpy.types.Object) -> None:
-    bound_elbow.modifiers.new("Subdivision", "SUBSURF")
-
-
-def displaced(bound_elbow: bpy.types.Object) -> None:
-    bound_elbow.modifiers.new("Displace", "DISPLACE").strength = 0.02
-
-
-CHANGES = [full, strength, mask, linear, rig_mode, subdivided, displaced, add_shape_key]
-
-
-@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_undeformed_coordinates_do_not_follow_the_pose(change, bound_elbow, render):
     # Rendering would set the pose of the action again.
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
