@@ -22,14 +22,29 @@ from .networks.networks import TrainedPartition
 class TrainedModel:
     """A trained character with J joints, V vertices and P partitions.
 
-    `prepared` has the fit, the components and the network of each partition.
+    Attributes:
+        rig, partitions: the rig, and the partitions of the recording.
+        inputs: the features.
+        parts: parts of the partitions (`preparation.make_parts`), as partitions with fewer vertices.
+        prepared: the fit, the components and the network of each part.
+        training_range: the range of the joints and controls.
     """
 
     rig: Rig
     partitions: tuple[Partition, ...]
     inputs: NetworkInputs
+    parts: tuple[Partition, ...]
     prepared: tuple[TrainedPartition, ...]
     training_range: TrainingRange
+
+    def partition_indices(self) -> list[int]:
+        """Return the index of the partition of each part."""
+        index_by_joint = {partition.joint: index for index, partition in enumerate(self.partitions)}
+        return [index_by_joint[part.joint] for part in self.parts]
+
+    def parts_of(self, partition: Partition) -> list[tuple[Partition, TrainedPartition]]:
+        """Return the parts of a partition, with their fits and networks."""
+        return [pair for pair in zip(self.parts, self.prepared, strict=True) if pair[0].joint == partition.joint]
 
     def half_rotation_joints(self) -> np.ndarray:
         """Return (H,) int64, ascending, the joints whose half-rotation matrices some partition is fitted to."""
@@ -39,8 +54,11 @@ class TrainedModel:
     def checkpoint(self, holdout: str, config: TrainingConfig, history: list[dict]) -> Checkpoint:
         """Return the state from which the training can be continued; other arguments as in `Checkpoint`."""
         partitions = [
-            PartitionCheckpoint(p.columns, p.feature_mean, p.feature_scale, p.basis.mean, p.basis.components, p.network)
-            for p in self.prepared
+            PartitionCheckpoint(
+                *(part.joint, part.vertices, p.columns, p.feature_mean, p.feature_scale),
+                *(p.basis.mean, p.basis.components, p.network),
+            )
+            for part, p in zip(self.parts, self.prepared, strict=True)
         ]
         return Checkpoint(
             self.rig.fingerprint,
@@ -55,15 +73,20 @@ class TrainedModel:
 
 
 def make_trained_model(
-    recording: Recording, inputs: NetworkInputs, split: Split, prepared: Sequence[TrainedPartition]
+    recording: Recording,
+    inputs: NetworkInputs,
+    split: Split,
+    parts: Sequence[Partition],
+    prepared: Sequence[TrainedPartition],
 ) -> TrainedModel:
-    """Put together the result of a training, and measure the range of its training poses."""
+    """Put together the result of a training, and measure the range of its training poses; `parts` as in the model."""
     matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
     features = inputs.compute_features(matrices, controls)
     return TrainedModel(
         recording.rig,
         recording.partitions,
         inputs,
+        tuple(parts),
         tuple(prepared),
         measure_training_range(features, inputs.length_mask(), recording.rig, recording.partitions),
     )

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdda_addon.core.mathematics.features import MIN_FEATURE_SPREAD, float32_rounding
+from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, MIN_FEATURE_SPREAD, float32_rounding
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 
 from .blocks import block_slices
@@ -15,7 +16,11 @@ from .data.split import Split
 from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
 from .fits.half_rotations import regression_matrices
 from .fits.joint_fit import JointFit, JointRegression, joint_regression
+from .fits.parts import divide_partition
 from .inputs.network_inputs import NetworkInputs
+
+MIN_DIVIDED_VERTICES = 500
+"""Partitions with fewer vertices are not divided."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,7 @@ class PartitionData:
         read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
         min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
         columns: (F,) int64, indices of the features among all features of `NetworkInputs`; None for 0 to F - 1.
+        control_start: index of the first control among all features.
     """
 
     features: np.ndarray
@@ -36,6 +42,7 @@ class PartitionData:
     read_regression: Callable[[], JointRegression] | None = None
     min_spread: np.ndarray | float = MIN_FEATURE_SPREAD
     columns: np.ndarray | None = None
+    control_start: int = 0
 
 
 @dataclass(frozen=True)
@@ -83,10 +90,39 @@ class PreparedPartition:
         return np.sqrt((truncated**2).sum(axis=1) / self.vertex_count)
 
 
+def make_parts(recording: Recording, split: Split, tolerance: float) -> list[Partition]:
+    """Divide the partitions of a recording into parts that need different shape keys; `tolerance` in mesh units.
+
+    A part is a partition with fewer vertices: it has its own fit, components and network. The parts of a partition
+    have the same main joint and the same confidence.
+    """
+    rig = recording.rig
+    matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations=False)
+    parts = []
+    for partition in recording.partitions:
+        regression = joint_regression(rig, partition, matrices, recording.controls)
+        groups = [np.arange(len(partition.vertices))]
+        if len(regression.controls) and len(partition.vertices) >= MIN_DIVIDED_VERTICES:
+            residuals = np.asarray(recording.residuals[:, partition.vertices], np.float32)
+            fit, _ = regression.fit(residuals, split.training, tolerance / FINE_TOLERANCE_FACTOR)
+            values = regression.control_values[split.training][:, np.searchsorted(regression.controls, fit.controls)]
+            groups = divide_partition(fit, values.std(axis=0), tolerance)
+        parts += [replace(partition, vertices=partition.vertices[group]) for group in groups]
+    return parts
+
+
 def partition_data(
-    recording: Recording, inputs: NetworkInputs, use_half_rotations: bool = False
+    recording: Recording,
+    inputs: NetworkInputs,
+    use_half_rotations: bool = False,
+    parts: Sequence[Partition] | None = None,
 ) -> list[PartitionData]:
-    """Create the data of a recording's partitions; `use_half_rotations` as in `regression_matrices`."""
+    """Create the data of the parts of a recording's partitions, by default whole partitions.
+
+    Args:
+        inputs: inputs that were made for these parts.
+        use_half_rotations: as in `regression_matrices`.
+    """
     rig = recording.rig
     features = inputs.compute_features(recording.pose_matrices, recording.controls)
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations)
@@ -96,11 +132,12 @@ def partition_data(
         PartitionData(
             features[:, columns],
             lambda partition=partition: recording.residuals[:, partition.vertices],
-            lambda partition=partition: joint_regression(rig, partition, matrices),
+            lambda partition=partition: joint_regression(rig, partition, matrices, recording.controls),
             min_spread[columns],
             columns,
+            FEATURES_PER_JOINT * len(rig.joints),
         )
-        for partition, columns in zip(recording.partitions, inputs.columns, strict=True)
+        for partition, columns in zip(parts or recording.partitions, inputs.columns, strict=True)
     ]
 
 
@@ -123,18 +160,24 @@ def prepare_partition(
     is_varying = scale > partition.min_spread
     columns = np.flatnonzero(is_varying) if partition.columns is None else partition.columns[is_varying]
     mean, scale = training[:, is_varying].mean(axis=0).astype(np.float32), scale[is_varying].astype(np.float32)
+    mm_per_unit = 1000 * metres_per_unit
+    tolerance = tolerance_mm / mm_per_unit
     residuals = np.asarray(partition.read_residuals(), np.float32)
     vertex_count = residuals.shape[1]
     fit = JointFit(np.zeros(0, np.int64), np.zeros((0, vertex_count), np.float32))
     if partition.read_regression:
         regression = partition.read_regression()
         regression = regression if len(columns) else regression.main_joint_only()
-        fit, residuals = regression.fit(residuals, split.training)
+        fit, residuals = regression.fit(residuals, split.training, tolerance)
+        if len(regression.controls):
+            # A shape key that has no effect in this part is no input of its network.
+            idle_keys = partition.control_start + np.setdiff1d(regression.controls, fit.controls)
+            is_kept = ~np.isin(columns, idle_keys)
+            columns, mean, scale = columns[is_kept], mean[is_kept], scale[is_kept]
+            is_varying[is_varying] = is_kept
     residuals = residuals.reshape(len(features), -1)
-    mm_per_unit = 1000 * metres_per_unit
-    tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
     rng, weights = np.random.default_rng([seed, 2]), split.weights()
-    basis = make_basis(residuals[split.training], tolerance, rng, weights)
+    basis = make_basis(residuals[split.training], tolerance if len(columns) else np.inf, rng, weights)
     return PreparedPartition(
         vertex_count,
         columns,

@@ -15,6 +15,7 @@ from fdda_addon.core.checks.warning import RecordingWarning, raise_first_warning
 from fdda_addon.core.files.output import atomic_write_all
 from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.formats.report import report_text
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.estimate import training_size_sentence
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
@@ -32,9 +33,9 @@ from .model import TrainedModel, make_trained_model
 from .networks.checkpoint import Checkpoint, write_checkpoint
 from .networks.loop import train
 from .networks.networks import TrainedPartition
-from .networks.warm_start import initial_networks, read_initial_checkpoint, warm_start_config
+from .networks.warm_start import checkpoint_parts, initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import training_outputs
-from .preparation import PartitionData, partition_data, prepare_partitions
+from .preparation import PartitionData, make_parts, partition_data, prepare_partitions
 from .progress import MessageSink
 from .report.contents import make_report
 from .report.error_analysis import analyze_errors
@@ -76,10 +77,11 @@ def train_model(
         checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
         job = _Job(config, sink, recording, split, checkpoint)
         warnings = job.start(strict)
-        inputs = job.fit_inputs()
-        partitions = job.collect_partition_data(inputs)
+        parts = job.make_parts()
+        inputs = job.fit_inputs(parts)
+        partitions = job.collect_partition_data(inputs, parts)
         prepared = job.compress(job.train_networks(partitions), partitions)
-        trained_model = make_trained_model(recording, inputs, split, prepared)
+        trained_model = make_trained_model(recording, inputs, split, parts, prepared)
         exported = job.export(trained_model)
         report = job.measure(trained_model, exported, model_path.name)
         entry = {"poses": len(recording.pose_matrices), "p999": exported.info.held_out_mm["p999"]}
@@ -144,27 +146,38 @@ class _Job:
             raise_first_warning(warnings)
         return warnings
 
-    def fit_inputs(self) -> NetworkInputs:
+    def make_parts(self) -> list[Partition]:
+        """Divide partitions into parts. A warm start keeps the parts of the checkpoint."""
+        if self.checkpoint:
+            return checkpoint_parts(self.checkpoint, self.recording)
+        return make_parts(self.recording, self.split, self._tolerance)
+
+    @property
+    def _tolerance(self) -> float:
+        """The tolerance, mesh units."""
+        return self.config.tolerance_mm / (1000 * self.recording.rig.metres_per_unit)
+
+    def fit_inputs(self, parts: list[Partition]) -> NetworkInputs:
         """Fit the inputs of the networks. A warm start keeps the inputs of the checkpoint."""
         if self.checkpoint:
             states = self.checkpoint.input_states
         else:
             states = fit_inputs(self.recording, self.split, self.config)
-        inputs = make_inputs(self.recording.rig, self.recording.partitions, states)
+        inputs = make_inputs(self.recording.rig, parts, states)
         for block in inputs.blocks:
             if block.log_text:
                 self.log(block.log_text)
         return inputs
 
-    def collect_partition_data(self, inputs: NetworkInputs) -> list[PartitionData]:
-        """Collect the data of all partitions, and decide whether half-rotation features help."""
+    def collect_partition_data(self, inputs: NetworkInputs, parts: list[Partition]) -> list[PartitionData]:
+        """Collect the data of all parts, and decide whether half-rotation features help."""
         # Surface frames make half-rotation features unnecessary.
         use_half_rotations = not inputs.states.get(SurfaceFrameFeatures.name) and half_rotations_help(
             self.recording, self.split.training
         )
         if use_half_rotations:
             self.log("The rig blends rotations: residuals are fitted to half-rotation features, too.")
-        return partition_data(self.recording, inputs, use_half_rotations)
+        return partition_data(self.recording, inputs, use_half_rotations, parts)
 
     def train_networks(self, partitions: list[PartitionData]) -> list[TrainedPartition]:
         """Prepare the partitions, and train their networks from random weights, or from a checkpoint."""
@@ -198,8 +211,7 @@ class _Job:
         remaining = drop_components(prepared, self.split)
         if text := dropped_components_sentence(prepared, remaining):
             self.log(text)
-        tolerance = self.config.tolerance_mm / (1000 * self.recording.rig.metres_per_unit)
-        return [factorize_partition(*p, self.split, tolerance) for p in zip(remaining, partitions, strict=True)]
+        return [factorize_partition(*p, self.split, self._tolerance) for p in zip(remaining, partitions, strict=True)]
 
     def export(self, trained_model: TrainedModel) -> ExportedModel:
         """Build the model, and compare it with PyTorch on the held-out poses."""

@@ -78,11 +78,14 @@ def reference_positions(
     clamped = np.clip(features, training_range.low, training_range.high).astype(np.float64)
     matrices = regression_matrices(pose_matrices, rig, len(trained_model.half_rotation_joints()) > 0)
     local, offsets = (np.zeros((len(features), rig.vertex_count, 3), np.float32) for _ in range(2))
-    for index, (partition, prepared) in enumerate(zip(trained_model.partitions, trained_model.prepared, strict=True)):
+    parts = zip(trained_model.partition_indices(), trained_model.parts, trained_model.prepared, strict=True)
+    for index, partition, prepared in parts:
         inputs = (clamped[:, prepared.columns] - prepared.feature_mean) / prepared.feature_scale
         coefficients = prepared.network.evaluate(inputs.astype(np.float32))
         residuals = prepared.basis.reconstruct(coefficients) * confidence[:, index, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
+        if len(prepared.fit.controls):
+            local[:, partition.vertices] += prepared.fit.compute_key_residuals(controls)
         offsets[:, partition.vertices] = prepared.fit.compute_offsets(matrices) * confidence[:, index, None, None]
     return LinearSkinning(rig, trained_model.partitions).complex_positions(pose_matrices, local) + offsets, confidence
 
@@ -191,15 +194,18 @@ def _model_info(
 ) -> ModelInfo:
     """Create the metadata of a model; arguments as in `build_model`."""
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
-    partitions = zip(trained_model.partitions, trained_model.prepared, strict=True)
     return ModelInfo(
         rig.joints,
         rig.rest_matrices,
         rig.vertex_count,
         rig.fingerprint,
         tuple(
-            ModelPartition(p.joint, p.influencing, len(p.vertices), len(t.basis.components), p.controls, p.merged)
-            for p, t in partitions
+            ModelPartition(
+                *(p.joint, p.influencing, len(p.vertices)),
+                sum(len(prepared.basis.components) for _, prepared in trained_model.parts_of(p)),
+                *(p.controls, p.merged),
+            )
+            for p in trained_model.partitions
         ),
         *(bound[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         trained_model.training_range.controls,

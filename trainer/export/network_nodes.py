@@ -30,12 +30,12 @@ class Coefficients:
 
     Attributes:
         name: name of the (N, ·) coefficients without the last bias, mesh units.
-        start_by_partition: index of the first coefficient of each partition with components, by partition index. The
-            other coefficients of the partition follow.
+        start_by_part: index of the first coefficient of each part with components, by the index of the part. The other
+            coefficients of the part follow.
     """
 
     name: str
-    start_by_partition: dict[int, int]
+    start_by_part: dict[int, int]
 
 
 def add_networks(
@@ -64,7 +64,8 @@ def add_networks(
         biases = graph.floats(f"biases_{layer}", np.stack([network.biases[layer][None] for network in networks]))
         values = graph.add("Add", [values, biases], f"layer_{layer}")
         values = _add_activation(graph, values, activation, f"hidden_{layer}")
-    return _add_last_layer(graph, values, {index: p.network.weights[-1] for index, p in learned.items()})
+    layers = {index: p.network.weights[-1] for index, p in learned.items()}
+    return _add_last_layer(graph, values, layers, trained_model.partition_indices())
 
 
 def _chunk_size(layer_sizes: Sequence[int], width: int, combine_cost: int) -> int:
@@ -117,29 +118,33 @@ def _add_first_layer(graph: GraphBuilder, clamped: str, layers: list[tuple[np.nd
     return values
 
 
-def _add_last_layer(graph: GraphBuilder, values: str, layers: dict[int, np.ndarray]) -> Coefficients:
+def _add_last_layer(
+    graph: GraphBuilder, values: str, layers: dict[int, np.ndarray], partition_indices: list[int]
+) -> Coefficients:
     """Add the last layers.
 
     Args:
         values: name of the (L, N, H) values of the hidden units.
-        layers: (H, K) weights of each last layer, by partition index.
+        layers: (H, K) weights of each last layer, by the index of its part.
+        partition_indices: index of the partition of each part.
     """
     component_counts, units = [weights.shape[1] for weights in layers.values()], next(iter(layers.values())).shape[0]
     chunk_size = _chunk_size(component_counts, units, units)
-    chunks, partitions = _chunks(component_counts, chunk_size), list(layers)
+    chunks, parts = _chunks(component_counts, chunk_size), list(layers)
     chunk_networks, weights = [network for network, _ in chunks], np.zeros((len(chunks), units, chunk_size))
     for index, (network, layer_slice) in enumerate(chunks):
-        chunk_weights = layers[partitions[network]][:, layer_slice]
+        chunk_weights = layers[parts[network]][:, layer_slice]
         weights[index, :, : chunk_weights.shape[1]] = chunk_weights
     if len(chunks) > len(layers):
         values = graph.add("Gather", [values, graph.integers("chunk_owners", chunk_networks)], "chunk_hidden", axis=0)
     values = graph.add("MatMul", [values, graph.floats("output_weights", weights)], "coefficients_by_chunk")
     values = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
-    confidence = graph.integers("chunk_partitions", np.array([[partitions[network]] for network in chunk_networks]))
+    partitions = np.array([[partition_indices[parts[network]]] for network in chunk_networks])
+    confidence = graph.integers("chunk_partitions", partitions)
     confidence = graph.add("Gather", [CONFIDENCE_OUTPUT, confidence], "chunk_confidence", axis=1)
     values = graph.add("Mul", [values, confidence], "scaled_coefficients")
     name = graph.reshape(values, [0, len(chunks) * chunk_size], "coefficient_row")
-    return Coefficients(name, {partition: chunk_size * chunk_networks.index(n) for n, partition in enumerate(layers)})
+    return Coefficients(name, {part: chunk_size * chunk_networks.index(n) for n, part in enumerate(layers)})
 
 
 def _first_layer(features: Features, prepared: TrainedPartition) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from fdda_addon.core.formats.model import CONFIDENCE_OUTPUT, POSITIONS_OUTPUT
+from fdda_addon.core.formats.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSITIONS_OUTPUT
 from fdda_addon.core.mathematics.skinning import SkinBlock
 
 from ..graph_builder import GraphBuilder
@@ -21,12 +21,14 @@ same reason, translations are gathered in slices of three."""
 
 
 class _PartitionRows:
-    """The rows of a partition: three for each component and half rotation, four for each joint, and padding.
+    """The rows of a part: three for each component, shape key and half rotation, four for each joint, and padding.
 
     Attributes:
-        index, joint, vertices: index, main joint and (Vp,) vertices of the partition.
+        index, joint, vertices: index, main joint and (Vp,) vertices of the part.
+        partition_index: index of its partition.
         prepared, skin: its fit and components, and its skin weights.
         component_count: K.
+        controls: (S,) the shape keys of its fit.
         half_rotation_joints: joints with half-rotation matrices in the partition's fit, as in `JointFit`.
         joints: the joints of the partition's skin weights, followed by the joints of its fit.
         padding: number of zero rows at the end, which fill the last slice of three translations.
@@ -35,16 +37,18 @@ class _PartitionRows:
 
     def __init__(self, trained_model: TrainedModel, index: int):
         """Lay out the rows of the partition with this index."""
-        self.index, self._rig = index, trained_model.rig
+        part, self._rig = trained_model.parts[index], trained_model.rig
+        self.index, self.partition_index = index, trained_model.partition_indices()[index]
         self.prepared = trained_model.prepared[index]
-        self.joint, self.vertices = trained_model.partitions[index].joint, trained_model.partitions[index].vertices
-        self.skin = SkinBlock(self._rig, trained_model.partitions[index])
+        self.joint, self.vertices = part.joint, part.vertices
+        self.skin = SkinBlock(self._rig, part)
         is_half_rotation = self.prepared.fit.joints >= len(self._rig.joints)
         self.component_count = len(self.prepared.basis.components)
+        self.controls = self.prepared.fit.controls
         self.half_rotation_joints = self.prepared.fit.joints[is_half_rotation]
         self.joints = np.append(self.skin.joints, self.prepared.fit.joints[~is_half_rotation])
         self.padding = -len(self.joints) % 3
-        self._linear_only_count = 3 * (self.component_count + len(self.half_rotation_joints))
+        self._linear_only_count = 3 * (self.component_count + len(self.controls) + len(self.half_rotation_joints))
         self.row_count = self._linear_only_count + MATRIX_COLUMNS * len(self.joints) + self.padding
 
     def matrix(self) -> np.ndarray:
@@ -62,9 +66,12 @@ class _PartitionRows:
         has_translation = fit.joints < len(inverse_rest)
         component_rows = basis.components.reshape(-1, vertex_count, 3)
         component_rows = np.einsum("ab,kvb->kav", inverse_rest[self.joint, :3, :3], component_rows)
+        key_rows = fit.control_factors.reshape(len(self.controls), 3, vertex_count)
+        key_rows = np.einsum("ab,kbv->kav", inverse_rest[self.joint, :3, :3], key_rows)
         joint_rows = np.concatenate([inverse_rest[self.skin.joints] @ weighted_rest, fit_rows[has_translation]])
         padding_rows = np.zeros((self.padding, vertex_count))
-        row_blocks = [component_rows, fit_rows[~has_translation, :3], joint_rows[:, :3], joint_rows[:, 3], padding_rows]
+        linear_rows = [component_rows, key_rows, fit_rows[~has_translation, :3], joint_rows[:, :3]]
+        row_blocks = [*linear_rows, joint_rows[:, 3], padding_rows]
         return np.concatenate([rows.reshape(-1, vertex_count) for rows in row_blocks])
 
     def factorized_matrix(self) -> tuple[np.ndarray, np.ndarray]:
@@ -97,6 +104,7 @@ def add_skinning(
     | element | rows | constants |
     |---|---|---|
     | each component k | t c_k P_m | the component, rotated by B_m^-1 |
+    | each shape key k | s_k P_m | e_kv, rotated by B_m^-1 |
     | each joint j with a half rotation | t Q_j A_j | B_j^-1 u_vj |
     | each joint j of the skin weights | P_j | w_vj B_j^-1 (x_v, 1) |
     | each joint j of the fit | t P_j | B_j^-1 u_vj, for m including the mean residual |
@@ -110,8 +118,8 @@ def add_skinning(
         coefficients: coefficients of the networks, multiplied by the confidence; None without components.
         outside: name of the (N, 3 B') values that `add_range` returns. One of their elements is a constant 1.
     """
-    partitions = [_PartitionRows(trained_model, index) for index in range(len(trained_model.partitions))]
-    rows = _add_rows(graph, features, coefficients, outside, partitions)
+    partitions = [_PartitionRows(trained_model, index) for index in range(len(trained_model.parts))]
+    rows = _add_rows(graph, features, coefficients, outside, partitions, trained_model)
     row_counts, names = [p.row_count for p in partitions], [f"rows_{p.index}" for p in partitions]
     row_blocks = graph.split(rows, row_counts, names, axis=2)
     order = vertex_order([partition.vertices for partition in partitions])
@@ -151,11 +159,14 @@ def _add_rows(
     coefficients: Coefficients | None,
     outside: str,
     partitions: list[_PartitionRows],
+    trained_model: TrainedModel,
 ) -> str:
-    """Add the (N, 3, rows) rows of all partitions; other arguments as in `add_skinning`."""
-    scaled_matrices, slice_order = _order_slices(features, coefficients, partitions)
+    """Add the (N, 3, rows) rows of all parts; other arguments as in `add_skinning`."""
+    scaled_matrices, slice_order = _order_slices(features, coefficients, partitions, trained_model)
     joint_of_matrix, factor_of_matrix = zip(*scaled_matrices, strict=True)
     scalar_values = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
+    if any(len(partition.controls) for partition in partitions):
+        scalar_values.insert(0, CONTROLS_INPUT)
     factors = graph.integers("row_factors", np.array(factor_of_matrix)[:, None])
     factors = graph.add("Gather", [graph.join(scalar_values, "scalars", axis=1), factors], "factors", axis=1)
     # A product repeats each factor twelve times: broadcasting the multiplication takes three times as long.
@@ -174,7 +185,7 @@ def _add_rows(
 
 
 def _order_slices(
-    features: Features, coefficients: Coefficients | None, partitions: list[_PartitionRows]
+    features: Features, coefficients: Coefficients | None, partitions: list[_PartitionRows], trained_model: TrainedModel
 ) -> tuple[list[tuple[int, int]], list[int]]:
     """List the scaled matrices of all rows, and the order of their slices; arguments as in `_add_rows`.
 
@@ -182,24 +193,32 @@ def _order_slices(
         For each matrix its index in `Features.pose_rows`, and the index of its factor among the scalars. Then the order
         of the slices of nine elements: M linear parts, then M / 3 slices of translations.
     """
-    # The scalars are `outside`, whose last element is the constant 1, then the confidence, then the coefficients.
-    ones_index, confidence_start = VECTOR_SIZE * features.ones_vector, VECTOR_SIZE * (features.ones_vector + 1)
+    # The scalars are the controls, if there are keys, then `outside`, whose last element is the constant 1, then the
+    # confidence, then the coefficients.
+    has_keys = any(len(partition.controls) for partition in partitions)
+    control_count = len(trained_model.rig.controls) if has_keys else 0
+    partition_count = len(trained_model.partitions)
+    ones_index = control_count + VECTOR_SIZE * features.ones_vector
+    confidence_start = ones_index + VECTOR_SIZE
     scaled_matrices: list[tuple[int, int]] = []
     joint_starts = []
     for partition in partitions:
         joint_starts.append(len(scaled_matrices))
         skin_joints, fit_joints = np.split(partition.joints, [len(partition.skin.joints)])
         scaled_matrices += [(joint, ones_index) for joint in skin_joints]
-        scaled_matrices += [(joint, confidence_start + partition.index) for joint in fit_joints]
+        scaled_matrices += [(joint, confidence_start + partition.partition_index) for joint in fit_joints]
         scaled_matrices += partition.padding * [(0, ones_index)]
     # Slices of translations have negative values here, because their offset is known only at the end.
     slice_order = []
     for partition, joint_start in zip(partitions, joint_starts, strict=True):
         linear_start, joint_end = len(scaled_matrices), joint_start + len(partition.joints)
         if partition.component_count:
-            first_coefficient = confidence_start + len(partitions) + coefficients.start_by_partition[partition.index]
+            first_coefficient = confidence_start + partition_count + coefficients.start_by_part[partition.index]
             scaled_matrices += [(partition.joint, first_coefficient + k) for k in range(partition.component_count)]
-        scaled_matrices += [(joint, confidence_start + partition.index) for joint in partition.half_rotation_joints]
+        scaled_matrices += [(partition.joint, control) for control in partition.controls]
+        scaled_matrices += [
+            (joint, confidence_start + partition.partition_index) for joint in partition.half_rotation_joints
+        ]
         slice_order += [*range(linear_start, len(scaled_matrices)), *range(joint_start, joint_end)]
         slice_order += [~(matrix_index // 3) for matrix_index in range(joint_start, joint_end, 3)]
     scaled_matrices += -len(scaled_matrices) % 3 * [(0, ones_index)]

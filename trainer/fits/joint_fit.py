@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Linear regression of a partition's residuals on the transforms of nearby joints.
+"""Linear regression of a partition's residuals on the transforms of nearby joints and on the values of shape keys.
 
 Near a joint, smoothing mostly makes vertices follow the joints on both sides partly. This motion is linear in the
 joints' transforms, so least squares can fit it. The networks learn the remainder, which is small and smooth. Le and
 Lewis, Direct Delta Mush Skinning and Variants, 2019, show how much of delta mush is linear in this sense. For a rig
 that preserves volume, half-rotation features are also regressors (`half_rotations`).
+
+A shape key moves vertices in proportion to its value, before joints and smoothing move them on. In the space of the
+main joint this is nearly linear in the value, in any range.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,11 +30,18 @@ MIN_EQUATIONS_PER_UNKNOWN = 4
 """Minimum ratio of equations to unknowns of a vertex. With fewer equations the regression explains any residual."""
 MIN_SINGULAR_VALUE_RATIO = 1e-5
 """Directions are ignored if their singular value is below this part of the largest one."""
+CONTROL_RIDGE = 1e-5
+"""Ridge of a shape key, as a part of the number of poses times the variance of its value."""
+MIN_SIGNIFICANCE = 5.0
+"""A shape key is in the fit if it moves a vertex by more than this many standard errors of the fit."""
 
 
 @dataclass(frozen=True)
 class JointFit:
-    """The fitted part of the residuals of a partition: vertex v moves by sum_j S_j u_vj, with skin matrices S_j.
+    """The fitted part of the residuals of a partition.
+
+    Vertex v moves by sum_j S_j u_vj, with skin matrices S_j, and in the space of the main joint by sum_k s_k e_kv, with
+    values s_k of shape keys.
 
     The last elements of a vertex's u_vj sum to zero, so that a common motion of all joints has no effect.
 
@@ -40,10 +50,14 @@ class JointFit:
             the half-rotation matrix of joint j.
         factors: (4 Jf, Vp) float32, the u_vj joint by joint: three elements in mesh units and one without unit, which
             is 0 for half-rotation matrices.
+        controls: (S,) int64, indices of the shape keys among the controls of the rig, ascending.
+        control_factors: (3 S, Vp) float32, the e_kv key by key, mesh units per unit of the key.
     """
 
     joints: np.ndarray
     factors: np.ndarray
+    controls: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    control_factors: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def compute_offsets(self, matrices: np.ndarray) -> np.ndarray:
         """Compute the offsets of the vertices from linear skinning.
@@ -57,6 +71,12 @@ class JointFit:
         rows = matrices[:, self.joints, :3].transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1)
         return (rows.astype(np.float64) @ self.factors).transpose(0, 2, 1)
 
+    def compute_key_residuals(self, controls: np.ndarray) -> np.ndarray:
+        """Compute the (N, Vp, 3) float64 local residuals of shape keys, mesh units, from (N, C) values of controls."""
+        values = controls[:, self.controls].astype(np.float64)
+        by_axis = values @ self.control_factors.reshape(len(self.controls), 3 * self.factors.shape[1])
+        return by_axis.reshape(len(values), 3, -1).transpose(0, 2, 1)
+
 
 @dataclass(frozen=True)
 class JointRegression:
@@ -68,16 +88,20 @@ class JointRegression:
         design: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint. The last column of each joint is the motion of the
             center, which keeps the regression well conditioned far from the origin.
         size: as in `Rig`; makes the ridge independent of the mesh unit and of the size of the character.
+        controls: (S,) int64, the shape keys, as in `JointFit`.
+        control_values: (N, S) float64, their values.
     """
 
     joints: np.ndarray
     center: np.ndarray
     design: np.ndarray
     size: float
+    controls: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    control_values: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def main_joint_only(self) -> "JointRegression":
         """Return the regression on the main joint alone, which is constant in its own space."""
-        return JointRegression(self.joints[:1], self.center, self.design[:, :, :4], self.size)
+        return replace(self, joints=self.joints[:1], design=self.design[:, :, :4])
 
     def design_of(self, joints: np.ndarray) -> np.ndarray:
         """Return the (N, 3, 4 n) float64 columns of n of the joints, in the given order."""
@@ -96,38 +120,102 @@ class JointRegression:
         left_vectors, singular_values, _ = np.linalg.svd(flat, full_matrices=False)
         return left_vectors[:, singular_values > MIN_SINGULAR_VALUE_RATIO * singular_values[0]]
 
-    def fit(self, residuals: np.ndarray, training: np.ndarray) -> tuple[JointFit, np.ndarray]:
-        """Fit local residuals by ridge regression, and remove joints that hardly help.
+    def key_rows(self, controls: np.ndarray, poses: np.ndarray | slice) -> np.ndarray:
+        """Return the (n, 3, 3 s) float64 columns of s of the shape keys in n poses: their values for each axis."""
+        values = self.control_values[poses][:, np.searchsorted(self.controls, controls)]
+        return np.einsum("nk,ab->nakb", values, np.eye(3)).reshape(len(values), 3, -1)
+
+    def fit(self, residuals: np.ndarray, training: np.ndarray, min_effect: float = 0.0) -> tuple[JointFit, np.ndarray]:
+        """Fit local residuals by ridge regression, and remove the joints and shape keys that hardly help.
 
         Args:
             residuals: (N, Vp, 3) float32 local residuals, mesh units.
             training: indices of the poses to fit.
+            min_effect: a shape key that moves no vertex by more, over its range, is left out, mesh units.
 
         Returns:
             The fit, and the (N, Vp, 3) float32 remainder of the residuals of all poses, mesh units.
         """
-        width = self.design.shape[2]
-        gram, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
-        total = 0.0
+        joint_width = self.design.shape[2]
+        width, vertex_count = joint_width + 3 * len(self.controls), residuals.shape[1]
+        gram, moments = np.zeros((width, width)), np.zeros((width, vertex_count))
+        total, squares = 0.0, np.zeros(vertex_count)
         for block in block_slices(len(training), residuals[0].size):
             poses = training[block]
-            rows = self.design[poses].reshape(-1, width)
+            rows = self.design[poses]
+            if len(self.controls):
+                rows = np.concatenate([rows, self.key_rows(self.controls, poses)], axis=2)
+            rows = rows.reshape(-1, width)
             gram += rows.T @ rows
             values = residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1).astype(np.float64)
             moments += rows.T @ values
             total += (values**2).sum()
+            squares += np.einsum("nv,nv->v", values, values) if len(self.controls) else 0.0
         ridge = np.ones(width)
-        ridge[3::4] *= self.size**2
+        ridge[3:joint_width:4] *= self.size**2
         ridge *= RIDGE * len(training)
         # Hardly any for the main joint: its part is the mean of the residuals, which no other joint can share.
         ridge[:4] *= 1e-2
-        selected = _select_joints(add_ridge(gram, ridge), moments, total)
+        selected_keys = np.zeros(0, np.int64)
+        joint_gram, joint_moments = add_ridge(gram, ridge), moments
+        if len(self.controls):
+            variances = self.control_values[training].var(axis=0)
+            ridge[joint_width:] = np.repeat(CONTROL_RIDGE * len(training) * np.maximum(variances, 1e-12), 3)
+            joint_gram, joint_moments, eliminated, selected_keys = self._eliminate_keys(
+                add_ridge(gram, ridge), moments, squares, np.ptp(self.control_values[training], axis=0), min_effect
+            )
+            total -= eliminated
+        selected = _select_joints(joint_gram, joint_moments, total)
         columns = (4 * selected[:, None] + np.arange(4)).ravel()
-        solution = solve_ridge(gram[np.ix_(columns, columns)], moments[columns], ridge[columns])
-        remaining = np.empty_like(residuals)
+        key_columns = joint_width + (3 * selected_keys[:, None] + np.arange(3)).ravel()
+        all_columns = np.append(columns, key_columns)
+        solution = solve_ridge(gram[np.ix_(all_columns, all_columns)], moments[all_columns], ridge[all_columns])
+        solution, key_solution = solution[: len(columns)], solution[len(columns) :]
+        controls, remaining = self.controls[selected_keys], np.empty_like(residuals)
         for poses in block_slices(len(residuals), residuals[0].size):
-            remaining[poses] = residuals[poses] - (self.design[poses][:, :, columns] @ solution).transpose(0, 2, 1)
-        return JointFit(self.joints[selected], self._factors(solution.reshape(len(selected), 4, -1))), remaining
+            explained = self.design[poses][:, :, columns] @ solution
+            if len(controls):
+                explained += self.key_rows(controls, poses) @ key_solution
+            remaining[poses] = residuals[poses] - explained.transpose(0, 2, 1)
+        factors = self._factors(solution.reshape(len(selected), 4, -1))
+        return JointFit(self.joints[selected], factors, controls, key_solution.astype(np.float32)), remaining
+
+    def _eliminate_keys(
+        self, gram: np.ndarray, moments: np.ndarray, squares: np.ndarray, ranges: np.ndarray, min_effect: float
+    ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+        """Select the shape keys of the fit, and eliminate them from the normal equations.
+
+        Args:
+            gram, moments: of joints and all keys, the ridge included.
+            squares: (Vp,) sums of the squared residuals.
+            ranges: (S,) ranges of the keys.
+            min_effect: as in `fit`.
+
+        Returns:
+            Gram matrix and moments of the joints, the squares that the keys explain, and indices of the selected keys.
+        """
+        joint_width, pose_count = self.design.shape[2], len(self.design)
+        inverse = np.linalg.inv(gram)
+        solution = inverse @ moments
+        variances = np.maximum(squares - np.einsum("wv,wv->v", solution, moments), 0) / max(
+            1, 3 * pose_count - len(gram)
+        )
+        effects = np.linalg.norm(solution[joint_width:].reshape(len(ranges), 3, -1), axis=1)
+        key_variances = np.diag(inverse)[joint_width:].reshape(-1, 3).sum(axis=1)
+        min_effects = MIN_SIGNIFICANCE * np.sqrt(key_variances[:, None] * variances)
+        is_selected = ((effects > min_effects) & (effects * ranges[:, None] > min_effect)).any(axis=1)
+        columns = joint_width + (3 * np.flatnonzero(is_selected)[:, None] + np.arange(3)).ravel()
+        joints = slice(joint_width)
+        carried = np.linalg.solve(
+            gram[np.ix_(columns, columns)], np.concatenate([gram[columns, joints], moments[columns]], axis=1)
+        )
+        crossed = gram[joints, columns] @ carried
+        return (
+            gram[joints, joints] - crossed[:, joints],
+            moments[joints] - crossed[:, joint_width:],
+            float((moments[columns] * carried[:, joint_width:]).sum()),
+            np.flatnonzero(is_selected),
+        )
 
     def _factors(self, solution: np.ndarray) -> np.ndarray:
         """Convert factors (Jf, 4, Vp) of the design matrix to factors (4 Jf, Vp) of the skin matrices."""
@@ -171,13 +259,18 @@ def _select_joints(gram: np.ndarray, moments: np.ndarray, total: float) -> np.nd
     return selected
 
 
-def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> JointRegression:
-    """Create the regression on all joints whose motion relative to the main joint depends on influencing joints alone.
+def joint_regression(
+    rig: Rig, partition: Partition, matrices: np.ndarray, controls: np.ndarray | None = None
+) -> JointRegression:
+    """Create the regression on shape keys, and on all joints whose motion in the main joint's space is an influence.
+
+    Joints are those whose motion relative to the main joint depends on influencing joints alone.
 
     Args:
         rig, partition: the rig, and a partition of it.
         matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) followed by half-rotation
             matrices (`half_rotations.regression_matrices`). The rest pose may be any fixed pose.
+        controls: (N, C) values of the controls; None for a regression without shape keys.
     """
     references, center = rig.references, rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
     # The static joint never moves, so it influences nothing.
@@ -193,7 +286,12 @@ def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> Jo
     relative[:, :, :, 3] -= is_skin * matrices[:, main, None, :3, 3]
     local = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ relative
     local[:, :, :, 3] += is_skin * (local[:, :, :, :3] @ center - center)
-    return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), rig.size)
+    design, keys = local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1), np.zeros(0, np.int64)
+    if controls is not None and len(partition.controls):
+        keys = np.array([c for c in partition.controls if rig.controls[c].is_shape_key], np.int64)
+        keys = keys[np.ptp(controls[:, keys], axis=0) > 0]
+    values = controls[:, keys].astype(np.float64) if len(keys) else np.zeros((len(matrices), 0))
+    return JointRegression(joints, center, design, rig.size, keys, values)
 
 
 def joints_on_path(references: np.ndarray, first: int, second: int) -> set[int]:

@@ -66,7 +66,10 @@ def factorize(
         The factors; None if they save fewer parameters than one more product costs.
     """
     row_count, vertex_count = _row_count(fit, basis), fit.factors.shape[1]
-    inputs = _inputs(regression.design_of(fit.joints)[training], coefficients[training], weights)
+    design = regression.design_of(fit.joints)[training]
+    if len(fit.controls):
+        design = np.concatenate([design, regression.key_rows(fit.controls, training)], axis=2)
+    inputs = _inputs(design, coefficients[training], weights)
     eigenvalues, eigenvectors = np.linalg.eigh(inputs.T @ inputs)
     root = (np.sqrt(np.maximum(eigenvalues, 0)) * eigenvectors).T
     weighted = root @ _stacked_factors(fit, basis, regression.center)
@@ -77,31 +80,38 @@ def factorize(
     if rank * (row_count + vertex_count) + PRODUCT_PARAMETERS > row_count * vertex_count:
         return None
     vertex_factors = np.linalg.qr(weighted.T @ eigenvectors[:, :rank])[0].T.astype(np.float32)
-    factors = (fit.factors @ vertex_factors.T.astype(np.float64)) @ vertex_factors
-    fit = replace(fit, factors=factors.astype(np.float32))
+    fit = replace(fit, factors=_project(fit.factors, vertex_factors))
+    if len(fit.controls):
+        fit = replace(fit, control_factors=_project(fit.control_factors, vertex_factors))
     error = float(errors[rank])
     return LowRankFactors(vertex_factors, fit, *_projected_basis(vertex_factors, basis, error), error)
 
 
+def _project(factors: np.ndarray, vertex_factors: np.ndarray) -> np.ndarray:
+    """Project (n, Vp) factors to the span of the vertex factors; returns float32."""
+    return ((factors @ vertex_factors.T.astype(np.float64)) @ vertex_factors).astype(np.float32)
+
+
 def _row_count(fit: JointFit, basis: Basis) -> int:
-    return len(fit.factors) + 3 * len(basis.components)
+    return len(fit.factors) + len(fit.control_factors) + 3 * len(basis.components)
 
 
 def _inputs(design: np.ndarray, coefficients: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return (3 N, 4 Jf + 3 K) float64, the values that multiply a vertex's parameters, in the main joint's space."""
+    """Return (3 N, 4 Jf + 3 S + 3 K) float64, what multiplies a vertex's parameters, in the main joint's space."""
     by_axis = np.einsum("nk,ab->nakb", coefficients.astype(np.float64), np.eye(3))
     rows = np.concatenate([design, by_axis.reshape(len(design), 3, 3 * coefficients.shape[1])], axis=2)
     return (rows * np.sqrt(weights)[:, None, None]).reshape(3 * len(rows), -1)
 
 
 def _stacked_factors(fit: JointFit, basis: Basis, center: np.ndarray) -> np.ndarray:
-    """Return (4 Jf + 3 K, Vp) float64 parameters of the vertices; the mean is part of the main joint's parameters."""
+    """Return (4 Jf + 3 S + 3 K, Vp) float64 parameters of vertices; the mean is part of those of the main joint."""
     vertex_count, component_count = fit.factors.shape[1], len(basis.components)
     factors = fit.factors.reshape(-1, 4, vertex_count).astype(np.float64)
     factors[:, :3] -= center[:, None] * factors[:, 3:]
     factors[0, :3] += basis.mean.reshape(vertex_count, 3).T
     components = _by_axis(basis.components, vertex_count).reshape(3 * component_count, vertex_count)
-    return np.concatenate([factors.reshape(-1, vertex_count), components])
+    keys = fit.control_factors.reshape(3 * len(fit.controls), vertex_count)
+    return np.concatenate([factors.reshape(-1, vertex_count), keys, components])
 
 
 def _projected_basis(vertex_factors: np.ndarray, basis: Basis, error: float) -> tuple[Basis, np.ndarray]:

@@ -19,7 +19,7 @@ from fdda_addon.core.rig import Fingerprint
 from ..inputs.block import State
 from .networks import Network
 
-VERSION = 2
+VERSION = 3
 INPUTS_PREFIX = "inputs/"
 """Prefix of the arrays of input states: inputs/BLOCK/ARRAY."""
 READ_ERRORS = (
@@ -33,9 +33,10 @@ NOT_FINITE_CLAUSE = "its arrays hold values that are not numbers"
 
 @dataclass(frozen=True)
 class PartitionCheckpoint:
-    """The network of one partition, with the feature statistics and the basis that it was trained with.
+    """The network of a part of a partition, with the feature statistics and the basis that it was trained with.
 
     Attributes:
+        joint, vertices: main joint, and (Vp,) int32 vertices of the part, ascending.
         columns: (F',) int64, indices of the network's inputs among all features of `NetworkInputs`.
         feature_mean, feature_scale: (F',) float32, statistics of these features over the training poses.
         basis_mean: (3 Vp,) float32, mesh units.
@@ -43,6 +44,8 @@ class PartitionCheckpoint:
         network: maps standardized features to coefficients in mesh units.
     """
 
+    joint: int
+    vertices: np.ndarray
     columns: np.ndarray
     feature_mean: np.ndarray
     feature_scale: np.ndarray
@@ -62,7 +65,7 @@ class Checkpoint:
         hidden, activation: layers and activation of the networks, as in `TrainingConfig`.
         history: pose count and held-out error of this training and its predecessors, oldest first:
             `{"poses", "p999"}`, mm.
-        partitions: state of each partition, in the order of the recording.
+        partitions: state of each part of the partitions of the recording.
         input_states: state of each block of the inputs, by its name (`inputs.block`).
     """
 
@@ -128,11 +131,13 @@ def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
     hidden, activation = tuple(int(units) for units in metadata["hidden"]), str(metadata["activation"])
     partitions = []
     for index in range(int(metadata["partitions"])):
-        names = ("columns", "feature_mean", "feature_scale", "basis_mean", "basis_components")
+        names = ("vertices", "columns", "feature_mean", "feature_scale", "basis_mean", "basis_components")
         values = {name: arrays[f"{index}/{name}"] for name in names}
         layers = range(1 if not len(values["basis_components"]) else len(hidden) + 1)
         weights, biases = (tuple(arrays[f"{index}/{kind}_{layer}"] for layer in layers) for kind in ("weight", "bias"))
-        partition = PartitionCheckpoint(**values, network=Network(weights, biases, activation))
+        partition = PartitionCheckpoint(
+            int(arrays[f"{index}/joint"]), **values, network=Network(weights, biases, activation)
+        )
         _check_partition(partition, hidden)
         partitions.append(partition)
     return Checkpoint(
@@ -168,7 +173,10 @@ def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) ->
     for array in (*arrays, *network.weights, *network.biases):
         if array.dtype != np.float32 or not (np.abs(array) <= MAX_VALUE).all():
             raise ValueError(NOT_FINITE_CLAUSE)
+    vertices = partition.vertices
     if partition.columns.dtype != np.int64 or partition.columns.ndim != 1:
+        raise ValueError(CONTRADICTION_CLAUSE)
+    if vertices.dtype != np.int32 or vertices.ndim != 1 or (np.diff(vertices) <= 0).any():
         raise ValueError(CONTRADICTION_CLAUSE)
     feature_count, component_count = len(partition.columns), len(partition.basis_components)
     sizes = (feature_count, *hidden, component_count) if component_count else (feature_count, 0)
@@ -176,6 +184,7 @@ def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) ->
         [weight.shape for weight in network.weights] != list(pairwise(sizes))
         or [bias.shape for bias in network.biases] != [(size,) for size in sizes[1:]]
         or partition.basis_components.shape != (component_count, len(partition.basis_mean))
+        or len(partition.basis_mean) != 3 * len(vertices)
         or not (partition.feature_mean.shape == partition.feature_scale.shape == (feature_count,))
         or not (partition.feature_scale > 0).all()
     ):

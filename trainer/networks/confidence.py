@@ -2,9 +2,10 @@
 """The confidence of a partition: 1 for a pose inside the range of the training poses, 0 for a pose far outside.
 
 The range of a joint is a box around its features in the training poses, with a margin. The range of a control is an
-interval around its values. The excess of a pose is its distance from the box, divided by a fade width that grows with
-the range. With e the excess over all joints and controls that count for a partition, the confidence is
-max(0, 1 - e^2)^2. It is exactly 1 inside the box, 0 beyond one fade width, and smooth between.
+interval around its values. Shape keys do not count, because the linear fit is exact in any range. The excess of a pose
+is its distance from the box, divided by a fade width that grows with the range. With e the excess over all joints and
+controls that count for a partition, the confidence is max(0, 1 - e^2)^2. It is exactly 1 inside the box, 0 beyond one
+fade width, and smooth between.
 """
 
 from dataclasses import dataclass, replace
@@ -82,7 +83,7 @@ def measure_training_range(
     fade_width = np.maximum(FADE_RATIO * spread, min_fade_width)[:direct_columns]
     control_columns = slice(joint_columns, direct_columns)
     ranges = zip(rig.controls, low[control_columns].tolist(), high[control_columns].tolist(), strict=True)
-    counts = [_counting_joints(spread, rig, partitions), _counting_controls(rig, partitions)]
+    counts = [_counting_joints(spread, rig, partitions), _counting_controls(spread[control_columns], rig, partitions)]
     return TrainingRange(
         *(array.astype(np.float32) for array in (low - margin, high + margin, fade_width)),
         np.concatenate(counts, axis=1),
@@ -108,12 +109,14 @@ def _counting_joints(spread: np.ndarray, rig: Rig, partitions: tuple[Partition, 
     return np.repeat(counts, FEATURES_PER_JOINT, axis=1)
 
 
-def _counting_controls(rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarray:
+def _counting_controls(spread: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarray:
     """Return (P, C) bool, the controls that count for each partition.
 
-    A control without a range counts for every partition, because its effect was not recorded.
+    A control without a range counts for every partition, because its effect was not recorded. A shape key that moved in
+    the training poses counts for none, because its effect is linear; `spread` has the (C,) ranges in these poses.
     """
     counts = np.tile(np.array([control.low == control.high for control in rig.controls], bool), (len(partitions), 1))
     for index, partition in enumerate(partitions):
-        counts[index, list(partition.controls)] = True
+        counting = [c for c in partition.controls if spread[c] == 0 or not rig.controls[c].is_shape_key]
+        counts[index, counting] = True
     return counts

@@ -12,6 +12,7 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.report import checkpoint_path
+from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 
 from ..config import TrainingConfig
@@ -62,21 +63,32 @@ def warm_start_config(config: TrainingConfig) -> TrainingConfig:
     )
 
 
-def initial_networks(checkpoint: Checkpoint, prepared: list[PreparedPartition]) -> list[Network | None]:
-    """Convert the networks of a checkpoint to the features and bases of the current training.
-
-    The checkpoint is of the same rig, controls, hidden layers and activation.
-
-    Returns:
-        For each partition a network with nearly the former outputs; None where the partition has no network now or had
-        none before.
+def checkpoint_parts(checkpoint: Checkpoint, recording: Recording) -> list[Partition]:
+    """Return the parts of a checkpoint, which has the same rig.
 
     Raises:
         TrainingError: the checkpoint is of other partitions.
     """
-    sizes = [3 * partition.vertex_count for partition in prepared]
-    if sizes != [len(partition.basis_mean) for partition in checkpoint.partitions]:
+    by_joint = {partition.joint: partition for partition in recording.partitions}
+    parts, vertices = checkpoint.partitions, {joint: [] for joint in by_joint}
+    for part in parts:
+        vertices.setdefault(part.joint, []).append(part.vertices)
+    if vertices.keys() != by_joint.keys() or not all(
+        np.array_equal(np.sort(np.concatenate(vertices[joint] or [[]])), by_joint[joint].vertices) for joint in by_joint
+    ):
         raise TrainingError("The checkpoint is of other partitions; train without --warm-start.")
+    return [replace(by_joint[part.joint], vertices=part.vertices) for part in parts]
+
+
+def initial_networks(checkpoint: Checkpoint, prepared: list[PreparedPartition]) -> list[Network | None]:
+    """Convert the networks of a checkpoint to the features and bases of the current training.
+
+    The checkpoint is of the same rig, controls, parts, hidden layers and activation.
+
+    Returns:
+        For each partition a network with nearly the former outputs; None where the partition has no network now or had
+        none before.
+    """
     return [_convert_network(*partitions) for partitions in zip(checkpoint.partitions, prepared, strict=True)]
 
 

@@ -9,11 +9,10 @@ import numpy as np
 from fdda_addon.core.mathematics.metrics import error_statistics
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.rig import Rig
 
 from ..export.export import ExportedModel, Measurement
 from ..model import TrainedModel
-from ..networks.networks import TrainedPartition
+from ..networks.networks import Curves, TrainedPartition
 from .error_analysis import ErrorAnalysis
 
 HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
@@ -40,10 +39,8 @@ def make_report(
     """
     controls, held_out = [control.name for control in recording.rig.controls], exported.held_out
     partitions = [
-        _partition_entry(recording.rig, partition, prepared, analysis, held_out, training_errors)
-        for partition, prepared, analysis in zip(
-            trained_model.partitions, trained_model.prepared, analyses, strict=True
-        )
+        _partition_entry(trained_model, partition, analysis, held_out, training_errors)
+        for partition, analysis in zip(trained_model.partitions, analyses, strict=True)
     ]
     return {
         "unit": "mm",
@@ -72,25 +69,31 @@ def make_report(
 
 
 def _partition_entry(
-    rig: Rig,
+    trained_model: TrainedModel,
     partition: Partition,
-    prepared: TrainedPartition,
     analysis: ErrorAnalysis,
     held_out: Measurement,
     training_errors: Measurement,
 ) -> dict:
-    names, controls, vertices = rig.joint_names, [control.name for control in rig.controls], partition.vertices
-    curves = prepared.curves
+    rig, vertices = trained_model.rig, partition.vertices
+    names, controls = rig.joint_names, [control.name for control in rig.controls]
+    parts = [prepared for _, prepared in trained_model.parts_of(partition)]
+    keys = sorted({int(key) for part in parts for key in part.fit.controls})
+    sizes, curves = [part.vertex_count for part in parts], _common_curves(parts)
     return {
         "joint": names[partition.joint],
         "vertices": len(vertices),
         "influencing": [names[joint] for joint in partition.influencing],
         **({"controls": [controls[control] for control in partition.controls]} if partition.controls else {}),
         **({"merged": [names[joint] for joint in partition.merged]} if partition.merged else {}),
-        "features": len(prepared.columns),
-        "basis": len(prepared.basis.components),
-        "dropped": prepared.dropped_count,
-        "truncation": prepared.basis.truncation_rms * prepared.mm_per_unit,
+        **({"linear_keys": [controls[key] for key in keys]} if keys else {}),
+        **({"parts": len(parts)} if len(parts) > 1 else {}),
+        "features": len(np.unique(np.concatenate([part.columns for part in parts]))),
+        "basis": sum(len(part.basis.components) for part in parts),
+        "dropped": sum(part.dropped_count for part in parts),
+        "truncation": float(
+            np.sqrt(np.average([(p.basis.truncation_rms * p.mm_per_unit) ** 2 for p in parts], weights=sizes))
+        ),
         "training": error_statistics(training_errors.fdda[:, vertices]).to_json(),
         "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),
         "linear": error_statistics(held_out.linear[:, vertices]).to_json(),
@@ -103,6 +106,21 @@ def _partition_entry(
             "best_epoch": curves.best_epoch,
         },
     }
+
+
+def _common_curves(parts: Sequence[TrainedPartition]) -> Curves:
+    """Combine the curves of the parts of a partition; parts without a network have no curve."""
+    if len(parts) == 1:
+        return parts[0].curves
+    learned = [part for part in parts if part.curves.validation_mm]
+    if not learned:
+        return Curves()
+    weights = np.array([part.vertex_count for part in learned])
+    squares = [
+        np.average([np.square(getattr(part.curves, name)) for part in learned], axis=0, weights=weights)
+        for name in ("training_mm", "validation_mm", "worst_mm")
+    ]
+    return Curves(*(np.sqrt(values).tolist() for values in squares))
 
 
 def _histogram(errors: np.ndarray) -> list[int]:

@@ -99,8 +99,7 @@ def analyze_errors(
         for poses in (split.held_out, training)
     )
     analyses = []
-    partitions = zip(trained_model.partitions, trained_model.prepared, inputs.columns, strict=True)
-    for partition, prepared, columns in partitions:
+    for partition, columns in zip(trained_model.partitions, inputs.columns, strict=True):
         errors = held_out_errors[:, partition.vertices].astype(np.float64)
         count = max(1, round(errors.size * ANALYZED_FRACTION))
         largest = np.argpartition(errors.ravel(), -count)[-count:]
@@ -113,11 +112,14 @@ def analyze_errors(
         )
         distance = _ratio(float(nearest_distances[poses].mean()), float(np.median(nearest_distances)))
         joint, extreme = _most_extreme_joint(recording, partition, held_out_values, training_values, poses)
-        truncation = _truncation_fraction(recording, partition, prepared, split.held_out, poses, vertices, errors)
+        parts = trained_model.parts_of(partition)
+        truncation = _truncation_fraction(recording, partition, parts, split.held_out, poses, vertices, errors)
         percentiles = (float(np.percentile(e, 99.9)) for e in (errors, training_errors[:, partition.vertices]))
         generalization = _ratio(*percentiles)
         # Dropped components are the cause only if they are most of what the remaining ones leave.
-        is_dropped = 2 * prepared.dropped_rms**2 > prepared.basis.truncation_rms**2
+        dropped = sum(prepared.vertex_count * prepared.dropped_rms**2 for _, prepared in parts)
+        truncated = sum(prepared.vertex_count * prepared.basis.truncation_rms**2 for _, prepared in parts)
+        is_dropped = 2 * dropped > truncated
         cause = _cause(truncation, is_dropped, distance, generalization)
         counts = len(np.unique(poses)), len(np.unique(vertices))
         analyses.append(ErrorAnalysis(*counts, truncation, joint, extreme, distance, generalization, cause))
@@ -175,7 +177,7 @@ def _most_extreme_joint(
 def _truncation_fraction(
     recording: Recording,
     partition: Partition,
-    prepared: PreparedPartition,
+    parts: list[tuple[Partition, PreparedPartition]],
     held_out_poses: np.ndarray,
     poses: np.ndarray,
     vertices: np.ndarray,
@@ -191,14 +193,18 @@ def _truncation_fraction(
     unique_poses, rows = np.unique(poses, return_inverse=True)
     pose_indices = held_out_poses[unique_poses]
     remaining_residuals = recording.residuals[np.ix_(pose_indices, partition.vertices)].astype(np.float64)
-    if len(prepared.fit.joints):
-        use_half_rotations = prepared.fit.joints.max() >= len(recording.rig.joints)
-        pose_matrices = np.array(recording.pose_matrices[pose_indices])
-        matrices = regression_matrices(pose_matrices, recording.rig, use_half_rotations)
-        to_local = np.linalg.inv(matrices[:, prepared.fit.joints[0], :, :3].astype(np.float64))
-        remaining_residuals -= prepared.fit.compute_offsets(matrices) @ to_local.transpose(0, 2, 1)
-    remaining_residuals -= prepared.basis.reconstruct(prepared.coefficients[pose_indices]).reshape(
-        remaining_residuals.shape
-    )
+    pose_matrices, controls = (np.array(array[pose_indices]) for array in (recording.pose_matrices, recording.controls))
+    for part, prepared in parts:
+        rows_of_part = np.searchsorted(partition.vertices, part.vertices)
+        part_residuals = np.zeros((len(pose_indices), len(part.vertices), 3))
+        if len(prepared.fit.joints):
+            use_half_rotations = prepared.fit.joints.max() >= len(recording.rig.joints)
+            matrices = regression_matrices(pose_matrices, recording.rig, use_half_rotations)
+            to_local = np.linalg.inv(matrices[:, prepared.fit.joints[0], :, :3].astype(np.float64))
+            part_residuals += prepared.fit.compute_offsets(matrices) @ to_local.transpose(0, 2, 1)
+        if len(prepared.fit.controls):
+            part_residuals += prepared.fit.compute_key_residuals(controls)
+        components = prepared.basis.reconstruct(prepared.coefficients[pose_indices])
+        remaining_residuals[:, rows_of_part] -= part_residuals + components.reshape(part_residuals.shape)
     distances = np.linalg.norm(remaining_residuals, axis=2)[rows, vertices] * recording.rig.metres_per_unit
     return min(1.0, _ratio(float((distances**2).sum()), float((errors[poses, vertices] ** 2).sum())))
