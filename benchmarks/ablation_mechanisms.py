@@ -67,7 +67,7 @@ def _allocate_equally(
 
 
 def _fit_main_joint(
-    regression: JointRegression, residuals: np.ndarray, training: np.ndarray
+    regression: JointRegression, residuals: np.ndarray, training: np.ndarray, min_effect: float = 0.0
 ) -> tuple[JointFit, np.ndarray]:
     return _fit_all_joints(regression.main_joint_only(), residuals, training)
 

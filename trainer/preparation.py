@@ -9,6 +9,7 @@ import numpy as np
 from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, MIN_FEATURE_SPREAD, float32_rounding
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.rig import Rig
 
 from .blocks import block_slices
 from .config import TrainingConfig
@@ -94,12 +95,13 @@ def make_parts(recording: Recording, split: Split, tolerance: float) -> list[Par
     """Divide the partitions of a recording into parts that need different shape keys; `tolerance` in mesh units.
 
     A part is a partition with fewer vertices: it has its own fit, components and network. The parts of a partition
-    have the same main joint and the same confidence.
+    have the same main joint and the same confidence. Their controls include the shape keys of adjacent partitions,
+    because smoothing carries these across the border.
     """
     rig = recording.rig
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations=False)
     parts = []
-    for partition in recording.partitions:
+    for partition in _with_adjacent_keys(rig, recording.partitions):
         regression = joint_regression(rig, partition, matrices, recording.controls)
         groups = [np.arange(len(partition.vertices))]
         if len(regression.controls) and len(partition.vertices) >= MIN_DIVIDED_VERTICES:
@@ -109,6 +111,23 @@ def make_parts(recording: Recording, split: Split, tolerance: float) -> list[Par
             groups = divide_partition(fit, values.std(axis=0), tolerance)
         parts += [replace(partition, vertices=partition.vertices[group]) for group in groups]
     return parts
+
+
+def _with_adjacent_keys(rig: Rig, partitions: Sequence[Partition]) -> list[Partition]:
+    """Return partitions with the shape keys of the partitions with which they share an edge."""
+    keys = [{control for control in p.controls if rig.controls[control].is_shape_key} for p in partitions]
+    if not any(keys):
+        return list(partitions)
+    owner = np.empty(rig.vertex_count, np.int64)
+    for index, partition in enumerate(partitions):
+        owner[partition.vertices] = index
+    owners, controls = owner[rig.face_vertices], [set(partition.controls) for partition in partitions]
+    is_last_corner = np.isin(np.arange(1, len(owners)), rig.face_starts)
+    pairs = np.stack([owners[:-1], owners[1:]], axis=1)[~is_last_corner]
+    for first, second in np.unique(pairs, axis=0).tolist():
+        controls[first] |= keys[second]
+        controls[second] |= keys[first]
+    return [replace(p, controls=tuple(sorted(c))) for p, c in zip(partitions, controls, strict=True)]
 
 
 def partition_data(
