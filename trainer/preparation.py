@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, MIN_FEATURE_SPREAD, float32_rounding
+from fdda_addon.core.mathematics.features import MIN_FEATURE_SPREAD, float32_rounding
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
@@ -35,7 +35,6 @@ class PartitionData:
         read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
         min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
         columns: (F,) int64, indices of the features among all features of `NetworkInputs`; None for 0 to F - 1.
-        control_start: index of the first control among all features.
     """
 
     features: np.ndarray
@@ -43,7 +42,6 @@ class PartitionData:
     read_regression: Callable[[], JointRegression] | None = None
     min_spread: np.ndarray | float = MIN_FEATURE_SPREAD
     columns: np.ndarray | None = None
-    control_start: int = 0
 
 
 @dataclass(frozen=True)
@@ -154,7 +152,6 @@ def partition_data(
             lambda partition=partition: joint_regression(rig, partition, matrices, recording.controls),
             min_spread[columns],
             columns,
-            FEATURES_PER_JOINT * len(rig.joints),
         )
         for partition, columns in zip(parts or recording.partitions, inputs.columns, strict=True)
     ]
@@ -188,12 +185,6 @@ def prepare_partition(
         regression = partition.read_regression()
         regression = regression if len(columns) else regression.main_joint_only()
         fit, residuals = regression.fit(residuals, split.training, tolerance)
-        if len(regression.controls):
-            # A shape key that has no effect in this part is no input of its network.
-            idle_keys = partition.control_start + np.setdiff1d(regression.controls, fit.controls)
-            is_kept = ~np.isin(columns, idle_keys)
-            columns, mean, scale = columns[is_kept], mean[is_kept], scale[is_kept]
-            is_varying[is_varying] = is_kept
     residuals = residuals.reshape(len(features), -1)
     rng, weights = np.random.default_rng([seed, 2]), split.weights()
     basis = make_basis(residuals[split.training], tolerance if len(columns) else np.inf, rng, weights)
