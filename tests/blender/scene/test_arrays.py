@@ -24,7 +24,7 @@ ELEMENTS_BY_OWNER = {
     "FloatVectorAttributeValue": (VECTOR_ELEMENT,),
     "MeshNormalValue": (VECTOR_ELEMENT,),
     "FloatColorAttributeValue": (arrays.COLOR_ELEMENT,),
-    "ShapeKey": (arrays.MUTE_ELEMENT,),
+    "ShapeKey": (arrays.KEY_VALUE_ELEMENT, arrays.MUTE_ELEMENT),
     "MeshPolygon": (LOOP_START_ELEMENT, arrays.MATERIAL_INDEX_ELEMENT),
     "MeshLoop": (arrays.VERTEX_INDEX_ELEMENT,),
     "MeshLoopTriangle": (arrays.TRIANGLE_ELEMENT,),
