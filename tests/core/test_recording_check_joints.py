@@ -84,6 +84,11 @@ def test_controls_that_change_nothing_are_reported(clean_recording):
     )
 
 
+def test_a_shape_key_that_never_moves_is_reported_with_what_drives_it(clean_recording):
+    text = single_warning_text(replace(clean_recording, controls=np.zeros((200, 1), np.float32)), "dead-controls")
+    assert text.startswith("The shape key 'Bulge' has one value in all poses, so a model cannot learn it: record")
+
+
 def with_additional_joint(
     recording: Recording, joint: Joint, local_transforms: np.ndarray, is_sampled: bool = True
 ) -> Recording:

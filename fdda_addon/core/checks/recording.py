@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from ..controls import SHAPE_KEY_PATH
 from ..defaults import MIN_PARTITION_VERTICES
 from ..mathematics.features import float32_rounding, joint_features_in_metres
 from ..recording.reader import Recording
@@ -147,9 +148,20 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
         for control in idle_controls
         if not _are_related(recording.controls[poses, control : control + 1], features)
     ]
-    dead_controls = sorted([*idle_controls, *constant_controls])
+    constant_keys = {control for control in constant_controls if controls[control].is_shape_key}
+    dead_controls = sorted({*idle_controls, *constant_controls} - constant_keys)
+    warnings = []
+    if constant_keys:
+        names = [SHAPE_KEY_PATH.fullmatch(controls[control].path)["name"] for control in sorted(constant_keys)]
+        it = "it" if len(names) == 1 else "them"
+        text = (
+            f"{format_with_noun(names, 'shape key')} {'has' if len(names) == 1 else 'have'} one value in all poses, so "
+            f"a model cannot learn {it}: record an action that moves {it}, or bones that drive {it} (--sample), or "
+            f"mute {it}."
+        )
+        warnings.append(RecordingWarning("dead-controls", text[0].upper() + text[1:]))
     if not dead_controls:
-        return []
+        return warnings
     constant_names = [controls[control].name for control in dead_controls if control in constant_controls]
     constant_text = f", {format_list(constant_names)} of them always the same" if constant_names else ""
     text = (
@@ -157,7 +169,7 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
         f"{'changes' if len(dead_controls) == 1 else 'change'} nothing in this recording{constant_text}: leave "
         f"{'it' if len(dead_controls) == 1 else 'them'} out, or give a wider range, and record again."
     )
-    return [RecordingWarning("dead-controls", text[0].upper() + text[1:])]
+    return [*warnings, RecordingWarning("dead-controls", text[0].upper() + text[1:])]
 
 
 def _check_joints(recording: Recording) -> list[RecordingWarning]:
