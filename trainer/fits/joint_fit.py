@@ -162,7 +162,7 @@ class JointRegression:
             variances = self.control_values[training].var(axis=0)
             ridge[joint_width:] = np.repeat(CONTROL_RIDGE * len(training) * np.maximum(variances, 1e-12), 3)
             joint_gram, joint_moments, eliminated, selected_keys = self._eliminate_keys(
-                add_ridge(gram, ridge), moments, squares, np.ptp(self.control_values[training], axis=0), min_effect
+                add_ridge(gram, ridge), moments, squares, training, min_effect
             )
             total -= eliminated
         selected = _select_joints(joint_gram, joint_moments, total)
@@ -181,25 +181,23 @@ class JointRegression:
         return JointFit(self.joints[selected], factors, controls, key_solution.astype(np.float32)), remaining
 
     def _eliminate_keys(
-        self, gram: np.ndarray, moments: np.ndarray, squares: np.ndarray, ranges: np.ndarray, min_effect: float
+        self, gram: np.ndarray, moments: np.ndarray, squares: np.ndarray, training: np.ndarray, min_effect: float
     ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
         """Select the shape keys of the fit, and eliminate them from the normal equations.
 
         Args:
             gram, moments: of joints and all keys, the ridge included.
             squares: (Vp,) sums of the squared residuals.
-            ranges: (S,) ranges of the keys.
-            min_effect: as in `fit`.
+            training, min_effect: as in `fit`.
 
         Returns:
             Gram matrix and moments of the joints, the squares that the keys explain, and indices of the selected keys.
         """
-        joint_width, pose_count = self.design.shape[2], len(self.design)
+        joint_width, ranges = self.design.shape[2], np.ptp(self.control_values[training], axis=0)
         inverse = np.linalg.inv(gram)
         solution = inverse @ moments
-        variances = np.maximum(squares - np.einsum("wv,wv->v", solution, moments), 0) / max(
-            1, 3 * pose_count - len(gram)
-        )
+        degrees_of_freedom = max(1, 3 * len(training) - len(gram))
+        variances = np.maximum(squares - np.einsum("wv,wv->v", solution, moments), 0) / degrees_of_freedom
         effects = np.linalg.norm(solution[joint_width:].reshape(len(ranges), 3, -1), axis=1)
         key_variances = np.diag(inverse)[joint_width:].reshape(-1, 3).sum(axis=1)
         min_effects = MIN_SIGNIFICANCE * np.sqrt(key_variances[:, None] * variances)
