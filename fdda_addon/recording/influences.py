@@ -16,7 +16,7 @@ from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.rig import Rig
 from ..rig.reading import PoseEvaluator
-from ..rig.shape_keys import control_distances, muted_key_drivers
+from ..rig.shape_keys import key_distances, muted_key_drivers
 from ..scene.bone_transform import controls_by_bone
 from ..scene.scene_rig import SceneRig
 from .influence_trials import JOINT, InfluenceSearch, prepared_trials
@@ -79,7 +79,7 @@ def detect_influences(
             "counts as an influence. Look for a constraint, driver or modifier that fails in extreme poses."
         )
         yield Progress("influences", done, total, note)
-    key_distances = control_distances(scene_rig.mesh_object)
+    distances_of_keys = key_distances(scene_rig.mesh_object)
     # The first control of a bone stands for all controls of its transform.
     controls_of_bones = {indices[0]: indices for indices in controls_by_bone(rig.controls).values()}
     by_kind: dict[str, dict[int, tuple[int, ...]]] = {JOINT: {}, CONTROL: {}}
@@ -92,7 +92,7 @@ def detect_influences(
             (CONTROL, index)
             for index, control in enumerate(rig.controls)
             if control.is_shape_key
-            and (search.has_target or (key_distances[control.path][partition.vertices] > threshold).any())
+            and (search.has_target or (distances_of_keys[control.path][partition.vertices] > threshold).any())
         }
         for kind, by_joint in by_kind.items():
             by_joint[partition.joint] = tuple(sorted(index for each, index in partition_inputs if each == kind))

@@ -31,7 +31,7 @@ from ..poses.sampling import (
 from ..rig.dependencies import read_dependencies
 from ..rig.pose_setter import NO_TARGET, TargetSettings
 from ..rig.reading import read_rig
-from ..rig.shape_keys import control_distances, find_unposed_keys
+from ..rig.shape_keys import find_unposed_keys, key_distances
 from ..rig.target import find_target
 from ..scene.controls import parse_controls
 from ..scene.scene_rig import SceneRig
@@ -94,9 +94,9 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
         RigError: the rig cannot be read, or has nothing to sample.
     """
     selection, extra_joints = read_sample_selection(scene_rig, settings)
-    distances = control_distances(scene_rig.mesh_object)
     # A shape key that moves no vertex is no input.
-    controls = tuple(c for c in selection.controls if not c.is_shape_key or distances[c.path].any())
+    moving_keys = {path for path, distances in key_distances(scene_rig.mesh_object).items() if distances.any()}
+    controls = tuple(c for c in selection.controls if not c.is_shape_key or c.path in moving_keys)
     selection = replace(selection, controls=controls)
     rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings, selection.controls))
     return replace(rig, controls=controls), random_pose_channels(scene_rig, rig, selection) if settings.poses else ()

@@ -34,20 +34,14 @@ def key_positions(shape_keys: bpy.types.Key) -> Iterator[tuple[bpy.types.ShapeKe
             yield block, read(block.data, COORDINATE_ELEMENT), relative_positions[relative_key.name]
 
 
-def control_distances(mesh_object: bpy.types.Object) -> dict[str, np.ndarray]:
+def key_distances(mesh_object: bpy.types.Object) -> dict[str, np.ndarray]:
     """Return how far each shape key moves the vertices of a mesh at most, (V,) float32, by the path of its value."""
-    shape_keys = mesh_object.data.shape_keys
-    return (
-        {}
-        if shape_keys is None
-        else {
-            f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value': np.linalg.norm(
-                positions - relative, axis=1
-            )
-            * max(abs(block.slider_min), abs(block.slider_max))
-            for block, positions, relative in key_positions(shape_keys)
-        }
-    )
+    distances, shape_keys = {}, mesh_object.data.shape_keys
+    for block, positions, relative_positions in key_positions(shape_keys) if shape_keys else ():
+        path = f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value'
+        largest_value = max(abs(block.slider_min), abs(block.slider_max))
+        distances[path] = np.linalg.norm(positions - relative_positions, axis=1) * largest_value
+    return distances
 
 
 def find_unposed_keys(scene_rig: SceneRig, channels: Iterable[Channel]) -> set[str]:
