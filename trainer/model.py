@@ -55,8 +55,14 @@ class TrainedModel:
         """Return the state from which the training can be continued; other arguments as in `Checkpoint`."""
         partitions = [
             PartitionCheckpoint(
-                *(part.joint, part.vertices, p.columns, p.feature_mean, p.feature_scale),
-                *(p.basis.mean, p.basis.components, p.network),
+                joint=part.joint,
+                vertices=part.vertices,
+                columns=p.columns,
+                feature_mean=p.feature_mean,
+                feature_scale=p.feature_scale,
+                basis_mean=p.basis.mean,
+                basis_components=p.basis.components,
+                network=p.network,
             )
             for part, p in zip(self.parts, self.prepared, strict=True)
         ]

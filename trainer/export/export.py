@@ -201,9 +201,12 @@ def _model_info(
         rig.fingerprint,
         tuple(
             ModelPartition(
-                *(p.joint, p.influencing, len(p.vertices)),
+                p.joint,
+                p.influencing,
+                len(p.vertices),
                 sum(len(prepared.basis.components) for _, prepared in trained_model.parts_of(p)),
-                *(p.controls, p.merged),
+                p.controls,
+                p.merged,
             )
             for p in trained_model.partitions
         ),

@@ -11,6 +11,7 @@ of times in a cycle, and these times (Alembic's AbcCoreOgawa/WriteUtil, WriteTim
 
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
 from ..files.input_file import open_input
 
@@ -35,33 +36,42 @@ def read_time_range(path: Path) -> tuple[float, float] | None:
     """
     with open_input(path) as file:
         try:
-            header = file.read(16)
-            if header[:5] != SIGNATURE:
-                raise ValueError("another container")
-            file.seek(struct.unpack("<8xQ", header)[0])
-            child_count = struct.unpack("<Q", file.read(8))[0]
-            if not TIME_SAMPLINGS_INDEX < child_count <= MAX_GROUP_CHILDREN:
-                raise ValueError("another archive")
-            position = struct.unpack(f"<{child_count}Q", file.read(8 * child_count))[TIME_SAMPLINGS_INDEX]
-            if not position & DATA_BLOCK_FLAG:
-                raise ValueError("no data")
-            file.seek(position & ~DATA_BLOCK_FLAG)
-            size = struct.unpack("<Q", file.read(8))[0]
-            if size > MAX_TABLE_BYTES:
-                raise ValueError("too many samplings")
-            table = file.read(size)
-            offset, time_ranges = 0, []
-            while offset < len(table):
-                sample_count, cycle_seconds, time_count = struct.unpack_from("<IdI", table, offset)
-                times = struct.unpack_from(f"<{time_count}d", table, offset + 16)
-                offset += 16 + 8 * time_count
-                # A time sampling with one sample is static. Each table begins with such a time sampling.
-                if sample_count > 1 and times:
-                    last_time = times[min(sample_count, time_count) - 1] if cycle_seconds > MAX_CYCLE_SECONDS else 0.0
-                    if cycle_seconds <= MAX_CYCLE_SECONDS:
-                        cycles, remainder = divmod(sample_count - 1, time_count)
-                        last_time = times[remainder] + cycles * cycle_seconds
-                    time_ranges.append((times[0], last_time))
-            return (min(start for start, _ in time_ranges), max(end for _, end in time_ranges)) if time_ranges else None
+            return _compute_time_range(_read_time_samplings(file))
         except (struct.error, ValueError, OverflowError):
             return None
+
+
+def _read_time_samplings(file: BinaryIO) -> bytes:
+    """Read the table of time samplings; raise ValueError or struct.error where the file has none."""
+    header = file.read(16)
+    if header[:5] != SIGNATURE:
+        raise ValueError("another container")
+    file.seek(struct.unpack("<8xQ", header)[0])
+    child_count = struct.unpack("<Q", file.read(8))[0]
+    if not TIME_SAMPLINGS_INDEX < child_count <= MAX_GROUP_CHILDREN:
+        raise ValueError("another archive")
+    position = struct.unpack(f"<{child_count}Q", file.read(8 * child_count))[TIME_SAMPLINGS_INDEX]
+    if not position & DATA_BLOCK_FLAG:
+        raise ValueError("no data")
+    file.seek(position & ~DATA_BLOCK_FLAG)
+    size = struct.unpack("<Q", file.read(8))[0]
+    if size > MAX_TABLE_BYTES:
+        raise ValueError("too many samplings")
+    return file.read(size)
+
+
+def _compute_time_range(table: bytes) -> tuple[float, float] | None:
+    """Compute the earliest and the latest time of all time samplings in a table; None where none is animated."""
+    offset, time_ranges = 0, []
+    while offset < len(table):
+        sample_count, cycle_seconds, time_count = struct.unpack_from("<IdI", table, offset)
+        times = struct.unpack_from(f"<{time_count}d", table, offset + 16)
+        offset += 16 + 8 * time_count
+        # A time sampling with one sample is static. Each table begins with such a time sampling.
+        if sample_count > 1 and times:
+            last_time = times[min(sample_count, time_count) - 1] if cycle_seconds > MAX_CYCLE_SECONDS else 0.0
+            if cycle_seconds <= MAX_CYCLE_SECONDS:
+                cycles, remainder = divmod(sample_count - 1, time_count)
+                last_time = times[remainder] + cycles * cycle_seconds
+            time_ranges.append((times[0], last_time))
+    return (min(start for start, _ in time_ranges), max(end for _, end in time_ranges)) if time_ranges else None
