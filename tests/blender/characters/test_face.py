@@ -19,6 +19,7 @@ from fdda_addon.scene.scene_rig import SceneRig
 
 from .. import linked
 from ..conftest import assert_plays, run, train
+from ..rig_changes import trigger_check
 
 MAX_ERROR_RATIO = 0.5
 """Limit for the model's mean error after a short training, as a ratio of linear skinning's mean error."""
@@ -104,6 +105,13 @@ def test_the_bound_face_plays_the_action_and_a_shape_key(face_folder, tmp_path):
         bpy.context.view_layer.update()
         shapes.append(assert_plays(mesh_object, face_folder / "face.onnx"))
     assert np.abs(shapes[0] - shapes[1]).max() > 0.003
+    # Whatever gives shape keys their values may change.
+    for curve in list(keys.animation_data.drivers):
+        keys.driver_remove(curve.data_path)
+    keys.key_blocks["smile.L"].value = 0.4
+    trigger_check("frame")
+    assert mesh_object.fdda.mode == "FDDA" and not mesh_object.fdda.status
+    assert np.abs(assert_plays(mesh_object, face_folder / "face.onnx") - shapes[2]).max() > 0.0005
 
 
 def override_face(bound_path: Path, shot_path: Path) -> bpy.types.Object:

@@ -11,7 +11,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.models.entries import bound_entry
 from fdda_addon.runtime import packed_model
 
-from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose
+from ..conftest import ELBOW, assert_plays, pose
 from ..refusals import refused
 from ..rig_changes import paint_weight
 
@@ -128,15 +128,3 @@ def test_a_damaged_packed_model_is_refused(packed_elbow, elbow_files):
         packed_model.read(mesh_object.fdda.packed)
     with pytest.raises(ModelError, match="it is not an ONNX file"):
         packed_model.pack("text", b"no model")
-
-
-def test_a_packed_model_is_appended_with_its_object(packed_elbow, elbow_files, tmp_path):
-    path = tmp_path / "library.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    with bpy.data.libraries.load(str(path)) as (_, wanted):
-        wanted.objects = [ELBOW, ELBOW_RIG]
-    for appended in wanted.objects:
-        bpy.context.scene.collection.objects.link(appended)
-    pose(angle=1.2)
-    assert_plays(wanted.objects[0], elbow_files.model)
