@@ -40,7 +40,9 @@ CROWD_SIZE = 20
 def frames(rig: str, model: str, count: str = "100") -> dict:
     """Time a frame with the rig, linear skinning, the model and constant positions, as the verb `benchmark` does."""
     bpy.ops.wm.open_mainfile(filepath=rig)
-    return run_job(benchmark(find_rig(), Path(model), int(count))).to_json()
+    scene_rig = find_rig()
+    models = {scene_rig.mesh_object: Path(model)}
+    return run_job(benchmark(scene_rig.armature_object, int(count), models)).to_json()
 
 
 def recording(rig: str, poses: str = "60") -> dict:

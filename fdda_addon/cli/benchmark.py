@@ -1,23 +1,26 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`benchmark RIG.blend MODEL.onnx --json OUT.json`: measures the time per frame of rig, linear skinning and model.
+"""`benchmark RIG.blend [MODEL.onnx] --json OUT.json`: measures the time per frame of a character, before and after.
 
-`benchmark RIG.blend --profile --json OUT.json` needs no model: it measures the parts of a frame of the rig, and what a
-fast rig would save. `--fast-rig` measures the latter alone.
+A character is all meshes of one armature. Without a model, those that are bound in the file are measured, or untrained
+models of the same size. `--profile` measures the parts of a frame of the rig, and what models and a fast rig would
+save. `--fast-rig` measures the latter alone.
 """
 
 import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
+import bpy
+
+from ..core.errors import TRY_AGAIN, FDDAError, RigError, WrongUsageError, exit_status
 from ..core.files.file_kind import BENCHMARK
 from ..core.files.output import check_outputs, write_json
 from ..core.files.temporary import check_temporary_folder
 from ..fast_rig.saving import measure_saving
-from ..runtime.binding import model_disabled
+from ..scene.scene_rig import find_rig, find_rigs
 from ..timing.benchmark import benchmark
 from ..timing.profiling import profile_frame
-from .files import add_rig_options, open_rig
+from .files import add_rig_options, open_file
 from .folders import open_rigs, to_json_by_object, with_heading
 from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
@@ -30,7 +33,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL.onnx",
         type=Path,
         nargs="?",
-        help="the model, or a folder of models; none with --profile and --fast-rig",
+        help="the model, or a folder of models; other meshes play the models that are bound to them. Without any model "
+        "untrained models of the same size give an estimate",
     )
     group = parser.add_mutually_exclusive_group()
     group.add_argument(
@@ -50,18 +54,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     if options.frames < 1:
         raise WrongUsageError("--frames must be 1 or more.")
-    needs_model = not (options.profile or options.fast_rig)
-    if (options.model is not None) != needs_model:
-        raise WrongUsageError("Give a model to measure, or --profile or --fast-rig without a model.")
+    if options.model is not None and (options.profile or options.fast_rig):
+        raise WrongUsageError(
+            "--profile and --fast-rig take no model; they measure the bound models, or untrained ones."
+        )
     check_outputs({options.json: BENCHMARK}, list(filter(None, (options.rig, options.model))), options.overwrite)
-    if not needs_model:
+    if options.model is None:
         check_temporary_folder()  # before the measurements, which take a minute
     if options.profile:
-        scene_rig, failure = open_rig(options), None
+        armature_object, failure = _open_armature(options), None
         with ProgressPrinter() as progress:
-            profile = progress.run(profile_frame(scene_rig))
+            profile = progress.run(profile_frame(armature_object))
             try:
-                profile = replace(profile, fast_rig=progress.run(measure_saving(scene_rig, options.rig)))
+                profile = replace(profile, fast_rig=progress.run(measure_saving(armature_object, options.rig)))
             except FDDAError as error:
                 profile, failure = replace(profile, fast_rig_problem=str(error)), error
         write_json(options.json, profile.to_json())
@@ -71,17 +76,26 @@ def run(options: argparse.Namespace) -> None:
         return
     if options.fast_rig:
         with ProgressPrinter() as progress:
-            saving = progress.run(measure_saving(open_rig(options), options.rig))
+            saving = progress.run(measure_saving(_open_armature(options), options.rig))
         write_json(options.json, saving.to_json() | {"unit": "ms"})
-        print(saving.sentence)
+        print(saving.describe(saving.full.median))
         return
+    models: dict[bpy.types.Object, dict[bpy.types.Object, Path]] = {}
+    if options.model is None:
+        models[_open_armature(options)] = {}
+    else:
+        for scene_rig, model in open_rigs(options).values():
+            models.setdefault(scene_rig.armature_object, {})[scene_rig.mesh_object] = model
     benchmarks, errors = {}, []
-    for name, (scene_rig, model) in open_rigs(options).items():
+    for armature_object, models_of_meshes in models.items():
+        name = armature_object.name if len(models) > 1 else ""
         try:
-            with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
-                benchmarks[name] = progress.run(benchmark(scene_rig, model, options.frames))
+            with ProgressPrinter() as progress:
+                result = benchmarks[name] = progress.run(benchmark(armature_object, options.frames, models_of_meshes))
+            measured = {mesh_object.name for mesh_object in models_of_meshes}
+            errors += [FDDAError(mesh.reason) for mesh in result.meshes if mesh.reason and mesh.name in measured]
         except FDDAError as error:
-            # The times of the other meshes took minutes.
+            # The times of the others took minutes.
             errors.append(error)
     if benchmarks:
         write_json(options.json, to_json_by_object({name: result.to_json() for name, result in benchmarks.items()}))
@@ -89,3 +103,20 @@ def run(options: argparse.Namespace) -> None:
         print(with_heading(name, result.table()))
     if errors:
         raise errors[0]
+
+
+def _open_armature(options: argparse.Namespace) -> bpy.types.Object:
+    """Open the file, and return the armature of its character, or of the mesh object of the options.
+
+    Raises:
+        FDDAError: the file cannot be opened, or has no character or several.
+    """
+    open_file(options.rig)
+    rigs = [find_rig(options.object)] if options.object else find_rigs()
+    names = sorted({rig.armature_object.name for rig in rigs})
+    if len(names) > 1:
+        raise RigError(
+            f"'{options.rig}' has {len(names)} characters (armatures {', '.join(names)}); choose one with --object "
+            "and the name of a mesh of it."
+        )
+    return rigs[0].armature_object

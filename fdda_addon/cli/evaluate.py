@@ -132,10 +132,11 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
     """Time the rig and the model, write the film of the first action, and print the progress to stderr."""
     clip = find_clips([scene_rig], options.action, options.strip)[0]
     with ProgressPrinter() as progress:
-        times = progress.run(benchmark(scene_rig, model, FILM_TIMED_FRAMES)).frame_times("")
+        models = {scene_rig.mesh_object: model}
+        times = progress.run(benchmark(scene_rig.armature_object, FILM_TIMED_FRAMES, models))
         settings = FilmSettings(
             fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base * time_ratio(),
-            times_ms={RIG: times.rig, FDDA: times.fdda} | ({LINEAR: times.linear} if times.linear else {}),
+            times_ms={variant: times.median(variant) for variant in (RIG, LINEAR, FDDA) if variant in times.times},
             reference_label=f"Target {options.target}" if options.target else LABELS[RIG],
         )
         with model_disabled(scene_rig.mesh_object):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Times the frames of a full rig and of its fast rig, by opening both files in turns."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -19,14 +19,11 @@ from ..scene.blend_file import blender_path, report_message, silenced_stdout
 from ..scene.scene_rig import find_rig
 from ..scene.temporary_state import assign_action
 from ..scene.time_stretching import unstretched_time
-from ..timing.benchmark import time_calls
+from ..timing.durations import WARM_UP_FRAMES, time_calls
 from .compared_poses import set_random_pose
 from .controls import animating_actions
 
 ROUNDS = 3
-WARM_UP_FRAMES = 3
-FrameCall = tuple[Callable[[], object], Callable[[], object]]
-"""A function that prepares a frame, which takes time of its own, and one that shows it, which is timed."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +82,16 @@ def measure_frames(
     for round_index in range(rounds):
         # The fast rig first: the full rig may have further actions, which key only removed bones.
         for index, path in enumerate((fast, full)):
-            calls_range = range(round_index * frames_per_round - WARM_UP_FRAMES, (round_index + 1) * frames_per_round)
             armature_object = _open_rig(path, object_name)
             if action_name is None:
                 action_name = _action_name(armature_object)
-            calls = _frame_calls(armature_object, action_name, controls, size, calls_range)
-            times[path] += _time_calls(calls, shows_rig=path == full)
+            indices = range(round_index * frames_per_round - WARM_UP_FRAMES, (round_index + 1) * frames_per_round)
+            with ExitStack() as stack:
+                stack.enter_context(unstretched_time())
+                for scene_object in bpy.context.scene.objects if path == full else ():
+                    if scene_object.type == "MESH" and scene_object.fdda.is_bound:
+                        stack.enter_context(model_disabled(scene_object))
+                times[path] += time_calls(_frame_calls(armature_object, action_name, controls, size, indices))
             yield Progress("frames", 2 * round_index + index + 1, 2 * rounds)
     return RigTimes(tuple(times[full]), tuple(times[fast]))
 
@@ -115,30 +116,16 @@ def _action_name(armature_object: bpy.types.Object) -> str:
 
 def _frame_calls(
     armature_object: bpy.types.Object, action_name: str, controls: tuple[str, ...], size: float, indices: range
-) -> list[FrameCall]:
-    """Return functions that show frames of an action, or random poses if its name is empty; one for each index."""
+) -> Iterator[Callable[[], object]]:
+    """Yield functions that show frames of an action, or random poses if its name is empty; one for each index."""
     if not action_name:
-        update = bpy.context.view_layer.update
-        return [
-            (partial(set_random_pose, armature_object, controls, size, index + WARM_UP_FRAMES), update)
-            for index in indices
-        ]
+        for index in indices:
+            set_random_pose(armature_object, controls, size, index + WARM_UP_FRAMES)
+            yield bpy.context.view_layer.update
+        return
     action = bpy.data.actions[action_name]
     for datablock, slot in slots_of_action(action, dependencies(armature_object)).items():
         assign_action(datablock, action, slot)
     frames = action_frames(action)
-    return [(lambda: None, partial(bpy.context.scene.frame_set, frames[index % len(frames)])) for index in indices]
-
-
-def _time_calls(calls: list[FrameCall], shows_rig: bool) -> list[float]:
-    """Time the calls after those that warm up, in milliseconds, with all models or with all rigs in their place."""
-    times = []
-    with ExitStack() as exit_stack:
-        exit_stack.enter_context(unstretched_time())
-        for scene_object in bpy.context.scene.objects if shows_rig else ():
-            if scene_object.type == "MESH" and scene_object.fdda.is_bound:
-                exit_stack.enter_context(model_disabled(scene_object))
-        for prepare, show in calls:
-            prepare()
-            times += time_calls([show])
-    return times[WARM_UP_FRAMES:]
+    for index in indices:
+        yield partial(bpy.context.scene.frame_set, frames[index % len(frames)])

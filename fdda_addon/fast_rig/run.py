@@ -97,23 +97,7 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
     """
     scene_rigs = [scene_rig for scene_rig, _ in rigs_and_models]
     armature_object = _shared_armature(scene_rigs)
-    for scene_rig, model in rigs_and_models:
-        # Bind a model and pack it.
-        mesh_object = scene_rig.mesh_object
-        unbind(mesh_object)
-        check_evaluable(scene_rig)
-        data = read_model(model)[1]
-        text = packed_model.pack(model.name, data)
-        bind(scene_rig, model, use_in_render=True, packed_text=text)
-        binding = mesh_object.fdda
-        # The other models of the library were trained for the full rig, and their files may not be there.
-        binding.models.clear()
-        entry = binding.models.add()
-        entry.name, entry.path, entry.packed, entry.packed_bytes = model.stem, binding.model, text, len(data)
-        binding.model_index = 0
-        _evaluate_model(mesh_object)
-    networks = [network_of(rig.mesh_object) for rig in scene_rigs]
-    joint_names = tuple(dict.fromkeys(n for network in networks for n in network.info.joint_names if n != STATIC_JOINT))
+    joint_names = bind_packed_models(rigs_and_models)
     controls = tuple(sorted(control_bones(armature_object, choices)))
     if not controls:
         raise RigError(
@@ -127,7 +111,7 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
     before, unrepeated = yield from _evaluate_full_rig(poses)
     bones_before = len(armature_object.data.bones)
     keyed = {action.name: keyed_bones(armature_object, action) for action in actions}
-    removed = _remove_unneeded(scene_rigs, joint_names, controls)
+    removed = remove_unneeded_parts(scene_rigs, joint_names, controls)
     after = yield from evaluate_poses(poses, "fast rig")
 
     if differences := differing_bones(poses, before.matrices, after.matrices, TOLERANCE):
@@ -179,7 +163,30 @@ def _shared_armature(scene_rigs: list[SceneRig]) -> bpy.types.Object:
     return scene_rigs[0].armature_object
 
 
-def _remove_unneeded(scene_rigs: list[SceneRig], joint_names: tuple[str, ...], controls: tuple[str, ...]) -> Removed:
+def bind_packed_models(rigs_and_models: list[tuple[SceneRig, Path]]) -> tuple[str, ...]:
+    """Bind the models of rigs and pack them; return the names of the joints that they read."""
+    joint_names: list[str] = []
+    for scene_rig, model in rigs_and_models:
+        mesh_object = scene_rig.mesh_object
+        unbind(mesh_object)
+        check_evaluable(scene_rig)
+        data = read_model(model)[1]
+        text = packed_model.pack(model.name, data)
+        bind(scene_rig, model, use_in_render=True, packed_text=text)
+        binding = mesh_object.fdda
+        # The other models of the library were trained for the full rig, and their files may not be there.
+        binding.models.clear()
+        entry = binding.models.add()
+        entry.name, entry.path, entry.packed, entry.packed_bytes = model.stem, binding.model, text, len(data)
+        binding.model_index = 0
+        _evaluate_model(mesh_object)
+        joint_names += network_of(mesh_object).info.joint_names
+    return tuple(dict.fromkeys(name for name in joint_names if name != STATIC_JOINT))
+
+
+def remove_unneeded_parts(
+    scene_rigs: list[SceneRig], joint_names: tuple[str, ...], controls: tuple[str, ...]
+) -> Removed:
     """Remove what models and controls do not need, and play the models."""
     for scene_rig in scene_rigs:
         scene_rig.mesh_object.fdda.mode = "RIG"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Measures what a fast rig would save, also for a character without a model."""
+"""Measures what a fast rig would save, also for a character without models."""
 
 from pathlib import Path
 
@@ -9,64 +9,52 @@ import numpy as np
 from ..core.errors import RigError
 from ..core.files.temporary import temporary_folder
 from ..core.progress import Job
-from ..core.rig import STATIC_JOINT
-from ..rig.dependencies import read_dependencies
-from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import unbind
 from ..scene.blend_file import save_copy
-from ..scene.scene_rig import SceneRig, armature_modifier, armature_of
-from ..scene.skin import read_skin
+from ..scene.scene_rig import check_full_rig, rigs_of_armature
 from ..timing.durations import Duration
 from ..timing.fast_rig_saving import FastRigSaving
+from ..timing.untrained_models import untrained_models
 from .compared_poses import rig_size
 from .controls import VISIBLE, control_bones
 from .frame_times import measure_frames
-from .removal import remove_unneeded
+from .run import bind_packed_models, remove_unneeded_parts
 
 ROUNDS, FRAMES_PER_ROUND = 5, 12
 """Each round opens both files, and measures them one after the other."""
 
 
-def measure_saving(scene_rig: SceneRig, file: Path) -> Job[FastRigSaving]:
-    """Time a rig, and a copy without what its visible controls and its joints do not need.
+def measure_saving(armature_object: bpy.types.Object, file: Path) -> Job[FastRigSaving]:
+    """Time a rig, and a fast rig of it whose meshes play untrained models.
 
-    The joints are the bones with weights on the mesh, and those that deform it in other ways. The open file is changed
+    The fast rig keeps the visible bones, and what the meshes need that no model can deform. The open file is changed
     and replaced by others, so run this in a process of its own.
 
     Args:
+        armature_object: the armature of the rig.
         file: the open file, as it is saved.
 
     Raises:
-        FDDAError: a model cannot replace the modifiers, bones cannot be removed, or a file cannot be written or opened.
+        FDDAError: no mesh can have a model, bones cannot be removed, or a file cannot be written or opened.
     """
-    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    if mesh_object.fdda.is_fast_rig:
-        raise RigError(f"'{mesh_object.name}' is a fast rig already; open the file of the full rig.")
-    for scene_object in bpy.context.scene.objects:
-        if scene_object.type == "MESH" and scene_object.fdda.is_bound and armature_of(scene_object) == armature_object:
-            unbind(scene_object)
-    check_evaluable(scene_rig)
-    joints = _joint_names(scene_rig)
-    controls = tuple(sorted(control_bones(armature_object, (VISIBLE,))))
-    object_name, size, vertex_count = mesh_object.name, rig_size(armature_object), len(mesh_object.data.vertices)
-    bone_count = len(armature_object.data.bones)
-    remove_unneeded([scene_rig], joints, controls)
-    kept_count = len(armature_object.data.bones)
-    with temporary_folder() as folder:
-        pruned_file = folder / "pruned.blend"
-        save_copy(pruned_file)
+    rigs = rigs_of_armature(armature_object)
+    for scene_rig in rigs:
+        check_full_rig(scene_rig.mesh_object)
+        unbind(scene_rig.mesh_object)
+    bone_count, controls = len(armature_object.data.bones), tuple(sorted(control_bones(armature_object, (VISIBLE,))))
+    with temporary_folder() as folder, untrained_models(rigs) as (models, reasons):
+        if not models:
+            raise RigError(next(iter(reasons.values())))
+        rigs_and_models = [(rig, models[rig.mesh_object]) for rig in rigs if rig.mesh_object in models]
+        joints = bind_packed_models(rigs_and_models)
+        remove_unneeded_parts([rig for rig, _ in rigs_and_models], joints, controls)
+        kept_count, size = len(armature_object.data.bones), rig_size(armature_object)
+        object_name, fast_file = rigs_and_models[0][0].mesh_object.name, folder / "fast.blend"
+        save_copy(fast_file)
         frames = ROUNDS * FRAMES_PER_ROUND
-        times = yield from measure_frames(file, pruned_file, object_name, controls, frames, size, ROUNDS)
-    full, pruned = (
+        times = yield from measure_frames(file, fast_file, object_name, controls, frames, size, ROUNDS)
+    full, fast = (
         Duration.of([float(np.median(round_times)) for round_times in np.split(np.array(all_times), ROUNDS)])
         for all_times in (times.full, times.fast)
     )
-    return FastRigSaving(vertex_count, bone_count, kept_count, len(joints), len(controls), full, pruned)
-
-
-def _joint_names(scene_rig: SceneRig) -> set[str]:
-    """Return the names of the bones that deform a mesh; all deforming bones if none has a weight."""
-    armature_object = scene_rig.armature_object
-    skin = read_skin(scene_rig.mesh_object, armature_object, armature_modifier(scene_rig.mesh_object))
-    names = {*skin.bones, *read_dependencies(scene_rig).bones} - {STATIC_JOINT}
-    return names or {bone.name for bone in armature_object.data.bones if bone.use_deform}
+    return FastRigSaving(bone_count, kept_count, len(joints), len(controls), full, fast)

@@ -15,9 +15,9 @@ from ..runtime import model_files, packed_model, playback
 from ..runtime.binding import bind, unbind
 from ..runtime.opened_model import read_matching_rig
 from ..scene.draw_cache import computed_once
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import absolute_path, stored_path_for
-from ..timing import frame_times
+from ..timing import measurements
 from .entries import active_entry, bound_entry, bound_model_name, is_bound
 
 
@@ -46,7 +46,8 @@ def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGr
             )
             if was_bound and is_changed:
                 last_evaluation.remove(mesh_object)
-                frame_times.remove(mesh_object)
+                if (armature_object := armature_of(mesh_object)) is not None:
+                    measurements.remove(armature_object)
                 playback.reload_model(mesh_object)
                 mesh_object.update_tag()
             return entry

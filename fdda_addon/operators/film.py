@@ -71,11 +71,11 @@ class FDDA_OT_render_comparison(FileJobOperator, bpy.types.Operator):
         name = self._action_name(scene_rig)
         network = network_of(scene_rig.mesh_object)
         with model_disabled(scene_rig.mesh_object):
-            times = (yield from benchmark(scene_rig, None, FILM_TIMED_FRAMES)).frame_times("")
+            times = yield from benchmark(scene_rig.armature_object, FILM_TIMED_FRAMES)
             settings = FilmSettings(
                 view=View.from_direction(self.direction) if any(self.direction) else View(),
                 fps=scene.render.fps / scene.render.fps_base * time_ratio(),
-                times_ms={RIG: times.rig, FDDA: times.fdda} | ({LINEAR: times.linear} if times.linear else {}),
+                times_ms={variant: times.median(variant) for variant in (RIG, LINEAR, FDDA) if variant in times.times},
             )
             evaluation = yield from evaluate_action(scene_rig, network, name)
             first_frame = action_frames(find_action(name)).start

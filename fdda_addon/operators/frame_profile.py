@@ -18,29 +18,23 @@ from ..timing.profiling import profile_frame
 from .job import JobOperator
 
 
-def last_profile(mesh_object: bpy.types.Object) -> FrameProfile | None:
-    """Return the last profile of a mesh; None if there is none with its current number of vertices."""
-    profile = measurements.last(FDDA_OT_profile_frame.verb, mesh_object)
-    return profile if profile is not None and profile.vertices == len(mesh_object.data.vertices) else None
-
-
 class FDDA_OT_profile_frame(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.profile_frame"
     bl_label = "Profile Frame"
     bl_description = (
         "Measure how much time bones, each modifier, the rest of the evaluation and drawing take in a frame; which "
-        "bones are the slowest; and what a model and a fast rig would save"
+        "bones are the slowest; and what models of all meshes and a fast rig would save"
     )
     bl_options = {"REGISTER"}
-    verb, title = "profile_frame", "Profiling"
+    verb, title = measurements.PROFILE, "Profiling"
 
     def steps(self, context: bpy.types.Context) -> Job[FrameProfile]:
         scene_rig = self.rig(context)
-        profile = yield from profile_frame(scene_rig)
+        profile = yield from profile_frame(scene_rig.armature_object)
         return (yield from _with_fast_rig(profile, scene_rig.mesh_object.name))
 
     def finish(self, context: bpy.types.Context, result: FrameProfile) -> str:
-        measurements.store(self.verb, self.rig(context).mesh_object, result)
+        measurements.store(self.verb, self.rig(context).armature_object, result)
         largest_part = max(result.parts, key=lambda part: part.duration.median)
         share = largest_part.duration.median / max(result.total, 1e-9)
         return f"A frame takes {result.total:.2f} ms; {largest_part.title} takes {share:.0%}."

@@ -18,7 +18,7 @@ MENU_OPERATORS = (
     ("fdda.add_control", "fdda.add_control_bones", "fdda.remove_control"),
     ("fdda.record", "fdda.delete_recording"),
     ("fdda.check_trainer", "fdda.train", "fdda.refine", "fdda.create_trainer_environment"),
-    ("fdda.bind", "fdda.set_mode", "fdda.measure_model", "fdda.bake", "fdda.fast_rig", "fdda.relink", "fdda.unbind"),
+    ("fdda.bind", "fdda.set_mode", "fdda.bake", "fdda.fast_rig", "fdda.relink", "fdda.unbind"),
     ("fdda.evaluate", "fdda.render_comparison", "fdda.show_rig", "fdda.color_mesh", "fdda.fit_color_range"),
     ("fdda.jump_to_worst", "fdda.add_worst_markers", "fdda.remove_markers", "fdda.open_report"),
     ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model", "fdda.check_model"),

@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section "Model": bind and unbind a model, switch the deformation, relink, measure the speed."""
+"""Operators of the section "Model": bind and unbind a model, switch the deformation, relink."""
 
 from pathlib import Path
 
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from ..core.progress import Job
 from ..evaluation import side_by_side
 from ..models import model_list
 from ..models.entries import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
-from ..runtime.binding import model_disabled, unbind
+from ..runtime.binding import unbind
 from ..scene.scene_rig import SceneRig, check_full_rig, remaining_rig_note
-from ..timing import frame_times
-from ..timing.benchmark import Benchmark, benchmark
-from .job import JobOperator
 from .rig_operator import NEEDS_MODEL, ModelFileOperator, RigOperator
 
 LARGE_MODEL_BYTES = 32_000_000
@@ -194,31 +190,4 @@ class FDDA_OT_relink(ModelFileOperator, bpy.types.Operator):
         return f"'{scene_rig.mesh_object.name}' plays {self.chosen_path()}.{message}"
 
 
-class FDDA_OT_measure_model(JobOperator, bpy.types.Operator):
-    bl_idname = "fdda.measure_model"
-    bl_label = "Measure Speed of the Model"
-    bl_description = "Measure the time per frame of the rig, of linear skinning and of the model"
-    bl_options = {"REGISTER"}
-    needs = NEEDS_MODEL
-    verb, title = "measure_model", "Measurement"
-
-    frames: bpy.props.IntProperty(
-        name="Frames", description="Number of frames to measure", default=50, min=5, max=10000
-    )
-
-    def steps(self, context: bpy.types.Context) -> Job[Benchmark]:
-        scene_rig = self.bound_rig(context)
-        with model_disabled(scene_rig.mesh_object):
-            return (yield from benchmark(scene_rig, None, self.frames))
-
-    def finish(self, context: bpy.types.Context, result: Benchmark) -> str:
-        mesh_object = self.bound_rig(context).mesh_object
-        times = result.frame_times(mesh_object.fdda.model)
-        frame_times.store(mesh_object, times)
-        return (
-            f"'{mesh_object.name}': {times.rig:.2f} ms per frame with the rig, {times.fdda:.2f} ms with the model "
-            f"({times.floor:.2f} ms of it in Blender). {times.sentence}"
-        )
-
-
-CLASSES = (FDDA_OT_bind, FDDA_OT_unbind, FDDA_OT_set_mode, FDDA_OT_relink, FDDA_OT_measure_model)
+CLASSES = (FDDA_OT_bind, FDDA_OT_unbind, FDDA_OT_set_mode, FDDA_OT_relink)

@@ -8,14 +8,8 @@ from ..arm.rig import build_arm
 from ..core.progress import Job
 from ..scene.viewport import frame_objects
 from ..timing import measurements
-from ..timing.rig_cost import RigCost, measure
+from ..timing.benchmark import FDDA, RIG, Benchmark, benchmark
 from .job import JobOperator
-
-
-def measured_cost(mesh_object: bpy.types.Object) -> RigCost | None:
-    """Return the measured cost of a rig; None if it was not measured with its current number of vertices."""
-    cost = measurements.last(FDDA_OT_measure.verb, mesh_object)
-    return cost if cost is not None and cost.vertices == len(mesh_object.data.vertices) else None
 
 
 class FDDA_OT_add_sample_arm(bpy.types.Operator):
@@ -82,16 +76,26 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
 class FDDA_OT_measure(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.measure"
     bl_label = "Measure Speed"
-    bl_description = "Measure the time per frame of this rig, and estimate it for a model"
+    bl_description = (
+        "Measure the time per frame of all meshes of this armature, with the rig and with the bound models. "
+        "Without a bound model, untrained models of the same size give an estimate"
+    )
     bl_options = {"REGISTER"}
-    verb, title = "measure", "Measuring"
+    verb, title = measurements.MEASURE, "Measuring"
 
-    def steps(self, context: bpy.types.Context) -> Job[RigCost]:
-        return (yield from measure(self.rig(context)))
+    frames: bpy.props.IntProperty(
+        name="Frames", description="Number of frames to measure", default=30, min=5, max=10000
+    )
 
-    def finish(self, context: bpy.types.Context, result: RigCost) -> str:
-        measurements.store(self.verb, self.rig(context).mesh_object, result)
-        return f"{result.rig:.2f} ms per frame with the rig. {result.sentence}"
+    def steps(self, context: bpy.types.Context) -> Job[Benchmark]:
+        return (yield from benchmark(self.rig(context).armature_object, self.frames))
+
+    def finish(self, context: bpy.types.Context, result: Benchmark) -> str:
+        measurements.store(self.verb, self.rig(context).armature_object, result)
+        return (
+            f"'{result.armature}': {result.median(RIG):.2f} ms per frame with the rig, {result.median(FDDA):.2f} ms "
+            f"with {result.describe_models()}. {result.sentence}"
+        )
 
 
 def _draw_add_menu(self: bpy.types.Menu, _context: bpy.types.Context) -> None:

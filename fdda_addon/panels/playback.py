@@ -5,7 +5,6 @@ from pathlib import Path
 
 import bpy
 
-from ..jobs import job
 from ..models.entries import active_entry, bound_model_name
 from ..rig.modifier_stack import is_playback_modifier
 from ..runtime.confidence import partition_confidence
@@ -13,8 +12,10 @@ from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of, remaining_rig_note
 from ..scene.stored_paths import resolve_path
-from ..timing import frame_times
+from ..timing import measurements
+from ..timing.benchmark import FDDA, RIG
 from .bone_names import short_bone_name
+from .frame_profile import draw_model_times
 from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
 from .timed_value import timed_values
 from .trained_file import find_trained_file
@@ -51,7 +52,7 @@ CONFIDENCE_SECONDS = 0.2
 class FDDA_PT_playback(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_playback"
     bl_label = "Model"
-    verbs = ("measure_model", "bake", "fast_rig")
+    verbs = ("bake", "fast_rig")
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
@@ -72,7 +73,6 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         self._draw_bound(context, mesh_object)
         if not mesh_object.fdda.status:
-            self._draw_times(context, mesh_object)
             self._draw_confidence(context, mesh_object)
             self._draw_bake(context)
             if mesh_object.fdda.is_fast_rig:
@@ -138,16 +138,16 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             for mode, text in modes:
                 row.prop_enum(binding, "mode", mode, text=text)
         if not mesh_object.fdda.is_fast_rig:
-            times, state = frame_times.get(mesh_object), job.state_of("measure_model")
+            armature_object = armature_of(mesh_object)
+            times = measurements.last(measurements.MEASURE, armature_object) if armature_object is not None else None
             row = layout.row(align=True)
             if times is not None:
-                row.label(text=f"{times.rig:.2f} → {times.fdda:.2f} ms per frame", icon="TIME")
-                row.operator("fdda.measure_model", text="", icon="FILE_REFRESH")
+                row.label(text=f"{times.median(RIG):.2f} → {times.median(FDDA):.2f} ms per frame", icon="TIME")
+                row.operator("fdda.measure", text="", icon="FILE_REFRESH")
                 draw_wrapped(layout, context, times.sentence, "CHECKMARK" if times.is_worthwhile else "INFO")
+                draw_model_times(layout, times)
             else:
-                row.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
-            if state is not None and (state.is_running or state.outcome_level != "INFO"):
-                draw_job(layout, context, "measure_model")
+                row.operator("fdda.measure", text="Measure Speed", icon="TIME")
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         strength = column.row()
@@ -156,28 +156,6 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         column.prop(binding, "use_in_render")
         if text := mask_problem(mesh_object):
             draw_wrapped(layout, context, text, "ERROR")
-
-    def _draw_times(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-        times = frame_times.get(mesh_object)
-        if times is None:
-            return
-        header, body = self.layout.panel("fdda_frame_times", default_closed=True)
-        header.label(text="Speed")
-        if body is None:
-            return
-        grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-        for label, value in (
-            ("Rig", f"{times.rig:.2f} ms"),
-            *((("Armature Only", f"{times.linear:.2f} ms"),) if times.linear else ()),
-            ("Model", f"{times.fdda:.2f} ms"),
-            ("   Blender", f"{times.floor:.2f} ms"),
-            ("   Network", f"{times.inference:.2f} ms"),
-            *((("   Memory", f"{times.constant_bytes / 1e6:.1f} MB"),) if times.constant_bytes else ()),
-        ):
-            grid.label(text=label)
-            number = grid.row()
-            number.alignment = "RIGHT"
-            number.label(text=value)
 
     def _draw_confidence(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         # While the sub-panel is closed the model is not evaluated.

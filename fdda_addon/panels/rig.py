@@ -5,13 +5,11 @@ import bpy
 
 from ..core.sentences.counts import format_count
 from ..jobs import job
-from ..operators.rig import measured_cost
 from ..properties.character import file_problem
 from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
-from ..timing import frame_times
 from . import checks, curves, limits
-from .frame_profile import draw_profile
+from .frame_profile import draw_profile, draw_times
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
 from .trained_file import find_trained_file
 from .training import read_assessment
@@ -75,24 +73,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
                 count = len(mesh_object.data.shape_keys.key_blocks) - 1
                 column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
         if not is_fast_rig:
-            cost = measured_cost(rig.mesh_object)
-            state = job.state_of("measure")
-            if state is not None and (state.is_running or state.outcome_level != "INFO"):
-                draw_job(layout, context, "measure")
-            if cost is not None:
-                column = layout.column(align=True)
-                measured = frame_times.get(rig.mesh_object)
-                for label, time_text in (
-                    ("Rig", f"{cost.rig:.2f} ms per frame"),
-                    ("Armature Only", f"{cost.linear:.2f} ms"),
-                    ("Model", f"{measured.fdda:.2f} ms") if measured else ("Model (estimate)", f"{cost.model:.1f} ms"),
-                ):
-                    row = column.split(factor=0.45)
-                    row.label(text=label)
-                    row.label(text=time_text)
-                draw_wrapped(layout, context, measured.sentence if measured else cost.sentence, "INFO")
-            if state is None or not state.is_running:
-                layout.operator("fdda.measure", text="Measure Speed", icon="TIME")
+            draw_times(layout, context, rig)
             draw_profile(layout, context, rig)
 
 

@@ -6,9 +6,8 @@ from collections.abc import Callable
 import bpy
 
 from ..core.errors import RigError
-from .comparison import is_comparison
 from .draw_cache import draw_cached
-from .scene_rig import SceneRig, armature_of, find_rig, parenting_message
+from .scene_rig import SceneRig, armature_of, find_rig, parenting_message, rigs_of_armature
 
 
 def active_rig(context: bpy.types.Context, mesh_object_name: str = "") -> SceneRig:
@@ -89,17 +88,12 @@ def rigs_of_active_armature(context: bpy.types.Context) -> list[SceneRig]:
     active_object = context.view_layer.objects.active
     if active_object is None or active_object.type != "ARMATURE":
         return []
-    meshes = _meshes_of(context, active_object)
-    return [SceneRig(mesh_object, active_object) for mesh_object in meshes] if len(meshes) > 1 else []
-
-
-def _meshes_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> list[bpy.types.Object]:
-    meshes = [o for o in context.scene.objects if o.type == "MESH" and armature_of(o) == armature_object]
-    return [o for o in meshes if not is_comparison(o)]
+    rigs = rigs_of_armature(active_object)
+    return rigs if len(rigs) > 1 else []
 
 
 def _choose_mesh(context: bpy.types.Context, armature_object: bpy.types.Object) -> bpy.types.Object:
-    meshes = _meshes_of(context, armature_object)
+    meshes = [rig.mesh_object for rig in rigs_of_armature(armature_object)]
     if not meshes:
         for child in armature_object.children:
             if child.type == "MESH" and (message := parenting_message(child)):

@@ -69,6 +69,12 @@ def find_rigs() -> list[SceneRig]:
     return [SceneRig(o, armature_of(o)) for o in rigged_objects] or [find_rig()]
 
 
+def rigs_of_armature(armature_object: bpy.types.Object) -> list[SceneRig]:
+    """Return the rigs of all meshes of the current scene that follow an armature, in the order of the scene."""
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and armature_of(o) == armature_object]
+    return [SceneRig(o, armature_object) for o in meshes if not is_comparison(o)]
+
+
 def describe_left_out_meshes(rigs: list[SceneRig]) -> str:
     """Describe the other meshes that follow the armatures of rigs from `find_rigs`; empty if there are none."""
     armature_objects = {rig.armature_object for rig in rigs}

@@ -16,11 +16,16 @@ from ..rig.reading import read_rig
 from ..scene.action_slots import active_action
 from ..scene.armature import Poser, clear_pose
 from ..scene.comparison import hidden_comparison_objects
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, armature_modifier
 from ..scene.time_stretching import unstretched_time
 
 RANDOM_POSE_COUNT, KEY_STEP_FRAMES = 20, 5
 """Number of random poses that animate a rig without an action, and the number of frames from one to the next."""
+
+
+def main_rig(rigs: list[SceneRig]) -> SceneRig:
+    """Return the rig whose bones are animated: that of the largest mesh with an Armature modifier, if there is one."""
+    return max(rigs, key=lambda r: (armature_modifier(r.mesh_object) is not None, len(r.mesh_object.data.vertices)))
 
 
 @contextmanager

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Times frames of a rig, of linear skinning and of a model.
+"""Times frames of a character, which is all meshes of one armature, with its rig and with models.
 
 The variants are measured alternately, so that other work on the machine slows all of them and their ratios stay right.
 """
 
 import os
 import platform
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,24 +15,56 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..core.errors import RigError
+from ..core.errors import FDDAError, RigError
 from ..core.progress import Job, Progress
+from ..core.sentences.counts import format_count
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..runtime import model_files, playback
 from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
-from ..runtime.opened_model import open_model
-from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
+from ..runtime.opened_model import read_matching_rig
+from ..scene.scene_rig import armature_modifier, check_full_rig, rigs_of_armature
 from ..scene.temporary_state import deformation_disabled, temporary_attributes
-from .animation import temporary_animation
-from .frame_times import FrameTimes, compare_times
+from .animation import main_rig, temporary_animation
+from .durations import WARM_UP_FRAMES, temporary_armature_scene, temporary_scene, time_calls, time_frames
+from .untrained_models import untrained_models
 
 ROUNDS, MAX_ROUNDS = 5, 15
 """Smallest and largest number of rounds. Each round measures all variants, one after the other."""
 MAX_RATIO_SPREAD = 0.1
-"""Spread of the ratio of two times (`ratio_spread`) at which no further round is measured."""
-WARM_UP_FRAMES = 3
-"""Number of frames before each measurement that are not timed."""
+"""Spread of the ratio of two times (`_ratio_spread`) at which no further round is measured."""
+MIN_WORTHWHILE_RATIO = 1.5
+"""Smallest ratio of the frame times of rig and models at which models are worth it."""
+MAX_RATIO_RANGE = 1.6
+"""Largest ratio of the quartiles of the ratios of all rounds that allows a verdict."""
+RIG, LINEAR, FDDA, FLOOR, WITHOUT_MESHES, BONES = "rig", "linear", "fdda", "floor", "without_meshes", "bones"
+INFERENCE = "inference"
+LABELS = {
+    RIG: "rig",
+    LINEAR: "Armature modifiers alone",
+    FDDA: "FDDA",
+    FLOOR: "FDDA without running the models",
+    WITHOUT_MESHES: "without the meshes",
+    BONES: "bones alone",
+    INFERENCE: "the models alone, one pose",
+}
+
+
+@dataclass(frozen=True)
+class MeshTimes:
+    """A mesh of a character.
+
+    Attributes:
+        name: name of the mesh object.
+        vertices: its number of vertices.
+        has_model: whether a model of it was measured; its name is then the variant with this model alone.
+        reason: why no model can replace its rig; else empty.
+    """
+
+    name: str
+    vertices: int
+    has_model: bool = False
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,205 +72,300 @@ class Benchmark:
     """Times of `scene.frame_set`, including everything that it evaluates, in milliseconds.
 
     Attributes:
-        vertices: number of vertices of the mesh.
+        armature: name of the armature object.
+        meshes: the meshes of the character, those with the most vertices first.
+        model_count: number of meshes with a model.
         frames: number of timed frames of each variant.
-        rig: times with all modifiers of the rig.
-        linear: times with the Armature modifier alone; empty for a mesh without one.
-        fdda: times with the model.
-        floor: times as for `fdda`, without running the model.
-        inference: times of one run of the model for one pose, outside of Blender's evaluation.
-        constant_bytes: size of the constants of the model's graph, which each frame reads; 0 if unknown.
-        ratios: ratio of the median times of rig and model in each round.
+        times: the times of each variant. `LINEAR` lacks for a character without Armature modifiers; meshes without one
+            do not deform in it. `FDDA` has all models, `FLOOR` does not run them. `WITHOUT_MESHES` evaluates everything
+            that models keep except the meshes of the character, `BONES` the armature alone. `INFERENCE` is one run of
+            all models for one pose, outside of Blender's evaluation.
+        rounds: the median time of each variant but `INFERENCE` in each round.
+        constant_bytes: size of the constants of the models' graphs, which each frame reads; 0 if unknown.
+        is_estimate: whether the models are untrained.
     """
 
-    vertices: int
+    armature: str
+    meshes: tuple[MeshTimes, ...]
+    model_count: int
     frames: int
-    rig: list[float]
-    linear: list[float]
-    fdda: list[float]
-    floor: list[float]
-    inference: list[float]
+    times: Mapping[str, list[float]]
+    rounds: Mapping[str, list[float]]
     constant_bytes: int
-    ratios: list[float]
+    is_estimate: bool
 
-    def frame_times(self, model: str) -> FrameTimes:
-        """Return the median times.
+    def median(self, variant: str) -> float:
+        """Return the median time of a variant, ms; 0 if it was not measured.
 
-        Args:
-            model: path of the model, as its binding stores it.
+        It is the median ratio to the rig in the same round, times the median of the rig, so that all times agree.
         """
-        return FrameTimes(
-            **{"linear": 0.0}
-            | {variant: float(np.median(times)) for variant, times in self._times_by_variant().items()},
-            constant_bytes=self.constant_bytes,
-            model=model,
-            ratio_low=self.ratio_range[0],
-            ratio_high=self.ratio_range[1],
-        )
+        if variant not in self.rounds:
+            return float(np.median(self.times.get(variant, [0.0])))
+        return float(np.median(np.divide(self.rounds[variant], self.rounds[RIG])) * np.median(self.rounds[RIG]))
 
     @property
     def ratio(self) -> float:
-        """Return how many times faster a frame is with the model than with the rig."""
-        return float(np.median(self.rig) / np.median(self.fdda))
+        """Return how many times faster a frame is with the models than with the rig."""
+        return self.median(RIG) / self.median(FDDA)
 
     @property
-    def ratio_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest ratio of a round."""
-        return min(self.ratios), max(self.ratios)
+    def quartiles(self) -> tuple[float, float]:
+        """Return the quartiles of the ratios of all rounds."""
+        low, high = np.percentile(np.divide(self.rounds[RIG], self.rounds[FDDA]), (25, 75))
+        return float(low), float(high)
+
+    @property
+    def is_worthwhile(self) -> bool:
+        """Return whether the models are clearly faster than the rig."""
+        return min(self.quartiles[0], self.ratio) >= MIN_WORTHWHILE_RATIO
+
+    @property
+    def sentence(self) -> str:
+        """Return a verdict; if there is nothing to gain, with the reason."""
+        low, high = self.quartiles
+        note = " (estimate)" if self.is_estimate else ""
+        if self.is_worthwhile:
+            return f"{'Worth it: ' if self.is_estimate else ''}{self.ratio:.1f}x faster than the rig{note}."
+        if high > MAX_RATIO_RANGE * low and high >= 1:
+            return (
+                f"The machine is busy: {low:.1f} to {high:.1f}x as fast as the rig in repeated measurements{note}. "
+                "Measure again when it is idle."
+            )
+        if self.ratio > 1:
+            return f"Little difference: {self.ratio:.1f}x faster than the rig{note}. {self._reason}"
+        return f"Not worth it here: the rig is faster than {self.describe_models()}{note}. {self._reason}"
+
+    def describe_models(self) -> str:
+        """Return the words for the measured models."""
+        count = self.model_count
+        return "its model" if count == 1 else f"the models of {count} meshes"
+
+    @property
+    def _reason(self) -> str:
+        """Return a sentence that says why there is little to gain."""
+        rig, linear, others, bones = map(self.median, (RIG, LINEAR, WITHOUT_MESHES, BONES))
+        if others >= rig / 2:
+            subject, ms = ("The bones", bones) if bones >= others / 2 else ("Other objects", others - bones)
+            return f"{subject} take {ms:.2f} of {rig:.2f} ms, which models do not change."
+        if linear and rig - linear < rig / 4:
+            return f"The rig takes only {max(rig - linear, 0):.2f} ms more than linear skinning alone."
+        subject = "The meshes take" if len(self.meshes) > 1 else "The mesh takes"
+        return (
+            f"{subject} only {max(rig - others, 0):.2f} ms with the rig, and {self.median(FDDA) - others:.2f} ms "
+            f"with {self.describe_models()}."
+        )
+
+    @property
+    def shares(self) -> list[tuple[str, float, float]]:
+        """Return the parts of a frame with their times with the rig and with the models, ms."""
+        rig, fdda, others, bones = map(self.median, (RIG, FDDA, WITHOUT_MESHES, BONES))
+        return [
+            (
+                "meshes" if len(self.meshes) > 1 else "mesh",
+                max(rig - others, 0.0),
+                max(fdda - others, 0.0),
+            ),
+            ("bones", bones, bones),
+            ("other objects", max(others - bones, 0.0), max(others - bones, 0.0)),
+        ]
 
     def to_json(self) -> dict:
         """Return the times as JSON, described in docs/formats.md."""
         return {
             "unit": "ms",
-            "vertices": self.vertices,
+            "armature": self.armature,
+            "vertices": sum(mesh.vertices for mesh in self.meshes),
+            "meshes": [
+                {"name": m.name, "vertices": m.vertices, "has_model": m.has_model, "reason": m.reason}
+                for m in self.meshes
+            ],
             "frames": self.frames,
             "blender": bpy.app.version_string,
             "processor": platform.processor() or platform.machine(),
             "cores": os.cpu_count(),
             **{
-                variant: {"median": _round(np.median(times)), "p90": _round(np.percentile(times, 90))}
-                for variant, times in self._times_by_variant().items()
+                variant: {"median": _round(self.median(variant)), "p90": _round(np.percentile(times, 90))}
+                for variant, times in self.times.items()
+                if variant in LABELS
             },
+            "model_alone": {m.name: _round(self.median(m.name)) for m in self.meshes if m.name in self.times},
             "ratio": _round(self.ratio),
+            "ratio_quartiles": [_round(ratio) for ratio in self.quartiles],
             "is_faster": self.ratio > 1,
+            "is_estimate": self.is_estimate,
             "constant_bytes": self.constant_bytes,
         }
 
-    def _times_by_variant(self) -> dict[str, list[float]]:
-        variants = ("rig", "linear", "fdda", "floor", "inference")
-        return {variant: times for variant in variants if (times := getattr(self, variant))}
-
     def table(self) -> str:
-        """Format the times as a table, followed by a sentence that compares rig and model."""
-        labels = {
-            "rig": "rig",
-            "linear": "Armature modifier alone",
-            "fdda": "FDDA",
-            "floor": "FDDA without running the model",
-            "inference": "the model alone, one pose",
-        }
-        lines = [f"{f'{self.vertices} vertices, ms per frame':<33}{'median':>10}{'p90':>10}"]
-        for variant, times in self._times_by_variant().items():
-            lines.append(f"  {labels[variant]:<31}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
+        """Format the times as tables, followed by a verdict."""
+        names = f"{format_count(len(self.meshes), 'mesh', 'meshes')} of {self.armature}, ms per frame"
+        lines = [f"{names:<37}{'median':>10}{'p90':>10}"]
+        for variant, times in ((variant, times) for variant, times in self.times.items() if variant in LABELS):
+            lines.append(f"  {LABELS[variant]:<35}{self.median(variant):>10.3f}{np.percentile(times, 90):>10.3f}")
         if self.constant_bytes:
-            lines.append(f"  {'model data read per frame, MB':<31}{self.constant_bytes / 1e6:>10.2f}")
-        lines.append(f"  {compare_times(*map(float, map(np.median, (self.rig, self.fdda))), self.ratio_range)}")
-        return "\n".join(lines)
+            lines.append(f"  {'model data read per frame, MB':<35}{self.constant_bytes / 1e6:>10.2f}")
+        lines.append(f"{'part of a frame, ms':<37}{'rig':>17}{'FDDA':>17}")
+        rig, fdda = self.median(RIG), self.median(FDDA)
+        for label, before, after in self.shares:
+            lines.append(f"  {label:<35}{before:>10.3f} {before / rig:>5.0%}{after:>11.3f} {after / fdda:>5.0%}")
+        lines += [f"  {line}" for line in self.mesh_lines()]
+        return "\n".join([*lines, f"  {self.sentence}"])
+
+    def mesh_lines(self) -> list[str]:
+        """Return a line for each mesh of several."""
+        lines = []
+        for mesh in self.meshes if len(self.meshes) > 1 else ():
+            text = mesh.reason or ("" if mesh.has_model else "no model")
+            if mesh.name in self.times:
+                ms = self.median(mesh.name)
+                text = f"its model alone {ms:.2f} ms, {self.median(RIG) / ms:.1f}x as fast"
+            lines.append(f"{mesh.name} ({mesh.vertices:,} vertices): {text or 'the only model'}")
+        return lines
 
 
 def _round(value: float) -> float:
     return round(float(value), 4)
 
 
-def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Job[Benchmark]:
-    """Time a rig and a model while the generator is iterated.
+def benchmark(
+    armature_object: bpy.types.Object, frames: int, models: Mapping[bpy.types.Object, Path] | None = None
+) -> Job[Benchmark]:
+    """Time the rig of a character and its models while the generator is iterated.
 
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
 
     Args:
-        model: path of the model; None for the bound model.
         frames: number of frames to time for each variant.
+        models: paths of models, by mesh object; further meshes play their bound models. If there is no model at all,
+            untrained models are measured.
 
     Raises:
-        RigError: as `check_full_rig`, or the rig cannot be evaluated.
-        ModelError: the model cannot be read, or was trained for another rig.
+        FDDAError: as `check_full_rig`; or no mesh can be evaluated, or no model was trained for its rig. Meshes that
+            fail beside others have a `reason`.
     """
-    check_full_rig(scene_rig.mesh_object)
-    check_evaluable(scene_rig)
-    mesh_object = scene_rig.mesh_object
-    opened_model = open_model(scene_rig, model or model_files.network_of(mesh_object))
-    channels = model_channels(scene_rig, opened_model.rig, opened_model.network.info)
-    binding = temporary_binding(scene_rig, model) if model else model_disabled(mesh_object)
-    with temporary_animation(scene_rig, channels) as animation_frames, binding:
-        show_variant = {
-            "rig": model_disabled,
-            "linear": skinning_only,
-            "fdda": partial(temporary_mode, mode="FDDA"),
-            "floor": _playback_without_model_runs,
+    rigs = rigs_of_armature(armature_object)
+    models = dict(models or {})
+    for scene_rig in rigs:
+        check_full_rig(scene_rig.mesh_object)
+    with ExitStack() as stack:
+        for scene_rig in rigs:
+            stack.enter_context(model_disabled(scene_rig.mesh_object))
+        candidates = [rig for rig in rigs if rig.mesh_object in models or rig.mesh_object.fdda.is_bound]
+        is_estimate, reasons = not candidates, {}
+        if is_estimate:
+            models, reasons = stack.enter_context(untrained_models(rigs))
+            candidates = [rig for rig in rigs if rig.mesh_object in models]
+        played, networks = [], []
+        error: FDDAError | None = None
+        for scene_rig in candidates:
+            mesh_object = scene_rig.mesh_object
+            try:
+                check_evaluable(scene_rig)
+                if mesh_object in models:
+                    stack.enter_context(temporary_binding(scene_rig, models[mesh_object]))
+                networks.append(model_files.network_of(mesh_object))
+            except FDDAError as mesh_error:
+                error, reasons[mesh_object] = error or mesh_error, str(mesh_error)
+            else:
+                played.append(scene_rig)
+        if not played:
+            raise error or RigError(next(iter(reasons.values())))
+        animated, channels = main_rig(played), ()
+        if not is_estimate:
+            network = networks[played.index(animated)]
+            channels = model_channels(animated, read_matching_rig(animated, network.path, network.info), network.info)
+        animation_frames = stack.enter_context(temporary_animation(animated, channels))
+        mesh_objects = [rig.mesh_object for rig in rigs]
+        others = [o for o in bpy.context.scene.objects if o not in mesh_objects and o.visible_get()]
+        scenes = {
+            WITHOUT_MESHES: stack.enter_context(temporary_scene(others)),
+            BONES: stack.enter_context(temporary_armature_scene(armature_object)),
         }
-        if armature_modifier(mesh_object) is None:
-            del show_variant["linear"]
-        times: dict[str, list[float]] = {variant: [] for variant in show_variant}
+        meshes = [rig.mesh_object for rig in played]
+        show: dict[str, Callable[[], AbstractContextManager]] = {
+            RIG: partial(_models_shown, ()),
+            LINEAR: partial(_skinning_shown, [rig.mesh_object for rig in rigs]),
+            FDDA: partial(_models_shown, meshes),
+            FLOOR: partial(_models_shown, meshes, runs=False),
+            WITHOUT_MESHES: partial(_models_shown, ()),
+            BONES: partial(_models_shown, ()),
+        }
+        if all(armature_modifier(mesh_object) is None for mesh_object in meshes):
+            del show[LINEAR]
+        if len(rigs) > 1 and len(meshes) > 1:
+            show |= {mesh_object.name: partial(_models_shown, [mesh_object]) for mesh_object in meshes}
+        times: dict[str, list[float]] = {variant: [] for variant in show}
+        rounds: dict[str, list[float]] = {variant: [] for variant in show}
         frames_per_round = max(1, -(-frames // ROUNDS))
-        ratios: list[float] = []
-        while len(ratios) < ROUNDS or (len(ratios) < MAX_ROUNDS and ratio_spread(ratios) > MAX_RATIO_SPREAD):
-            medians: dict[str, float] = {}
-            round_count = max(ROUNDS, len(ratios) + 1)
-            for number, (variant, show) in enumerate(show_variant.items(), 1):
-                with show(mesh_object):
-                    round_times = time_frames(animation_frames, len(ratios) * frames_per_round, frames_per_round)
+        index = 0
+        while index < ROUNDS or (index < MAX_ROUNDS and _ratio_spread(rounds) > MAX_RATIO_SPREAD):
+            for number, (variant, shown) in enumerate(show.items(), 1):
+                with shown():
+                    scene = scenes.get(variant, bpy.context.scene)
+                    round_times = time_frames(scene, animation_frames, index * frames_per_round, frames_per_round)
                 times[variant] += round_times
-                medians[variant] = float(np.median(round_times))
-                done = len(ratios) * len(show_variant) + number
-                yield Progress("benchmark", done, round_count * len(show_variant))
-            ratios.append(medians["rig"] / medians["fdda"])
-        network = model_files.network_of(mesh_object)
-        pose_matrices = network.info.rest_matrices[None]
-        controls = np.zeros((1, len(network.info.controls)), np.float32)
-        calls = [lambda: network.positions(pose_matrices, controls)] * (frames + WARM_UP_FRAMES)
-        inference = time_calls(calls)[WARM_UP_FRAMES:]
+                rounds[variant].append(float(np.median(round_times)))
+                done, total = index * len(show) + number, max(ROUNDS, index + 1) * len(show)
+                yield Progress("benchmark", done, total)
+            index += 1
+        times[INFERENCE] = list(np.sum([_inference_times(network, frames) for network in networks], axis=0))
+    described = [
+        MeshTimes(
+            o.name,
+            len(o.data.vertices),
+            o in meshes,
+            reasons.get(o, ""),
+        )
+        for o in mesh_objects
+    ]
     return Benchmark(
-        len(mesh_object.data.vertices),
-        frames_per_round * len(ratios),
-        **{"linear": [], **times},
-        inference=inference,
-        constant_bytes=network.info.constant_bytes,
-        ratios=ratios,
+        armature_object.name,
+        tuple(sorted(described, key=lambda mesh: -mesh.vertices)),
+        len(networks),
+        frames_per_round * index,
+        times,
+        rounds,
+        sum(network.info.constant_bytes for network in networks),
+        is_estimate,
     )
 
 
-def ratio_spread(ratios: list[float]) -> float:
-    """Return the distance of the quartiles of measured ratios, relative to their median."""
-    low, middle, high = np.percentile(ratios, (25, 50, 75))
+def _inference_times(network: object, frames: int) -> list[float]:
+    pose_matrices = network.info.rest_matrices[None]
+    controls = np.zeros((1, len(network.info.controls)), np.float32)
+    return time_calls([lambda: network.positions(pose_matrices, controls)] * (frames + WARM_UP_FRAMES))
+
+
+def _ratio_spread(rounds: Mapping[str, list[float]]) -> float:
+    """Return the distance of the quartiles of the ratios of rig and models in all rounds, relative to their median."""
+    low, middle, high = np.percentile(np.divide(rounds[RIG], rounds[FDDA]), (25, 50, 75))
     return float((high - low) / middle)
 
 
-def time_frames(animation_frames: range, first_index: int, count: int) -> list[float]:
-    """Time frames of an animation after some warm-up frames.
+@contextmanager
+def _models_shown(mesh_objects: list[bpy.types.Object], runs: bool = True) -> Iterator[None]:
+    """Play the models of mesh objects in the block.
 
     Args:
-        first_index: index of the first timed frame in the animation. After its end the animation starts again.
-        count: number of frames to time.
-
-    Returns:
-        Milliseconds of each timed frame.
+        runs: whether the models run; else they show the pose that they have shown last.
     """
-    scene = bpy.context.scene
-
-    def make_call(index: int) -> Callable[[], None]:
-        return lambda: scene.frame_set(animation_frames[index % len(animation_frames)])
-
-    calls = [make_call(first_index + offset) for offset in range(-WARM_UP_FRAMES, count)]
-    return time_calls(calls)[WARM_UP_FRAMES:]
-
-
-def time_calls(calls: list[Callable[[], object]]) -> list[float]:
-    """Time each call, in milliseconds."""
-    times = []
-    for call in calls:
-        start = time.perf_counter()
-        call()
-        times.append((time.perf_counter() - start) * 1000)
-    return times
+    with ExitStack() as stack:
+        for mesh_object in mesh_objects:
+            stack.enter_context(temporary_mode(mesh_object, "FDDA"))
+        if not runs:
+            bpy.context.view_layer.update()
+            stack.enter_context(playback.without_model_runs())
+        yield
 
 
 @contextmanager
-def skinning_only(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Show Blender's own linear skinning in the block: the Armature modifier alone, with the first shape key pinned."""
-    skin_modifier = armature_modifier(mesh_object)
-    if skin_modifier is None:
-        raise RigError(f"'{mesh_object.name}' has no Armature modifier: there is no linear skinning to time.")
-    with model_disabled(mesh_object):
-        other_modifiers = [modifier for modifier in deforming_modifiers(mesh_object) if modifier != skin_modifier]
-        linear = temporary_attributes(skin_modifier, use_deform_preserve_volume=False)
-        with deformation_disabled(mesh_object, other_modifiers), linear:
-            yield
-
-
-@contextmanager
-def _playback_without_model_runs(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Play the bound model in the block without running it."""
-    with temporary_mode(mesh_object, "FDDA"):
-        bpy.context.view_layer.update()
-        with playback.without_model_runs():
-            yield
+def _skinning_shown(mesh_objects: list[bpy.types.Object]) -> Iterator[None]:
+    """Show Blender's own linear skinning in the block: Armature modifiers alone, with the first shape key pinned."""
+    with ExitStack() as stack:
+        for mesh_object in mesh_objects:
+            skin_modifier = armature_modifier(mesh_object)
+            other_modifiers = [modifier for modifier in deforming_modifiers(mesh_object) if modifier != skin_modifier]
+            if skin_modifier is not None:
+                stack.enter_context(temporary_attributes(skin_modifier, use_deform_preserve_volume=False))
+            stack.enter_context(deformation_disabled(mesh_object, other_modifiers))
+        yield

@@ -14,7 +14,7 @@ import bpy
 from ..core.progress import Job, Progress
 from ..rig.bone_paths import split_bone_path
 from .armature_copy import RemovablePart, armature_copy
-from .durations import Duration, scene_times
+from .durations import Duration, frame_ms
 
 MAX_GROUPS = 10
 MAX_MEASUREMENTS = 40
@@ -143,8 +143,8 @@ def _measure_group(
     with armature_copy(armature_object, group) as scene:
         for round_index in range(ROUNDS):
             first_index = round_index * FRAMES_PER_ROUND
-            rounds.append(scene_times(full_scene, frames, first_index, FRAMES_PER_ROUND))
-            ratios.append(1 - scene_times(scene, frames, first_index, FRAMES_PER_ROUND) / rounds[-1])
+            rounds.append(frame_ms(full_scene, frames, first_index, FRAMES_PER_ROUND))
+            ratios.append(1 - frame_ms(scene, frames, first_index, FRAMES_PER_ROUND) / rounds[-1])
     full_ms = statistics.median(rounds)
     driver_count = sum(isinstance(part, bpy.types.FCurve) for part in group)
     return BoneGroup(

@@ -2,9 +2,10 @@
 """Times the evaluation of scenes and the drawing of windows."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import bpy
 import numpy as np
@@ -12,10 +13,10 @@ import numpy as np
 from ..core.progress import Job, Progress
 from ..scene.temporary_state import temporary_attributes
 
-WARM_UP_FRAMES = 2
+WARM_UP_FRAMES = 3
 """Number of frames before each measurement that are not timed."""
-ARMATURE_SCENE_NAME = "FDDA Profile"
-"""Name of the temporary scene with one armature object."""
+TEMPORARY_SCENE_NAME = "FDDA Profile"
+"""Name of temporary scenes."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,8 @@ class Duration:
         return f"{self.median:.2f} ± {self.spread:.2f}"
 
 
-def scene_times(scene: bpy.types.Scene, animation_frames: range, first_index: int, count: int) -> float:
-    """Return the time of the evaluation of a scene's frame, ms: the lower quartile over the timed frames.
-
-    Other work on the machine only adds time, so the lower quartile depends less on it than the median.
+def time_frames(scene: bpy.types.Scene, animation_frames: range, first_index: int, count: int) -> list[float]:
+    """Time the evaluation of frames of a scene (`scene.frame_set`), after frames that warm up, in milliseconds.
 
     Args:
         scene: the scene; it need not be shown.
@@ -59,26 +58,42 @@ def scene_times(scene: bpy.types.Scene, animation_frames: range, first_index: in
         first_index: index of the first timed frame in the animation.
         count: number of frames to time.
     """
+    indices = range(first_index - WARM_UP_FRAMES, first_index + count)
+    return time_calls(partial(scene.frame_set, animation_frames[i % len(animation_frames)]) for i in indices)
+
+
+def time_calls(calls: Iterable[Callable[[], object]]) -> list[float]:
+    """Time each call, but for those that warm up, in milliseconds. Work between the calls is not timed."""
     times = []
-    for offset in range(-WARM_UP_FRAMES, count):
-        frame = animation_frames[(first_index + offset) % len(animation_frames)]
+    for call in calls:
         start = time.perf_counter()
-        scene.frame_set(frame)
-        if offset >= 0:
-            times.append((time.perf_counter() - start) * 1000)
-    return float(np.percentile(times, 25))
+        call()
+        times.append((time.perf_counter() - start) * 1000)
+    return times[WARM_UP_FRAMES:]
+
+
+def frame_ms(scene: bpy.types.Scene, animation_frames: range, first_index: int, count: int) -> float:
+    """Return the lower quartile of `time_frames`: other work on the machine only adds time."""
+    return float(np.percentile(time_frames(scene, animation_frames, first_index, count), 25))
+
+
+@contextmanager
+def temporary_scene(objects: Iterable[bpy.types.Object]) -> Iterator[bpy.types.Scene]:
+    """Create a scene with objects, and what they depend on; remove it afterwards."""
+    scene = bpy.data.scenes.new(TEMPORARY_SCENE_NAME)
+    try:
+        for scene_object in objects:
+            scene.collection.objects.link(scene_object)
+        yield scene
+    finally:
+        bpy.data.scenes.remove(scene)
 
 
 @contextmanager
 def temporary_armature_scene(armature_object: bpy.types.Object) -> Iterator[bpy.types.Scene]:
     """Create a scene with an armature object alone, and what its bones depend on; remove it afterwards."""
-    scene = bpy.data.scenes.new(ARMATURE_SCENE_NAME)
-    try:
-        scene.collection.objects.link(armature_object)
-        with temporary_attributes(armature_object, hide_viewport=False):
-            yield scene
-    finally:
-        bpy.data.scenes.remove(scene)
+    with temporary_scene([armature_object]) as scene, temporary_attributes(armature_object, hide_viewport=False):
+        yield scene
 
 
 def time_redraws(frames: range, rounds: int, frames_per_round: int) -> Job[list[float]]:
@@ -89,15 +104,15 @@ def time_redraws(frames: range, rounds: int, frames_per_round: int) -> Job[list[
     """
     medians: list[float] = []
     window = None if bpy.app.background else bpy.context.window_manager.windows[0]
+
+    def redraws(first_index: int) -> Iterator[Callable[[], object]]:
+        for index in range(first_index - WARM_UP_FRAMES, first_index + frames_per_round):
+            bpy.context.scene.frame_set(frames[index % len(frames)])
+            yield partial(bpy.ops.wm.redraw_timer, type="DRAW_WIN_SWAP", iterations=1)
+
     for round_index in range(rounds if window else 0):
-        times = []
         with bpy.context.temp_override(window=window):
-            for offset in range(-WARM_UP_FRAMES, frames_per_round):
-                bpy.context.scene.frame_set(frames[(round_index * frames_per_round + offset) % len(frames)])
-                start = time.perf_counter()
-                bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
-                if offset >= 0:
-                    times.append((time.perf_counter() - start) * 1000)
+            times = time_calls(redraws(round_index * frames_per_round))
         medians.append(float(np.median(times)))
         yield Progress("drawing", round_index + 1, rounds)
     return medians

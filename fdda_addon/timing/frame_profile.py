@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import bpy
 
+from .benchmark import RIG, Benchmark
 from .bone_groups import BoneGroup
 from .durations import Duration
 from .fast_rig_saving import FastRigSaving
@@ -52,24 +53,21 @@ class FrameProfile:
     """The parts of a frame, in milliseconds.
 
     Attributes:
-        vertices: number of vertices of the mesh of the rig.
         frame: time of the evaluation of a frame (`scene.frame_set`).
         parts: bones, modifiers and shape keys, and the rest of the evaluation, largest first; drawing last, if there is
             a window.
         groups: bones whose constraints and drivers take the most time, largest first.
-        model_limit: the time that a model of the mesh could save at most, which is the time of the modifiers and shape
-            keys that it replaces; None if it cannot replace them.
-        model_saving: estimate of the time that it will save; None like `model_limit`.
+        times: times with the rig and with models; None if no model can replace the rig of a mesh.
+        model_problem: why no model can; else empty.
         fast_rig: what a fast rig would save; None if it was not measured.
         fast_rig_problem: why no fast rig can be made; empty if one can.
     """
 
-    vertices: int
     frame: Duration
     parts: tuple[FramePart, ...]
     groups: tuple[BoneGroup, ...]
-    model_limit: float | None
-    model_saving: float | None
+    times: Benchmark | None = None
+    model_problem: str = ""
     fast_rig: FastRigSaving | None = None
     fast_rig_problem: str = ""
 
@@ -83,12 +81,11 @@ class FrameProfile:
         return {
             "unit": "ms",
             "profile": {
-                "vertices": self.vertices,
                 "frame": self.frame.to_json(),
                 "parts": [{**asdict(part), "duration": part.duration.to_json()} for part in self.parts],
                 "groups": [group.to_json() for group in self.groups],
-                "model_limit": self.model_limit,
-                "model_saving": self.model_saving,
+                "models": self.times and self.times.to_json(),
+                "model_problem": self.model_problem,
                 "fast_rig": self.fast_rig and self.fast_rig.to_json(),
                 "fast_rig_problem": self.fast_rig_problem,
             },
@@ -114,18 +111,31 @@ class FrameProfile:
         return "\n".join([*lines, *self.savings_sentences()])
 
     def savings_sentences(self) -> list[str]:
-        """Return sentences that say what a model, and what a fast rig, would save."""
-        sentences = [self._model_sentence()]
+        """Return sentences about the most expensive modifier, and what models and a fast rig would save.
+
+        Their times are those of the frame, divided by measured ratios, so that they can be compared.
+        """
+        frame_ms, sentences = self.frame.median, []
+        modifiers = [part for part in self.parts if part.kind == MODIFIER]
+        if largest := max(modifiers, key=lambda part: part.duration.median, default=None):
+            sentences.append(
+                f"The most expensive modifier is {largest.name} of {largest.object}: {largest.duration.median:.2f} ms."
+            )
+        if self.times is None:
+            sentences.append(f"No model can replace the rig: {self.model_problem}")
+        else:
+            times, rig_ms = self.times, self.times.median(RIG)
+            subject = "All" if times.model_count == len(times.meshes) else f"{times.model_count} of {len(times.meshes)}"
+            subject = "The model" if len(times.meshes) == 1 else f"{subject} meshes with models"
+            sentences.append(f"{subject}: {frame_ms / times.ratio:.2f} ms. {times.sentence}")
+            for mesh in times.meshes if len(times.meshes) > 1 else ():
+                if mesh.reason:
+                    sentences.append(f"{mesh.name} has no model: {mesh.reason}")
+                elif mesh.name in times.times:
+                    ms = frame_ms * times.median(mesh.name) / rig_ms
+                    sentences.append(f"Only {mesh.name} with a model: {ms:.2f} ms.")
         if self.fast_rig is not None:
-            sentences.append(self.fast_rig.sentence)
+            sentences.append(self.fast_rig.describe(frame_ms))
         elif self.fast_rig_problem:
             sentences.append(f"A fast rig cannot be made: {self.fast_rig_problem}")
         return sentences
-
-    def _model_sentence(self) -> str:
-        if self.model_limit is None:
-            return "A model cannot replace the modifiers of this mesh."
-        at_most = f"A model could save {self.model_limit:.2f} ms at most"
-        if self.model_saving <= 0:
-            return f"{at_most}, and takes as long itself."
-        return f"{at_most}, and will save about {self.model_saving:.2f} ms."

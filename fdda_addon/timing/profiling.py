@@ -8,55 +8,63 @@ the rounds tells how sure it is.
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 
 import bpy
 
-from ..core.errors import RigError
+from ..core.errors import FDDAError
 from ..core.progress import Job, Progress
-from ..rig.modifier_stack import check_posable, deforming_modifiers, is_fdda_modifier
+from ..rig.modifier_stack import check_posable, is_fdda_modifier
 from ..rig.shape_keys import muted_key_drivers
 from ..runtime.binding import model_disabled
-from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
+from ..scene.scene_rig import SceneRig, check_full_rig, rigs_of_armature
 from ..scene.temporary_state import temporary_attributes
-from .animation import temporary_animation
+from .animation import main_rig, temporary_animation
+from .benchmark import benchmark
 from .bone_groups import find_expensive_groups
-from .durations import Duration, scene_times, temporary_armature_scene, time_redraws
+from .durations import Duration, frame_ms, temporary_armature_scene, time_redraws
 from .frame_profile import BONES, DRAWING, KEY_DRIVERS, MODIFIER, REST, ROUNDS, SHAPE_KEYS, FramePart, FrameProfile
-from .rig_cost import estimate_playback_ms
 
-FRAMES_PER_ROUND = 8
+FRAMES_PER_ROUND, TIMED_FRAMES = 8, 30
 MIN_SHARE = 0.01
 """Smallest share of an object in a frame that is divided into its modifiers."""
 
 
-def profile_frame(scene_rig: SceneRig) -> Job[FrameProfile]:
-    """Profile a frame of the scene while the generator is iterated.
+def profile_frame(armature_object: bpy.types.Object) -> Job[FrameProfile]:
+    """Profile a frame of the scene while the generator is iterated, and time models of the character (`benchmark`).
 
-    It plays the action of the armature, or random poses if there is none, and restores the scene afterwards. A bound
-    model does not play meanwhile. In a window, it also draws.
+    It plays the action of the armature, or random poses if there is none, and restores the scene afterwards. Bound
+    models do not play while the parts of the frame are measured. In a window, it also draws.
 
     Raises:
         RigError: as `check_full_rig` and `check_posable`, or there is no action and no bone that random poses may move.
     """
-    check_full_rig(scene_rig.mesh_object)
-    with model_disabled(scene_rig.mesh_object):
-        check_posable(scene_rig)
-        return (yield from _profile_shown_rig(scene_rig))
+    rigs = rigs_of_armature(armature_object)
+    with ExitStack() as stack:
+        for scene_rig in rigs:
+            check_full_rig(scene_rig.mesh_object)
+            stack.enter_context(model_disabled(scene_rig.mesh_object))
+        check_posable(main_rig(rigs))
+        profile = yield from _profile_shown_rig(rigs)
+    try:
+        return replace(profile, times=(yield from benchmark(armature_object, TIMED_FRAMES)))
+    except FDDAError as error:
+        return replace(profile, model_problem=str(error))
 
 
-def _profile_shown_rig(scene_rig: SceneRig) -> Job[FrameProfile]:
-    with temporary_animation(scene_rig) as frames:
-        measurement = _Measurement(scene_rig, frames)
-        with temporary_armature_scene(scene_rig.armature_object) as armature_scene:
+def _profile_shown_rig(rigs: list[SceneRig]) -> Job[FrameProfile]:
+    armature_object = rigs[0].armature_object
+    with temporary_animation(main_rig(rigs)) as frames:
+        measurement = _Measurement(rigs, frames)
+        with temporary_armature_scene(armature_object) as armature_scene:
             yield from measurement.measure_objects(armature_scene)
             yield from measurement.measure_parts()
-        groups = yield from find_expensive_groups(scene_rig.armature_object, frames)
+        groups = yield from find_expensive_groups(armature_object, frames)
         redraw_rounds = yield from time_redraws(frames, ROUNDS, FRAMES_PER_ROUND)
     parts = measurement.parts()
     if redraw_rounds:
         parts.append(FramePart(DRAWING, "", "", Duration.of(redraw_rounds)))
-    vertex_count, frame = len(scene_rig.mesh_object.data.vertices), Duration.of(measurement.frame_rounds)
-    return FrameProfile(vertex_count, frame, tuple(parts), groups, *_model_savings(scene_rig, parts))
+    return FrameProfile(Duration.of(measurement.frame_rounds), tuple(parts), groups)
 
 
 class _Measurement:
@@ -66,15 +74,16 @@ class _Measurement:
         frame_rounds: times of the whole evaluation, ms.
     """
 
-    def __init__(self, scene_rig: SceneRig, frames: range):
-        self._scene_rig, self._frames = scene_rig, frames
+    def __init__(self, rigs: list[SceneRig], frames: range):
+        self._armature_object, self._frames = rigs[0].armature_object, frames
+        self._mesh_objects = {rig.mesh_object for rig in rigs}
         self.frame_rounds: list[float] = []
         self._bone_ratios: list[float] = []
         self._object_ratios: dict[bpy.types.Object, list[float]] = {o: [] for o in _objects_with_modifiers()}
         self._part_ratios: dict[tuple[str, str, str], list[float]] = {}
 
     def _frame_ms(self, round_index: int, scene: bpy.types.Scene | None = None) -> float:
-        return scene_times(scene or bpy.context.scene, self._frames, round_index * FRAMES_PER_ROUND, FRAMES_PER_ROUND)
+        return frame_ms(scene or bpy.context.scene, self._frames, round_index * FRAMES_PER_ROUND, FRAMES_PER_ROUND)
 
     def _whole_frame_ms(self, round_index: int) -> float:
         self.frame_rounds.append(self._frame_ms(round_index))
@@ -112,14 +121,14 @@ class _Measurement:
                 yield Progress("modifiers", round_index * len(objects) + index, ROUNDS * len(objects))
 
     def _is_clear(self, scene_object: bpy.types.Object) -> bool:
-        """Return whether the share of an object is larger than the noise; the mesh of the rig counts in any case."""
+        """Return whether the share of an object is larger than the noise; meshes of the character count anyway."""
         share = Duration.of(self._object_ratios[scene_object])
-        return share.median > max(share.spread, MIN_SHARE) or scene_object == self._scene_rig.mesh_object
+        return share.median > max(share.spread, MIN_SHARE) or scene_object in self._mesh_objects
 
     def parts(self) -> list[FramePart]:
         """Return the parts of the evaluation, largest first. Objects within the noise belong to the rest."""
         clear_objects = [o for o in self._object_ratios if self._is_clear(o)]
-        ratios_by_part = {(BONES, self._scene_rig.armature_object.name, ""): self._bone_ratios, **self._part_ratios}
+        ratios_by_part = {(BONES, self._armature_object.name, ""): self._bone_ratios, **self._part_ratios}
         divided_objects = {name for _, name, _ in self._part_ratios}
         for scene_object in clear_objects:
             if scene_object.name not in divided_objects:
@@ -135,31 +144,6 @@ class _Measurement:
             for key, ratios in ratios_by_part.items()
         ]
         return sorted(parts, key=lambda part: -part.duration.median)
-
-
-def _model_savings(scene_rig: SceneRig, parts: list[FramePart]) -> tuple[float | None, float | None]:
-    """Return what a model could save at most and what it will probably save, in ms; None if it cannot replace the rig.
-
-    Reading the pose and writing the positions takes as long as the Armature modifier alone and a small share for each
-    vertex (`estimate_playback_ms`).
-    """
-    mesh_object = scene_rig.mesh_object
-    try:
-        replaced_names = {modifier.name for modifier in deforming_modifiers(mesh_object)}
-    except RigError:
-        return None, None
-    replaced_parts = [
-        part
-        for part in parts
-        if part.object == mesh_object.name
-        and (part.kind == SHAPE_KEYS or (part.kind == MODIFIER and part.name in replaced_names))
-    ]
-    model_limit = sum(part.duration.median for part in replaced_parts)
-    skin_modifier = armature_modifier(mesh_object)
-    skinning_ms = sum(
-        part.duration.median for part in replaced_parts if skin_modifier and part.name == skin_modifier.name
-    )
-    return model_limit, model_limit - skinning_ms - estimate_playback_ms(len(mesh_object.data.vertices))
 
 
 def _objects_with_modifiers() -> list[bpy.types.Object]:

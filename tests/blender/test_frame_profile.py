@@ -15,14 +15,13 @@ from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.progress import run_job
 from fdda_addon.jobs import job
-from fdda_addon.operators.frame_profile import last_profile
-from fdda_addon.panels import frame_profile as frame_profile_panel
 from fdda_addon.panels.frame_profile import draw_profile
 from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
+from fdda_addon.timing import measurements
 from fdda_addon.timing.armature_copy import armature_copy
 from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, parts_by_bone
-from fdda_addon.timing.durations import ARMATURE_SCENE_NAME, Duration
+from fdda_addon.timing.durations import TEMPORARY_SCENE_NAME, Duration
 from fdda_addon.timing.fast_rig_saving import FastRigSaving
 from fdda_addon.timing.frame_profile import (
     BONES,
@@ -36,7 +35,7 @@ from fdda_addon.timing.frame_profile import (
 )
 from fdda_addon.timing.profiling import profile_frame
 
-from .conftest import run
+from .conftest import ELBOW_RIG, run
 from .drawing import Layout
 from .scene_state import assert_same_state, scene_state
 
@@ -68,14 +67,14 @@ def hide_extra_bones(rig: SceneRig) -> None:
 
 
 def profile_of(rig: SceneRig) -> FrameProfile:
-    return run_job(profile_frame(rig))
+    return run_job(profile_frame(rig.armature_object))
 
 
 def test_the_parts_add_up_to_the_frame_and_the_slow_modifier_is_the_largest(slow_rig):
     before = scene_state(slow_rig)
     profile = profile_of(slow_rig)
     assert_same_state(before, scene_state(slow_rig))
-    assert ARMATURE_SCENE_NAME not in bpy.data.scenes
+    assert TEMPORARY_SCENE_NAME not in bpy.data.scenes
     assert all(
         constraint.mute == (bone.name == "extra.2")
         for bone in slow_rig.armature_object.pose.bones
@@ -85,10 +84,10 @@ def test_the_parts_add_up_to_the_frame_and_the_slow_modifier_is_the_largest(slow
     assert set(parts) >= {(BONES, ""), (MODIFIER, "CorrectiveSmooth"), (MODIFIER, "Armature"), (REST, "")}
     assert parts[MODIFIER, "CorrectiveSmooth"] > 0.4 * profile.frame.median
     assert profile.total == pytest.approx(profile.frame.median, rel=0.3)
-    assert profile.model_limit == pytest.approx(
-        parts[MODIFIER, "CorrectiveSmooth"] + parts[MODIFIER, "Armature"], rel=1e-6
-    )
-    assert profile.model_saving < profile.model_limit
+    assert profile.times.is_estimate and profile.times.model_count == 1
+    sentences = profile.savings_sentences()
+    assert sentences[0].startswith("The most expensive modifier is CorrectiveSmooth of elbow: ")
+    assert sentences[1] == f"The model: {profile.frame.median / profile.times.ratio:.2f} ms. {profile.times.sentence}"
 
 
 def test_shape_keys_and_their_drivers_are_parts(slow_rig):
@@ -101,9 +100,6 @@ def test_shape_keys_and_their_drivers_are_parts(slow_rig):
     assert_same_state(before, scene_state(slow_rig))
     parts = {part.kind: part for part in profile.parts}
     assert parts[KEY_DRIVERS].title == "elbow: Drivers of Shape Keys" and SHAPE_KEYS in parts
-    replaced = [part for part in profile.parts if part.kind in {MODIFIER, SHAPE_KEYS}]
-    # A model keeps the drivers.
-    assert profile.model_limit == pytest.approx(sum(part.duration.median for part in replaced), abs=1e-9)
 
 
 def expensive_groups(armature_object: bpy.types.Object, frames: range) -> tuple[BoneGroup, ...]:
@@ -218,22 +214,20 @@ def test_the_verb_writes_the_profile(elbow_files, tmp_path, capfd):
     assert profile["frame"]["median"] > 0 and profile["frame"]["spread"] >= 0
     assert profile["fast_rig"]["kept_bones"] == profile["fast_rig"]["bones"] == 2 and not profile["fast_rig_problem"]
     output = capfd.readouterr().out
-    assert "A frame takes" in output and "A model could save" in output
-    assert "A fast rig with all visible controls (2) and joints (2) would keep 2 of 2 bones" in output
+    assert "A frame takes" in output and "The model: " in output
+    assert "A fast rig would keep all 2 bones, because the visible controls (2) and joints (2) need them" in output
 
 
 def test_a_fast_rig_leaves_out_the_slow_bone_that_nothing_needs(slow_rig, tmp_path, capfd):
     """Only the twelve hidden bones may go, and with them the 400 constraints that take nearly all time of the bones."""
     hide_extra_bones(slow_rig)
-    slow_rig.mesh_object.modifiers["CorrectiveSmooth"].iterations = 1
     file, path = tmp_path / "slow.blend", tmp_path / "saving.json"
     bpy.ops.wm.save_as_mainfile(filepath=str(file))
     content = file.read_bytes()
     assert run("benchmark", file, "--fast-rig", "--json", path) == 0
     saving = FastRigSaving.from_json(json.loads(path.read_text()))
     assert (saving.bones, saving.kept_bones, saving.joints, saving.controls) == (14, 2, 2, 2)
-    assert saving.pruned.median < 0.5 * saving.full.median
-    assert saving.pruned.median < saving.fast == pytest.approx(json.loads(path.read_text())["fast"], abs=1e-4)
+    assert saving.fast.median < saving.full.median
     assert "would keep 2 of 14 bones" in capfd.readouterr().out
     assert file.read_bytes() == content
 
@@ -282,24 +276,23 @@ def test_a_full_temporary_disk_is_refused_before_the_measurement(elbow_files, tm
 def test_the_button_keeps_the_profile_without_a_temporary_folder(slow_rig, monkeypatch):
     monkeypatch.setattr(tempfile, "TemporaryDirectory", fail_to_write)
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile = last_profile(slow_rig.mesh_object)
+    profile = measurements.last(measurements.PROFILE, slow_rig.armature_object)
     assert profile.parts and "No temporary file can be written" in profile.fast_rig_problem
 
 
-@pytest.mark.parametrize("arguments", [["m.onnx", "--profile"], ["m.onnx", "--fast-rig"], []])
-def test_a_model_or_the_profile_is_measured(elbow_files, tmp_path, capfd, arguments):
+@pytest.mark.parametrize("arguments", [["m.onnx", "--profile"], ["m.onnx", "--fast-rig"]])
+def test_a_profile_takes_no_model(elbow_files, tmp_path, capfd, arguments):
     assert run("benchmark", elbow_files.rig, *arguments, "--json", tmp_path / "p.json") == 2
-    assert "Give a model to measure, or --profile or --fast-rig without a model." in capfd.readouterr().err
+    assert "--profile and --fast-rig take no model" in capfd.readouterr().err
 
 
 def test_the_button_stores_the_profile(slow_rig):
     hide_extra_bones(slow_rig)
-    assert last_profile(slow_rig.mesh_object) is None
+    assert measurements.last(measurements.PROFILE, slow_rig.armature_object) is None
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile = last_profile(slow_rig.mesh_object)
-    assert profile.vertices == len(slow_rig.mesh_object.data.vertices)
+    profile = measurements.last(measurements.PROFILE, slow_rig.armature_object)
     assert (profile.fast_rig.bones, profile.fast_rig.kept_bones) == (14, 2) and not profile.fast_rig_problem
-    assert profile.fast_rig.full.median > profile.fast_rig.pruned.median
+    assert profile.fast_rig.full.median > profile.fast_rig.fast.median
     assert len(slow_rig.armature_object.data.bones) == 14, "only a copy was pruned"
 
 
@@ -313,13 +306,17 @@ def test_a_bound_model_does_not_play_while_its_rig_is_profiled(bound_elbow):
     bpy.context.view_layer.objects.active = bound_elbow
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
     assert bound_elbow.fdda.mode == "FDDA" and not bound_elbow.fdda.status
-    parts = {part.name for part in last_profile(bound_elbow).parts if part.kind == MODIFIER}
+    parts = {
+        part.name
+        for part in measurements.last(measurements.PROFILE, bpy.data.objects[ELBOW_RIG]).parts
+        if part.kind == MODIFIER
+    }
     assert parts == {"Armature", "CorrectiveSmooth"}
 
 
 def test_the_sidebar_draws_a_bar_with_the_shares(slow_rig):
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile, drawn = last_profile(slow_rig.mesh_object), []
+    profile, drawn = measurements.last(measurements.PROFILE, slow_rig.armature_object), []
     context = SimpleNamespace(region=SimpleNamespace(width=300), preferences=bpy.context.preferences)
     draw_profile(Layout(drawn), context, slow_rig)
     texts = [element.text for element in drawn]
@@ -331,17 +328,17 @@ def test_the_sidebar_draws_a_bar_with_the_shares(slow_rig):
     wide_parts = sum(part.duration.median >= 0.05 * profile.total for part in profile.parts)
     assert "".join(segments) == "ABCD"[:wide_parts]
     sentences = profile.savings_sentences()
-    assert len(sentences) == 2
+    assert len(sentences) == 3
     assert all(sentence.split(" ms")[0] in " ".join(texts) for sentence in sentences)
 
 
 def test_slow_drawing_hides_no_part(slow_rig, monkeypatch):
     """Without a graphics card, drawing takes a hundred times as long as the rig."""
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile, drawn = last_profile(slow_rig.mesh_object), []
+    profile, drawn = measurements.last(measurements.PROFILE, slow_rig.armature_object), []
     drawing = FramePart(DRAWING, "", "", Duration(1000 * profile.frame.median, 0.0))
     slow = replace(profile, parts=(*profile.parts, drawing))
-    monkeypatch.setattr(frame_profile_panel, "last_profile", lambda _: slow)
+    monkeypatch.setattr(measurements, "last", lambda *_: slow)
     context = SimpleNamespace(region=SimpleNamespace(width=300), preferences=bpy.context.preferences)
     draw_profile(Layout(drawn), context, slow_rig)
     texts = [element.text for element in drawn]

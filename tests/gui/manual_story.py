@@ -144,8 +144,8 @@ def bind(folder: Path) -> Iterator[float]:
     yield from _drag_left_edge(properties, WIDER_PIXELS)
     properties.spaces.active.context = "OBJECT"
     yield from sidebar.open_section("playback")
-    yield from sidebar.press_button("fdda.measure_model")
-    yield from wait_for_job("measure_model", 90)
+    yield from sidebar.press_button("fdda.measure()")
+    yield from wait_for_job("measure", 90)
     yield from redraw_window()
     yield from _shoot(folder, "manual_model", numbers=[])
 

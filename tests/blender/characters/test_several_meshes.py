@@ -199,7 +199,7 @@ def test_models_are_copied_beside_a_file_elsewhere(two, tmp_path, capfd):
         assert_plays(bpy.data.objects[name], two.models / name / f"{name}.onnx")
 
 
-def test_evaluation_and_benchmark_are_by_object(two, tmp_path, capfd):
+def test_evaluation_is_by_object_and_the_benchmark_by_character(two, tmp_path, capfd):
     out = tmp_path / "out.json"
     assert run("evaluate", two.rig, two.models, "--json", out, "--poses", 5) == 0
     objects = json.loads(out.read_text())["objects"]
@@ -208,8 +208,46 @@ def test_evaluation_and_benchmark_are_by_object(two, tmp_path, capfd):
     assert run("evaluate", two.rig, two.models, "--json", out, "--poses", 5, "--object", SLEEVE) == 0
     assert json.loads(out.read_text()) == objects[SLEEVE]
     times = tmp_path / "times.json"
-    assert run("benchmark", two.rig, two.models, "--json", times, "--frames", 2) == 0
-    assert set(json.loads(times.read_text())["objects"]) == {BODY, SLEEVE}
+    # A benchmark is about the character: models of the arguments, or those that are bound.
+    for arguments in ([two.rig, two.models], [two.bound]):
+        assert run("benchmark", *arguments, "--json", times, "--frames", 2, "--overwrite") == 0
+        report = json.loads(times.read_text())
+        assert report["vertices"] == 600 and not report["is_estimate"]
+        assert [(mesh["name"], mesh["has_model"]) for mesh in report["meshes"]] == [(BODY, True), (SLEEVE, True)]
+        assert set(report["model_alone"]) == {BODY, SLEEVE}
+        assert "sleeve (300 vertices): its model alone " in capfd.readouterr().out
+
+
+def test_an_estimate_includes_meshes_without_an_armature_modifier_and_names_others(two, tmp_path, capfd):
+    """A skirt follows the body by Surface Deform, and a bow is not bound to it."""
+
+    def add_followers() -> None:
+        body = bpy.data.objects[BODY]
+        for name in ("skirt", "bow"):
+            follower = bpy.data.objects.new(name, bpy.data.objects[SLEEVE].data.copy())
+            bpy.context.scene.collection.objects.link(follower)
+            modifier = follower.modifiers.new("Follow", "SURFACE_DEFORM")
+            modifier.target = body
+            if name == "skirt":
+                with bpy.context.temp_override(object=follower, active_object=follower):
+                    assert bpy.ops.object.surfacedeform_bind(modifier="Follow") == {"FINISHED"}
+
+    times = tmp_path / "times.json"
+    clothed = changed(two, tmp_path / "clothed.blend", add_followers)
+    assert run("benchmark", clothed, "--json", times, "--frames", 2) == 0
+    report, output = json.loads(times.read_text()), capfd.readouterr().out
+    assert {mesh["name"]: mesh["has_model"] for mesh in report["meshes"]} == {
+        BODY: True,
+        SLEEVE: True,
+        "skirt": True,
+        "bow": False,
+    }
+    assert report["is_estimate"] and set(report["model_alone"]) == {BODY, SLEEVE, "skirt"}
+    assert "bow (300 vertices): Modifier 'Follow' of 'bow' is not bound, so it does nothing; bind it first" in output
+    assert run("benchmark", clothed, "--profile", "--json", times, "--overwrite") == 0
+    profile, output = json.loads(times.read_text())["profile"], capfd.readouterr().out
+    assert profile["models"]["vertices"] == 1200 and {part["object"] for part in profile["parts"]} >= {BODY, SLEEVE}
+    assert "3 of 4 meshes with models: " in output and f"Only {SLEEVE} with a model: " in output
 
 
 def changed(two: Files, path: Path, change) -> Path:
@@ -227,8 +265,9 @@ def test_a_mesh_that_fails_loses_no_times_of_others(two, tmp_path, capfd):
     moved = changed(two, tmp_path / "moved.blend", move_vertex)
     assert run("benchmark", moved, two.models, "--json", times, "--frames", 2) == 1
     output = capfd.readouterr()
-    assert "was trained for another rig" in output.err and "'elbow':" in output.out
-    assert list(json.loads(times.read_text())["objects"]) == [BODY]
+    assert "was trained for another rig" in output.err and "elbow (300 vertices)" in output.out
+    meshes = {mesh["name"]: mesh for mesh in json.loads(times.read_text())["meshes"]}
+    assert meshes[BODY]["has_model"] and "was trained for another rig" in meshes[SLEEVE]["reason"]
 
 
 def test_two_names_with_the_same_folder_are_refused(two, tmp_path, capfd):

@@ -18,7 +18,7 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.scene.temporary_state import assign_action
-from fdda_addon.timing.benchmark import time_calls
+from fdda_addon.timing.durations import time_calls
 
 from ..command_output import output_of
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, run, train

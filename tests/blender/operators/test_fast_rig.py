@@ -53,7 +53,6 @@ def test_a_fast_rig_is_not_compared_with_what_is_left_of_the_rig(bound_elbow):
         lambda: bpy.ops.fdda.set_mode(mode="NEXT"),
         lambda: bpy.ops.fdda.show_rig(placement="BESIDE"),
         lambda: bpy.ops.fdda.evaluate(source="RANDOM", poses=2),
-        lambda: bpy.ops.fdda.measure_model(frames=5),
         bpy.ops.fdda.measure,
         bpy.ops.fdda.profile_frame,
         bpy.ops.fdda.record,

@@ -10,7 +10,7 @@ import pytest
 
 from fdda_addon.models.entries import bound_entry, format_file_size
 from fdda_addon.runtime.binding import bind
-from fdda_addon.timing import frame_times
+from fdda_addon.timing import measurements
 
 from ... import systems
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose, write_edited
@@ -132,8 +132,9 @@ def test_a_model_file_that_is_replaced_is_reloaded(active, elbow_files, second, 
     path = tmp_path / "second.onnx"
     bpy.ops.fdda.bind(filepath=str(path))
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
-    bpy.ops.fdda.measure_model(frames=5)
-    assert frame_times.get(active) is not None
+    bpy.ops.fdda.measure(frames=5)
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    assert measurements.last(measurements.MEASURE, armature_object) is not None
     pose(angle=1.3)
     before = assert_plays(active, path)
 
@@ -147,7 +148,7 @@ def test_a_model_file_that_is_replaced_is_reloaded(active, elbow_files, second, 
     bpy.context.view_layer.update()
     after = assert_plays(active, path)
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
-    assert last_evaluation.get(active) is None and frame_times.get(active) is None
+    assert last_evaluation.get(active) is None and measurements.last(measurements.MEASURE, armature_object) is None
     assert len(active.fdda.models) == 2
 
 

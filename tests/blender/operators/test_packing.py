@@ -75,7 +75,7 @@ def test_a_packed_model_can_be_unbound_bound_again_and_measured(packed_elbow, el
     pose(angle=1.0)
     assert_plays(packed_elbow, elbow_files.model)
     assert packed_elbow.fdda.packed is not None
-    bpy.ops.fdda.measure_model(frames=5)
+    bpy.ops.fdda.measure(frames=5)
     assert packed_elbow.fdda.packed is not None and packed_elbow.fdda.is_bound
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from fdda_addon.runtime import confidence, model_files, playback_modifier
-from fdda_addon.timing import frame_times
+from fdda_addon.timing import measurements
+from fdda_addon.timing.benchmark import LABELS
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
 from ..refusals import refused
@@ -87,7 +88,7 @@ def test_bind_and_unbind_can_be_undone(rig, elbow_files):
 def test_disabled_operators_say_why(elbow_files):
     refused(bpy.ops.fdda.unbind, "Nothing with a rig is active")
     bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
-    for name in ("unbind", "set_mode", "measure_model", "relink", "evaluate", "open_report"):
+    for name in ("unbind", "set_mode", "relink", "evaluate", "open_report"):
         refused(getattr(bpy.ops.fdda, name), "No model is bound; bind one first")
 
 
@@ -113,16 +114,15 @@ def test_set_mode_says_why_a_model_cannot_play(active):
 
 def test_measuring_stores_frame_times_and_restores_the_mode(active):
     active.fdda.mode = "LINEAR"
-    assert frame_times.get(active) is None
-    assert bpy.ops.fdda.measure_model(frames=5) == {"FINISHED"}
-    times = frame_times.get(active)
-    assert min(times.rig, times.linear, times.fdda, times.floor, times.inference) > 0
-    assert times.constant_bytes == model_files.network_of(active).info.constant_bytes > 0
-    is_faster = times.rig > times.fdda
-    assert ("x faster than the rig" if is_faster else "Not worth it here") in times.sentence
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    assert measurements.last(measurements.MEASURE, armature_object) is None
+    assert bpy.ops.fdda.measure(frames=5) == {"FINISHED"}
+    times = measurements.last(measurements.MEASURE, armature_object)
+    assert set(times.times) == set(LABELS) and min(map(times.median, LABELS)) > 0
+    assert times.constant_bytes == model_files.network_of(active).info.constant_bytes > 0 and not times.is_estimate
     assert active.fdda.mode == "LINEAR" and active.fdda.is_bound and active.fdda.model == "//elbow.onnx"
     bpy.ops.fdda.unbind()
-    assert frame_times.get(active) is None
+    assert measurements.last(measurements.MEASURE, armature_object) is None
 
 
 def test_relink_finds_a_model_that_was_moved(elbow_files, tmp_path):

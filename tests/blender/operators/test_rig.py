@@ -5,7 +5,8 @@ import bpy
 import pytest
 
 from fdda_addon.jobs import job
-from fdda_addon.operators.rig import measured_cost
+from fdda_addon.timing import measurements
+from fdda_addon.timing.benchmark import BONES, FDDA, LINEAR, RIG
 
 from ..conftest import ELBOW
 from ..scene_state import assert_same_state, scene_state
@@ -59,10 +60,11 @@ class TestSampleArm:
         before = scene_state(saved)
         assert bpy.ops.fdda.measure() == {"FINISHED"}
         assert_same_state(before, scene_state(saved))
-        cost = measured_cost(saved.mesh_object)
-        assert cost.vertices == len(saved.mesh_object.data.vertices)
-        assert cost.rig > cost.linear > 0 and cost.model > cost.linear
-        assert job.state_of("measure").outcome.endswith("this rig is faster than a model (estimate).")
+        times = measurements.last(measurements.MEASURE, saved.armature_object)
+        assert [(mesh.name, mesh.has_model) for mesh in times.meshes] == [(ELBOW, True)]
+        assert times.median(RIG) > times.median(LINEAR) > times.median(BONES) > 0
+        assert times.median(FDDA) > times.median(BONES) and times.is_estimate
+        assert job.state_of("measure").outcome.endswith(times.sentence) and "(estimate)" in times.sentence
 
     def test_an_armature_in_rest_position_is_not_measured(self, saved):
         saved.armature_object.data.pose_position = "REST"

@@ -23,7 +23,7 @@ from fdda_addon.recording.rig_check import RigCheck
 from fdda_addon.rig.dependencies import read_dependencies
 from fdda_addon.scene import draw_cache
 from fdda_addon.scene.scene_rig import SceneRig
-from fdda_addon.timing.rig_cost import RigCost, estimate_playback_ms
+from fdda_addon.timing.benchmark import Benchmark, MeshTimes
 
 from ..conftest import ELBOW
 from ..scene_state import fresh_elbow
@@ -220,23 +220,45 @@ class TestTraining:
         assert not (tmp_path / "m.onnx").exists()
 
 
-class TestRigCost:
-    @pytest.mark.parametrize(
-        "vertex_count, rig_ms, armature_ms, fdda_ms",
-        [(1476, 0.56, 0.09, 0.35), (9960, 5.18, 0.55, 0.69), (50618, 28.7, 0.74, 1.22), (13380, 4.54, 0.38, 0.88)],
-    )
-    def test_estimate_is_close_to_a_benchmark(self, vertex_count, rig_ms, armature_ms, fdda_ms):
-        assert estimate_playback_ms(vertex_count) == pytest.approx(fdda_ms - armature_ms, abs=0.2)
-        cost = RigCost(vertex_count, rig_ms, armature_ms)
-        assert rig_ms / cost.model == pytest.approx(rig_ms / fdda_ms, rel=0.3)
-        assert cost.sentence.startswith("Worth it")
+def times_of(
+    model_ms: float, linear_ms: float = 1.0, bones_ms: float = 1.0, factors: tuple = (1.0, 1.0, 1.0)
+) -> Benchmark:
+    """Return times of a rig that takes 10 ms, and in each round these times with its models, times a factor."""
+    medians = {"rig": 10.0, "linear": linear_ms, "fdda": model_ms, "without_meshes": bones_ms, "bones": bones_ms}
+    rounds = {name: [ms * (factor if name == "fdda" else 1) for factor in factors] for name, ms in medians.items()}
+    return Benchmark("rig", (MeshTimes("body", 100, has_model=True),), 1, 3, rounds, rounds, 0, True)
 
-    @pytest.mark.parametrize(
-        "rig_ms, sentence_start",
-        [(0.80, "Worth it: 1.4 to 4.8x faster (estimate)."), (0.40, "Little difference"), (0.20, "Not worth it here")],
-    )
-    def test_sentence_follows_the_estimated_ratio(self, rig_ms, sentence_start):
-        assert RigCost(1_476, rig_ms, 0.10).sentence.startswith(sentence_start)
+
+@pytest.mark.parametrize(
+    ("times", "sentence"),
+    [
+        (times_of(2.0), "Worth it: 5.0x faster than the rig (estimate)."),
+        (
+            times_of(8.0, linear_ms=7.0, bones_ms=6.5),
+            "Little difference: 1.2x faster than the rig (estimate). The bones take 6.50 of 10.00 ms, which models do "
+            "not change.",
+        ),
+        (
+            times_of(12.0, linear_ms=9.0),
+            "Not worth it here: the rig is faster than its model (estimate). The rig takes only 1.00 ms more than "
+            "linear skinning alone.",
+        ),
+        (
+            times_of(12.0),
+            "Not worth it here: the rig is faster than its model (estimate). The mesh takes only 9.00 ms with the rig, "
+            "and 11.00 ms with its model.",
+        ),
+        # The quartiles count: on a busy machine nothing is worth it.
+        (
+            times_of(5.0, factors=(0.6, 0.9, 3.3)),
+            "The machine is busy: 1.4 to 2.8x as fast as the rig in repeated measurements (estimate). Measure again "
+            "when it is idle.",
+        ),
+    ],
+)
+def test_the_verdict_about_speed_has_a_reason(times, sentence):
+    assert times.sentence == sentence
+    assert times.is_worthwhile == sentence.startswith("Worth it")
 
 
 @pytest.mark.parametrize(

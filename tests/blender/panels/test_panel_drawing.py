@@ -78,7 +78,7 @@ def test_missing_limits_are_named_beside_the_button_that_records(rig: SceneRig, 
 def test_a_section_of_a_bound_model_draws(active: bpy.types.Object, name: str, text: str):
     checks.check_now(SceneRig(active, bpy.data.objects[ELBOW_RIG]))
     bpy.ops.fdda.evaluate()
-    bpy.ops.fdda.measure_model(frames=5)
+    bpy.ops.fdda.measure(frames=5)
     bpy.ops.fdda.color_mesh(colors="ERRORS")
     timed_values.compute_now(playback._read_confidence, active)
     timed_values.compute_now(models._find_problems, active)

@@ -10,7 +10,6 @@ from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.timing.benchmark import benchmark
 
@@ -136,7 +135,7 @@ def test_an_evaluation_restores_the_scene(rig, elbow_files, step):
 def test_a_benchmark_restores_the_scene(rig, elbow_files, step):
     set_unusual_state(rig)
     before = scene_state(rig)
-    drain(benchmark(rig, elbow_files.model, 5), stop_after=step)
+    drain(benchmark(rig.armature_object, 5, {rig.mesh_object: elbow_files.model}), stop_after=step)
     assert_same_state(before, scene_state(rig))
 
 
@@ -145,6 +144,5 @@ def test_a_benchmark_of_a_bound_rig_without_an_action_restores_the_scene(bound_e
     rig.armature_object.animation_data_clear()
     before = scene_state(rig)
     assert before["binding"] == (True, "FDDA", "")
-    with model_disabled(rig.mesh_object):
-        drain(benchmark(rig, elbow_files.model, 5))
+    drain(benchmark(rig.armature_object, 5, {rig.mesh_object: elbow_files.model}))
     assert_same_state(before, scene_state(rig))

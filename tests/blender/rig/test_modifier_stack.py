@@ -15,7 +15,7 @@ from fdda_addon.recording.run import record
 from fdda_addon.rig.modifier_stack import ModifierStack, read_stack
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.scene.scene_rig import SceneRig
-from fdda_addon.timing import benchmark, rig_cost
+from fdda_addon.timing import benchmark
 
 from ..conftest import assert_plays, evaluated_positions, pose
 from ..modifiers import FEW_POSES, add_modifier_at, add_nodes_at, build_rig
@@ -95,28 +95,27 @@ def test_an_evaluation_disables_downstream_modifiers_and_restores_them(rig, elbo
     assert_same_state(before, scene_state(rig))
 
 
-def test_frame_times_include_downstream_modifiers(rig, elbow_files, monkeypatch):
+@pytest.mark.parametrize("is_trained", [True, False])
+def test_frame_times_include_downstream_modifiers(rig, elbow_files, monkeypatch, is_trained):
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     before = scene_state(rig)
     seen, time_frames = [], benchmark.time_frames
 
-    def watch(*arguments: object) -> list[float]:
-        seen.append([m.name for m in rig.mesh_object.modifiers if m.show_viewport])
-        return time_frames(*arguments)
+    def watch(scene: bpy.types.Scene, *arguments: object) -> list[float]:
+        is_shown = scene == bpy.context.scene
+        seen.append([m.name for m in rig.mesh_object.modifiers if m.show_viewport] if is_shown else None)
+        return time_frames(scene, *arguments)
 
     monkeypatch.setattr(benchmark, "time_frames", watch)
-    monkeypatch.setattr(rig_cost, "time_frames", watch)
-    drain(benchmark.benchmark(rig, elbow_files.model, 5))
-    drain(rig_cost.measure(rig))
+    models = {rig.mesh_object: elbow_files.model} if is_trained else {}
+    assert drain(benchmark.benchmark(rig.armature_object, 5, models)).is_estimate != is_trained
     true, linear, model = (
         [*own, "Subdivision"] for own in (["Armature", "CorrectiveSmooth"], ["Armature"], ["FDDA", "FDDA Undeformed"])
     )
     # More rounds follow while the times vary.
-    rounds = next(index for index in range(0, len(seen), 4) if seen[index + 2 : index + 3] != [model]) // 4
-    rig_rounds = (len(seen) - 4 * rounds) // 2
-    assert seen == [true, linear, model, model] * rounds + [true, linear] * rig_rounds
+    rounds = len(seen) // 6
+    assert seen == [true, linear, model, model, None, None] * rounds
     assert benchmark.ROUNDS <= rounds <= benchmark.MAX_ROUNDS
-    assert rig_cost.ROUNDS <= rig_rounds <= rig_cost.MAX_ROUNDS
     assert_same_state(before, scene_state(rig))
 
 

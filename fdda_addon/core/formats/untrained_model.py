@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writes a model that is not trained: linear skinning, and networks of the usual size that add nothing.
+
+It reads, computes and writes as much as a trained model of the same rig, so its frames take as long. The `onnx` package
+writes trained models, but Blender lacks it; so the protobuf messages are written here (`onnx_file` reads them).
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..mathematics.partition import Partition, make_merged_partitions
+from ..mathematics.skinning import SkinBlock
+from ..rig import STATIC_JOINT, Rig
+from .model import CHECKSUM_KEY, CONFIDENCE_OUTPUT, CONTROLS_INPUT, METADATA_KEY, POSE_INPUT, POSITIONS_OUTPUT
+from .model_info import ModelInfo, ModelPartition
+
+OPSET, IR_VERSION = 17, 8
+FLOAT, INT64 = 1, 7
+"""Numbers of ONNX data types."""
+HIDDEN_UNITS = 64
+COMPONENTS, FIT_JOINTS, INFLUENCING_JOINTS = 12, 8, 6
+"""Typical numbers of a body part of a trained model: components, joints of its linear fit, joints that it reads."""
+MAX_ROWS, RANK = 256, 128
+"""The constants of a body part with more rows are two factors of this rank, as in a trained model."""
+
+
+def build_untrained_model(rig: Rig, key_distances: Mapping[str, np.ndarray]) -> bytes:
+    """Build the bytes of an untrained model.
+
+    Args:
+        rig: the rig, with the controls that a model would read. If it has no skin weights, each vertex follows the
+            nearest joint.
+        key_distances: (V,) distances by which each shape key moves the vertices, by the path of its value.
+    """
+    skinned = _with_skin_weights(rig)
+    partitions = make_merged_partitions(skinned)
+    graph = _Graph()
+    _add_deformation(graph, skinned, partitions, key_distances)
+    inputs = [(POSE_INPUT, (len(rig.joints), 4, 4))]
+    if rig.controls:
+        inputs.append((CONTROLS_INPUT, (len(rig.controls),)))
+    outputs = [(POSITIONS_OUTPUT, (rig.vertex_count, 3)), (CONFIDENCE_OUTPUT, (len(partitions),))]
+    content = graph.to_bytes(inputs, outputs)
+    controls = tuple(range(len(rig.controls)))
+    low, high = (np.full((len(rig.joints), 12), bound, np.float32) for bound in (-1, 1))
+    info = ModelInfo(
+        joints=rig.joints,
+        rest_matrices=rig.rest_matrices,
+        vertex_count=rig.vertex_count,
+        fingerprint=rig.fingerprint,
+        partitions=tuple(
+            ModelPartition(p.joint, (), len(p.vertices), COMPONENTS, controls, p.merged) for p in partitions
+        ),
+        feature_low=low,
+        feature_high=high,
+        controls=rig.controls,
+        metres_per_unit=rig.metres_per_unit,
+        constant_bytes=graph.constant_bytes,
+    )
+    metadata = {CHECKSUM_KEY: hashlib.sha256(content).hexdigest(), METADATA_KEY: info.to_json()}
+    return b"".join(
+        [
+            _integer(1, IR_VERSION),
+            _bytes(7, content),
+            _bytes(8, _text(1, "") + _integer(2, OPSET)),
+            *(_bytes(14, _text(1, key) + _text(2, value)) for key, value in metadata.items()),
+        ]
+    )
+
+
+def _with_skin_weights(rig: Rig) -> Rig:
+    """Return a rig whose vertices follow the nearest joint, if no bone has a weight."""
+    is_bone = np.array([name != STATIC_JOINT for name in rig.joint_names], bool)
+    if is_bone[np.unique(rig.skin_joints[rig.skin_weights > 0])].any() or not is_bone.any():
+        return rig
+    heads, nearest = rig.rest_matrices[is_bone][:, :3, 3], []
+    for positions in np.array_split(rig.rest_positions, max(1, rig.vertex_count // 1000)):
+        nearest.append(((positions[:, None] - heads[None]) ** 2).sum(axis=2).argmin(axis=1))
+    joints = np.flatnonzero(is_bone)[np.concatenate(nearest)][:, None].astype(np.int32)
+    return replace(rig, skin_joints=joints, skin_weights=np.ones(joints.shape, np.float32))
+
+
+def _add_deformation(
+    graph: "_Graph", rig: Rig, partitions: tuple[Partition, ...], key_distances: Mapping[str, np.ndarray]
+) -> None:
+    """Add the nodes from the inputs to the outputs, in the order of `trainer.export.graph.build_graph`."""
+    joint_count, part_count = len(rig.joints), len(partitions)
+    random = np.random.default_rng(0)
+    parents = graph.integers("parents", np.maximum(rig.parents, 0))
+    parents = graph.add("Gather", [POSE_INPUT, parents], "parent_poses", axis=1)
+    relative = graph.add("MatMul", [parents, graph.floats("rest", rig.rest_matrices)], "relative_poses")
+    features = graph.reshape(relative, [0, 16 * joint_count], "joint_features")
+    if rig.controls:
+        features = graph.add("Concat", [features, CONTROLS_INPUT], "features", axis=1)
+    feature_count = 16 * joint_count + len(rig.controls)
+    limit = np.full((1, feature_count), 10.0)
+    clamped = graph.add("Max", [features, graph.floats("low", -limit)], "raised")
+    clamped = graph.add("Min", [clamped, graph.floats("high", limit)], "clamped")
+    outside = graph.add("Sub", [features, clamped], "outside")
+    confidence = np.zeros((feature_count, part_count))
+    confidence = graph.add("MatMul", [outside, graph.floats("confidence_weights", confidence)], "distance")
+    graph.add("Sigmoid", [confidence], CONFIDENCE_OUTPUT)
+    # The networks.
+    input_count = 16 * INFLUENCING_JOINTS + len(rig.controls)
+    columns = [_input_columns(rig, partition.joint, input_count) for partition in partitions]
+    values = graph.add("Gather", [clamped, graph.integers("columns", np.array(columns))], "network_inputs", axis=1)
+    values = graph.add("Transpose", [values], "inputs_by_network", perm=[1, 0, 2])
+    for index, (inputs, outputs) in enumerate(pairwise((input_count, HIDDEN_UNITS, HIDDEN_UNITS, COMPONENTS))):
+        weights = 1e-3 * random.standard_normal((part_count, inputs, outputs))
+        values = graph.add("MatMul", [values, graph.floats(f"weights_{index}", weights)], f"layer_{index}")
+        if outputs == HIDDEN_UNITS:
+            sigmoid = graph.add("Sigmoid", [values], f"sigmoid_{index}")
+            values = graph.add("Mul", [values, sigmoid], f"hidden_{index}")
+    coefficients = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
+    coefficients = graph.reshape(coefficients, [0, part_count * COMPONENTS], "coefficient_row")
+    # The rows: poses of joints, multiplied by the coefficients, the values of shape keys, the confidence, or 1.
+    poses = graph.reshape(POSE_INPUT, [0, 16 * joint_count], "pose_row")
+    ones = graph.add("Gather", [poses, graph.integers("last_element", np.array([15]))], "ones", axis=1)
+    scalars = [ones, CONFIDENCE_OUTPUT, coefficients, *([CONTROLS_INPUT] if rig.controls else [])]
+    scalars = graph.add("Concat", scalars, "scalars", axis=1)
+    distances = {i: key_distances[c.path] for i, c in enumerate(rig.controls) if c.path in key_distances}
+    parts = [
+        _Part(rig, index, p, part_count, [i for i in distances if distances[i][p.vertices].any()])
+        for index, p in enumerate(partitions)
+    ]
+    factors = graph.integers("row_factors", np.concatenate([part.factors for part in parts])[:, None])
+    factors = graph.add("Gather", [scalars, factors], "factors", axis=1)
+    factors = graph.add("MatMul", [factors, graph.floats("twelve_ones", np.ones((1, 12)))], "factors_of_rows")
+    columns = graph.add("Transpose", [POSE_INPUT], "pose_columns", perm=[0, 1, 3, 2])
+    bounds = [graph.integers(name, np.array([bound])) for name, bound in (("start", 0), ("end", 3), ("axis", 3))]
+    columns = graph.add("Slice", [columns, *bounds], "affine_columns")
+    columns = graph.reshape(columns, [0, joint_count, 12], "column_rows")
+    joints = graph.integers("row_joints", np.concatenate([part.joints for part in parts]))
+    rows = graph.add("Mul", [graph.add("Gather", [columns, joints], "unscaled", axis=1), factors], "scaled")
+    rows = graph.reshape(rows, [0, 4 * sum(len(part.joints) for part in parts), 3], "rows")
+    rows = graph.add("Transpose", [rows], "rows_by_axis", perm=[0, 2, 1])
+    sizes = graph.integers("row_counts", np.array([4 * len(part.joints) for part in parts]))
+    blocks = [f"rows_{index}" for index in range(part_count)]
+    graph.add("Split", [rows, sizes], *blocks, axis=2)
+    products = [
+        graph.product(name, part.matrices(rig), f"block_{index}")
+        for index, (name, part) in enumerate(zip(blocks, parts, strict=True))
+    ]
+    positions = graph.add("Concat", products, "blocks", axis=2)
+    positions = graph.add("Transpose", [positions], "positions_by_part", perm=[0, 2, 1])
+    order = np.argsort(np.concatenate([partition.vertices for partition in partitions]))
+    graph.add("Gather", [positions, graph.integers("order", order)], POSITIONS_OUTPUT, axis=1)
+
+
+def _input_columns(rig: Rig, joint: int, count: int) -> np.ndarray:
+    """Return the (count,) indices of the features that the network of a body part reads."""
+    joint_columns = (16 * joint + np.arange(count - len(rig.controls))) % (16 * len(rig.joints))
+    return np.append(joint_columns, 16 * len(rig.joints) + np.arange(len(rig.controls)))
+
+
+class _Part:
+    """The rows of a body part, four for each matrix.
+
+    Attributes:
+        joints: the joint of each matrix; those of the skin weights come first.
+        factors: index of the scalar that multiplies each matrix.
+    """
+
+    def __init__(self, rig: Rig, index: int, partition: Partition, part_count: int, keys: list[int]):
+        self._skin = SkinBlock(rig, partition)
+        fit_count = min(FIT_JOINTS, len(rig.joints))
+        fit_joints = (partition.joint + np.arange(fit_count)) % len(rig.joints)
+        others = np.full(COMPONENTS + len(keys), partition.joint)
+        self.joints = np.concatenate([self._skin.joints, fit_joints, others])
+        first_coefficient = 1 + part_count + COMPONENTS * index
+        first_control = 1 + part_count + COMPONENTS * part_count
+        self.factors = np.concatenate(
+            [
+                np.zeros(len(self._skin.joints), np.int64),
+                np.full(fit_count, 1 + index),
+                first_coefficient + np.arange(COMPONENTS),
+                first_control + np.array(keys, np.int64),
+            ]
+        )
+
+    def matrices(self, rig: Rig) -> list[np.ndarray]:
+        """Return the constant matrix of the part, (rows, vertices), or its two factors."""
+        inverse_rest = np.linalg.inv(rig.rest_matrices.astype(np.float64))
+        weighted_rest = self._skin.weighted_rest.reshape(len(self._skin.joints), 4, -1)
+        skin_rows = (inverse_rest[self._skin.joints] @ weighted_rest).reshape(-1, weighted_rest.shape[2])
+        row_count, vertex_count = 4 * len(self.joints), skin_rows.shape[1]
+        if row_count <= max(MAX_ROWS, len(skin_rows) + RANK):
+            return [np.concatenate([skin_rows, np.zeros((row_count - len(skin_rows), vertex_count))])]
+        left = np.zeros((row_count, len(skin_rows) + RANK))
+        left[: len(skin_rows), : len(skin_rows)] = np.eye(len(skin_rows))
+        return [left, np.concatenate([skin_rows, np.zeros((RANK, vertex_count))])]
+
+
+class _Graph:
+    """An ONNX graph that is built node by node.
+
+    Attributes:
+        constant_bytes: size of its constants.
+    """
+
+    def __init__(self) -> None:
+        self._nodes: list[bytes] = []
+        self._constants: list[bytes] = []
+        self.constant_bytes = 0
+
+    def add(self, operator: str, inputs: list[str], *outputs: str, **attributes: int | list[int]) -> str:
+        """Add a node, and return the name of its first output."""
+        content = [*(_text(1, name) for name in inputs), *(_text(2, name) for name in outputs), _text(4, operator)]
+        for name, value in attributes.items():
+            is_list = isinstance(value, list)
+            values = b"".join(_integer(8, item) for item in value) if is_list else _integer(3, value)
+            content.append(_bytes(5, _text(1, name) + values + _integer(20, 7 if is_list else 2)))
+        self._nodes.append(b"".join(content))
+        return outputs[0]
+
+    def floats(self, name: str, array: np.ndarray) -> str:
+        """Add a constant of float32, and return its name."""
+        return self._add_constant(name, FLOAT, np.asarray(array, np.float32))
+
+    def integers(self, name: str, array: np.ndarray) -> str:
+        """Add a constant of int64, and return its name."""
+        return self._add_constant(name, INT64, np.asarray(array, np.int64))
+
+    def reshape(self, value: str, shape: list[int], name: str) -> str:
+        """Add a Reshape; a size of 0 keeps the size of the input."""
+        return self.add("Reshape", [value, self.integers(f"{name}_shape", np.array(shape))], name)
+
+    def product(self, value: str, matrices: list[np.ndarray], name: str) -> str:
+        """Add the product with constant matrices, and return its name."""
+        for index, matrix in enumerate(matrices):
+            value = self.add("MatMul", [value, self.floats(f"{name}_matrix_{index}", matrix)], f"{name}_{index}")
+        return value
+
+    def to_bytes(self, inputs: list[tuple[str, tuple]], outputs: list[tuple[str, tuple]]) -> bytes:
+        """Return the GraphProto; the first dimension of inputs and outputs is the number of poses."""
+        parts = [*(_bytes(1, node) for node in self._nodes), _text(2, "deformation")]
+        parts += [_bytes(5, constant) for constant in self._constants]
+        for number, values in ((11, inputs), (12, outputs)):
+            for name, shape in values:
+                dimensions = _bytes(1, _text(2, "N")) + b"".join(_bytes(1, _integer(1, size)) for size in shape)
+                tensor = _integer(1, FLOAT) + _bytes(2, dimensions)
+                parts.append(_bytes(number, _text(1, name) + _bytes(2, _bytes(1, tensor))))
+        return b"".join(parts)
+
+    def _add_constant(self, name: str, data_type: int, array: np.ndarray) -> str:
+        dimensions = b"".join(_integer(1, size) for size in array.shape)
+        self._constants.append(dimensions + _integer(2, data_type) + _text(8, name) + _bytes(9, array.tobytes()))
+        self.constant_bytes += array.nbytes
+        return name
+
+
+def _varint(value: int) -> bytes:
+    parts = bytearray()
+    while value > 0x7F:
+        parts.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*parts, value])
+
+
+def _integer(number: int, value: int) -> bytes:
+    """Encode a field with an integer of at least 0."""
+    return _varint(number << 3) + _varint(int(value))
+
+
+def _bytes(number: int, content: bytes) -> bytes:
+    """Encode a field with bytes, such as a message."""
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def _text(number: int, text: str) -> bytes:
+    return _bytes(number, text.encode())
