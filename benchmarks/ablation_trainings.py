@@ -14,9 +14,9 @@ from benchmarks.ablation_mechanisms import ALL, MECHANISMS
 from fdda_addon.core.files.output import write_json
 from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.mathematics.metrics import distances, error_statistics
-from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import RANDOM
-from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from fdda_addon.runtime.network import Network
 from trainer import train
 from trainer.config import TrainingConfig
@@ -44,7 +44,7 @@ class Character:
 
     def __init__(self, folder: Path, epochs: int):
         self.folder, self._epochs = folder, epochs
-        self.held_out = read_recording(folder / "held_out")
+        self.held_out = skin_recording(read_recording(folder / "held_out"))
         self._build_arguments: dict[int, tuple] = {}
 
     def result(self, without: str, seed: int) -> dict:
@@ -111,7 +111,7 @@ class Character:
             model.write_bytes(train.build_model(*self._build_arguments[seed]).content)
 
 
-def kinds_of_poses(recording: Recording) -> dict[str, np.ndarray]:
+def kinds_of_poses(recording: SkinnedRecording) -> dict[str, np.ndarray]:
     """Return the indices of the poses of each kind that a held-out recording has."""
     is_random = np.concatenate([np.full(s.poses, s.kind == RANDOM) for s in recording.info.sampling.sources])
     random, margin = np.flatnonzero(is_random), recording.info.sampling.margin
@@ -120,16 +120,16 @@ def kinds_of_poses(recording: Recording) -> dict[str, np.ndarray]:
     return {kind: poses for kind, poses in kinds.items() if len(poses)}
 
 
-def measure_errors(model: Path, held_out: Recording) -> dict[str, list[float]]:
+def measure_errors(model: Path, held_out: SkinnedRecording) -> dict[str, list[float]]:
     """Return mean, 99.9th percentile and largest error of each kind of poses, as fractions of linear skinning's."""
-    network, skinning = Network(model), LinearSkinning(held_out.rig, held_out.partitions)
+    network, skinning = Network(model), held_out.skinning
     result = {}
     for kind, poses in kinds_of_poses(held_out).items():
         errors: tuple[list, list] = ([], [])
         for start in range(0, len(poses), BLOCK_POSES):
             block = poses[start : start + BLOCK_POSES]
-            matrices, controls = np.array(held_out.pose_matrices[block]), np.array(held_out.controls[block])
-            true_positions = skinning.complex_positions(matrices, np.array(held_out.residuals[block]))
+            matrices, controls = held_out.pose_matrices[block], held_out.controls[block]
+            true_positions = held_out.read_positions(block)
             positions = (network.positions(matrices, controls), skinning.positions(matrices))
             for method_positions, kept in zip(positions, errors, strict=True):
                 kept.append(distances(method_positions, true_positions, held_out.rig.metres_per_unit))
@@ -139,7 +139,7 @@ def measure_errors(model: Path, held_out: Recording) -> dict[str, list[float]]:
     return result
 
 
-def frame_ratio(model: Path, reference: Path, held_out: Recording, poses: int = TIMED_POSES) -> float:
+def frame_ratio(model: Path, reference: Path, held_out: SkinnedRecording, poses: int = TIMED_POSES) -> float:
     """Return the median time of a pose of a model, as a multiple of that of another; both run in turns.
 
     The model that is loaded first takes 5 to 12 % longer, so each is first once.
@@ -151,7 +151,7 @@ def frame_ratio(model: Path, reference: Path, held_out: Recording, poses: int = 
     return math.sqrt(first[0] / first[1] * second[1] / second[0])
 
 
-def _median_times(models: tuple[Path, Path], held_out: Recording, poses: int) -> tuple[float, float]:
+def _median_times(models: tuple[Path, Path], held_out: SkinnedRecording, poses: int) -> tuple[float, float]:
     """Return the median seconds of a pose of two models that run in turns."""
     networks, other_memory = [Network(model) for model in models], np.ones(CACHE_FLUSH_BYTES // 4, np.float32)
     times: tuple[list[float], list[float]] = ([], [])

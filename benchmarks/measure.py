@@ -66,7 +66,7 @@ def _time_bare_loop(scene_rig: SceneRig, count: int) -> float:
 
 
 def _time_recording(scene_rig: SceneRig, count: int) -> float:
-    """Time the stage "poses" alone: the stage before it takes the same time for any number of poses."""
+    """Time the stage "poses" alone: the checks before it take the same time for any number of poses."""
     with tempfile.TemporaryDirectory() as folder:
         start_time = 0.0
         for step in record(scene_rig, Path(folder) / "recording", RecordingSettings(poses=count, influence_poses=1)):

@@ -6,10 +6,15 @@ import sys
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from fdda_addon.core.defaults import EPOCHS, TOLERANCE_MM
+from fdda_addon.core.defaults import EPOCHS, MIN_PARTITION_VERTICES, TOLERANCE_MM
 from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.joint_option import ALL, parse_joints
+from fdda_addon.core.mathematics.partition import INFLUENCE_TOLERANCE
+from fdda_addon.core.mathematics.skin_fit import FIT_KINDS
 
 ACTIVATIONS = ("silu", "gelu", "tanh", "relu")
+CHOICES = {"activation": ACTIVATIONS, "fit_linear": ("", *FIT_KINDS)}
+"""Values of settings that are texts; "" is the default, which no option gives."""
 MAX_SEED = (1 << 63) - 1
 """torch takes no larger seeds."""
 ABOVE_ZERO, LARGEST = sys.float_info.min, sys.float_info.max
@@ -47,12 +52,24 @@ class TrainingConfig:
         0.0, "distance that 99.9 %% of the held-out vertices should not exceed, in mm; 0 for no goal", 0
     )
     include_unsettled: bool = _setting(False, "also use poses in which the target did not come to rest")
+    fit_linear: str = _setting(
+        "", "skin weights to fit: hard for one joint per vertex, smooth for at most four; the rig's own if left out"
+    )
+    joints: str = _setting(ALL, "joints that the model reads: auto for the fewest, all, or their number")
+    min_partition_vertices: int = _setting(
+        MIN_PARTITION_VERTICES, "merge partitions with fewer vertices into others; 0 to merge none"
+    )
+    influence_tolerance: float = _setting(
+        INFLUENCE_TOLERANCE, "an input influences a partition when it changes residuals by more, in character sizes"
+    )
 
     def __post_init__(self):
         for setting in fields(self):
             value, limits = getattr(self, setting.name), setting.metadata
-            if isinstance(setting.default, str | bool):
-                is_valid = value in (ACTIVATIONS if setting.name == "activation" else (False, True))
+            if setting.name == "joints":
+                is_valid = _is_joints_option(value)
+            elif isinstance(setting.default, str | bool):
+                is_valid = value in CHOICES.get(setting.name, (False, True))
             else:
                 values = value if isinstance(value, tuple) else (value,)
                 is_valid = values and all(limits["low"] <= number <= limits["high"] for number in values)
@@ -66,6 +83,13 @@ class TrainingConfig:
         return {**asdict(self), "hidden": list(self.hidden)}
 
 
+def _is_joints_option(text: str) -> bool:
+    try:
+        return parse_joints(text) == text
+    except ValueError:
+        return False
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add an option for each setting to a parser, for example `--batch-size` for `batch_size`."""
     group = parser.add_argument_group("training settings")
@@ -75,15 +99,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             group.add_argument(name, action="store_true", help=help_text)
             continue
         is_list = isinstance(default, tuple)
-        kind = type(default[0] if is_list else default)
+        kind = parse_joints if setting.name == "joints" else type(default[0] if is_list else default)
         group.add_argument(
             name,
             type=kind,
             default=default,
             nargs="+" if is_list else None,
-            choices=ACTIVATIONS if setting.name == "activation" else None,
+            choices=[choice for choice in CHOICES.get(setting.name, ()) if choice] or None,
             metavar={int: "N", float: "X"}.get(kind),
-            help=f"{help_text} (default: {' '.join(map(str, default)) if is_list else default})",
+            help=help_text
+            + (f" (default: {' '.join(map(str, default)) if is_list else default})" if default != "" else ""),
         )
 
 

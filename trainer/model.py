@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from .config import TrainingConfig
@@ -51,7 +51,7 @@ class TrainedModel:
         fitted = np.unique(np.concatenate([prepared.fit.joints for prepared in self.prepared]))
         return fitted[fitted >= len(self.rig.joints)] - len(self.rig.joints)
 
-    def checkpoint(self, holdout: str, config: TrainingConfig, history: list[dict]) -> Checkpoint:
+    def checkpoint(self, deformation: str, holdout: str, config: TrainingConfig, history: list[dict]) -> Checkpoint:
         """Return the state from which the training can be continued; other arguments as in `Checkpoint`."""
         partitions = [
             PartitionCheckpoint(
@@ -69,6 +69,7 @@ class TrainedModel:
         return Checkpoint(
             self.rig.fingerprint,
             tuple(control.name for control in self.rig.controls),
+            deformation,
             holdout,
             config.hidden,
             config.activation,
@@ -79,7 +80,7 @@ class TrainedModel:
 
 
 def make_trained_model(
-    recording: Recording,
+    recording: SkinnedRecording,
     inputs: NetworkInputs,
     split: Split,
     parts: Sequence[Partition],

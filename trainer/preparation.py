@@ -8,7 +8,7 @@ import numpy as np
 
 from fdda_addon.core.mathematics.features import MIN_FEATURE_SPREAD, float32_rounding
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from .blocks import block_slices
@@ -89,7 +89,7 @@ class PreparedPartition:
         return np.sqrt((truncated**2).sum(axis=1) / self.vertex_count)
 
 
-def make_parts(recording: Recording, split: Split, tolerance: float) -> list[Partition]:
+def make_parts(recording: SkinnedRecording, split: Split, tolerance: float) -> list[Partition]:
     """Divide the partitions of a recording into parts that need different shape keys; `tolerance` in mesh units.
 
     A part is a partition with fewer vertices: it has its own fit, components and network. The parts of a partition
@@ -103,7 +103,7 @@ def make_parts(recording: Recording, split: Split, tolerance: float) -> list[Par
         regression = joint_regression(rig, partition, matrices, recording.controls)
         groups = [np.arange(len(partition.vertices))]
         if len(regression.controls) and len(partition.vertices) >= MIN_DIVIDED_VERTICES:
-            residuals = np.asarray(recording.residuals[:, partition.vertices], np.float32)
+            residuals = recording.compute_partition_residuals(partition)
             fit, _ = regression.fit(residuals, split.training, tolerance / FINE_TOLERANCE_FACTOR)
             values = regression.control_values[split.training][:, np.searchsorted(regression.controls, fit.controls)]
             groups = divide_partition(fit, values.std(axis=0), tolerance)
@@ -129,7 +129,7 @@ def _with_adjacent_keys(rig: Rig, partitions: Sequence[Partition]) -> list[Parti
 
 
 def partition_data(
-    recording: Recording,
+    recording: SkinnedRecording,
     inputs: NetworkInputs,
     use_half_rotations: bool = False,
     parts: Sequence[Partition] | None = None,
@@ -148,7 +148,7 @@ def partition_data(
     return [
         PartitionData(
             features[:, columns],
-            lambda partition=partition: recording.residuals[:, partition.vertices],
+            lambda partition=partition: recording.compute_partition_residuals(partition),
             lambda partition=partition: joint_regression(rig, partition, matrices, recording.controls),
             min_spread[columns],
             columns,

@@ -10,14 +10,15 @@ from pathlib import Path
 import onnxruntime
 import torch
 
-from fdda_addon.core.checks.recording import check_recording
+from fdda_addon.core.checks.recording import check_recording, merges_sentence
 from fdda_addon.core.checks.warning import RecordingWarning, raise_first_warning
 from fdda_addon.core.files.output import atomic_write_all
 from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.formats.report import report_text
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.estimate import training_size_sentence
-from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.estimate import format_size, recording_bytes
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
 from .compression import drop_components, dropped_components_sentence, factorize_partition
@@ -40,6 +41,10 @@ from .progress import MessageSink
 from .report.contents import make_report
 from .report.error_analysis import analyze_errors
 from .report.page import render_html
+from .skin.split_deformation import split_deformation
+
+PARTITIONS_STAGE = "partitions"
+"""Stage of the message `PREPARING` in which principal components are computed."""
 
 
 def train_model(
@@ -71,7 +76,7 @@ def train_model(
     """
     start_time = time.perf_counter()
     with stoppable():
-        recording = read_recording(recording_path)
+        recording = split_deformation(read_recording(recording_path), config, sink)
         split = split_recording(recording, config)
         holdout = holdout_fingerprint(recording, split)
         checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
@@ -98,7 +103,7 @@ def train_model(
     model_path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
-        write_checkpoint(checkpoint_file, trained_model.checkpoint(holdout, config, history))
+        write_checkpoint(checkpoint_file, trained_model.checkpoint(recording.digest(), holdout, config, history))
         report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
     return _send_final_messages(sink, model_path, report, goal_text, start_time, last_message)
@@ -110,7 +115,7 @@ class _Job:
 
     config: TrainingConfig
     sink: MessageSink
-    recording: Recording
+    recording: SkinnedRecording
     split: Split
     checkpoint: Checkpoint | None
     device: str = CPU
@@ -138,7 +143,9 @@ class _Job:
         )
         if chosen.problem:
             self.warn_of_card(chosen.card, chosen.problem)
-        self.log(training_size_sentence(self.recording))
+        self.log(_training_size_sentence(self.recording))
+        if merges := merges_sentence(self.recording, self.config.min_partition_vertices):
+            self.log(merges)
         warnings = check_recording(self.recording)
         for warning in warnings:
             self.sink.send(MessageType.WARNING, **warning.to_json())
@@ -187,7 +194,9 @@ class _Job:
             self.split,
             config,
             self.recording.rig.metres_per_unit,
-            lambda done: self.sink.send(MessageType.PREPARING, done=done, total=len(partitions)),
+            lambda done: self.sink.send(
+                MessageType.PREPARING, stage=PARTITIONS_STAGE, done=done, total=len(partitions)
+            ),
         )
         if self.checkpoint:
             config, initial = warm_start_config(config), initial_networks(self.checkpoint, prepared)
@@ -236,6 +245,18 @@ class _Job:
         surface = measure_surface(exported.session, recording, split.held_out)
         analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, training_errors.fdda)
         return make_report(recording, trained_model, exported, training_errors, surface, model_name, analyses)
+
+
+def _training_size_sentence(recording: SkinnedRecording) -> str:
+    """Describe the disk space of a recording and the memory that its training needs."""
+    poses, rig = len(recording.rows), recording.rig
+    largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
+    vertices = len(largest.vertices)
+    return (
+        f"{poses:,} poses of {rig.vertex_count:,} vertices: {format_size(recording_bytes(rig, poses))} on the disk; "
+        f"residuals of the largest partition, '{rig.joints[largest.joint].name or STATIC_JOINT_LABEL}', of "
+        f"{vertices:,} vertices: {format_size(12 * poses * vertices)}, in memory two or three times."
+    )
 
 
 def _send_final_messages(

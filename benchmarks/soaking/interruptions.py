@@ -36,10 +36,10 @@ from fdda_addon.core.recording.writer import RecordingWriter
 source, path = map(Path, sys.argv[1:])
 recording = read_recording(source)
 print("ready", flush=True)
-with RecordingWriter(path, recording.rig, recording.partitions, recording.info, resume=path.exists()) as writer:
+with RecordingWriter(path, recording.rig, recording.info, resume=path.exists()) as writer:
     while writer.complete < len(recording.pose_matrices):
         poses = slice(writer.complete, writer.complete + 1)
-        writer.append(recording.pose_matrices[poses], recording.residuals[poses])
+        writer.append(recording.pose_matrices[poses], recording.positions[poses])
 """
 
 

@@ -35,6 +35,7 @@ class Row:
         recording: settings of the recording.
         meshes: names of the mesh objects; each gets a model.
         epochs: epochs of the training.
+        training: further options of the training.
         is_linear: whether the rig is only linear skinning, so that the model must be exact.
         is_linked: whether the bound character is linked into another file and overridden twice, in different poses.
     """
@@ -46,6 +47,7 @@ class Row:
     recording: RecordingSettings = field(default_factory=lambda: _recording_settings())
     meshes: tuple[str, ...] = ("elbow",)
     epochs: int = 60
+    training: tuple[str, ...] = ()
     is_linear: bool = False
     is_linked: bool = False
 
@@ -191,7 +193,7 @@ ROWS: tuple[Row, ...] = (
         MESHES,
         meshes.through_a_lattice,
         "no weights: a lattice follows the bones and deforms the mesh; fitted linear skinning",
-        recording=_recording_settings(fit_linear="smooth"),
+        training=("--fit-linear", "smooth"),
     ),
     Row(
         "five_hundred_bones",

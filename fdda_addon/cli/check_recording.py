@@ -23,16 +23,23 @@ def run(options: argparse.Namespace) -> None:
     """
     from ..core.checks.recording import check_recording
     from ..core.checks.warning import raise_first_warning
+    from ..core.errors import RecordingError
     from ..core.files.file_kind import WARNINGS
     from ..core.files.output import check_outputs, write_json
     from ..core.recording.reader import read_recording
+    from ..core.recording.skinned import skin_recording
 
     if options.json:
         check_outputs({options.json: WARNINGS}, overwrite=options.overwrite)
     recording = read_recording(options.recording)
+    if not recording.rig.has_weights:
+        raise RecordingError(
+            f"The rig of '{options.recording}' has no skin weights, and its residuals follow from fitted ones; train "
+            "with --fit-linear smooth, which checks the recording."
+        )
     if recording.info.repeatability:
         print(recording.info.repeatability.sentence())
-    warnings = check_recording(recording)
+    warnings = check_recording(skin_recording(recording))
     for warning in warnings:
         print(warning)
     if options.json:

@@ -26,6 +26,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    from ..core.checks.target import unsettled_sentence
+    from ..core.recording.index import read_index, read_info
     from ..runtime.binding import model_disabled
     from .files import open_file
     from .pose_notes import print_control_bones, print_remix_hint
@@ -48,29 +50,15 @@ def run(options: argparse.Namespace) -> None:
                 print(step.note, flush=True)
             progress.show(step.stage, step.done, step.total, step.detail)
     seconds = time.monotonic() - start
+    if options.refine:
+        print(f"{options.recording}: {format_count(step.total, 'pose')} added in {seconds:.1f} s")
+        return
     for _, recording in rigs:
-        if not options.refine:
-            _print_notes(recording, options.min_partition_vertices)
-        poses_text = f"{format_count(step.total, 'pose')}{' added' if options.refine else ''}"
-        print(f"{recording}: {poses_text} in {seconds:.1f} s")
-
-
-def _print_notes(recording: Path, min_partition_vertices: int) -> None:
-    """Print what a new recording says about its fit, its partitions and its target."""
-    from ..core.checks.recording import merges_sentence
-    from ..core.checks.target import unsettled_sentence
-    from ..core.recording.index import read_index, read_info
-
-    index = read_index(recording)
-    info = read_info(index)
-    sentences = [
-        info.fit and info.fit.sentence(),
-        merges_sentence(index, min_partition_vertices),
-        unsettled_sentence(index),
-        info.repeatability and info.repeatability.sentence(),
-    ]
-    for sentence in filter(None, sentences):
-        print(sentence)
+        index = read_index(recording)
+        repeatability = read_info(index).repeatability
+        for sentence in filter(None, (unsettled_sentence(index), repeatability and repeatability.sentence())):
+            print(sentence)
+        print(f"{recording}: {format_count(index['poses'], 'pose')} in {seconds:.1f} s")
 
 
 def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
@@ -109,9 +97,6 @@ def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) 
         overwrite=options.overwrite,
         sample=tuple(options.sample),
         controls=tuple(options.control),
-        fit_linear=options.fit_linear,
-        joints=options.joints,
-        min_partition_vertices=options.min_partition_vertices,
         strips=tuple(options.strip),
         mirror=options.mirror,
         target=target_settings(options),

@@ -4,9 +4,8 @@
 import argparse
 from pathlib import Path
 
-from ..core.defaults import MARGIN, MIN_PARTITION_VERTICES, POSES, REFINEMENT_POSES, SPREAD
+from ..core.defaults import MARGIN, POSES, REFINEMENT_POSES, SPREAD
 from ..core.errors import WrongUsageError
-from ..core.joint_option import ALL, parse_joints
 from ..core.mathematics.poses import MAX_MARGIN
 from .files import add_rig_argument
 from .target import add_repeatability_option, add_target_options, target_settings
@@ -17,7 +16,6 @@ def add_record_options(parser: argparse.ArgumentParser) -> None:
     add_rig_argument(parser)
     _add_mesh_options(parser)
     _add_pose_options(parser)
-    _add_model_options(parser)
     parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
     add_target_options(parser)
@@ -90,10 +88,6 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
         "that the action keys, in the ranges that it uses), bone:NAME, selected, or remix (every second pose takes "
         "each limb from a random frame of the actions of --action, with noise); repeatable",
     )
-
-
-def _add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for what the model reads and how the mesh is split."""
     parser.add_argument(
         "--control",
         action="append",
@@ -103,35 +97,6 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
         "OWNER/PATH, or control bones, collection:NAME or bone:NAME: their unlocked channels and custom properties; "
         "inputs that drivers of the mesh read are detected automatically; repeatable",
     )
-    parser.add_argument(
-        "--fit-linear",
-        choices=("hard", "smooth"),
-        default="",
-        help="fit the skin weights of linear skinning to the poses: one bone per vertex, or at most four (smooth)",
-    )
-    parser.add_argument(
-        "--joints",
-        type=_parse_joints,
-        default=ALL,
-        metavar="auto|N|all",
-        help="bones that the model reads: the fewest from which the other bones follow (auto), their number, or all "
-        f"(default {ALL}); skin weights are fitted to these bones, and the model learns the rest",
-    )
-    parser.add_argument(
-        "--min-partition-vertices",
-        type=int,
-        default=MIN_PARTITION_VERTICES,
-        metavar="N",
-        help=f"merge body parts with fewer vertices into a neighbor; 0: none (default {MIN_PARTITION_VERTICES})",
-    )
-
-
-def _parse_joints(text: str) -> str:
-    """Check the option `--joints`; raise argparse.ArgumentTypeError if it is invalid."""
-    try:
-        return parse_joints(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def check_options(options: argparse.Namespace) -> None:
@@ -140,8 +105,8 @@ def check_options(options: argparse.Namespace) -> None:
     Raises:
         WrongUsageError: a value is out of its range, or two options contradict each other.
     """
-    if (options.poses or 0) < 0 or options.seed < 0 or options.min_partition_vertices < 0:
-        raise WrongUsageError("--poses, --seed and --min-partition-vertices must be 0 or more.")
+    if (options.poses or 0) < 0 or options.seed < 0:
+        raise WrongUsageError("--poses and --seed must be 0 or more.")
     # At 10 the distribution is uniform. Above, most values would lie outside of the range and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
@@ -154,14 +119,12 @@ def check_options(options: argparse.Namespace) -> None:
         options.mirror,
         options.sample,
         options.control,
-        options.fit_linear,
-        options.joints != ALL,
         options.target,
     )
     if options.refine and (any(new_recording_options) or options.poses == 0):
         raise WrongUsageError(
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
-            "--control, --fit-linear, --joints, and --target out."
+            "--control and --target out."
         )
     if options.refine and (options.all or len(options.object) > 1):
         raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")

@@ -67,7 +67,8 @@ def _train(arguments: list[str]) -> tuple[int, dict]:
         for message in training.messages():
             values = message.values
             if message.type is MessageType.PREPARING:
-                progress.show("preparation", values["done"], values["total"])
+                stage = values["stage"] if values["stage"] != "partitions" else "preparation"
+                progress.show(stage, values["done"], values["total"])
             elif message.type is MessageType.PROGRESS:
                 note = f"validation {values['validation_mm']:.4f} mm"
                 progress.show("training", values["epoch"], values["epochs"], note)

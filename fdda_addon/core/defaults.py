@@ -10,8 +10,6 @@ SPREAD = 1.0
 """Standard deviation of random poses, as a ratio of half the range of motion."""
 MARGIN = 1.0
 """Factor by which the range of motion is scaled for poses of the margin (`poses.Margin`); 1 for no margin."""
-INFLUENCE_POSES = 4
-"""Number of base poses from which joints are moved, to detect the partitions that they influence."""
 MIN_PARTITION_VERTICES = 8
 """Partitions with fewer vertices are merged into others."""
 REFINEMENT_POSES = 250

@@ -189,6 +189,13 @@ class Rig:
         return len(self.rest_positions)
 
     @property
+    def has_weights(self) -> bool:
+        """Whether vertices follow other joints than the static joint."""
+        return any(
+            self.joint_names[joint] != STATIC_JOINT for joint in np.unique(self.skin_joints[self.skin_weights > 0])
+        )
+
+    @property
     def size(self) -> float:
         """Diagonal of the bounding box of the rest positions, units of mesh-object space."""
         return float(np.linalg.norm(np.ptp(self.rest_positions, axis=0)))

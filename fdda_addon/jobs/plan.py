@@ -46,7 +46,9 @@ class JobPlan:
 
     @property
     def heading(self) -> str:
-        """Return the text "Step 2 of 5: recording"."""
+        """Return the text "Step 2 of 5: recording", or "Recording" if that is the only step."""
+        if len(self.steps) == 1:
+            return self.current.label.capitalize()
         return f"Step {self.index + 1} of {len(self.steps)}: {self.current.label}"
 
     def enter(self, stage: str) -> None:
@@ -78,24 +80,21 @@ class JobPlan:
         return total
 
 
-def recording_steps(pose_count: int, fits_weights: bool = False, has_target: bool = False) -> list[JobStep]:
+def recording_steps(pose_count: int, has_target: bool = False) -> list[JobStep]:
     """Return the steps of a recording."""
-    steps = []
-    if fits_weights:
-        steps.append(JobStep("fitting the skinning", ("poses to fit", "key joints", "fit"), 10.0))
-    if has_target:
-        steps.append(JobStep("checking the object", ("target",), None, 1))
-    steps.append(JobStep("testing bones", ("influences",)))
-    steps.append(JobStep("recording", ("poses", "repeatability"), None, pose_count))
-    return steps
+    check = [JobStep("checking the object", ("target",), None, 1)] if has_target else []
+    return [*check, JobStep("recording", ("poses", "repeatability"), None, pose_count)]
 
 
-def training_steps(partition_count: int, vertex_count: int, pose_count: int, epochs: int) -> list[JobStep]:
+def training_steps(
+    partition_count: int, vertex_count: int, pose_count: int, epochs: int, fits_weights: bool = False
+) -> list[JobStep]:
     """Return the steps of a training, with their estimated times."""
     seconds = SECONDS_PER_PARTITION * partition_count + SECONDS_PER_VERTEX * vertex_count
     seconds *= pose_count / 1000
     return [
         JobStep("reading the recording", ("starting",), LOADING_SECONDS),
+        *([JobStep("fitting the skinning", ("key joints", "fit"), 10.0)] if fits_weights else ()),
         JobStep("preparing body parts", ("partitions prepared",), 0.2 * seconds),
         JobStep("training", ("epochs",), 0.8 * seconds * epochs / 200),
     ]

@@ -8,6 +8,7 @@ from ..core.progress import Job
 from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import planned_pose_count
+from ..recording.rig_check import check_has_weights
 from ..scene.scene_rig import SceneRig, armature_of
 from .playback import bind_model
 from .recording import is_recorded, record_rigs, recording_plan
@@ -30,6 +31,9 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
         for rig in rigs:
             if rig.mesh_object.library is not None:
                 raise RigError(f"'{rig.mesh_object.name}' is linked; make its model in the file that it comes from.")
+            settings = rig.mesh_object.fdda.settings
+            if settings.fit_linear == "RIG" and settings.joints == "ALL":
+                check_has_weights(rig)
         files = [(rig, recording_folder(rig.mesh_object), model_file(rig.mesh_object)) for rig in rigs]
         pose_count = planned_pose_count(self.rig(context))
         trainings = [step for rig in rigs for step in self.training_plan(rig.mesh_object, pose_count)]

@@ -43,8 +43,7 @@ def recording_plan(rig: SceneRig) -> list[JobStep]:
     """Return the steps of a recording with the settings of a rig."""
     settings = rig.mesh_object.fdda.settings
     pose_count = planned_pose_count(rig)
-    fits_weights = settings.fit_linear != "RIG" or settings.joints != "ALL"
-    return recording_steps(pose_count, fits_weights, bool(settings.target))
+    return recording_steps(pose_count, bool(settings.target))
 
 
 def is_recorded(path: Path) -> bool:

@@ -82,8 +82,10 @@ class TrainingOperator(JobOperator):
 
     def training_plan(self, mesh_object: bpy.types.Object, pose_count: int) -> list[JobStep]:
         """Return the steps of a training on a recording with this number of poses."""
-        mesh, epochs = mesh_object.data, mesh_object.fdda.settings.epochs
-        return training_steps(len(mesh_object.vertex_groups), len(mesh.vertices), pose_count, epochs)
+        mesh, settings = mesh_object.data, mesh_object.fdda.settings
+        fits_weights = settings.fit_linear != "RIG" or settings.joints != "ALL"
+        counts = len(mesh_object.vertex_groups), len(mesh.vertices), pose_count
+        return training_steps(*counts, settings.epochs, fits_weights)
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
         if not bpy.app.background and is_detached(model):
@@ -99,6 +101,10 @@ class TrainingOperator(JobOperator):
         settings = mesh_object.fdda.settings
         arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
         arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
+        arguments += ["--min-partition-vertices", str(settings.min_partition_vertices)]
+        if settings.fit_linear != "RIG":
+            arguments += ["--fit-linear", settings.fit_linear.lower()]
+        arguments += ["--joints", str(settings.joint_count) if settings.joints == "NUMBER" else settings.joints.lower()]
         if settings.use_goal:
             arguments += ["--goal-mm", f"{settings.goal_mm:.6g}"]
         if warm_start:
@@ -109,7 +115,8 @@ class TrainingOperator(JobOperator):
         """Convert a message of the trainer to `Progress`; return None for other messages."""
         values, state = message.values, self.state
         if message.type is MessageType.PREPARING:
-            return Progress("partitions prepared", values["done"], values["total"])
+            stage = values["stage"] if values["stage"] != "partitions" else "partitions prepared"
+            return Progress(stage, values["done"], values["total"])
         if message.type is MessageType.PROGRESS:
             for name, curve in state.curves.items():
                 if values["epoch"] == 1:

@@ -122,6 +122,8 @@ class FDDA_PT_models(Section, bpy.types.Panel):
                 draw_wrapped(box, context, problem[1], problem[0])
             elif problems is not None:
                 draw_wrapped(layout, context, "Matches this rig", "CHECKMARK")
+                if sentence := entry_info(mesh_object, entry).skin_sentence:
+                    draw_wrapped(layout, context, sentence)
 
 
 CLASSES = (FDDA_UL_models, FDDA_PT_models)

@@ -42,10 +42,9 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
         modified_ns = -1 if path.exists() else 0
 
     def read() -> "FolderContent":
-        weights = settings.fit_linear, settings.joints
         if check is None or check.rig is None:
-            return read_folder(path, None, None, weights)
-        return read_folder(path, check.rig, _current_sampling(rig, settings, check), weights)
+            return read_folder(path)
+        return read_folder(path, check.rig, _current_sampling(rig, settings, check))
 
     name = ("recording folder", rig.mesh_object.session_uid)
     return computed_once(name, (path, modified_ns, check, settings), read)
@@ -117,8 +116,8 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_wrapped(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
     if settings.target:
         draw_wrapped(layout, context, f"It learns from '{settings.target}' (Advanced).", "INFO")
-    for sentence in content.measured_sentences:
-        draw_wrapped(layout, context, sentence)
+    if content.measured_sentence:
+        draw_wrapped(layout, context, content.measured_sentence)
     if content.sentence:
         draw_wrapped(layout, context, content.sentence, "INFO" if content.state is FolderState.COMPLETE else "ERROR")
     if content.is_recording:
@@ -126,21 +125,14 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 def _draw_settings(column: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
-    # The labels are above the fields, because a narrow sidebar would cut them off beside the fields.
-    for name in ("target", "fit_linear", "joints"):
-        field = column.column(align=True)
-        field.use_property_split = False
-        field.label(text=settings.bl_rna.properties[name].name)
-        if name == "target":
-            field.prop_search(settings, name, context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
-        else:
-            field.prop(settings, name, text="")
-    if settings.joints == "NUMBER":
-        column.prop(settings, "joint_count")
+    # The label is above the field, because a narrow sidebar would cut it off beside the field.
+    field = column.column(align=True)
+    field.use_property_split = False
+    field.label(text=settings.bl_rna.properties["target"].name)
+    field.prop_search(settings, "target", context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
     if settings.target:
         column.prop(settings, "pre_roll")
         column.prop(settings, "max_settle_frames")
-    column.prop(settings, "min_partition_vertices")
 
 
 def _draw_record(

@@ -3,6 +3,7 @@
 
 import bpy
 
+from ..core.recording.folder import FolderState
 from ..core.sentences.counts import format_count
 from ..jobs import job
 from ..properties.character import file_problem
@@ -10,6 +11,7 @@ from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
 from . import checks, curves, limits
 from .frame_profile import draw_profile, draw_times
+from .recording import read_content
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
 from .trained_file import find_trained_file
 from .training import read_assessment
@@ -110,7 +112,10 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
     row.scale_y = 1.3
     problem = file_problem(rig.mesh_object)
     row.enabled = not problem
-    draw_button(row, context, "fdda.build_model", "Record, Train & Bind", "PLAY")
+    content = read_content(rig)
+    is_recorded = not isinstance(content, str) and content[1].state is FolderState.COMPLETE
+    label = "Train & Bind" if is_recorded else "Record, Train & Bind"
+    draw_button(row, context, "fdda.build_model", label, "PLAY")
     if problem:
         draw_wrapped(layout, context, problem, "INFO")
     elif limits.lacks_limits(rig) and rig.mesh_object.fdda.settings.poses:

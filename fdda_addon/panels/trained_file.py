@@ -22,10 +22,12 @@ class TrainedFile:
     Attributes:
         path: the file.
         mismatch: how the model differs from the rig; empty if it matches.
+        skin_sentence: as `ModelInfo.skin_sentence`.
     """
 
     path: Path
     mismatch: str = ""
+    skin_sentence: str = ""
 
 
 def find_trained_file(rig: SceneRig) -> TrainedFile | None:
@@ -44,14 +46,14 @@ def _find_trained_file(rig: SceneRig) -> tuple[TrainedFile | None]:
         return (TrainedFile(path),)
     status = os.stat(path)
     name, inputs = ("trained file", path), (status.st_mtime_ns, status.st_size, check.rig)
-    return (TrainedFile(path, computed_once(name, inputs, lambda: _describe_mismatch(rig, check.rig, path))),)
+    return (computed_once(name, inputs, lambda: _read_trained_file(rig, check.rig, path)),)
 
 
-def _describe_mismatch(scene_rig: SceneRig, rig: object, path: Path) -> str:
+def _read_trained_file(scene_rig: SceneRig, rig: object, path: Path) -> TrainedFile:
     try:
         info = read_model_info(path)
         current_rig = rig_of_model(scene_rig, rig, info)
         model_rig = (info.joints, info.rest_matrices, info.vertex_count, info.fingerprint)
-        return "; ".join(rig_differences(*model_rig, current_rig))
+        return TrainedFile(path, "; ".join(rig_differences(*model_rig, current_rig)), info.skin_sentence)
     except FDDAError as error:
-        return str(error)
+        return TrainedFile(path, str(error))

@@ -74,7 +74,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         if (state := _last_training(rig)) is not None:
             curves.draw(layout, state.curves)
         if trained is not None and not trained.mismatch:
-            _draw_assessment(layout, context, trained.path)
+            _draw_assessment(layout, context, trained)
             # Draw the buttons that follow a training: the model is bound, or improved.
             if not rig.mesh_object.fdda.is_bound:
                 row = layout.row()
@@ -91,7 +91,15 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             _draw_report(layout, context, rig, trained.path)
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
             settings = rig.mesh_object.fdda.settings
-            for name in ("epochs", "tolerance_mm", "training_seed"):
+            # The labels are above the fields, because a narrow sidebar would cut them off beside the fields.
+            for name in ("fit_linear", "joints"):
+                field = advanced.column(align=True)
+                field.use_property_split = False
+                field.label(text=settings.bl_rna.properties[name].name)
+                field.prop(settings, name, text="")
+            if settings.joints == "NUMBER":
+                advanced.prop(settings, "joint_count")
+            for name in ("min_partition_vertices", "epochs", "tolerance_mm", "training_seed"):
                 advanced.prop(settings, name)
             draw_path(advanced, settings, "model", default_model(rig.mesh_object))
 
@@ -170,9 +178,9 @@ def _draw_settings(
         draw_wrapped(layout, context, f"{trained.path.name} exists; Train Again keeps it as the previous model.")
 
 
-def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, model: Path) -> None:
-    """Draw what the errors of the training mean, and what to do next."""
-    report, assessment = _read_report(report_path(model)), read_assessment(model)
+def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, trained: TrainedFile) -> None:
+    """Draw what the errors of the training mean, what its skin weights and key joints are, and what to do next."""
+    report, assessment = _read_report(report_path(trained.path)), read_assessment(trained.path)
     if report is None or assessment is None:
         return
     box = layout.box()
@@ -183,6 +191,8 @@ def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, mod
         draw_wrapped(box, context, warning, "BLANK1")
     if assessment.next_step:
         draw_wrapped(box, context, assessment.next_step, "BLANK1")
+    if trained.skin_sentence:
+        draw_wrapped(box, context, trained.skin_sentence, "BLANK1")
     if warnings := report.get("warnings"):
         header, body = layout.panel("fdda_recording_warnings", default_closed=True)
         header.label(text=f"Recording Warnings ({len(warnings)})", icon="INFO")

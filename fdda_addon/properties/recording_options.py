@@ -32,22 +32,9 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         resume=resume,
         sample=_sample_options(settings, actions),
         controls=_control_options(settings),
-        fit_linear=_fit_kind(settings),
-        min_partition_vertices=settings.min_partition_vertices,
         mirror=settings.mirror and bool(actions),
         target=target_settings(settings),
-        joints=_joint_option(settings),
     )
-
-
-def _fit_kind(settings: FDDA_PG_character) -> str:
-    """Return the kind of fitted skin weights (`mathematics.skin_fit.FIT_KINDS`); empty for the weights of the rig."""
-    return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
-
-
-def _joint_option(settings: FDDA_PG_character) -> str:
-    """Return the joints that the model reads, as the option `joints` of a recording (`core.joint_option`)."""
-    return str(settings.joint_count) if settings.joints == "NUMBER" else settings.joints.lower()
 
 
 def complete_settings(scene_rig: SceneRig) -> "RecordingSettings | None":
@@ -74,11 +61,7 @@ def copy_sampling_settings(settings: FDDA_PG_character, source: FDDA_PG_characte
         "margin",
         "sample",
         "bone_collection",
-        "fit_linear",
-        "joints",
-        "joint_count",
         "mirror",
-        "min_partition_vertices",
     ):
         setattr(settings, name, getattr(source, name))
     for name, attributes in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Appends evaluated poses to a recording in batches, in a thread while Blender evaluates the next poses."""
 
-import contextlib
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Self
 
 import numpy as np
 
-from ..core.mathematics.skinning import LinearSkinning
 from ..core.recording.extension import RecordingExtension
 from ..core.recording.writer import RecordingWriter
 from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter
@@ -30,14 +27,13 @@ class PoseAppender:
     def __init__(
         self,
         evaluator: PoseEvaluator,
-        skinning: LinearSkinning,
         writer: RecordingWriter | RecordingExtension,
+        vertex_count: int,
         pose_setter: PoseSetter = DIRECT_POSE_SETTER,
     ) -> None:
-        self._pose_setter = pose_setter
+        self._evaluator, self._writer, self._pose_setter = evaluator, writer, pose_setter
         self.pose_count = writer.complete
-        self._evaluator, self._skinning, self._writer = evaluator, skinning, writer
-        self._batch_size = max(1, min(BATCH_POSES, BATCH_BYTES // (skinning.rig.vertex_count * 12)))
+        self._batch_size = max(1, min(BATCH_POSES, BATCH_BYTES // (vertex_count * 12)))
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._pending_append: Future | None = None
         self._batch: list[tuple] = []
@@ -61,10 +57,16 @@ class PoseAppender:
             self._pending_append.result()
 
     def _append(self, batch: list[tuple]) -> None:
-        pose_matrices, positions, controls, are_at_rest = (np.stack(arrays) for arrays in zip(*batch, strict=True))
+        *arrays, are_at_rest = (np.stack(arrays) for arrays in zip(*batch, strict=True))
         unsettled_indices = np.flatnonzero(~are_at_rest).tolist()
-        arrays = pose_matrices, self._skinning.local_residuals(pose_matrices, positions), controls
         self._writer.append(*arrays, *([unsettled_indices] if unsettled_indices else []))
+
+    def flush(self) -> None:
+        """Append all evaluated poses."""
+        self._wait_for_append()
+        if self._batch:
+            self._append(self._batch)
+            self._batch = []
 
     def __enter__(self) -> Self:
         return self
@@ -72,29 +74,6 @@ class PoseAppender:
     def __exit__(self, exception_type: type | None, *_: object) -> None:
         try:
             if exception_type is None or exception_type is GeneratorExit:
-                self._wait_for_append()
-                if self._batch:
-                    self._append(self._batch)
+                self.flush()
         finally:
             self._pool.shutdown()
-
-
-def append_poses(poses: Iterator[object], appenders: list[PoseAppender]) -> Iterator[int]:
-    """Append each pose to the recordings that lack it, and yield the number of poses that all recordings have.
-
-    When the generator is closed, all evaluated poses are appended.
-
-    Args:
-        poses: iterator that sets one pose per iteration, from the index of the smallest `pose_count`.
-        appenders: the appenders of all meshes.
-    """
-    with contextlib.ExitStack() as stack:
-        for appender in appenders:
-            stack.enter_context(appender)
-        pose_count = min(appender.pose_count for appender in appenders)
-        for _ in poses:
-            for appender in appenders:
-                if appender.pose_count == pose_count:
-                    appender.append_current_pose()
-            pose_count += 1
-            yield pose_count

@@ -3,13 +3,12 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import bpy
 
 from ..core.controls import Control
-from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD
-from ..core.joint_option import ALL
-from ..core.mathematics.partition import INFLUENCE_TOLERANCE
+from ..core.defaults import MARGIN, POSES, SPREAD
 from ..core.mathematics.poses import CONTROL, Channel, Margin, make_margin
 from ..core.mathematics.remix import PoseSampler
 from ..core.recording.index import RANDOM, Sampling, Source
@@ -30,11 +29,14 @@ from ..poses.sampling import (
 )
 from ..rig.dependencies import read_dependencies
 from ..rig.pose_setter import NO_TARGET, TargetSettings
-from ..rig.reading import read_rig
+from ..rig.reading import PoseEvaluator, read_rig
 from ..rig.shape_keys import find_unposed_keys, key_distances
 from ..rig.target import find_target
 from ..scene.controls import parse_controls
 from ..scene.scene_rig import SceneRig
+
+INFLUENCE_POSES = 4
+"""Number of base poses from which each input is moved alone."""
 
 
 @dataclass(frozen=True)
@@ -49,18 +51,13 @@ class RecordingSettings:
             margin.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
-        influence_poses: number of base poses from which joints are moved, to find the partitions that they influence.
-        influence_tolerance: a joint influences a residual that it changes by more than this ratio of the rig's size.
+        influence_poses: number of base poses from which joints are moved alone, to find what they influence.
         resume: continue an interrupted recording.
         overwrite: replace a recording in the folder.
         sample: control bones that the random poses move, in the syntax of `sampling.parse_sample_selection`; empty for
             the default bones.
-        fit_linear: kind of the skin weights that are fitted (`skin_fit.FIT_KINDS`); empty for those of the rig.
         controls: inputs besides the automatic controls, in the syntax of `split_control_bones` and `parse_controls`.
-        min_partition_vertices: partitions with fewer vertices are merged into others; 0 to merge no partitions.
         target: settings of the target whose surface is recorded.
-        joints: the joints that the model reads: "all", "auto" for the fewest from which the others follow, or their
-            number.
     """
 
     poses: int = POSES
@@ -69,22 +66,37 @@ class RecordingSettings:
     margin: float = MARGIN
     actions: tuple[str, ...] = ()
     influence_poses: int = INFLUENCE_POSES
-    influence_tolerance: float = INFLUENCE_TOLERANCE
     resume: bool = False
     sample: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
-    fit_linear: str = ""
-    min_partition_vertices: int = MIN_PARTITION_VERTICES
     strips: tuple[str, ...] = ()
     mirror: bool = False
     target: TargetSettings = NO_TARGET
     overwrite: bool = False
-    joints: str = ALL
+
+
+@dataclass(eq=False)
+class RecordedMesh:
+    """A mesh that is recorded.
+
+    Attributes:
+        scene_rig: the rig as scene objects.
+        rig: the rig as arrays, with its own skin weights and all joints.
+        path: folder of the recording.
+        channels: channels of the random poses that belong to the mesh or its armature.
+        evaluator: evaluates the mesh, or its target.
+    """
+
+    scene_rig: SceneRig
+    rig: Rig
+    path: Path
+    channels: tuple[Channel, ...]
+    evaluator: PoseEvaluator
 
     @property
-    def fits_weights(self) -> bool:
-        """Return whether skin weights are fitted to poses of the rig."""
-        return bool(self.fit_linear) or self.joints != ALL
+    def name(self) -> str:
+        """Return the name of the mesh object."""
+        return self.scene_rig.mesh_object.name
 
 
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the reference joints of a rig in poses of its recording."""
 
-from collections.abc import Iterator
+from collections.abc import Collection
 from contextlib import closing
 from copy import copy
 
@@ -18,24 +18,41 @@ from ..rig.sources import Sources
 from ..scene.armature import clear_pose
 from ..scene.scene_rig import SceneRig
 from .pose_plan import PosePlan
-from .recorded_mesh import RecordedMesh
 
 MAX_POSES = 24
 """Largest number of random poses, and of frames of actions, in which the motions of joints are compared."""
 
 
-def find_references(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> Rig:
-    """Return the rig of a mesh with its reference joints (`core.mathematics.references`).
+def find_fixed_joints(scene_rig: SceneRig) -> set[str]:
+    """Return the names of the bones that keep their parents as reference joints.
+
+    What a driver reads of a bone without a parent is relative to the armature.
+    """
+    armature_object, read_bones = scene_rig.armature_object, set()
+    for _, curve in Sources(scene_rig, scene_rig.mesh_object, follows_shape_keys=False).drivers.values():
+        for variable in curve.driver.variables:
+            for target in (target for target in variable.targets if target.id == armature_object):
+                is_number = variable.type == "SINGLE_PROP"
+                name = split_bone_path(armature_object, target.data_path)[0] if is_number else target.bone_target
+                bone = armature_object.pose.bones.get(name or "")
+                if bone is not None and not bone.parent and variable.type in ("SINGLE_PROP", "TRANSFORMS"):
+                    read_bones.add(bone.name)
+    return read_bones
+
+
+def find_references(
+    scene_rig: SceneRig, rig: Rig, fixed_joints: Collection[str], plan: PosePlan, player: ClipPlayer
+) -> Rig:
+    """Return a rig with its reference joints (`core.mathematics.references`).
 
     Args:
-        mesh: the mesh, prepared by `temporary_rig_states`, with the skin weights of linear skinning.
+        scene_rig, rig: the rig, prepared by `temporary_rig_states`.
+        fixed_joints: result of `find_fixed_joints`.
         plan: plan of the poses.
         player: player of the clips of the plan.
     """
-    rig, scene_rig = mesh.rig, mesh.scene_rig
-    # What a driver reads of a bone without a parent is relative to the armature.
-    read_bones = {bone.name for bone in _bones_read_by_drivers(scene_rig) if not bone.parent}
-    is_fixed = np.array([name in read_bones for name in rig.joint_names])
+    armature_object = scene_rig.armature_object
+    is_fixed = np.array([name in fixed_joints for name in rig.joint_names])
     if not has_reference_choice(rig, is_fixed):
         return rig
     # The joints follow a pose at once; only a simulated target does not.
@@ -51,22 +68,9 @@ def find_references(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> R
     with closing(plan.show_poses(player, indices)) as poses:
         for _ in poses:
             depsgraph = bpy.context.evaluated_depsgraph_get()
-            objects = (o.evaluated_get(depsgraph) for o in (scene_rig.mesh_object, scene_rig.armature_object))
+            objects = (o.evaluated_get(depsgraph) for o in (scene_rig.mesh_object, armature_object))
             pose_matrices.append(reader.read(*objects))
     player.stop()
-    clear_pose(scene_rig.armature_object)
+    clear_pose(armature_object)
     player.restore_numbers()
     return choose_references(rig, is_fixed, np.stack(pose_matrices))
-
-
-def _bones_read_by_drivers(scene_rig: SceneRig) -> Iterator[bpy.types.PoseBone]:
-    """Yield the bones of the rig whose channels or transforms the drivers of its mesh read."""
-    armature_object = scene_rig.armature_object
-    for _, curve in Sources(scene_rig, scene_rig.mesh_object, follows_shape_keys=False).drivers.values():
-        for variable in curve.driver.variables:
-            for target in variable.targets:
-                name = target.bone_target if variable.type == "TRANSFORMS" else ""
-                if variable.type == "SINGLE_PROP":
-                    name = split_bone_path(armature_object, target.data_path)[0]
-                if target.id == armature_object and name in armature_object.pose.bones:
-                    yield armature_object.pose.bones[name]

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Refines a recording: adds poses where a model that was trained on it has its largest errors."""
 
-import contextlib
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +15,14 @@ from ..core.mathematics.metrics import distances
 from ..core.mathematics.partition import Partition
 from ..core.mathematics.poses import Channel, sample_pose
 from ..core.mathematics.refinement import Probes, choose_poses, nearest_recorded_distances
-from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.recording.extension import RecordingExtension
-from ..core.recording.index import REFINED
+from ..core.recording.index import ALONE, REFINED
 from ..core.recording.reader import Recording, read_recording
 from ..core.rig import Rig, rig_differences
 from ..poses.sampling import model_channels, rig_allows_ranges
 from ..rig.modifier_stack import check_evaluable
-from ..rig.reading import PoseEvaluator
+from ..rig.reading import PoseEvaluator, read_rig
 from ..rig.shape_keys import set_keys_undriven
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
@@ -32,7 +30,7 @@ from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig, check_full_rig
-from .appender import PoseAppender, append_poses
+from .appender import PoseAppender
 
 PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
 """First indices of random probe poses and base poses, larger than any pose index of a recording or an evaluation."""
@@ -82,10 +80,10 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     recording = _read_rig_recording(path)
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
-    network, rig = opened.network, opened.rig
+    network, rig = opened.network, replace(opened.rig, joints=opened.network.info.joints)
     check_time_inputs(scene_rig, rig.controls, stack)
     channels = model_channels(scene_rig, rig, network.info)
-    _check_recording(scene_rig, recording, rig, channels)
+    _check_recording(scene_rig, recording, channels)
     added_count = _count_added_poses(recording, model, network.info) if settings.resume else 0
     if settings.resume and added_count >= settings.poses:
         yield Progress("poses", settings.poses, settings.poses)
@@ -99,23 +97,26 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
                 for i in range(max(MIN_PROBES, settings.poses))
             ]
         )
-        probe_matrices, errors = yield from _evaluate_probes(
-            probe_poses, poser, evaluator, network, recording.partitions
-        )
-        probes = Probes(probe_poses, errors, _distances_to_recording(recording, recorded_count, probe_matrices))
+        partitions = network.info.partitions_of(opened.linear_rig)
+        probe_matrices, errors = yield from _evaluate_probes(probe_poses, poser, evaluator, network, partitions)
+        distances_to_recording = _distances_to_recording(recording, recorded_count, probe_matrices, rig, partitions)
+        probes = Probes(probe_poses, errors, distances_to_recording)
         base_poses = np.stack(
             [sample_pose(channels, settings.seed, BASE_INDEX + recorded_count + i) for i in range(settings.poses)]
         )
         rng = np.random.default_rng([settings.seed, recorded_count])
-        chosen_poses = choose_poses(probes, channels, _channels_by_partition(recording, channels), base_poses, rng)
-        with RecordingExtension(recording, model.name, added_count) as extension:
-            pose_steps = (poser.set(pose) for pose in chosen_poses[added_count:])
-            skinning = LinearSkinning(recording.rig, recording.partitions)
-            with contextlib.closing(
-                append_poses(pose_steps, [PoseAppender(evaluator, skinning, extension)])
-            ) as pose_counts:
-                for pose_count in pose_counts:
-                    yield Progress("poses", pose_count - recorded_count, settings.poses)
+        chosen_poses = choose_poses(
+            probes, channels, _channels_by_partition(rig, partitions, channels), base_poses, rng
+        )
+        recorded_evaluator = PoseEvaluator(scene_rig, recording.rig)
+        with (
+            RecordingExtension(recording, model.name, added_count) as extension,
+            PoseAppender(recorded_evaluator, extension, rig.vertex_count) as appender,
+        ):
+            for pose in chosen_poses[added_count:]:
+                poser.set(pose)
+                appender.append_current_pose()
+                yield Progress("poses", appender.pose_count - recorded_count, settings.poses)
 
 
 def _read_rig_recording(path: Path) -> Recording:
@@ -156,8 +157,9 @@ def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np
     return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else SPREAD)
 
 
-def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
+def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[Channel, ...]) -> None:
     recorded_rig = recording.rig
+    rig = replace(read_rig(scene_rig, recorded_rig.joint_names), controls=recorded_rig.controls)
     differences = rig_differences(
         recorded_rig.joints, recorded_rig.rest_matrices, recorded_rig.vertex_count, recorded_rig.fingerprint, rig
     )
@@ -183,7 +185,7 @@ def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> in
     Raises:
         RecordingError: the poses were not chosen for this model.
     """
-    added_count = len(recording.pose_matrices) - info.trained_poses
+    added_count = int((~_find_alone_poses(recording)).sum()) - info.trained_poses
     last_source = recording.info.sampling.sources[-1]
     if added_count == 0 or (
         last_source.kind == REFINED and (last_source.name, last_source.poses) == (model.name, added_count)
@@ -195,21 +197,35 @@ def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> in
     )
 
 
-def _distances_to_recording(recording: Recording, recorded_count: int, pose_matrices: np.ndarray) -> np.ndarray:
+def _find_alone_poses(recording: Recording) -> np.ndarray:
+    """Return (N,) bool, the poses in which one input moves alone, which no model is trained on."""
+    return np.concatenate([np.full(s.poses, s.kind == ALONE) for s in recording.info.sampling.sources])
+
+
+def _distances_to_recording(
+    recording: Recording,
+    recorded_count: int,
+    pose_matrices: np.ndarray,
+    rig: Rig,
+    partitions: Sequence[Partition],
+) -> np.ndarray:
     """Compute the distance of each pose to the nearest recorded pose, in the inputs of each partition.
 
     Args:
-        recording: the recording, with P partitions.
+        recording: the recording.
         recorded_count: number of recorded poses to consider, from the first.
         pose_matrices: (M, J, 4, 4), the poses.
+        rig: the rig with the J joints of the model.
+        partitions: the P partitions of the model.
 
     Returns:
         (M, P) distances.
     """
-    rig = recording.rig
+    columns = [recording.rig.joint_names.index(name) for name in rig.joint_names]
+    poses = np.flatnonzero(~_find_alone_poses(recording)[:recorded_count])
+    recorded_matrices = np.array(recording.pose_matrices[poses][:, columns])
     probe_features, recorded_features = (
-        joint_features(matrices, rig.rest_matrices, rig.references)
-        for matrices in (pose_matrices, np.array(recording.pose_matrices[:recorded_count]))
+        joint_features(matrices, rig.rest_matrices, rig.references) for matrices in (pose_matrices, recorded_matrices)
     )
     return np.stack(
         [
@@ -219,18 +235,20 @@ def _distances_to_recording(recording: Recording, recorded_count: int, pose_matr
                     for features in (probe_features, recorded_features)
                 )
             )
-            for partition in recording.partitions
+            for partition in partitions
         ],
         axis=1,
     )
 
 
-def _channels_by_partition(recording: Recording, channels: tuple[Channel, ...]) -> list[np.ndarray]:
+def _channels_by_partition(
+    rig: Rig, partitions: Sequence[Partition], channels: tuple[Channel, ...]
+) -> list[np.ndarray]:
     """Return the indices of the channels that influence each partition."""
-    names, controls = recording.rig.joint_names, recording.rig.controls
+    names, controls = rig.joint_names, rig.controls
     influencing_names = [
         {names[joint] for joint in partition.influencing} | {controls[control].name for control in partition.controls}
-        for partition in recording.partitions
+        for partition in partitions
     ]
     return [
         np.array([index for index, channel in enumerate(channels) if channel.name in names_of_partition], int)

@@ -8,25 +8,24 @@ import numpy as np
 
 from ..core.mathematics.metrics import distances, error_statistics
 from ..core.mathematics.partition import GOLDEN_RATIO
-from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.recording.arrays import open_array
 from ..core.recording.target import Repeatability
 from ..core.recording.writer import RecordingWriter
 from ..poses.clip_player import ClipPlayer
+from ..rig.reading import PoseEvaluator
 from .pose_plan import PosePlan
-from .recorded_mesh import RecordedMesh
 
 
 def measure_repeatability(
-    mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, max_poses: int
+    evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, max_poses: int
 ) -> Iterator[Progress]:
     """Reach some poses from another direction, and write the distance from the recorded target to the index.
 
     Does nothing if the repeatability was measured before. Poses that did not come to rest are left out.
 
     Args:
-        mesh: the recorded mesh.
+        evaluator: evaluates the target.
         plan: plan of the poses.
         player: player of the clips; None without clips.
         writer: writer of the complete recording.
@@ -44,29 +43,16 @@ def measure_repeatability(
             for number in range(max_poses)
         }
     )
-    rig, skinning = writer.rig, LinearSkinning(writer.rig, writer.partitions)
-    residuals = open_array(writer.path / "residuals.npy", (writer.complete, rig.vertex_count, 3), np.float32)
-    target_distances, linear_distances = [], []
+    shape = writer.complete, writer.rig.vertex_count, 3
+    recorded, pose_distances = open_array(writer.path / "positions.npy", shape, np.float32), []
     # Closing the generator stops playback.
     with closing(plan.show_poses_again(player, pose_indices)) as shown_poses:
         for compared_count, pose_index in enumerate(shown_poses, 1):
-            pose_matrices, positions, _ = mesh.evaluator.evaluate()
-            recorded_positions = skinning.complex_positions(pose_matrices[None], np.array(residuals[pose_index])[None])[
-                0
-            ]
-            target_distances.append(distances(positions, recorded_positions, rig.metres_per_unit))
-            linear_distances.append(
-                distances(recorded_positions, skinning.positions(pose_matrices[None])[0], rig.metres_per_unit)
-            )
-            yield Progress(
-                "repeatability",
-                compared_count,
-                len(pose_indices),
-                detail=plan.pose_setter.rest_description,
-            )
-    statistics = {
-        name: round(value, 6) for name, value in error_statistics(np.stack(target_distances)).to_json().items()
-    }
+            positions = evaluator.evaluate()[1]
+            pose_distances.append(distances(positions, recorded[pose_index], writer.rig.metres_per_unit))
+            detail = plan.pose_setter.rest_description
+            yield Progress("repeatability", compared_count, len(pose_indices), detail=detail)
+    statistics = error_statistics(np.stack(pose_distances)).to_json()
     writer.set_repeatability(
-        Repeatability(tuple(pose_indices), statistics, round(float(np.mean(linear_distances)) * 1000, 6))
+        Repeatability(tuple(pose_indices), {name: round(value, 6) for name, value in statistics.items()})
     )

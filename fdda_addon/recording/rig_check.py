@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import Channel
-from ..core.rig import Rig
+from ..core.rig import STATIC_JOINT, Rig
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.time_inputs import check_time_inputs
-from ..scene.scene_rig import SceneRig, check_full_rig
+from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig
+from ..scene.skin import read_skin
 from .plan import (
     RecordingSettings,
     depends_on_time,
@@ -53,6 +54,21 @@ class RigCheck:
 def check_recordable_rig(scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> RigCheck:
     """Check a rig. While a model plays, the modifiers of the rig are off, so they are not checked."""
     return _check(scene_rig, settings, None)
+
+
+def check_has_weights(scene_rig: SceneRig) -> None:
+    """Check that vertices follow deforming bones, so that there is linear skinning to learn from.
+
+    Raises:
+        RigError: there is no Armature modifier, or no vertex has a weight on a deforming bone.
+    """
+    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    modifier = armature_modifier(mesh_object)
+    if modifier is None or set(read_skin(mesh_object, armature_object, modifier).bones) <= {STATIC_JOINT}:
+        raise RigError(
+            f"The vertices of '{mesh_object.name}' have no weights on deforming bones of '{armature_object.name}', so "
+            "there is no linear skinning to learn from; set Base Skinning in Training to Fit, or paint weights."
+        )
 
 
 def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: RigCheck | None) -> RigCheck:

@@ -1,253 +1,230 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Records meshes of one armature in one session, which has the settings, the poses and the meshes."""
+"""Records meshes of one armature in the same poses, each into its own folder."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import RecordingError
-from ..core.mathematics.key_joints import add_influences
-from ..core.mathematics.partition import GOLDEN_RATIO, Partition, assume_nearby_influences, make_merged_partitions
-from ..core.mathematics.skinning import LinearSkinning
+from ..core.errors import RecordingError, RigError
 from ..core.progress import Progress
 from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
 from ..core.recording.folder_check import check_recordable
-from ..core.recording.index import INDEX_NAME, RecordingInfo
+from ..core.recording.index import ALONE, RecordingInfo, Source
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
 from ..poses.clip import find_clips
-from ..poses.clip_player import ClipPlayer
-from ..rig.modifier_stack import check_evaluable
+from ..rig.dependencies import deforming_mesh_objects, read_dependencies
+from ..rig.modifier_stack import check_evaluable, read_stack
+from ..rig.reading import PoseEvaluator
 from ..rig.target_poses import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_states
 from ..rig.time_inputs import check_time_inputs
+from ..rig.unread_bones import describe_bones
 from ..scene.scene_rig import SceneRig, check_full_rig
-from .appender import PoseAppender, append_poses
-from .influence_trials import InfluenceSearch
-from .influences import detect_influences
-from .mesh_group import check_common_armature, group_into_passes, split_controls
-from .plan import RecordingSettings, find_actions, make_pose_sampler, make_sampling, read_sampled_rig
+from .alone_poses import AlonePosePlan, plan_alone_poses
+from .appender import PoseAppender
+from .first_checks import check_follows_pose, check_saturation, check_seams, check_target_moves
+from .plan import RecordedMesh, RecordingSettings, find_actions, listed_controls, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
-from .previous_recording import read_previous_partitions, read_previous_weights
-from .recorded_mesh import RecordedMesh, TimedEvaluator
-from .reference_joints import find_references
+from .reference_joints import find_fixed_joints, find_references
 from .repeatability import measure_repeatability
-from .saturation_check import check_saturation
-from .seam_check import check_seams
-from .target_check import check_target_moves
-from .time_check import check_follows_pose
-from .weight_fitting import FittedWeights, check_has_weights, fit_weights, make_fit_request
 
-INFLUENCE_SEED_OFFSET = 1 << 32
-"""Offset of the indices of random poses for the detection of influences, larger than any pose index of a recording."""
-MeshPhase = Callable[[RecordedMesh, ClipPlayer | None], Iterator[Progress]]
+MISSING_WEIGHTS = (
+    "'{}' has no skin weights on deforming bones, so its training needs fitted ones: --fit-linear smooth, or Base "
+    "Skinning in the sidebar."
+)
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
-    """Record a rig while the generator is iterated.
-
-    The scene is restored when the generator ends, is closed, or raises.
-
-    Args:
-        scene_rig: the rig.
-        path: folder of the recording.
-        settings: settings of the recording.
-
-    Yields:
-        Progress of the stages "influences" and "poses". If weights are fitted, the stages "poses to fit", "key joints"
-        if these are chosen, and "fit" come first. The first progress of "poses" has a note with the estimated time and
-        disk space.
-
-    Raises:
-        RigError: the rig cannot be recorded.
-        TrainingError: the trainer's Python cannot fit the weights.
-        RecordingError: the folder has a recording already, or the recording to resume differs.
-        OutputError: the folder cannot be written, or the disk has too little space.
-    """
+    """Record one mesh, as `record_meshes` does."""
     return record_meshes([(scene_rig, path)], settings)
 
 
 def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings) -> Iterator[Progress]:
-    """Record several meshes on one armature, each into its own folder, as `record` does.
+    """Record meshes on one armature while the generator is iterated; each pose is evaluated once for all of them.
 
-    The meshes share the poses, and each pose is evaluated once for all meshes of a pass (`group_into_passes`).
+    The scene is restored when the generator ends, is closed, or raises.
+
+    Args:
+        rigs: each mesh, and the folder of its recording.
+        settings: settings of the recording.
+
+    Yields:
+        Progress of the stage "poses", with a target also of "target" before and "repeatability" after it. The first
+        progress of "poses" has a note with the estimated time and disk space.
 
     Raises:
-        RigError: as `record`, or the meshes follow different armatures.
+        RigError: a rig cannot be recorded, or the meshes follow different armatures.
+        RecordingError: a folder has a recording already, or the recording to resume differs.
+        OutputError: a folder cannot be written, or the disk has too little space.
     """
-    yield from RecordingSession(rigs, settings).record()
-
-
-class RecordingSession:
-    """Records meshes on one armature, each into its own folder, in phases: the methods in their order.
-
-    `record` runs all phases. A phase is a generator that yields its progress, and stores its results in the meshes.
-
-    Attributes:
-        settings: settings of the recording.
-        clips: the clips whose frames follow the random poses.
-        meshes: the meshes.
-        poses: the poses, which the meshes share, and the target whose surface they have.
-    """
-
-    def __init__(self, rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings):
-        """Plan the recordings of meshes and their poses, and raise all errors that can be found in advance."""
-        scene_rigs, self.settings = [scene_rig for scene_rig, _ in rigs], settings
-        check_common_armature(scene_rigs)
-        self.clips = find_clips(scene_rigs, settings.actions, settings.strips, settings.mirror)
-        if settings.mirror and not self.clips:
-            raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
-        controls = [settings.controls] if len(rigs) == 1 else split_controls(scene_rigs, settings)
-        if settings.target.name and len(rigs) > 1:
-            raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
-        sampled_rigs, notes = [], []
-        for (scene_rig, path), mesh_controls in zip(rigs, controls, strict=True):
-            check_full_rig(scene_rig.mesh_object)
-            stack = check_evaluable(scene_rig)
-            sampled_rigs.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
-            notes.append("")
-            if not settings.target.name:
-                notes[-1] = check_time_inputs(scene_rig, sampled_rigs[-1][0].controls, stack, find_actions(settings))
-            check_recordable(path, settings.resume, settings.overwrite)
-        target_controls = sampled_rigs[0][0].controls
-        pose_setter = make_pose_setter(scene_rigs[0], settings.target, self.clips, settings.poses, target_controls)
-        channels = [mesh_channels for _, mesh_channels in sampled_rigs]
-        self.poses = PosePlan(list(zip(scene_rigs, channels, strict=True)), settings, self.clips, pose_setter)
-        if self.poses.total < 1:
-            raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
-        self.meshes = [
-            RecordedMesh(
-                *(scene_rig, rig, path, mesh_channels, self.poses.channels_of_mesh(index)),
-                *(path if settings.resume and (path / INDEX_NAME).exists() else None, pose_setter.target, notes[index]),
+    scene_rigs, first_rig = [scene_rig for scene_rig, _ in rigs], rigs[0][0]
+    for other_rig in scene_rigs:
+        if other_rig.armature_object != first_rig.armature_object:
+            raise RigError(
+                f"'{first_rig.mesh_object.name}' follows the armature '{first_rig.armature_object.name}' and "
+                f"'{other_rig.mesh_object.name}' follows '{other_rig.armature_object.name}'; record the meshes of each "
+                "armature by themselves, with --object."
             )
-            for index, ((scene_rig, path), (rig, mesh_channels)) in enumerate(zip(rigs, sampled_rigs, strict=True))
-        ]
-        check_disk_space([(mesh.path, recording_bytes(mesh.rig, self.poses.total)) for mesh in self.meshes])
+    clips = find_clips(scene_rigs, settings.actions, settings.strips, settings.mirror)
+    if settings.mirror and not clips:
+        raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
+    if settings.target.name and len(rigs) > 1:
+        raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
+    sampled_rigs, notes = [], []
+    for (scene_rig, path), controls in zip(rigs, _split_controls(scene_rigs, settings), strict=True):
+        check_full_rig(scene_rig.mesh_object)
+        stack = check_evaluable(scene_rig)
+        rig, channels = read_sampled_rig(scene_rig, replace(settings, controls=controls))
+        sampled_rigs.append((scene_rig, rig, channels))
+        notes.append([] if rig.has_weights else [MISSING_WEIGHTS.format(scene_rig.mesh_object.name)])
+        if not settings.target.name:
+            notes[-1].append(check_time_inputs(scene_rig, rig.controls, stack, find_actions(settings)))
+        check_recordable(path, settings.resume, settings.overwrite)
+    pose_setter = make_pose_setter(first_rig, settings.target, clips, settings.poses, sampled_rigs[0][1].controls)
+    plan = PosePlan([(scene_rig, channels) for scene_rig, _, channels in sampled_rigs], settings, clips, pose_setter)
+    if plan.total < 1:
+        raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
+    target = pose_setter.target
+    meshes = [
+        RecordedMesh(scene_rig, rig, path, channels, PoseEvaluator(scene_rig, rig, target))
+        for (scene_rig, rig, channels), (_, path) in zip(sampled_rigs, rigs, strict=True)
+    ]
+    check_disk_space([(mesh.path, recording_bytes(mesh.rig, plan.total)) for mesh in meshes])
+    with target.prepared() if target else nullcontext():
+        for indices in _group_into_passes(scene_rigs):
+            posed_rigs = [sampled_rigs[index] for index in indices]
+            other_rigs = [posed_rig for posed_rig in sampled_rigs if posed_rig not in posed_rigs]
+            with temporary_rig_states(posed_rigs, clips, other_rigs) as player:
+                recorded, seconds_per_pose = [meshes[index] for index in indices], None
+                if target:
+                    yield from check_target_moves(recorded[0], plan, player)
+                # A target that depends on time does not follow a moved joint at once.
+                follows_pose = not target or target.follows == POSE
+                if follows_pose:
+                    seconds_per_pose = check_follows_pose(recorded, plan, player)
+                alone_plans: list[AlonePosePlan | None] = [None] * len(recorded)
+                for number, mesh in enumerate(recorded):
+                    if follows_pose:
+                        notes[indices[number]] += [check_seams(mesh, plan, player), check_saturation(mesh)]
+                    for note in filter(None, notes[indices[number]]):
+                        yield Progress("poses", 0, plan.total, note)
+                    fixed_joints = find_fixed_joints(mesh.scene_rig)
+                    mesh.rig = find_references(mesh.scene_rig, mesh.rig, fixed_joints, plan, player)
+                    if follows_pose:
+                        alone_plans[number] = plan_alone_poses(
+                            mesh.scene_rig, mesh.rig, mesh.channels, settings, clips, player, target is not None
+                        )
+                with ExitStack() as stack:
+                    appenders = []
+                    for index, mesh, alone in zip(indices, recorded, alone_plans, strict=True):
+                        info = _make_info(mesh, settings, plan, plan.channels_of_mesh(index), alone)
+                        options = settings.resume, settings.overwrite
+                        writer = stack.enter_context(RecordingWriter(mesh.path, mesh.rig, info, *options))
+                        appender = PoseAppender(mesh.evaluator, writer, mesh.rig.vertex_count, pose_setter)
+                        appenders.append((appender, writer))
+                    # The appenders end before the writers, so that an interrupted recording keeps the evaluated poses.
+                    for appender, _ in appenders:
+                        stack.enter_context(appender)
+                    total = plan.total + sum(alone.description.poses for alone in alone_plans if alone)
+                    first_pose = min(plan.total, *(appender.pose_count for appender, _ in appenders))
+                    done = first_pose + sum(max(0, appender.pose_count - plan.total) for appender, _ in appenders)
+                    for _, writer in appenders:
+                        if writer.note:
+                            yield Progress("poses", done, total, writer.note)
+                    seconds = pose_setter.seconds_per_pose or seconds_per_pose
+                    remaining = Estimate(
+                        total - done,
+                        sum(mesh.rig.vertex_count for mesh in recorded),
+                        sum(recording_bytes(writer.rig, writer.info.poses) for _, writer in appenders),
+                        seconds and seconds * (total - done),
+                    )
+                    yield Progress("poses", done, total, remaining.sentence() if done < total else "")
+                    with closing(plan.show_poses(player, range(first_pose, plan.total))) as poses:
+                        for pose_index in poses:
+                            for appender, _ in appenders:
+                                if appender.pose_count == pose_index:
+                                    appender.append_current_pose()
+                            done += 1
+                            yield Progress("poses", done, total, detail=pose_setter.rest_description)
+                    player.stop()
+                    for (appender, _), alone in zip(appenders, alone_plans, strict=True):
+                        if alone:
+                            player.restore_numbers()
+                            with closing(alone.show_poses(appender.pose_count - plan.total)) as poses:
+                                for _ in poses:
+                                    appender.append_current_pose()
+                                    done += 1
+                                    yield Progress("poses", done, total)
+                    if plan.repeatable_poses and settings.target.repeatability_poses:
+                        appender.flush()
+                        count = settings.target.repeatability_poses
+                        yield from measure_repeatability(recorded[0].evaluator, plan, player, writer, count)
+                        yield Progress("poses", total, total)
 
-    def record(self) -> Iterator[Progress]:
-        """Run all phases; the meshes of a pass are evaluated together (`group_into_passes`)."""
-        target = self.poses.pose_setter.target
-        with target.prepared() if target else nullcontext():
-            posed_rigs = [mesh.posed_rig for mesh in self.meshes]
-            with (
-                temporary_rig_states(posed_rigs, self.clips) if self.settings.fits_weights else nullcontext() as player
-            ):
-                yield from self._for_each(self.meshes, self.fit_weights, player)
-            for mesh_indices in group_into_passes([mesh.scene_rig for mesh in self.meshes]):
-                meshes = [self.meshes[index] for index in mesh_indices]
-                other_rigs = [mesh.posed_rig for mesh in self.meshes if mesh not in meshes]
-                with temporary_rig_states([mesh.posed_rig for mesh in meshes], self.clips, other_rigs) as player:
-                    if target:
-                        yield from check_target_moves(meshes[0], self.poses, player)
-                    check_follows_pose(meshes, self.poses, player)
-                    yield from self._for_each(meshes, self.find_influences, player)
-                    yield from self.record_poses(meshes, player)
 
-    @staticmethod
-    def _for_each(meshes: list[RecordedMesh], phase: MeshPhase, player: ClipPlayer | None) -> Iterator[Progress]:
-        """Run a phase for each mesh. The stages of several meshes include the mesh's name."""
-        for mesh in meshes:
-            with closing(phase(mesh, player)) as steps:
-                for step in steps:
-                    yield step if len(meshes) == 1 else replace(step, stage=f"{step.stage} of '{mesh.name}'")
+def _split_controls(rigs: Sequence[SceneRig], settings: RecordingSettings) -> list[tuple[str, ...]]:
+    """Return for each mesh the controls of the settings that it has.
 
-    def fit_weights(self, mesh: RecordedMesh, player: ClipPlayer | None) -> Iterator[Progress]:
-        """Fit the skin weights of a mesh, read previously fitted weights, or keep the weights of the rig."""
-        if mesh.previous_path:
-            weights = read_previous_weights(mesh.previous_path, mesh.scene_rig, mesh.rig, self.settings)
-        elif self.settings.fits_weights:
-            request = make_fit_request(mesh.scene_rig, mesh.rig, self.settings, mesh.channels, self.poses.total)
-            shown_poses = self.poses.show_poses(player, frozenset(request.poses))
-            # After an error, its traceback keeps the generator, which would restore limits only later.
-            with closing(shown_poses):
-                weights = yield from fit_weights(mesh.scene_rig, mesh.rig, request, shown_poses, mesh.make_evaluator())
-        else:
-            check_has_weights(mesh.scene_rig, mesh.rig)
-            weights = FittedWeights(mesh.rig, None)
-        mesh.rig, mesh.fit, mesh.needed_inputs = weights.rig, weights.fit, weights.needed_inputs
+    Raises:
+        RigError: there is a control that no mesh has.
+    """
+    if len(rigs) == 1:
+        return [settings.controls]
+    controls_by_mesh: list[list[str]] = [[] for _ in rigs]
+    for text in settings.controls:
+        errors = []
+        for scene_rig, mesh_controls in zip(rigs, controls_by_mesh, strict=True):
+            try:
+                listed_controls(scene_rig, replace(settings, controls=(text,)))
+                mesh_controls.append(text)
+            except RigError as error:
+                errors.append(error)
+        if len(errors) == len(rigs):
+            raise errors[0]
+    return [tuple(mesh_controls) for mesh_controls in controls_by_mesh]
 
-    def find_influences(self, mesh: RecordedMesh, player: ClipPlayer) -> Iterator[Progress]:
-        """Read the reference joints and influences of a previous recording, or find them with this mesh's channels."""
-        mesh.evaluator = TimedEvaluator(mesh.make_evaluator())
-        min_vertices = self.settings.min_partition_vertices
-        if mesh.previous_path:
-            mesh.rig, mesh.partitions = read_previous_partitions(mesh.previous_path, mesh.rig, min_vertices)
-        if mesh.partitions:
-            return
-        for note in filter(None, (mesh.note, check_seams(mesh, self.poses, player), check_saturation(mesh))):
-            yield Progress("influences", 0, 1, note)
-        mesh.rig = find_references(mesh, self.poses, player)
-        partitions = make_merged_partitions(mesh.rig, min_vertices)
-        if mesh.target and mesh.target.follows != POSE:
-            # A target that depends on time does not follow a moved joint immediately: influences cannot be detected.
-            partitions = assume_nearby_influences(mesh.rig, partitions)
-        else:
-            partitions = yield from self._detect_influences(mesh, partitions, player)
-        if mesh.needed_inputs is not None:
-            partitions = add_influences(partitions, mesh.needed_inputs, len(mesh.rig.joints))
-        mesh.partitions = partitions
 
-    def _detect_influences(
-        self, mesh: RecordedMesh, partitions: tuple[Partition, ...], player: ClipPlayer
-    ) -> Iterator[Progress]:
-        sampler = make_pose_sampler(mesh.scene_rig, self.settings)
-        frames = [(clip, frame) for clip in self.clips for frame in clip.frames]
-        search = InfluenceSearch(
-            mesh.channels,
-            lambda index: sampler.draw_pose(mesh.channels, INFLUENCE_SEED_OFFSET + index),
-            # Consecutive indices result in frames that are far apart.
-            lambda index: player.show(*frames[int(index * GOLDEN_RATIO * len(frames)) % len(frames)]),
-            player.stop,
-            self.settings.influence_poses,
-            self.settings.influence_tolerance,
-            mesh.target is not None,
-            mesh.target is not None or mesh.needed_inputs is not None,
-        )
-        return (yield from detect_influences(mesh.scene_rig, mesh.rig, partitions, mesh.evaluator, search))
+def _group_into_passes(rigs: Sequence[SceneRig]) -> list[list[int]]:
+    """Group the indices of meshes that can be evaluated together.
 
-    def record_poses(self, meshes: list[RecordedMesh], player: ClipPlayer) -> Iterator[Progress]:
-        """Evaluate the poses that are missing, and write them; then measure the repeatability of a target."""
-        pose_setter, pose_count = self.poses.pose_setter, self.poses.total
-        with ExitStack() as stack:
-            appenders = []
-            for mesh in meshes:
-                info = self._make_info(mesh)
-                options = self.settings.resume, self.settings.overwrite
-                writer = stack.enter_context(RecordingWriter(mesh.path, mesh.rig, mesh.partitions, info, *options))
-                skinning = LinearSkinning(mesh.rig, mesh.partitions)
-                appenders.append(PoseAppender(mesh.evaluator, skinning, writer, pose_setter))
-                if writer.note:
-                    yield Progress("poses", 0, pose_count, writer.note)
-            done = min(appender.pose_count for appender in appenders)
-            yield Progress("poses", done, pose_count, self._describe_estimate(meshes, pose_count - done))
-            remaining_poses = self.poses.show_poses(player, range(done, pose_count))
-            # Close the generators before the writers, so that an interrupted recording keeps the evaluated poses.
-            with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as pose_counts:
-                for done in pose_counts:
-                    yield Progress("poses", done, pose_count, detail=pose_setter.rest_description)
-            repeated_count = self.settings.target.repeatability_poses
-            if self.poses.repeatable_poses and repeated_count:
-                yield from measure_repeatability(meshes[0], self.poses, player, writer, repeated_count)
-                yield Progress("poses", pose_count, pose_count)
+    Downstream modifiers are disabled while a mesh is evaluated. But another mesh may read the mesh with these
+    modifiers, as a shrinkwrapped sleeve reads a subdivided body. Such a mesh gets a pass of its own.
+    """
+    read_objects = {mesh_object for scene_rig in rigs for mesh_object in deforming_mesh_objects(scene_rig)}
+    separate_indices = [
+        index
+        for index, rig in enumerate(rigs)
+        if rig.mesh_object in read_objects and read_stack(rig.mesh_object).downstream
+    ]
+    common_indices = [index for index in range(len(rigs)) if index not in separate_indices]
+    return [indices for indices in (common_indices, *([index] for index in separate_indices)) if indices]
 
-    def _describe_estimate(self, meshes: list[RecordedMesh], remaining_count: int) -> str:
-        """Describe the remaining work of meshes that are evaluated together; empty if no poses remain."""
-        if not remaining_count:
-            return ""
-        settle_seconds = self.poses.pose_setter.seconds_per_pose
-        # The whole scene is evaluated for each pose, so the times of meshes do not add up.
-        seconds = [settle_seconds or mesh.evaluator.seconds_per_pose for mesh in meshes]
-        remaining_seconds = None if None in seconds else max(seconds) * remaining_count
-        vertex_count = sum(mesh.rig.vertex_count for mesh in meshes)
-        total_bytes = sum(recording_bytes(mesh.rig, self.poses.total) for mesh in meshes)
-        return Estimate(remaining_count, vertex_count, total_bytes, remaining_seconds).sentence()
 
-    def _make_info(self, mesh: RecordedMesh) -> RecordingInfo:
-        """Make the info of the recording of a mesh."""
-        sampling = make_sampling(mesh.scene_rig, self.settings, mesh.limits)
-        file_name, blender_version = Path(bpy.data.filepath).name, bpy.app.version_string
-        origin = file_name, mesh.name, blender_version, sampling, mesh.fit
-        return RecordingInfo(self.poses.total, 0, *origin, self.poses.pose_setter.recorded_target)
+def _make_info(
+    mesh: RecordedMesh, settings: RecordingSettings, plan: PosePlan, limits: tuple, alone: AlonePosePlan | None
+) -> RecordingInfo:
+    """Make the info of the recording of a mesh; `limits` are its channels and those that other meshes share."""
+    sampling, alone_poses = make_sampling(mesh.scene_rig, settings, limits), alone.description if alone else None
+    if alone_poses:
+        sampling = replace(sampling, sources=(*sampling.sources, Source(ALONE, alone_poses.poses)))
+    # Any joint may move a target.
+    dependencies = (
+        mesh.rig.joint_names
+        if settings.target.name
+        else read_dependencies(mesh.scene_rig, find_actions(settings)).bones
+    )
+    return RecordingInfo(
+        sum(source.poses for source in sampling.sources),
+        0,
+        Path(bpy.data.filepath).name,
+        mesh.name,
+        bpy.app.version_string,
+        sampling,
+        describe_bones(mesh.scene_rig, mesh.rig, dependencies, find_fixed_joints(mesh.scene_rig)),
+        plan.pose_setter.recorded_target,
+        alone=alone_poses,
+    )

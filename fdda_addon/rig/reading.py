@@ -27,7 +27,7 @@ from ..scene.unit import metres_per_unit
 from .deformation import read_deformation
 from .joints import choose_joints
 from .target import Target
-from .unread_bones import find_unread_bones, read_unread_bones
+from .unread_bones import read_unread_bones
 
 IDENTITY_TOLERANCE = 1e-6
 """A matrix counts as the identity if no element differs from the identity by more than this."""
@@ -123,29 +123,16 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
     """
     rig = read_rig(scene_rig, info.joint_names)
     if info.fingerprint.has_key_joints:
+        names = [name for name in info.joint_names if name in rig.joint_names]
+        is_complete = len(names) == len(info.joints)
+        selected = select_joints(rig, info.joints if is_complete else choose_joints(scene_rig, names, names))
         unread_bones = info.fingerprint.deformation.get("unread_bones", {})
-        rig = read_key_joints_rig(scene_rig, rig, info.joint_names, unread_bones)
+        deformation = rig.fingerprint.deformation | {"unread_bones": read_unread_bones(scene_rig, unread_bones)}
+        rig = replace(selected, fingerprint=replace(selected.fingerprint, deformation=deformation))
     if scene_rig.mesh_object.fdda.is_fast_rig:
         skin_weights, deformation = info.fingerprint.skin_weights, info.fingerprint.deformation
         rig = replace(rig, fingerprint=replace(rig.fingerprint, skin_weights=skin_weights, deformation=deformation))
     return replace(rig, controls=info.controls, metres_per_unit=info.metres_per_unit)
-
-
-def read_key_joints_rig(
-    scene_rig: SceneRig, rig: Rig, names: Iterable[str], unread_bones: Iterable[str] | None = None
-) -> Rig:
-    """Read a rig with some of its joints (`mathematics.key_joints.select_joints`), and how other bones follow them.
-
-    Args:
-        scene_rig, rig: the rig with its own skin weights.
-        names: names of the joints, every parent before its children; names that the rig lacks are ignored.
-        unread_bones: names of the other bones to read; None to find them (`find_unread_bones`).
-    """
-    names = [name for name in names if name in rig.joint_names]
-    selected = select_joints(rig, choose_joints(scene_rig, names, names))
-    unread_bones = sorted(find_unread_bones(scene_rig, rig, names) if unread_bones is None else unread_bones)
-    deformation = rig.fingerprint.deformation | {"unread_bones": read_unread_bones(scene_rig, unread_bones)}
-    return replace(selected, fingerprint=replace(selected.fingerprint, deformation=deformation))
 
 
 def armature_to_mesh_matrix(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:

@@ -14,7 +14,8 @@ from operator import attrgetter
 import bpy
 import numpy as np
 
-from ..core.rig import STATIC_JOINT, Fingerprint, Rig
+from ..core.recording.bones import RecordedBones
+from ..core.rig import Fingerprint, Rig
 from ..scene.bone_transform import controls_by_bone
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
@@ -29,20 +30,27 @@ _CONSTRAINT_LABELS = {"name", "type", "show_expanded", "is_override_data", "acti
 _IK_TYPES = {"IK", "SPLINE_IK"}
 
 
-def find_unread_bones(scene_rig: SceneRig, rig: Rig, joint_names: Iterable[str]) -> set[str]:
-    """Find the bones whose changes move the mesh without moving what a model reads.
-
-    These are the bones with skin weights that are no joints, and the bones that move these alone.
+def describe_bones(
+    scene_rig: SceneRig, rig: Rig, dependencies: Iterable[str], fixed_joints: Iterable[str]
+) -> RecordedBones:
+    """Describe the bones of a rig, so that key joints can be chosen without Blender.
 
     Args:
-        scene_rig, rig: the rig with its own skin weights and the controls of the model.
-        joint_names: names of the joints of the model.
+        scene_rig, rig: the rig with its own skin weights and all joints and controls.
+        dependencies: names of the joints that move the mesh otherwise than by skin weights.
+        fixed_joints: names of the joints that keep their parents as reference joints.
     """
+    sources, controlled = _sources_of_bones(scene_rig.armature_object), set(controls_by_bone(rig.controls))
     weighted = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
-    joints, sources = set(joint_names), _sources_of_bones(scene_rig.armature_object)
-    followers = weighted - joints - {STATIC_JOINT}
-    visible = _with_sources(sources, joints | set(controls_by_bone(rig.controls)))
-    return followers | (_with_sources(sources, followers) - visible)
+    described = sorted(_with_sources(sources, {*rig.joint_names, *controlled}))
+    indices = {name: index for index, name in enumerate(rig.joint_names)}
+    return RecordedBones(
+        tuple(sorted(indices[name] for name in dependencies if name in indices)),
+        tuple(sorted(indices[name] for name in fixed_joints if name in indices)),
+        tuple(sorted(controlled)),
+        {name: sorted(sources[name] & sources.keys()) for name in described},
+        read_unread_bones(scene_rig, sorted(_with_sources(sources, weighted))),
+    )
 
 
 def read_unread_bones(scene_rig: SceneRig, names: Iterable[str]) -> dict[str, dict]:

@@ -15,6 +15,7 @@ from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.poses.control_bones import (
     bones_without_location_range,
     describe_control_bones,
@@ -80,7 +81,7 @@ def test_the_recording_has_the_controls_and_their_influences(face_folder):
     recording = read_recording(face_folder / "with_recording")
     assert {control.path for control in recording.rig.controls} == PATHS
     assert list(recording.rig.joint_names) == ["upper", "lower"]
-    partition = next(p for p in recording.partitions if recording.rig.joint_names[p.joint] == "lower")
+    partition = next(p for p in skin_recording(recording).partitions if recording.rig.joint_names[p.joint] == "lower")
     assert set(partition.controls) == set(range(len(PATHS)))
     values = np.array(recording.controls)
     assert (np.ptp(values, axis=0) > 0.02).all()

@@ -13,6 +13,7 @@ import pytest
 
 from blend_fixtures.characters import rigify
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 
 from .conftest import assert_plays, run, train
 
@@ -60,7 +61,7 @@ def test_only_near_joints_influence_a_foot(character: Character):
     """No joint of head or hands influences a foot."""
     recording = read_recording(character.recording)
     names = recording.rig.joint_names
-    for partition in recording.partitions:
+    for partition in skin_recording(recording).partitions:
         influencing_names = {names[joint] for joint in partition.influencing}
         if "foot" in names[partition.joint] and "fore" not in names[partition.joint]:
             assert influencing_names

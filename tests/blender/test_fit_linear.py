@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recordings with fitted skin weights: training, playback, resuming, and errors."""
+"""Models with fitted skin weights: training, playback, the sidebar, and errors."""
 
 import dataclasses
 import json
@@ -12,29 +12,25 @@ import pytest
 
 from blend_fixtures.characters.base import cage, skin, tube
 from blend_fixtures.elbow import build_elbow, lower_weights
-from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.skin_fit import SkinFit
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.evaluation import heat_map
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
-from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.run import record
+from fdda_addon.recording.run import MISSING_WEIGHTS
 from fdda_addon.rig.reading import PoseReader, read_rig
 from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.network import Network
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import ELBOW, assert_plays, evaluated_positions, pose, run, train
 from .refusals import save_elbow
-from .resuming import check_resuming
-from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
+from .scene_state import drain
 from .stand_ins import import_from
-
-SMOOTH_SETTINGS = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
 
 
 def build_rigid_elbow() -> None:
@@ -63,12 +59,11 @@ def build_cloth() -> SceneRig:
 
 @dataclasses.dataclass(frozen=True)
 class FittedCharacter:
-    """Paths of a character with fitted linear skinning, and the output of `record`."""
+    """Paths of a character with fitted linear skinning."""
 
     rig: Path
     recording: Path
     model: Path
-    printed: str
 
     def open(self) -> SceneRig:
         bpy.ops.wm.open_mainfile(filepath=str(self.rig))
@@ -77,22 +72,19 @@ class FittedCharacter:
 
 @pytest.fixture(scope="module")
 def make_fitted_character(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], FittedCharacter]:
-    """Return a function that records a character with fitted weights and trains a model, once for each kind."""
+    """Return a function that records a character and trains a model with fitted weights, once for each kind."""
     characters: dict[str, FittedCharacter] = {}
 
-    def make(kind: str, build: Callable[[], object], capfd: pytest.CaptureFixture) -> FittedCharacter:
+    def make(kind: str, build: Callable[[], object]) -> FittedCharacter:
         if kind not in characters:
             folder = tmp_path_factory.mktemp("fitted")
             files = [folder / name for name in ("rig.blend", "recording", "model.onnx")]
             bpy.ops.wm.read_factory_settings(use_empty=True)
             build()
             save_copy(files[0])
-            capfd.readouterr()
-            options = ("--object", ELBOW, "--poses", 120, "--fit-linear", kind)
-            assert run("record", *files[:2], *options) == 0
-            printed = capfd.readouterr().out
-            train(*files[1:], "--epochs", 25)
-            characters[kind] = FittedCharacter(*files, printed)
+            assert run("record", *files[:2], "--object", ELBOW, "--poses", 120) == 0
+            train(*files[1:], "--epochs", 25, "--fit-linear", kind)
+            characters[kind] = FittedCharacter(*files)
         return characters[kind]
 
     return make
@@ -109,11 +101,11 @@ def pose_matrices(rig: SceneRig, recorded: Rig) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("kind", "build"), KINDS_AND_BUILDERS)
-def test_fitted_weights_reduce_errors_and_are_in_the_model(kind, build, make_fitted_character, capfd):
-    files = make_fitted_character(kind, build, capfd)
+def test_fitted_weights_reduce_errors_and_are_in_the_model(kind, build, make_fitted_character):
+    files = make_fitted_character(kind, build)
     recording, info = read_recording(files.recording), read_model_info(files.model)
-    fit = recording.info.fit
-    assert fit.sentence() in files.printed and (fit.kind, fit.poses) == (kind, 120)
+    fit = SkinFit.from_json(info.training["fit"])
+    assert fit.sentence() == info.skin_sentence and (fit.kind, fit.poses) == (kind, 120)
     for gain in (fit.held_out, fit.training):
         assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
 
@@ -122,7 +114,8 @@ def test_fitted_weights_reduce_errors_and_are_in_the_model(kind, build, make_fit
     # The fingerprint describes the rig, and does not include fitted weights.
     assert recording.rig.fingerprint == rig_data.fingerprint == info.fingerprint
     assert [rig_data.joint_names[p.joint] for p in info.partitions] == ["upper", "lower"]
-    assert (recording.rig.skin_weights > 0).sum(axis=1).max() == (1 if kind == "hard" else 2)
+    linear_rig = Network(files.model).linear_rig(rig_data)
+    assert (linear_rig.skin_weights > 0).sum(axis=1).max() == (1 if kind == "hard" else 2)
     assert (rig_data.skin_weights > 0).sum(axis=1).max() == 1
 
     evaluation = drain(evaluate(rig, files.model, EvaluationSettings(30)))
@@ -134,8 +127,8 @@ def test_fitted_weights_reduce_errors_and_are_in_the_model(kind, build, make_fit
 
 
 @pytest.mark.parametrize(("kind", "build"), KINDS_AND_BUILDERS)
-def test_playback_uses_the_fitted_weights(kind, build, make_fitted_character, capfd):
-    files = make_fitted_character(kind, build, capfd)
+def test_playback_uses_the_fitted_weights(kind, build, make_fitted_character):
+    files = make_fitted_character(kind, build)
     rig = files.open()
     pose(angle=1.2)
     rig_shape = evaluated_positions(rig.mesh_object)
@@ -145,27 +138,29 @@ def test_playback_uses_the_fitted_weights(kind, build, make_fitted_character, ca
     assert len(np.unique(heat_map.colors_of(rig.mesh_object), axis=0)) == 2
     rig.mesh_object.fdda.mode = "LINEAR"
     linear_positions = evaluated_positions(rig.mesh_object)
-    recording = read_recording(files.recording)
-    matrices = pose_matrices(rig, recording.rig)
-    np.testing.assert_allclose(linear_positions, LinearSkinning(recording.rig).positions(matrices[None])[0], atol=1e-5)
+    linear_rig = Network(files.model).linear_rig(read_recording(files.recording).rig)
+    matrices = pose_matrices(rig, linear_rig)
+    np.testing.assert_allclose(linear_positions, LinearSkinning(linear_rig).positions(matrices[None])[0], atol=1e-5)
     errors = [np.linalg.norm(positions - rig_shape, axis=1).mean() for positions in (model_positions, linear_positions)]
     assert errors[0] < errors[1] < 0.01
 
 
-def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_path):
-    build_cloth()
+def test_a_mesh_without_weights_is_recorded_and_needs_fitted_ones(refusal, tmp_path, capfd):
+    rig = build_cloth()
     save_copy(tmp_path / "cloth.blend")
-    assert refusal("record", tmp_path / "cloth.blend", tmp_path / "recording", "--object", ELBOW) == (
-        "'elbow' has no Armature modifier, so there is no linear skinning to learn from; have one fitted (--fit-linear "
-        "smooth, or Base Skinning in the sidebar)."
-    )
-    mesh_object, armature_object = bpy.data.objects[ELBOW], bpy.data.objects["elbow_rig"]
-    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    rig.mesh_object.modifiers.new("Armature", "ARMATURE").object = rig.armature_object
     save_copy(tmp_path / "without_weights.blend")
-    assert refusal("record", tmp_path / "without_weights.blend", tmp_path / "recording", "--object", ELBOW) == (
-        "The vertices of 'elbow' have no weights on deforming bones of 'elbow_rig', so there is no linear skinning to "
-        "learn from; have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint weights."
-    )
+    for name in ("cloth", "without_weights"):
+        assert run("record", tmp_path / f"{name}.blend", tmp_path / name, "--object", ELBOW, "--poses", 12) == 0
+        assert MISSING_WEIGHTS.format(ELBOW) in capfd.readouterr().out
+        text = refusal("train", tmp_path / name, tmp_path / "m.onnx")
+        assert text.startswith("The vertices of 'elbow' follow no bone by skin weights") and "--fit-linear" in text
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "cloth.blend"))
+    settings = bpy.data.objects[ELBOW].fdda.settings
+    settings.recording = str(tmp_path / "other")
+    with pytest.raises(RuntimeError, match="have no weights on deforming bones of 'elbow_rig', so there is no linear"):
+        bpy.ops.fdda.build_model(object=ELBOW)
+    assert not (tmp_path / "other").exists()
 
 
 def test_all_meshes_are_those_with_an_armature_modifier_and_others_are_named(tmp_path, capfd):
@@ -181,7 +176,7 @@ def test_all_meshes_are_those_with_an_armature_modifier_and_others_are_named(tmp
 
 
 def test_the_times_of_a_mesh_without_armature_modifier_lack_linear_skinning(make_fitted_character, capfd, tmp_path):
-    files = make_fitted_character(*KINDS_AND_BUILDERS[0], capfd)
+    files = make_fitted_character(*KINDS_AND_BUILDERS[0])
     times = tmp_path / "times.json"
     assert run("benchmark", files.rig, files.model, "--object", ELBOW, "--json", times, "--frames", 2) == 0
     assert "linear" not in json.loads(times.read_text())
@@ -190,72 +185,17 @@ def test_the_times_of_a_mesh_without_armature_modifier_lack_linear_skinning(make
 
 
 def test_fitting_to_too_few_poses_is_refused(refusal, tmp_path):
-    path = save_elbow(tmp_path / "elbow.blend")
-    assert refusal("record", path, tmp_path / "recording", "--poses", 9, "--fit-linear", "hard") == (
-        "Skin weights are fitted to at least 10 poses, and these are 9; record more, or leave --fit-linear out."
+    assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 9) == 0
+    text = refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--fit-linear", "hard")
+    assert text.startswith(
+        "Skin weights are fitted to at least 10 poses, and the recording has 9; record more, or leave --fit"
     )
 
 
-def test_a_python_without_scipy_leaves_no_recording(refusal, tmp_path, monkeypatch):
-    path = save_elbow(tmp_path / "elbow.blend")
+def test_a_python_without_scipy_is_named(refusal, elbow_files, tmp_path, monkeypatch):
     packages = tmp_path / "packages"
     packages.mkdir()
     (packages / "sitecustomize.py").write_text("import sys\nsys.modules['scipy'] = None\n")
     import_from(packages, monkeypatch)
-    text = refusal("record", path, tmp_path / "recording", "--poses", 12, "--fit-linear", "smooth")
-    assert text.startswith("Fitting skin weights needs the Python package 'scipy', which ")
-
-
-def test_a_fit_whose_process_dies_prints_an_error(refusal, tmp_path, monkeypatch):
-    path = save_elbow(tmp_path / "elbow.blend")
-    (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(3)\n")
-    import_from(tmp_path, monkeypatch)
-    assert refusal("record", path, tmp_path / "recording", "--poses", 12, "--fit-linear", "smooth") == (
-        "The trainer ended with status 3 before it was done; no skin weights were fitted, record again."
-    )
-
-
-def test_refining_poses_cannot_fit_weights_again(tmp_path, refusal):
-    assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 3) == 0
-    status = run(
-        "record", tmp_path / "elbow.blend", tmp_path / "recording", "--refine", "m.onnx", "--fit-linear", "hard"
-    )
-    assert status == 2
-
-
-def test_a_resumed_recording_keeps_its_weights(tmp_path, monkeypatch):
-    others = [dataclasses.replace(SMOOTH_SETTINGS, fit_linear=kind) for kind in ("", "hard")]
-    check_resuming(fresh_elbow(), tmp_path, SMOOTH_SETTINGS, others, "--fit-linear smooth", monkeypatch)
-
-
-def test_a_recording_of_the_rigs_own_weights_is_not_resumed_with_others(tmp_path):
-    rig = fresh_elbow()
-    drain(record(rig, tmp_path / "own", RecordingSettings(poses=4, influence_poses=1)))
-    with pytest.raises(RecordingError, match="it was recorded with the rig's own weights; give that"):
-        drain(record(rig, tmp_path / "own", dataclasses.replace(SMOOTH_SETTINGS, poses=4, resume=True)))
-
-
-def test_a_canceled_fit_leaves_no_files(tmp_path):
-    rig = fresh_elbow()
-    before = scene_state(rig)
-    for stage in ("poses to fit", "fit"):
-        steps = record(rig, tmp_path / "recording", SMOOTH_SETTINGS)
-        assert any(step.stage == stage for step in steps)
-        steps.close()
-    assert_same_state(before, scene_state(rig))
-    assert not (tmp_path / "recording").exists()
-
-
-def test_the_sidebar_records_with_fitted_weights(tmp_path):
-    rig = fresh_elbow()
-    settings = rig.mesh_object.fdda.settings
-    settings.poses, settings.fit_linear = 12, "HARD"
-    assert bpy.ops.fdda.record(object=ELBOW, folder=str(tmp_path / "recording")) == {"FINISHED"}
-    index = json.loads((tmp_path / "recording" / "recording.json").read_text())
-    assert (index["fit"]["kind"], index["fit"]["poses"]) == ("hard", 12)
-    rig_data = read_rig(rig)
-    same_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], ("hard", "all"))
-    assert (same_settings.state, same_settings.sentence) == (FolderState.COMPLETE, "")
-    assert same_settings.measured_sentences[0].startswith("Linear skinning with fitted weights (hard), mm: ")
-    other_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], ("", "all"))
-    assert other_settings.sentence == "It was recorded with other settings than those above: base skinning."
+    text = refusal("train", elbow_files.recording, tmp_path / "m.onnx", "--fit-linear", "smooth")
+    assert "'scipy'" in text

@@ -16,11 +16,14 @@ from blend_fixtures.characters.bones import (
     add_bones,
     limit,
 )
-from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseEvaluator
 from fdda_addon.scene.scene_rig import find_rig
+
+from .scene_state import drain
 
 
 def chains() -> None:
@@ -84,17 +87,17 @@ def test_joints_influence_their_chain_and_shape_keys_what_they_move(
     monkeypatch.setattr(meshes, "BONES_PER_CHAIN", 8)
     build()
     settings = RecordingSettings(poses=1, sample=sample)
-    steps = [step for step in record(find_rig(), tmp_path / "recording", settings) if step.stage == "influences"]
-    recording = read_index(tmp_path / "recording")
-    names = [joint["name"] for joint in recording["joints"]]
-    chain_and_bone = [tuple(map(int, name.split(".")[1:])) for name in names]
-    assert len(steps) == steps[-1].done == steps[-1].total == settings.influence_poses * (1 + len(names))
-    for partition in recording["partitions"]:
-        chain, bone = chain_and_bone[partition["joint"]]
-        influencing = {chain_and_bone[joint] for joint in partition["influencing"]}
+    drain(record(find_rig(), tmp_path / "recording", settings))
+    recording = skin_recording(read_recording(tmp_path / "recording"))
+    chain_and_bone = [tuple(map(int, name.split(".")[1:])) for name in recording.rig.joint_names]
+    keys = recording.rig.controls
+    assert len(recording.recorded_positions) == 1 + settings.influence_poses * (1 + len(chain_and_bone)) + len(keys)
+    for partition in recording.partitions:
+        chain, bone = chain_and_bone[partition.joint]
+        influencing = {chain_and_bone[joint] for joint in partition.influencing}
         # A bone that drives a shape key of another chain acts there through the value of the key alone.
         assert {joint for joint in influencing if joint[0] != chain} == set()
-        key_values = [recording["controls"][control]["path"] for control in partition.get("controls", ())]
+        key_values = [keys[control].path for control in partition.controls]
         assert key_values == ([f'key_blocks["key {chain}"].value'] if build is chains_with_distant_influences else [])
         # Delta mush lets the neighbors of a bone move its vertices.
         assert influencing & {(chain, bone - 1), (chain, bone + 1)}
@@ -113,18 +116,14 @@ def test_a_joint_that_makes_positions_infinite_is_an_influence(is_broken, tmp_pa
             positions[:5] = np.nan
         return pose_matrices, positions, controls
 
-    monkeypatch.setattr(PoseEvaluator, "evaluate", evaluate_with_fault)
-    settings = RecordingSettings(poses=4)
-    notes = []
-    for step in record(scene_rig, tmp_path / "recording", settings):
-        if step.stage == "poses":
-            # A recording of positions that are not finite is refused.
-            monkeypatch.setattr(PoseEvaluator, "evaluate", evaluate)
-        elif step.note:
-            notes.append(step.note)
-    recording = read_index(tmp_path / "recording")
-    names = [joint["name"] for joint in recording["joints"]]
-    (upper,) = [p for p in recording["partitions"] if names[p["joint"]] == "upper"]
-    assert (names.index("lower") in upper["influencing"]) == is_broken
+    for step in record(scene_rig, tmp_path / "recording", RecordingSettings(poses=4)):
+        # Other poses with positions that are not finite are refused.
+        if step.done == 4:
+            monkeypatch.setattr(PoseEvaluator, "evaluate", evaluate_with_fault)
+    notes: list[str] = []
+    recording = skin_recording(read_recording(tmp_path / "recording"), note=notes.append)
+    names = recording.rig.joint_names
+    (upper,) = [p for p in recording.partitions if names[p.joint] == "upper"]
+    assert (names.index("lower") in upper.influencing) == is_broken
     assert len(notes) == is_broken
     assert all("are not finite in " in note and "'lower' moves from the rest pose" in note for note in notes)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recordings with key joints: choice, training, playback, fast rigs, resuming, the sidebar, and errors."""
+"""Models of key joints: choice, training, playback, fast rigs, the sidebar, and errors."""
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
@@ -14,40 +13,41 @@ from blend_fixtures.characters.bones import NewBone, add_bones, limit
 from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
 from fdda_addon.core.controls import Control
-from fdda_addon.core.errors import ModelError, RigError
+from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.formats.model_info import ModelInfo
+from fdda_addon.core.mathematics.key_joints import find_unread_bones
+from fdda_addon.core.mathematics.skin_fit import SkinFit
 from fdda_addon.core.recording.folder import FolderState, read_folder
+from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.recording.weight_fitting import MIN_RANDOM_POSES, choose_fit_poses
-from fdda_addon.rig.reading import PoseEvaluator, read_rig
-from fdda_addon.rig.unread_bones import find_unread_bones
-from fdda_addon.runtime.binding import bind
+from fdda_addon.rig.reading import read_rig
+from fdda_addon.rig.unread_bones import describe_bones
+from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.session import session
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import assert_plays, run, train
-from .resuming import check_resuming
 from .rig_changes import change_in_edit_mode, trigger_check
-from .scene_state import assert_same_state, drain, scene_state
+from .scene_state import drain
 from .waves import wave
 
-SETTINGS = RecordingSettings(poses=80, influence_poses=2, joints="auto")
+SETTINGS = RecordingSettings(poses=80, influence_poses=2)
 
 
 @dataclasses.dataclass(frozen=True)
 class LimbFiles:
-    """Paths of the limb with helpers, its recording and model with key joints, and the output of `record`."""
+    """Paths of the limb with helpers, its recording, and its model with key joints."""
 
     rig: Path
     recording: Path
     model: Path
-    printed: str
 
     def open(self) -> SceneRig:
         bpy.ops.wm.open_mainfile(filepath=str(self.rig))
@@ -55,25 +55,28 @@ class LimbFiles:
 
 
 @pytest.fixture(scope="module")
-def limb_files(tmp_path_factory, request) -> LimbFiles:
+def limb_files(tmp_path_factory) -> LimbFiles:
     folder = tmp_path_factory.mktemp("limb")
     files = [folder / name for name in ("rig.blend", "recording", "model.onnx")]
     bpy.ops.wm.read_factory_settings(use_empty=True)
     limb_with_helpers()
     save_copy(files[0])
-    capture = request.config.pluginmanager.getplugin("capturemanager")
-    with capture.global_and_fixture_disabled():
-        pass
-    capture.read_global_capture()
-    assert run("record", *files[:2], "--poses", 300, "--joints", "auto") == 0
-    printed = capture.read_global_capture().out
-    train(*files[1:], "--epochs", 60)
-    return LimbFiles(*files, printed)
+    assert run("record", *files[:2], "--poses", 300) == 0
+    train(*files[1:], "--epochs", 60, "--joints", "auto")
+    return LimbFiles(*files)
 
 
 def build_limb(build=limb_with_helpers) -> SceneRig:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     return SceneRig(*build())
+
+
+def trained(rig: SceneRig, folder: Path, *options: object, settings: RecordingSettings = SETTINGS) -> ModelInfo:
+    """Record a rig, unless it is recorded, and train a model with key joints; return the metadata of the model."""
+    if not folder.exists():
+        drain(record(rig, folder / "recording", settings))
+    train(folder / "recording", folder / "model.onnx", "--epochs", 1, "--joints", *(options or ("auto",)))
+    return read_model_info(folder / "model.onnx")
 
 
 def pose_limb(armature_object: bpy.types.Object) -> None:
@@ -84,13 +87,15 @@ def pose_limb(armature_object: bpy.types.Object) -> None:
 
 def test_bones_that_follow_others_are_not_read(limb_files):
     recording, info = read_recording(limb_files.recording), read_model_info(limb_files.model)
-    assert recording.rig.joint_names == info.joint_names == MAIN_BONES
-    report = recording.info.fit.key_joints
+    assert info.joint_names == MAIN_BONES
+    report = SkinFit.from_json(info.training["fit"]).key_joints
     assert (report.joints, report.rig_joints, report.independent, report.still) == (3, 7, (), ())
-    assert report.sentence() in limb_files.printed
+    assert info.skin_sentence.startswith("Key joints: the model reads 3 of 7 joints; in random poses the ")
     rig = read_rig(limb_files.open())
-    assert set(rig.joint_names) == {*MAIN_BONES, *HELPERS}
-    assert recording.rig.fingerprint.skin_weights != rig.fingerprint.skin_weights
+    assert set(rig.joint_names) == set(recording.rig.joint_names) == {*MAIN_BONES, *HELPERS}
+    assert recording.rig.fingerprint == rig.fingerprint
+    assert info.fingerprint.skin_weights != rig.fingerprint.skin_weights
+    assert set(info.fingerprint.deformation["unread_bones"]) == set(HELPERS)
 
 
 def test_the_rest_is_learnt(limb_files):
@@ -242,8 +247,10 @@ def test_bones_that_move_only_bones_that_are_not_read_are_compared():
     chain.target = chain.pole_target = rig.armature_object
     chain.subtarget, chain.pole_subtarget, chain.chain_count = "bone.0", "pole", 1
     controls = (Control("armature_object", 'pose.bones["control"].location[0]', -1, 1),)
-    bones = find_unread_bones(rig, dataclasses.replace(read_rig(rig), controls=controls), MAIN_BONES)
-    assert bones == {*HELPERS, "mechanism", "above", "pole"}
+    rig_data = dataclasses.replace(read_rig(rig), controls=controls)
+    bones = describe_bones(rig, rig_data, (), ())
+    unread = find_unread_bones(bones.sources, bones.controlled, rig_data, MAIN_BONES)
+    assert unread == sorted([*HELPERS, "mechanism", "above", "pole"]) and set(unread) <= bones.settings.keys()
 
 
 def test_a_fast_rig_has_only_the_bones_that_the_model_reads(limb_files, tmp_path):
@@ -269,21 +276,22 @@ def test_poses_are_added_at_the_worst_errors(limb_files, tmp_path):
     options = ("--refine", limb_files.model, "--poses", 6)
     assert run("record", limb_files.rig, tmp_path / "recording", *options) == 0
     recording = read_recording(tmp_path / "recording")
-    assert len(recording.pose_matrices) == 306 and recording.rig.joint_names == MAIN_BONES
+    assert recording.info.sampling.sources[-1].poses == 6 and len(recording.rig.joints) == 7
 
 
-def test_nothing_is_removed_from_a_limb_of_free_bones(tmp_path, capfd):
+def test_nothing_is_removed_from_a_limb_of_free_bones(tmp_path):
+    """One recording is enough for any choice of joints."""
     rig = build_limb(limb_of_free_bones)
-    save_copy(tmp_path / "rig.blend")
-    for name, options in (("all", ()), ("auto", ("--joints", "auto")), ("number", ("--joints", 6))):
-        assert run("record", tmp_path / "rig.blend", tmp_path / name, "--poses", 60, *options) == 0
-        printed = capfd.readouterr().out
-        sentence = "Key joints: all 6 joints are read, because "
-        reason = {"auto": "each moves by more than ", "number": "6 were asked for."}.get(name, "")
-        assert (sentence + reason in printed) == (name != "all")
-        for file in (tmp_path / "all").iterdir():
-            assert file.read_bytes() == (tmp_path / name / file.name).read_bytes(), file.name
-    assert rig is not None
+    for joints, sentence in (
+        ("all", ""),
+        ("auto", "Key joints: all 6 joints are read, because each moves by more than "),
+        (6, "Key joints: all 6 joints are read, because 6 were asked for."),
+        (4, "Key joints: the model reads 4 of 6 joints, but 2 of the others ('"),
+    ):
+        info = trained(rig, tmp_path / "files", joints)
+        assert info.skin_sentence.startswith(sentence) and bool(info.skin_sentence) == bool(sentence)
+        assert len(info.joints) == (4 if joints == 4 else 6)
+    assert "') move independently of these, by up to " in info.skin_sentence
 
 
 def test_a_bone_that_a_control_moves_follows_from_the_control(tmp_path):
@@ -293,25 +301,12 @@ def test_a_bone_that_a_control_moves_follows_from_the_control(tmp_path):
     drivers = {curve.data_path: curve.driver for curve in armature_object.animation_data.drivers}
     drivers['pose.bones["push.1"].location'].variables[0].targets[0].data_path = '["puff"]'
     settings = dataclasses.replace(SETTINGS, poses=160)
-    drain(record(rig, tmp_path / "without", settings))
-    still = read_recording(tmp_path / "without").info.fit.key_joints
-    assert (still.joints, still.still) == (3, ("push.1",))
-    assert "No random pose moves 1 of the others ('push.1') relative to their parents, so" in still.sentence()
+    info = trained(rig, tmp_path / "without", settings=settings)
+    assert len(info.joints) == 3
+    assert "No random pose moves 1 of the others ('push.1') relative to their parents, so" in info.skin_sentence
     settings = dataclasses.replace(settings, controls=('armature_object/["puff"]',))
-    drain(record(rig, tmp_path / "with", settings))
-    recording = read_recording(tmp_path / "with")
-    assert recording.rig.joint_names == MAIN_BONES
-    assert any(partition.controls for partition in recording.partitions)
-
-
-def test_a_number_says_which_motion_is_lost(tmp_path, capfd):
-    build_limb(limb_of_free_bones)
-    save_copy(tmp_path / "rig.blend")
-    assert run("record", tmp_path / "rig.blend", tmp_path / "recording", "--poses", 60, "--joints", 4) == 0
-    printed = capfd.readouterr().out
-    assert "Key joints: the model reads 4 of 6 joints, but 2 of the others ('" in printed
-    assert "') move independently of these, by up to " in printed
-    assert len(read_recording(tmp_path / "recording").rig.joints) == 4
+    info = trained(rig, tmp_path / "with", settings=settings)
+    assert info.joint_names == MAIN_BONES and any(partition.controls for partition in info.partitions)
 
 
 def test_weights_stay_with_their_joints_if_the_order_changes(tmp_path):
@@ -329,13 +324,11 @@ def test_weights_stay_with_their_joints_if_the_order_changes(tmp_path):
     far = np.flatnonzero(positions[:, 0] > np.quantile(positions[:, 0], 0.9)).tolist()
     rig.mesh_object.vertex_groups.new(name="tail").add(far, 0.5, "REPLACE")
     all_names = read_rig(rig).joint_names
-    drain(record(rig, tmp_path / "recording", SETTINGS))
-    recording = read_recording(tmp_path / "recording")
-    names, fit = recording.rig.joint_names, recording.info.fit
-    assert "copy" in all_names and "copy" not in names
-    assert names != tuple(name for name in all_names if name in names)
-    residuals_mm = 1000 * np.linalg.norm(np.load(tmp_path / "recording" / "residuals.npy"), axis=2)
-    assert np.sqrt((residuals_mm**2).mean()) < 1.5 * fit.training.rms_mm["fitted"]
+    info = trained(rig, tmp_path / "files")
+    assert "copy" in all_names and "copy" not in info.joint_names and "tail" in info.joint_names
+    evaluation = drain(evaluate(rig, tmp_path / "files" / "model.onnx", EvaluationSettings(20)))
+    fit = SkinFit.from_json(info.training["fit"])
+    assert evaluation.linear.rms < 1.5 * fit.training.rms_mm["fitted"]
 
 
 def test_a_root_that_follows_another_is_moved_with_it(tmp_path):
@@ -353,80 +346,45 @@ def test_a_root_that_follows_another_is_moved_with_it(tmp_path):
         limit(bones[name], "LIMIT_ROTATION", {0: (-40.0, 40.0), 1: (-40.0, 40.0), 2: (-40.0, 40.0)})
     for number, name in enumerate(("pin", "fin")):
         rig.mesh_object.vertex_groups.new(name=name).add(range(number, 200, 2), 0.5, "REPLACE")
-    drain(record(rig, tmp_path / "recording", SETTINGS))
-    recording = read_recording(tmp_path / "recording")
-    names = recording.rig.joint_names
+    info = trained(rig, tmp_path / "files")
+    names = info.joint_names
     assert {"world", "bone.0"} <= set(names) and "pin" not in names
-    influences = {names[joint] for partition in recording.partitions for joint in partition.influencing}
+    influences = {names[joint] for partition in info.partitions for joint in partition.influencing}
     assert influences and influences.isdisjoint({"world", "bone.0"})
 
 
-def test_the_search_shows_its_progress(tmp_path):
-    steps = list(record(build_limb(), tmp_path / "recording", SETTINGS))
-    searches = [step for step in steps if step.stage == "key joints"]
-    assert searches and all(0 <= step.done <= step.total for step in searches)
-    stages = list(dict.fromkeys(step.stage for step in steps))
-    assert stages[:2] == ["poses to fit", "fit"] or stages[:2] == ["poses to fit", "key joints"]
-
-
-def test_a_resumed_recording_keeps_its_joints(tmp_path, monkeypatch):
-    others = [dataclasses.replace(SETTINGS, joints=joints) for joints in ("all", "3")]
-    check_resuming(build_limb(), tmp_path, SETTINGS, others, "--joints auto", monkeypatch)
-
-
-def test_the_sidebar_records_with_key_joints(tmp_path):
+def test_the_sidebar_trains_with_other_joints_without_recording_again(tmp_path):
     rig = build_limb()
-    settings = rig.mesh_object.fdda.settings
-    settings.poses, settings.joints = 160, "AUTO"
-    assert bpy.ops.fdda.record(object="limb", folder=str(tmp_path / "recording")) == {"FINISHED"}
-    index = json.loads((tmp_path / "recording" / "recording.json").read_text())
-    assert index["fit"]["key_joints"]["requested"] == "auto"
-    same = read_folder(tmp_path / "recording", read_rig(rig), index["sampling"], ("", "auto"))
-    assert (same.state, same.sentence) == (FolderState.COMPLETE, "")
-    assert same.measured_sentences[0].startswith("Key joints: the model reads 3 of 7 joints; ")
-    other = read_folder(tmp_path / "recording", read_rig(rig), index["sampling"], ("", "all"))
-    assert other.sentence == "It was recorded with other settings than those above: base skinning."
+    settings, files = rig.mesh_object.fdda.settings, (tmp_path / "recording", tmp_path / "model.onnx")
+    settings.poses, settings.epochs = 160, 1
+    assert bpy.ops.fdda.record(object="limb", folder=str(files[0])) == {"FINISHED"}
+    recorded = (files[0] / "recording.json").read_bytes()
+    sampling = read_index(files[0])["sampling"]
+    sampling["sources"] = [source for source in sampling["sources"] if source["kind"] != "alone"]
+    for joints, fit_linear, joint_count in (("ALL", "RIG", 7), ("AUTO", "RIG", 3), ("NUMBER", "HARD", 5)):
+        settings.joints, settings.joint_count, settings.fit_linear = joints, 5, fit_linear
+        content = read_folder(files[0], read_rig(rig), sampling)
+        assert (content.state, content.sentence) == (FolderState.COMPLETE, "")
+        paths = {"recording": str(files[0]), "model": str(files[1])}
+        assert bpy.ops.fdda.train(object="limb", **paths) == {"FINISHED"}
+        info = read_model_info(files[1])
+        assert len(info.joints) == joint_count
+        assert info.training.get("fit", {}).get("kind") == {"ALL": None, "AUTO": "smooth", "NUMBER": "hard"}[joints]
+        bind(rig, files[1])
+        pose_limb(rig.armature_object)
+        assert_plays(rig.mesh_object, files[1])
+        unbind(rig.mesh_object)
+    assert (files[0] / "recording.json").read_bytes() == recorded
     rig.mesh_object.vertex_groups["half.1"].add([0, 1, 2, 3], 0.5, "REPLACE")
-    changed = read_folder(tmp_path / "recording", read_rig(rig))
+    changed = read_folder(files[0], read_rig(rig))
     assert changed.state is FolderState.OTHER and "the skin weights differ" in changed.sentence
 
 
-def test_large_meshes_have_enough_random_poses():
-    poses = choose_fit_poses(1000, 2_000_000, 600)
-    assert sum(index < 600 for index in poses) == MIN_RANDOM_POSES and len(poses) == 60
-    assert len(choose_fit_poses(1000, 2_000_000)) < MIN_RANDOM_POSES
-
-
-def test_an_error_in_a_pose_of_the_fit_restores_limits_at_once(tmp_path, monkeypatch):
-    rig = build_limb(limb_of_free_bones)
-    for bone in rig.armature_object.pose.bones:
-        limit(bone, "LIMIT_ROTATION", {0: (-40.0, 40.0), 1: (-40.0, 40.0), 2: (-40.0, 40.0)})
-    before = scene_state(rig)
-    settings = dataclasses.replace(SETTINGS, margin=1.5)
-    limits = [constraint for bone in rig.armature_object.pose.bones for constraint in bone.constraints]
-
-    def evaluate_pose(_):
-        if any(constraint.mute for constraint in limits):
-            raise RigError("no pose")
-        return evaluate_before(_)
-
-    evaluate_before = PoseEvaluator.evaluate
-    monkeypatch.setattr(PoseEvaluator, "evaluate", evaluate_pose)
-    # The error keeps its traceback, and that the frames of the generators.
-    with pytest.raises(RigError, match="no pose") as error:
-        drain(record(rig, tmp_path / "recording", settings))
-    assert_same_state(before, scene_state(rig))
-    assert error.traceback and not any(constraint.mute for constraint in limits)
-
-
 def test_too_few_random_poses_are_refused(refusal, tmp_path):
-    build_limb()
-    save_copy(tmp_path / "rig.blend")
-    assert refusal("record", tmp_path / "rig.blend", tmp_path / "r", "--poses", 20, "--joints", "auto") == (
-        "Key joints are chosen by at least 40 random poses, and these are 20; record more (--poses), or leave --joints "
-        "out."
+    rig = build_limb()
+    drain(record(rig, tmp_path / "recording", dataclasses.replace(SETTINGS, poses=20)))
+    assert refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--joints", "auto").startswith(
+        "Key joints are chosen by at least 40 random poses, and the recording has 20; record more (--poses), "
+        "or leave --joints"
     )
-
-
-def test_an_invalid_number_is_wrong_usage(tmp_path):
-    assert run("record", tmp_path / "rig.blend", tmp_path / "r", "--joints", "0") == 2
+    assert run("train", tmp_path / "recording", tmp_path / "m.onnx", "--joints", "0") == 2

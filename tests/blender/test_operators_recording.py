@@ -42,8 +42,9 @@ def test_a_recording_follows_the_settings_and_is_stored_beside_the_file(saved, t
     assert [(s.kind, s.poses, s.name) for s in sampling.sources] == [
         ("random", 20, ""),
         ("action", 30, "elbow_wave"),
+        ("alone", 12, ""),
     ]
-    assert job.state_of("record").outcome == "Recorded 50 poses into 'elbow_recording'."
+    assert job.state_of("record").outcome == "Recorded 62 poses into 'elbow_recording'."
 
 
 def test_an_unsaved_file_is_refused_without_a_folder():
@@ -57,9 +58,9 @@ def test_an_unsaved_file_is_refused_without_a_folder():
 def test_a_recording_is_stored_in_the_given_folder(saved, tmp_path):
     saved.mesh_object.fdda.settings.recording = "//deep/down"
     assert record(saved) == {"FINISHED"}
-    assert read_index(tmp_path / "deep" / "down")["complete"] == 20
+    assert read_index(tmp_path / "deep" / "down")["complete"] == 32
     assert record(saved, folder=str(tmp_path / "other")) == {"FINISHED"}
-    assert read_index(tmp_path / "other")["complete"] == 20
+    assert read_index(tmp_path / "other")["complete"] == 32
 
 
 def test_a_canceled_recording_keeps_its_poses_and_is_resumed(saved, tmp_path, monkeypatch):
@@ -77,11 +78,11 @@ def test_a_canceled_recording_keeps_its_poses_and_is_resumed(saved, tmp_path, mo
     assert_same_state(before, scene_state(saved))
     outcome = job.state_of("record").outcome
     complete = read_index(recorded_folder(tmp_path))["complete"]
-    assert complete >= 8 and f"{complete} of 20 poses are kept" in outcome
+    assert complete >= 8 and f"{complete} of 32 poses are kept" in outcome
     with pytest.raises(RuntimeError, match="holds a recording already"):
         record(saved)
     assert record(saved, resume=True) == {"FINISHED"}
-    assert len(read_recording(recorded_folder(tmp_path)).residuals) == 20
+    assert len(read_recording(recorded_folder(tmp_path)).positions) == 32
 
 
 def test_a_folder_locked_by_another_blender_is_refused(saved, tmp_path):
@@ -110,6 +111,6 @@ def test_a_bound_character_is_recorded_with_its_rig(bound_elbow, elbow_files, tm
     assert bound_elbow.fdda.is_playing
     bound_elbow.fdda.settings.poses = 5
     assert bpy.ops.fdda.record(folder=str(tmp_path / "r")) == {"FINISHED"}
-    first, again = (read_recording(path).residuals[:5] for path in (elbow_files.recording, tmp_path / "r"))
+    first, again = (read_recording(path).positions[:5] for path in (elbow_files.recording, tmp_path / "r"))
     np.testing.assert_allclose(again, first, atol=1e-6)
     assert bound_elbow.fdda.is_playing

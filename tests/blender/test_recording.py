@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recordings of the elbow: residuals reproduce the mesh that Blender shows, for any pose and object transform."""
+"""Recordings of the elbow: they have the mesh that Blender shows, for any pose and object transform."""
 
 import json
 import re
@@ -15,9 +15,10 @@ from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.progress import Progress
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.recording.alone_poses import follows_control_bones
 from fdda_addon.recording.appender import BATCH_POSES
-from fdda_addon.recording.influence_trials import follows_control_bones
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseReader, read_rig
@@ -44,12 +45,15 @@ def shown(rig: SceneRig) -> np.ndarray:
 
 
 def assert_reproduces(rig: SceneRig, recording: Recording, poses) -> None:
-    """Assert that recorded poses and residuals reproduce the mesh that Blender shows in the same poses."""
-    skinning = LinearSkinning(recording.rig, recording.partitions)
-    positions = skinning.complex_positions(recording.pose_matrices, recording.residuals)
+    """Assert that recorded positions are those that Blender shows in the same poses."""
     for index, set_pose in poses:
         set_pose()
-        assert np.abs(shown(rig) - positions[index]).max() < 1e-5
+        assert np.abs(shown(rig) - recording.positions[index]).max() < 1e-6
+
+
+def influencing_joints(recording: Recording) -> list[tuple[int, tuple[int, ...]]]:
+    """Return each main joint with the joints that influence its partition."""
+    return [(p.joint, p.influencing) for p in skin_recording(recording).partitions]
 
 
 def random_pose(rig: SceneRig, recording: Recording, index: int):
@@ -58,12 +62,13 @@ def random_pose(rig: SceneRig, recording: Recording, index: int):
     return index, lambda: Poser(rig, channels).set(values)
 
 
-def test_residuals_reproduce_what_blender_shows(fresh, tmp_path):
+def test_positions_are_those_that_blender_shows(fresh, tmp_path):
     recording = recorded(fresh, tmp_path / "r", poses=12, seed=3)
     fresh.armature_object.animation_data_clear()
     assert_reproduces(fresh, recording, (random_pose(fresh, recording, index) for index in (0, 5, 11)))
-    assert np.abs(recording.residuals).max() > 2e-3, "the rig differs from its linear skinning"
-    assert len({pose.tobytes() for pose in recording.pose_matrices}) == 12
+    linear = LinearSkinning(recording.rig).positions(np.array(recording.pose_matrices))
+    assert np.abs(recording.positions - linear).max() > 2e-3, "the rig differs from its linear skinning"
+    assert len({pose.tobytes() for pose in recording.pose_matrices[:12]}) == 12
 
 
 def test_linear_skinning_is_blender_s_armature_modifier(fresh):
@@ -115,7 +120,7 @@ def test_objects_with_different_transforms(fresh, tmp_path):
 def test_influences_of_the_elbow(fresh, tmp_path):
     """The bend of the lower bone affects the upper half, and the rotation of the upper bone affects no residual."""
     recording = recorded(fresh, tmp_path / "r", poses=3)
-    assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
+    assert influencing_joints(recording) == [(0, (1,)), (1, (1,))]
 
 
 def test_a_driven_joint_is_found_by_a_name_with_quotes(fresh):
@@ -132,7 +137,7 @@ def test_rounding_far_from_the_origin_is_no_influence(fresh, tmp_path):
     fresh.mesh_object.data.transform(away)
     fresh.armature_object.data.transform(away)
     recording = recorded(fresh, tmp_path / "r", poses=3)
-    assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
+    assert influencing_joints(recording) == [(0, (1,)), (1, (1,))]
 
 
 def test_influences_include_distant_vertices(fresh, tmp_path):
@@ -151,7 +156,8 @@ def test_influences_include_distant_vertices(fresh, tmp_path):
     variable.targets[0].transform_type, variable.targets[0].transform_space = "ROT_Z", "LOCAL_SPACE"
     driver.expression = "var"
     recording = recorded(fresh, tmp_path / "r", poses=3)
-    assert [(p.joint, p.influencing, p.controls) for p in recording.partitions] == [(0, (1,), ()), (1, (1,), (0,))]
+    partitions = skin_recording(recording).partitions
+    assert [(p.joint, p.influencing, p.controls) for p in partitions] == [(0, (1,), ()), (1, (1,), (0,))]
 
 
 def test_an_action_is_recorded_frame_by_frame(fresh, tmp_path):
@@ -159,16 +165,17 @@ def test_an_action_is_recorded_frame_by_frame(fresh, tmp_path):
     assert [(s.kind, s.poses, s.name, s.frames) for s in recording.info.sampling.sources] == [
         ("random", 4, "", (0, 0)),
         ("action", 30, "elbow_wave", (1, 1)),
+        ("alone", 12, "", (0, 0)),
     ]
     frames = ((4 + frame - 1, lambda frame=frame: bpy.context.scene.frame_set(frame)) for frame in (1, 10, 23, 30))
     assert_reproduces(fresh, recording, frames)
 
 
 def test_an_action_alone(fresh, tmp_path):
-    """For influences, joints are posed one at a time as in the action. The upper joint changes no residual."""
+    """Joints are moved alone to their transforms in the action. The upper joint changes no residual."""
     recording = recorded(fresh, tmp_path / "r", poses=0, actions=("elbow_wave",))
-    assert recording.pose_matrices.shape[0] == 30
-    assert [p.influencing for p in recording.partitions] == [(1,), (1,)]
+    assert len(recording.pose_matrices) == 30 + 12
+    assert influencing_joints(recording) == [(0, (1,)), (1, (1,))]
 
 
 def test_an_action_that_moves_the_object_restores_its_transform(fresh, tmp_path):
@@ -204,40 +211,45 @@ def test_the_index_describes_the_rig_and_its_sampling(fresh, elbow_files):
 def test_progress(fresh, tmp_path):
     poses = BATCH_POSES + 5
     steps = list(record(fresh, tmp_path / "r", RecordingSettings(poses=poses, influence_poses=4)))
-    # There are 4 influence poses, each with a base pose and one pose for each of the 2 joints.
-    assert steps[:12] == [Progress("influences", done, 12) for done in range(1, 13)]
-    first, *others = steps[12:]
+    # There are 4 base poses, and from each, one pose for each of the 2 joints.
+    poses += 12
+    first, *others = steps
     assert (first.stage, first.done, first.total) == ("poses", 0, poses)
-    assert re.fullmatch(r"255 poses of 300 vertices: less than 1 MB on the disk, about (a|\d+) seconds?", first.note)
+    assert re.fullmatch(r"267 poses of 300 vertices: about 1 MB on the disk, about (a|\d+) seconds?", first.note)
     assert others == [Progress("poses", done, poses) for done in range(1, poses + 1)]
 
 
-def test_a_recording_that_is_closed_keeps_its_poses(fresh, tmp_path):
-    settings = RecordingSettings(poses=20, seed=5)
-    whole = recorded(fresh, tmp_path / "whole", poses=20, seed=5)
-    steps = record(fresh, tmp_path / "r", settings)
-    while next(steps) != Progress("poses", 7, 20):
+@pytest.mark.parametrize(("source", "actions"), [("channels", ()), ("overrides", ("elbow_wave",))])
+@pytest.mark.parametrize("closed_after", [7, 20, 26])
+def test_a_recording_that_is_closed_keeps_its_poses(fresh, tmp_path, closed_after, source, actions):
+    """The poses that move one input alone resume like all others, whether by channels or by transforms of joints."""
+    if source == "overrides":
+        fresh.armature_object.pose.bones["lower"].constraints.new("COPY_ROTATION").target = fresh.armature_object
+        fresh.armature_object.pose.bones["lower"].constraints[-1].subtarget = "upper"
+    options = {"poses": 20 if source == "channels" else 5, "seed": 5, "actions": actions}
+    recorded(fresh, tmp_path / "whole", **options)
+    steps = record(fresh, tmp_path / "r", RecordingSettings(**options))
+    while next(steps).done != closed_after:
         pass
     steps.close()
-    assert read_index(tmp_path / "r")["complete"] == 7
-    resumed = recorded(fresh, tmp_path / "r", poses=20, seed=5, resume=True)
-    assert np.array_equal(resumed.residuals, whole.residuals)
-    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == sorted(
-        path.name for path in (tmp_path / "whole").iterdir()
-    )
+    assert read_index(tmp_path / "r")["complete"] == closed_after
+    recorded(fresh, tmp_path / "r", **options, resume=True)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "r").iterdir()} == {
+        path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()
+    }
 
 
 def test_the_seed_determines_the_poses(fresh, tmp_path):
     first, second, other = (
         recorded(fresh, tmp_path / name, poses=3, seed=seed) for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
-    assert np.array_equal(first.residuals, second.residuals)
+    assert np.array_equal(first.positions, second.positions)
     assert not np.array_equal(first.pose_matrices, other.pose_matrices)
 
 
 def test_more_poses_begin_with_the_same_ones(fresh, tmp_path):
     few, many = (recorded(fresh, tmp_path / str(count), poses=count) for count in (3, 8))
-    assert np.array_equal(few.residuals, many.residuals[:3])
+    assert np.array_equal(few.positions[:3], many.positions[:3])
 
 
 def test_nothing_to_record(fresh, tmp_path):
@@ -256,7 +268,7 @@ def test_a_joint_scaled_to_nothing_is_named(fresh, tmp_path):
     limit = bone.constraints.new("LIMIT_SCALE")
     limit.use_max_x = limit.use_max_y = limit.use_max_z = True
     limit.owner_space = "LOCAL"
-    with pytest.raises(RigError, match="Bone 'lower' has a scale of zero in some pose"):
+    with pytest.raises(RecordingError, match="The bone 'lower' has a scale of zero in pose 0; look for the key"):
         recorded(fresh, tmp_path / "r", poses=3)
     assert not (tmp_path / "r").exists()
 

@@ -9,6 +9,7 @@ import pytest
 
 from blend_fixtures.characters import targets
 from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import run
@@ -53,7 +54,7 @@ def test_a_control_that_moves_the_target_through_other_bones_is_an_input(tmp_pat
     control = SLIDE if bounds[0] == -0.05 else f"{SLIDE}={bounds[0]}:{bounds[1]}"
     recording = recorded(tmp_path, "--target", "flesh", "--poses", 20, *ARM, "--control", control)
     assert list(recording.rig.joint_names) == ["upper", "lower"]
-    partition = next(p for p in recording.partitions if recording.rig.joint_names[p.joint] == "lower")
+    partition = next(p for p in skin_recording(recording).partitions if recording.rig.joint_names[p.joint] == "lower")
     assert partition.controls == (0,)
     # It is one control with one range and is sampled once.
     (sampled,) = [channel for channel in recording.info.sampling.channels if "slider" in channel.name]
@@ -69,7 +70,7 @@ def test_a_control_of_a_bone_that_is_a_joint_is_an_input(tmp_path):
     save_copy(tmp_path / "rig.blend")
     bend = 'armature_object/pose.bones["lower"].rotation_euler[0]'
     recording = recorded(tmp_path, "--target", "flesh", "--poses", 20, "--control", bend)
-    assert [partition.controls for partition in recording.partitions] == [(0,), (0,)]
+    assert [partition.controls for partition in skin_recording(recording).partitions] == [(0,), (0,)]
     assert np.ptp(recording.controls) > 0.5
 
 
@@ -106,5 +107,6 @@ def test_a_keyed_property_that_is_a_control_does_not_bind_the_target_to_frames(t
     assert recording.info.target.follows == "pose"
     assert np.ptp(np.array(recording.controls)[:20, 0]) > 0.5
     # Half of the vertices move by 50 mm with the property.
-    residuals = np.linalg.norm(np.array(recording.residuals), axis=-1)
-    assert np.abs(np.corrcoef(recording.controls[:, 0], residuals.max(axis=1))[0, 1]) > 0.5
+    skinned = skin_recording(recording)
+    residuals = np.linalg.norm(skinned.compute_residuals(np.arange(len(skinned.rows))), axis=-1)
+    assert np.abs(np.corrcoef(skinned.controls[:, 0], residuals.max(axis=1))[0, 1]) > 0.5

@@ -12,8 +12,9 @@ from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
-from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
+
+from ..recordings import ResidualRecording, make_recording
 
 JOINTS = (Joint("root", -1), Joint("upper", 0), Joint("lower", 1), Joint("hand", 2))
 BONE_LENGTH, RADIUS = 0.25, 0.05
@@ -66,7 +67,7 @@ def pose_rig(rig: Rig, local_transforms: np.ndarray) -> np.ndarray:
     return pose_matrices.astype(np.float32)
 
 
-def good_recording(poses: int = 200, angles: np.ndarray | None = None, seed: int = 0) -> Recording:
+def good_recording(poses: int = 200, angles: np.ndarray | None = None, seed: int = 0) -> ResidualRecording:
     """Return a recording of the tube; the joints rotate about X, and joints and control make the tube bulge.
 
     Args:
@@ -89,33 +90,33 @@ def good_recording(poses: int = 200, angles: np.ndarray | None = None, seed: int
     sampling = Sampling(seed, 1.0, channels, (Source("random", len(angles)),))
     info = RecordingInfo(len(angles), len(angles), "tube.blend", "tube", "5.2.0", sampling)
     matrices = pose_rig(rig, axis_rotations(angles))
-    return Recording(Path("tube"), info, rig, partitions, matrices, residuals, controls)
+    return make_recording(Path("tube"), info, rig, partitions, matrices, residuals, controls)
 
 
-def with_rig(recording: Recording, **changes: object) -> Recording:
+def with_rig(recording: ResidualRecording, **changes: object) -> ResidualRecording:
     """Return the recording with changed fields of its rig; poses and residuals stay the same."""
     rig = replace(recording.rig, **changes)
     return replace(recording, rig=rig)
 
 
-def with_positions(recording: Recording, positions: np.ndarray) -> Recording:
+def with_positions(recording: ResidualRecording, positions: np.ndarray) -> ResidualRecording:
     """Return the recording with the residuals that follow when the rig evaluates to these (N, V, 3) positions."""
     skinning = LinearSkinning(recording.rig, recording.partitions)
     return replace(recording, residuals=skinning.local_residuals(recording.pose_matrices, positions))
 
 
-def warning_texts(recording: Recording) -> dict[str, str]:
+def warning_texts(recording: ResidualRecording) -> dict[str, str]:
     """Check the recording and return the text of each warning by its name."""
     return {warning.name: warning.text for warning in check_recording(recording)}
 
 
-def single_warning_text(recording: Recording, name: str) -> str:
+def single_warning_text(recording: ResidualRecording, name: str) -> str:
     """Check that the recording causes one warning, of this name, and return its text."""
     texts = warning_texts(recording)
     assert list(texts) == [name]
     return texts[name]
 
 
-def with_partitions(recording: Recording, **changes) -> Recording:
+def with_partitions(recording: ResidualRecording, **changes) -> ResidualRecording:
     """Return the recording with the same changed fields in each of its partitions."""
     return replace(recording, partitions=tuple(replace(p, **changes) for p in recording.partitions))

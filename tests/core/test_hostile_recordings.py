@@ -19,9 +19,9 @@ from fdda_addon.core.recording.writer import RecordingWriter
 from .. import systems
 from .damage import assert_refused, edit_index, npy_bytes
 from .good_recording import good_recording
-from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
+from .limb import make_rig, random_poses, random_positions, recording_info
 
-RECORDING_FILES = ("recording.json", "residuals.npy", "pose_matrices.npy", "rest_positions.npy", "skin_weights.npy")
+RECORDING_FILES = ("recording.json", "positions.npy", "pose_matrices.npy", "rest_positions.npy", "skin_weights.npy")
 NOT_REGULAR_FILE_ERROR = "it is not a regular file"
 
 
@@ -45,7 +45,7 @@ def _time_limit():
 def resume_recording(path, complete=12):
     """Return a writer that resumes the recording of the limb."""
     rig = make_rig()
-    return RecordingWriter(path, rig, partitions_of(rig), recording_info(complete), resume=True)
+    return RecordingWriter(path, rig, recording_info(complete), resume=True)
 
 
 @systems.named_pipes
@@ -73,7 +73,7 @@ def test_a_link_to_another_folder_is_refused(recording, tmp_path, name, target):
 
 
 @systems.symbolic_links
-@pytest.mark.parametrize("name", ["residuals.npy", "rest_positions.npy", "recording.json"])
+@pytest.mark.parametrize("name", ["positions.npy", "rest_positions.npy", "recording.json"])
 def test_resuming_does_not_write_through_links(recording, tmp_path, name):
     """All arrays are written again if no pose is complete."""
     victim = tmp_path / "victim"
@@ -83,8 +83,8 @@ def test_resuming_does_not_write_through_links(recording, tmp_path, name):
         (recording / name).unlink()
         (recording / name).symlink_to(victim)
         with resume_recording(recording) as writer:
-            writer.append(random_poses(12), random_residuals(12))
-        assert read_recording(recording).residuals.shape[0] == 12
+            writer.append(random_poses(12), random_positions(12))
+        assert read_recording(recording).positions.shape[0] == 12
     else:
         shutil.copy(recording / name, victim)
         text = victim.read_text()
@@ -100,9 +100,9 @@ def test_resuming_does_not_write_through_links(recording, tmp_path, name):
 @systems.symbolic_links
 def test_an_extension_does_not_write_through_links(recording, tmp_path):
     opened_recording = read_recording(recording)
-    victim = shutil.move(recording / "residuals.npy", tmp_path / "victim.npy")
+    victim = shutil.move(recording / "positions.npy", tmp_path / "victim.npy")
     bytes_before = (tmp_path / "victim.npy").read_bytes()
-    (recording / "residuals.npy").symlink_to(victim)
+    (recording / "positions.npy").symlink_to(victim)
     with pytest.raises(FDDAError, match="it is a link to another place"):
         RecordingExtension(opened_recording, "m.onnx")
     assert (tmp_path / "victim.npy").read_bytes() == bytes_before
@@ -137,12 +137,12 @@ def test_degenerate_joint_matrices_are_refused(recording, damage):
     assert_refused(recording, "The rest pose or skin weights of")
 
 
-@pytest.mark.parametrize("name", ["residuals", "pose_matrices", "rest_positions", "rest_matrices"])
+@pytest.mark.parametrize("name", ["positions", "pose_matrices", "rest_positions", "rest_matrices"])
 def test_huge_numbers_are_refused(recording, name):
     array = np.load(recording / f"{name}.npy")
     array.reshape(-1)[3] = 1e30
     np.save(recording / f"{name}.npy", array)
-    assert_refused(recording, "beyond all bounds" if name in ("residuals", "pose_matrices") else "rest pose")
+    assert_refused(recording, "beyond all bounds" if name in ("positions", "pose_matrices") else "rest pose")
 
 
 def test_poses_that_training_refuses_are_not_recorded(tmp_path):
@@ -150,8 +150,8 @@ def test_poses_that_training_refuses_are_not_recorded(tmp_path):
     recording = good_recording(4)
     matrices = recording.pose_matrices.copy()
     matrices[2, 1, :3, 0] = 0
-    writer = RecordingWriter(tmp_path / "r", recording.rig, recording.partitions, replace(recording.info, complete=0))
-    with writer, pytest.raises(RecordingError, match="Pose 2 of the rig evaluates to joints that have shrunk to noth"):
+    writer = RecordingWriter(tmp_path / "r", recording.rig, replace(recording.info, complete=0))
+    with writer, pytest.raises(RecordingError, match="has a scale of zero in pose 2; look for"):
         writer.append(matrices, recording.residuals, recording.controls)
 
 
@@ -233,7 +233,7 @@ def test_messages_are_short_and_escape_control_characters(recording):
         read_recording(recording)
     text = str(error.value)
     assert len(text) < 1200 and "\x1b" not in text and "\n" not in text
-    assert "\\x1b[2J" in text and text.endswith("this add-on reads version 1; record again.")
+    assert "\\x1b[2J" in text and text.endswith("this add-on reads version 2; record again.")
 
 
 @systems.sparse_files
@@ -245,7 +245,7 @@ def test_a_huge_sparse_recording_is_refused_without_reading_it(recording):
         ("rest_positions", (vertices, 3), "<f4"),
         ("skin_joints", (vertices, 4), "<i4"),
         ("skin_weights", (vertices, 4), "<f4"),
-        ("residuals", (12, vertices, 3), "<f4"),
+        ("positions", (12, vertices, 3), "<f4"),
     ):
         header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n"
         path = recording / f"{name}.npy"

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.joint_option import parse_joints
-from fdda_addon.core.mathematics.key_joints import KeyJointReport, add_influences, select_joints
-from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.key_joints import KeyJointReport, select_joints
 from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, weights_match
 from fdda_addon.core.rig import Fingerprint, Joint, Rig, rig_differences
 
@@ -73,16 +72,6 @@ def test_the_fingerprint_depends_on_all_weights_but_not_on_joints_without_weight
     assert rig_differences(recorded.joints, recorded.rest_matrices, 4, recorded.fingerprint, selected) == [
         "the skin weights differ"
     ]
-
-
-def test_influences_are_added_by_vertices():
-    rig = chain_rig("a", "b", "c", "d")
-    partitions = make_partitions(rig, {1: (1,)}, {2: (0,)})
-    needed = np.zeros((4, 6), bool)
-    needed[1, 3], needed[2, 5] = True, True
-    added = add_influences(partitions, needed, 4)
-    assert [partition.influencing for partition in added] == [(), (1, 3), (), ()]
-    assert [partition.controls for partition in added] == [(), (), (0, 1), ()]
 
 
 def test_the_report_is_read_back_and_says_what_is_lost():

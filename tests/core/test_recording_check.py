@@ -11,10 +11,10 @@ import pytest
 from fdda_addon.core.checks import residual_scan
 from fdda_addon.core.checks.recording import WARNING_NAMES, check_recording, compute_bone_lengths, merges_sentence
 from fdda_addon.core.checks.warning import RecordingWarning, format_length, format_list, format_with_noun
-from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.recording.index import Source
-from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.rig import STATIC_JOINT
+from fdda_addon.core.recording.skinned import SkinnedRecording
+from fdda_addon.core.rig import STATIC_JOINT, Joint
 
 from .good_recording import (
     BONE_LENGTH,
@@ -30,7 +30,7 @@ from .good_recording import (
 FORMATS_PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 
 
-def scaled_recording(recording: Recording, factor: float) -> Recording:
+def scaled_recording(recording: SkinnedRecording, factor: float) -> SkinnedRecording:
     """Return the recording of the same character, scaled by a factor."""
     rest_matrices, pose_matrices = recording.rig.rest_matrices.copy(), recording.pose_matrices.copy()
     for matrices in (rest_matrices, pose_matrices):
@@ -41,7 +41,7 @@ def scaled_recording(recording: Recording, factor: float) -> Recording:
     return replace(with_scaled_rig, pose_matrices=pose_matrices, residuals=recording.residuals * factor)
 
 
-def with_sources(recording: Recording, *sources: Source) -> Recording:
+def with_sources(recording: SkinnedRecording, *sources: Source) -> SkinnedRecording:
     """Return the recording with other sources of its poses."""
     sampling = replace(recording.info.sampling, sources=sources)
     return replace(recording, info=replace(recording.info, sampling=sampling))
@@ -127,7 +127,7 @@ def test_residuals_larger_than_bones_are_reported(clean_recording):
         "Residuals are larger than bones and vertices of 1 of 4 partitions, most of 'lower', 696 mm rms where bone and "
         "vertices are 254 mm long: "
     )
-    assert text.endswith("or record with --fit-linear smooth.")
+    assert text.endswith("or have weights fitted (--fit-linear smooth).")
 
 
 def test_one_huge_residual_is_reported(clean_recording):
@@ -191,16 +191,19 @@ def test_small_partitions_are_reported(clean_recording):
     assert warning_texts(replace(changed_recording, partitions=partitions)) == {}
 
 
-def test_sentence_about_merged_partitions():
-    joints = [{"name": name} for name in ("root", "a", "b", STATIC_JOINT, *map(str, range(20)))]
-    without_merges = {"joints": joints, "partitions": [{"joint": 0}]}
-    assert merges_sentence(without_merges, 8) == ""
-    two_merges = {"joints": joints, "partitions": [{"joint": 0, "merged": [2, 3]}, {"joint": 1}]}
-    assert merges_sentence(two_merges, 8) == (
+def test_sentence_about_merged_partitions(clean_recording):
+    joints = tuple(Joint(name, -1) for name in ("root", "a", "b", STATIC_JOINT, *map(str, range(20))))
+    recording = with_rig(clean_recording, joints=joints)
+
+    def sentence(merged: tuple[int, ...], min_vertices: int) -> str:
+        partitions = Partition(0, (), np.zeros(1, int), merged=merged), Partition(1, (), np.ones(1, int))
+        return merges_sentence(replace(recording, partitions=partitions), min_vertices)
+
+    assert sentence((), 8) == ""
+    assert sentence((2, 3), 8) == (
         "2 partitions of fewer than 8 vertices are merged: 'b' into 'root', 'no bone' into 'root'."
     )
-    many_merges = {"joints": joints, "partitions": [{"joint": 0, "merged": list(range(4, 20))}]}
-    assert merges_sentence(many_merges, 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
+    assert sentence(tuple(range(4, 20)), 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
 
 
 def test_bone_lengths_of_the_tube(clean_recording):

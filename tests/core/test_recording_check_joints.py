@@ -8,7 +8,7 @@ import numpy as np
 from fdda_addon.core.controls import Control
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import STATIC_JOINT, Joint
 
 from .good_recording import (
@@ -90,8 +90,8 @@ def test_a_shape_key_that_never_moves_is_reported_with_what_drives_it(clean_reco
 
 
 def with_additional_joint(
-    recording: Recording, joint: Joint, local_transforms: np.ndarray, is_sampled: bool = True
-) -> Recording:
+    recording: SkinnedRecording, joint: Joint, local_transforms: np.ndarray, is_sampled: bool = True
+) -> SkinnedRecording:
     """Return the recording with one additional joint that has no weights.
 
     Args:

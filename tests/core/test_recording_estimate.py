@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.recording.estimate import Estimate, check_disk_space, recording_bytes, training_size_sentence
+from fdda_addon.core.recording.estimate import Estimate, check_disk_space, recording_bytes
 from fdda_addon.core.recording.reader import read_recording
 
 from .limb import make_rig, record_limb
@@ -35,18 +35,6 @@ def test_estimated_bytes_equal_the_size_of_the_arrays(tmp_path):
     file_bytes = sum(path.stat().st_size for path in (tmp_path / "r").glob("*.npy"))
     header_bytes = 128 * len(list((tmp_path / "r").glob("*.npy")))
     assert recording_bytes(read_recording(tmp_path / "r").rig, 50) == file_bytes - header_bytes
-
-
-def test_sentence_about_the_size_of_a_training(tmp_path):
-    record_limb(tmp_path / "r", poses=50)
-    recording = read_recording(tmp_path / "r")
-    largest_partition = max(recording.partitions, key=lambda partition: len(partition.vertices))
-    name = recording.rig.joint_names[largest_partition.joint]
-    assert training_size_sentence(recording) == (
-        f"50 poses of {recording.rig.vertex_count} vertices: less than 1 MB on the disk; residuals of the largest "
-        f"partition, '{name}', of {len(largest_partition.vertices)} vertices: less than 1 MB, "
-        "in memory two or three times."
-    )
 
 
 def test_a_disk_with_too_little_space_is_refused(tmp_path):

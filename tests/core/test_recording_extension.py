@@ -12,7 +12,7 @@ from fdda_addon.core.recording.index import INDEX_NAME, REFINED, Source
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
-from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
+from .limb import make_rig, random_poses, random_positions, recording_info
 
 POSE_COUNT, ADDED_COUNT = 12, 5
 
@@ -20,16 +20,16 @@ POSE_COUNT, ADDED_COUNT = 12, 5
 def append_poses(path, count: int = ADDED_COUNT, seed: int = 7) -> None:
     """Append random poses to the recording as those of a refinement."""
     with RecordingExtension(read_recording(path), "limb.onnx") as extension:
-        extension.append(random_poses(count, seed), random_residuals(count, seed))
+        extension.append(random_poses(count, seed), random_positions(count, seed))
 
 
 def assert_poses(path, *parts: tuple[int, int]) -> None:
     """Check that the recording has its first poses, then those that `append_poses` adds for each (count, seed)."""
     recording = read_recording(path)
     matrices = [random_poses(POSE_COUNT), *(random_poses(count, seed) for count, seed in parts)]
-    residuals = [random_residuals(POSE_COUNT), *(random_residuals(count, seed) for count, seed in parts)]
+    positions = [random_positions(POSE_COUNT), *(random_positions(count, seed) for count, seed in parts)]
     assert np.array_equal(recording.pose_matrices, np.concatenate(matrices))
-    assert np.array_equal(recording.residuals, np.concatenate(residuals))
+    assert np.array_equal(recording.positions, np.concatenate(positions))
 
 
 def test_poses_are_appended_and_counted(recording):
@@ -38,7 +38,7 @@ def test_poses_are_appended_and_counted(recording):
     assert read_recording(recording).info.sampling.sources[2:] == (Source(REFINED, ADDED_COUNT, "limb.onnx"),)
     with RecordingExtension(read_recording(recording), "again.onnx") as extension:
         for seed in (8, 9):
-            extension.append(random_poses(2, seed), random_residuals(2, seed))
+            extension.append(random_poses(2, seed), random_positions(2, seed))
             assert extension.complete == POSE_COUNT + ADDED_COUNT + 2 * (seed - 7)
     assert_poses(recording, (ADDED_COUNT, 7), (2, 8), (2, 9))
     assert [s.poses for s in read_recording(recording).info.sampling.sources] == [POSE_COUNT - 2, 2, ADDED_COUNT, 4]
@@ -46,7 +46,7 @@ def test_poses_are_appended_and_counted(recording):
 
 def test_arrays_stay_plain_npy_files(recording):
     append_poses(recording, 1000)
-    for name in ("pose_matrices", "residuals"):
+    for name in ("pose_matrices", "positions"):
         assert len(np.load(recording / f"{name}.npy", mmap_mode="r", allow_pickle=False)) == POSE_COUNT + 1000
         assert (recording / f"{name}.npy").stat().st_size % 4 == 0
 
@@ -62,7 +62,7 @@ def test_poses_beyond_the_index_are_ignored_and_overwritten(recording):
 
 
 def test_bytes_beyond_the_header_are_ignored(recording):
-    with open(recording / "residuals.npy", "ab") as file:
+    with open(recording / "positions.npy", "ab") as file:
         file.write(b"torn")
     assert_poses(recording)
     append_poses(recording)
@@ -75,8 +75,8 @@ def test_an_array_shorter_than_its_header_says_is_refused(recording):
     index["poses"] = index["complete"] = POSE_COUNT
     index["sampling"]["sources"].pop()
     (recording / INDEX_NAME).write_text(json.dumps(index))
-    with open(recording / "residuals.npy", "r+b") as file:
-        file.truncate((recording / "residuals.npy").stat().st_size - 4)
+    with open(recording / "positions.npy", "r+b") as file:
+        file.truncate((recording / "positions.npy").stat().st_size - 4)
     with pytest.raises(RecordingError, match="truncated"):
         read_recording(recording)
 
@@ -90,13 +90,13 @@ def test_sources_that_contradict_the_pose_count_are_refused(recording):
 
 
 def test_non_finite_values_append_nothing(recording):
-    residuals = random_residuals(ADDED_COUNT)
-    residuals[3, 0, 0] = np.nan
+    positions = random_positions(ADDED_COUNT)
+    positions[3, 0, 0] = np.nan
     with (
-        pytest.raises(RecordingError, match=rf"Pose {POSE_COUNT + 3} of the rig .* not numbers \(residuals\)"),
+        pytest.raises(RecordingError, match=rf"Pose {POSE_COUNT + 3} of the rig .* not numbers \(positions\)"),
         RecordingExtension(read_recording(recording), "limb.onnx") as extension,
     ):
-        extension.append(random_poses(ADDED_COUNT), residuals)
+        extension.append(random_poses(ADDED_COUNT), positions)
     assert_poses(recording)
 
 
@@ -125,4 +125,4 @@ def test_poses_that_another_process_appended_are_not_overwritten(recording):
 def test_resuming_an_extended_recording_is_refused(recording):
     append_poses(recording)
     with pytest.raises(RecordingError, match=r"recorded differently \(poses, sampling\.sources\)"):
-        RecordingWriter(recording, make_rig(), partitions_of(make_rig()), recording_info(POSE_COUNT), resume=True)
+        RecordingWriter(recording, make_rig(), recording_info(POSE_COUNT), resume=True)

@@ -53,10 +53,10 @@ def test_state_of_a_complete_recording(tmp_path):
 
 def test_measurements_of_a_recording_are_reported(tmp_path):
     record_limb(tmp_path / "r", POSE_COUNT)
-    repeatability = Repeatability((1, 2), dict.fromkeys(STATISTIC_NAMES, 0.25), 5.0)
+    repeatability = Repeatability((1, 2), dict.fromkeys(STATISTIC_NAMES, 0.25))
     index = json.loads((tmp_path / "r" / "recording.json").read_text())
     (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "repeatability": repeatability.to_json()}))
-    assert read_limb_folder(tmp_path / "r").measured_sentences == (repeatability.sentence(),)
+    assert read_limb_folder(tmp_path / "r").measured_sentence == repeatability.sentence()
     assert "0.25 mm apart on average" in repeatability.sentence()
 
 
@@ -84,7 +84,7 @@ def test_state_of_a_damaged_recording(tmp_path):
     content = read_limb_folder(tmp_path / "r")
     assert content.state is FolderState.FOREIGN and "cannot be read" in content.sentence
     assert content.is_recording and content.sentence.endswith("record again with --overwrite.")
-    (tmp_path / "r" / "residuals.npy").unlink()
+    (tmp_path / "r" / "positions.npy").unlink()
     assert not read_limb_folder(tmp_path / "r").is_recording, "a '{' and some file may be anything"
 
 
@@ -104,7 +104,7 @@ def test_every_array_is_removed(tmp_path):
     """The array of controls is removed too; otherwise the folder would not be empty for the next recording."""
     path, recording = tmp_path / "r", good_recording(4)
     info = replace(recording.info, complete=0)
-    with RecordingWriter(path, recording.rig, recording.partitions, info) as writer:
+    with RecordingWriter(path, recording.rig, info) as writer:
         writer.append(recording.pose_matrices, recording.residuals, recording.controls)
     assert (path / "controls.npy").exists()
     assert {file.stem for file in path.glob("*.npy")} <= set(ARRAY_NAMES)
@@ -128,10 +128,10 @@ def test_leftovers_of_a_killed_first_write_are_ignored(tmp_path):
 
 
 def test_removing_from_a_folder_without_a_recording_is_refused(tmp_path):
-    (tmp_path / "residuals.npy").write_text("of someone else")
+    (tmp_path / "positions.npy").write_text("of someone else")
     with pytest.raises(RecordingError, match="holds no recording; there is nothing to remove"):
         remove_recording(tmp_path)
-    assert (tmp_path / "residuals.npy").exists()
+    assert (tmp_path / "positions.npy").exists()
 
 
 def test_a_recording_that_is_being_written_is_not_removed(tmp_path):
@@ -146,8 +146,8 @@ def test_a_recording_that_is_being_written_is_not_removed(tmp_path):
 
 def test_a_folder_that_cannot_be_removed_is_named(tmp_path):
     record_limb(tmp_path / "r", POSE_COUNT)
-    (tmp_path / "r" / "residuals.npy").unlink()
-    (tmp_path / "r" / "residuals.npy").mkdir()
+    (tmp_path / "r" / "positions.npy").unlink()
+    (tmp_path / "r" / "positions.npy").mkdir()
     with pytest.raises(OutputError, match="Cannot remove the recording"):
         remove_recording(tmp_path / "r")
     assert not (tmp_path / "r" / LOCK_NAME).exists()

@@ -18,7 +18,7 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .. import systems
-from .limb import make_rig, partitions_of, record_limb, recording_info
+from .limb import make_rig, record_limb, recording_info
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_LOCK = """
@@ -75,7 +75,7 @@ def lock_process(tmp_path: Path):
 def make_writer(path: Path, **options) -> RecordingWriter:
     """Return a writer of a recording of the limb, which acquires its lock."""
     rig = make_rig()
-    return RecordingWriter(path, rig, partitions_of(rig), recording_info(4), **options)
+    return RecordingWriter(path, rig, recording_info(4), **options)
 
 
 def test_the_second_process_is_refused_and_changes_nothing(lock_process, tmp_path):

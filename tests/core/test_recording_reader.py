@@ -44,12 +44,14 @@ def test_an_invalid_index_is_refused(recording, text, words):
     assert_refused(recording, words)
 
 
-@pytest.mark.parametrize("version", [2, 0, "1", None])
+@pytest.mark.parametrize("version", [1, 0, "2", None])
 def test_another_version_is_refused(recording, version):
     edit_index(recording, version=version)
-    assert_refused(recording, f"is a recording of version {version!r} and this add-on reads version 1; record again")
+    assert_refused(recording, f"is a recording of version {version!r} and this add-on reads version 2; record again")
 
 
+BONES = {"dependencies": [], "fixed": [], "controlled": [], "sources": {}, "settings": {}}
+ALONE = {"bases": 1, "inputs": [], "keys": [], "undetectable": []}
 REQUIRED_KEYS = (
     "poses",
     "complete",
@@ -58,7 +60,7 @@ REQUIRED_KEYS = (
     "rig",
     "joints",
     "controls",
-    "partitions",
+    "bones",
     "sampling",
     "blender",
 )
@@ -89,16 +91,25 @@ def test_a_value_of_a_wrong_type_is_refused(recording, key, value):
         ({"joints": []}, "no joints"),
         ({"joints": [{"name": "a", "parent": 0}]}, "the parent of joint 'a' is 0"),
         ({"joints": [{"name": "a", "parent": -1}, {"name": "a", "parent": 0}]}, "two of one name"),
-        ({"partitions": [{"joint": 4, "influencing": []}]}, "a partition has joint 4 of 4"),
-        ({"partitions": [{"joint": 0, "influencing": [-1]}]}, "a partition has joint -1 of 4"),
+        ({"bones": BONES | {"dependencies": [4]}}, "'dependencies' are none of its 4 joints"),
+        ({"alone": ALONE | {"bases": 0}}, "inputs move from 0 base poses"),
+        (
+            {"alone": {"bases": 1, "inputs": [["joint", 4]], "keys": [], "undetectable": []}},
+            "a moved input has joint 4 of 4",
+        ),
+        ({"alone": ALONE | {"inputs": [["bone", 0]]}}, "a moved input is 'bone'"),
+        ({"alone": ALONE | {"undetectable": [0]}}, "a moved input has control 0 of 0"),
+        ({"alone": ALONE | {"keys": [1]}}, "a moved input has control 1 of 0"),
+        (
+            {"alone": {"bases": 1, "inputs": [], "keys": [], "undetectable": []}},
+            "poses in which one input moves alone, not [1]",
+        ),
         ({"controls": [{"name": "fist"}]}, "lacks 'owner'"),
         ({"controls": {}}, "its controls are not a list"),
         ({"controls": [FIST_CONTROL, FIST_CONTROL]}, "two of its controls have one name"),
         ({"controls": [{**FIST_CONTROL, "owner": "../scene"}]}, "a control belongs to '../scene'"),
         ({"controls": [{**FIST_CONTROL, "path": 3}]}, "a control is called 3"),
         ({"controls": [{**FIST_CONTROL, "low": 2}]}, "has the range 2.0 to 1.0"),
-        ({"partitions": [{"joint": 0, "influencing": [], "controls": [0]}]}, "a partition has control 0 of 0"),
-        ({"partitions": [{"joint": 0, "influencing": [], "merged": [9]}]}, "a partition has joint 9 of 4"),
     ],
 )
 def test_inconsistent_values_are_refused(recording, changes, words):
@@ -129,14 +140,14 @@ def test_huge_counts_in_index_and_header_are_refused(recording):
     """Index and header agree, and the byte count overflows 64 bits to 0, so only the size of the file contradicts."""
     poses = 1 << 57
     edit_index(recording, poses=poses, complete=poses)
-    for name, shape in (("pose_matrices", (poses, 4, 4, 4)), ("residuals", (poses, 40, 3))):
+    for name, shape in (("pose_matrices", (poses, 4, 4, 4)), ("positions", (poses, 40, 3))):
         header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n"
         (recording / f"{name}.npy").write_bytes(npy_bytes(header, b"\0" * 4096))
     assert_refused(recording, "pose_matrices.npy' cannot be used: it is truncated")
 
 
 @pytest.mark.parametrize(
-    "name", ["residuals", "pose_matrices", "rest_positions", "skin_joints", "face_starts", "face_vertices"]
+    "name", ["positions", "pose_matrices", "rest_positions", "skin_joints", "face_starts", "face_vertices"]
 )
 def test_a_truncated_array_is_refused(recording, name):
     path = recording / f"{name}.npy"
@@ -150,7 +161,7 @@ def test_a_missing_array_is_refused(recording, name):
     assert_refused(recording, f"{name}.npy' cannot be used", systems.NOT_FOUND)
 
 
-@pytest.mark.parametrize("name", ["residuals", "pose_matrices"])
+@pytest.mark.parametrize("name", ["positions", "pose_matrices"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_non_finite_values_are_refused(recording, name, value):
     array = np.load(recording / f"{name}.npy")
@@ -182,24 +193,19 @@ def test_a_singular_rest_pose_is_refused(recording):
     assert_refused(recording, "The rest pose or skin weights of")
 
 
-def test_partitions_that_contradict_the_weights_are_refused(recording):
-    edit_index(recording, partitions=[{"joint": 0, "influencing": [1]}])
-    assert_refused(recording, "The partitions of", "contradict its skin weights; record again")
-
-
 @pytest.mark.parametrize("dtype", [np.float64, np.int32, ">f4", np.complex64])
 def test_another_dtype_is_refused(recording, dtype):
-    array = np.load(recording / "residuals.npy")
-    np.save(recording / "residuals.npy", array.astype(dtype))
-    assert_refused(recording, f"residuals.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not")
+    array = np.load(recording / "positions.npy")
+    np.save(recording / "positions.npy", array.astype(dtype))
+    assert_refused(recording, f"positions.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not")
 
 
 def test_another_shape_or_memory_order_is_refused(recording):
-    array = np.load(recording / "residuals.npy")
-    np.save(recording / "residuals.npy", array[:, :, :2])
+    array = np.load(recording / "positions.npy")
+    np.save(recording / "positions.npy", array[:, :, :2])
     assert_refused(recording, f"it holds {(12, 40, 2)} float32, not {array.shape} float32")
-    np.save(recording / "residuals.npy", np.asfortranarray(array))
-    assert_refused(recording, "residuals.npy' cannot be used")
+    np.save(recording / "positions.npy", np.asfortranarray(array))
+    assert_refused(recording, "positions.npy' cannot be used")
 
 
 class Unpickled:
@@ -219,8 +225,8 @@ def _mark_unpickled() -> None:
 def test_pickled_objects_are_not_loaded(recording):
     array = np.empty((12, 40, 3), object)
     array[:] = Unpickled()
-    np.save(recording / "residuals.npy", array)
-    assert_refused(recording, "residuals.npy' cannot be used: it holds (12, 40, 3) object")
+    np.save(recording / "positions.npy", array)
+    assert_refused(recording, "positions.npy' cannot be used: it holds (12, 40, 3) object")
     assert not Unpickled.is_unpickled
 
 
@@ -252,7 +258,7 @@ INVALID_HEADERS = {
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", ["residuals", "face_vertices"])
+@pytest.mark.parametrize("name", ["positions", "face_vertices"])
 @pytest.mark.parametrize("header", INVALID_HEADERS.values(), ids=INVALID_HEADERS.keys())
 def test_invalid_array_headers_are_refused(recording, name, header):
     (recording / f"{name}.npy").write_bytes(npy_bytes(header, b"\0" * 5760))
@@ -262,14 +268,14 @@ def test_invalid_array_headers_are_refused(recording, name, header):
 
 @pytest.mark.parametrize("data", [b"", b"\x93NUMPY", b"PK\x03\x04zip", npy_bytes("{}", version=b"\x02\x00")])
 def test_files_that_are_not_arrays_are_refused(recording, data):
-    (recording / "residuals.npy").write_bytes(data)
-    assert_refused(recording, "residuals.npy' cannot be used: ")
+    (recording / "positions.npy").write_bytes(data)
+    assert_refused(recording, "positions.npy' cannot be used: ")
 
 
 def test_data_beyond_the_complete_poses_is_not_read(recording):
-    with open(recording / "residuals.npy", "ab") as file:
+    with open(recording / "positions.npy", "ab") as file:
         file.write(b"\xff" * 1000)
-    assert read_recording(recording).residuals.shape == (12, 40, 3)
+    assert read_recording(recording).positions.shape == (12, 40, 3)
 
 
 def test_the_index_of_an_incomplete_recording_is_read(recording):

@@ -19,12 +19,10 @@ from fdda_addon.core.recording.writer import RecordingWriter
 
 from .. import systems
 from .limb import (
-    INFLUENCING,
     JOINTS,
     make_rig,
-    partitions_of,
     random_poses,
-    random_residuals,
+    random_positions,
     record_limb,
     recording_info,
 )
@@ -40,26 +38,25 @@ def file_bytes(path) -> dict[str, bytes]:
 def test_content_is_read_back_unchanged(recording):
     rig, read_back = make_rig(), read_recording(recording)
     assert np.array_equal(read_back.pose_matrices, random_poses(POSE_COUNT))
-    assert np.array_equal(read_back.residuals, random_residuals(POSE_COUNT))
-    assert isinstance(read_back.residuals, np.memmap) and not read_back.residuals.flags.writeable
+    assert np.array_equal(read_back.positions, random_positions(POSE_COUNT))
+    assert isinstance(read_back.positions, np.memmap) and not read_back.positions.flags.writeable
     for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights", "face_starts", "face_vertices"):
         assert np.array_equal(getattr(read_back.rig, name), getattr(rig, name))
         assert getattr(read_back.rig, name).dtype == getattr(rig, name).dtype
     assert read_back.rig.joints == JOINTS and read_back.rig.fingerprint == rig.fingerprint
-    assert [(p.joint, p.influencing) for p in read_back.partitions] == list(INFLUENCING.items())
     assert (read_back.info.poses, read_back.info.complete) == (POSE_COUNT, POSE_COUNT)
     assert read_back.info.sampling == recording_info(POSE_COUNT).sampling
 
 
 def test_arrays_are_plain_npy_files(recording):
-    residuals = np.load(recording / "residuals.npy", mmap_mode="r", allow_pickle=False)
-    assert residuals.shape == (POSE_COUNT, 40, 3) and residuals.dtype == np.float32
+    positions = np.load(recording / "positions.npy", mmap_mode="r", allow_pickle=False)
+    assert positions.shape == (POSE_COUNT, 40, 3) and positions.dtype == np.float32
     assert sorted(file_bytes(recording)) == [
         "face_starts.npy",
         "face_vertices.npy",
         "pose_matrices.npy",
+        "positions.npy",
         "recording.json",
-        "residuals.npy",
         "rest_matrices.npy",
         "rest_positions.npy",
         "skin_joints.npy",
@@ -94,9 +91,9 @@ def test_an_error_between_batches_keeps_complete_poses(tmp_path, recording, erro
     path, rig = tmp_path / "interrupted", make_rig()
     with (
         pytest.raises(error),
-        RecordingWriter(path, rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer,
+        RecordingWriter(path, rig, recording_info(POSE_COUNT)) as writer,
     ):
-        writer.append(random_poses(POSE_COUNT)[:5], random_residuals(POSE_COUNT)[:5])
+        writer.append(random_poses(POSE_COUNT)[:5], random_positions(POSE_COUNT)[:5])
         raise error
     record_limb(path, POSE_COUNT, resume=True)
     assert file_bytes(path) == file_bytes(recording)
@@ -104,14 +101,14 @@ def test_an_error_between_batches_keeps_complete_poses(tmp_path, recording, erro
 
 def test_an_error_before_the_first_pose_leaves_no_folder(tmp_path):
     path, rig = tmp_path / "new" / "deeper", make_rig()
-    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, rig, partitions_of(rig), recording_info(POSE_COUNT)):
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, rig, recording_info(POSE_COUNT)):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_error_before_the_first_pose_keeps_an_existing_folder(tmp_path):
     rig = make_rig()
-    with pytest.raises(RuntimeError), RecordingWriter(tmp_path, rig, partitions_of(rig), recording_info(POSE_COUNT)):
+    with pytest.raises(RuntimeError), RecordingWriter(tmp_path, rig, recording_info(POSE_COUNT)):
         raise RuntimeError
     assert tmp_path.is_dir() and list(tmp_path.iterdir()) == []
 
@@ -120,7 +117,7 @@ def test_an_incompletely_written_batch_is_not_read(tmp_path, recording):
     """After a power failure, the arrays may contain any bytes beyond the complete poses."""
     path = tmp_path / "torn"
     record_limb(path, POSE_COUNT, 5)
-    for name, shape in (("pose_matrices", (4, 4, 4)), ("residuals", (40, 3))):
+    for name, shape in (("pose_matrices", (4, 4, 4)), ("positions", (40, 3))):
         pose_bytes = 4 * math.prod(shape)
         with open(path / f"{name}.npy", "r+b") as file:
             file.seek(len(array_header((POSE_COUNT, *shape), np.float32)) + 5 * pose_bytes)
@@ -136,23 +133,23 @@ def test_poses_are_incomplete_if_the_index_cannot_be_written(tmp_path, monkeypat
     rig = make_rig()
     with (
         pytest.raises(OutputError, match="5 of 12 poses are complete, continue with --resume"),
-        RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer,
+        RecordingWriter(tmp_path / "r", rig, recording_info(POSE_COUNT)) as writer,
     ):
-        writer.append(random_poses(POSE_COUNT)[:5], random_residuals(POSE_COUNT)[:5])
+        writer.append(random_poses(POSE_COUNT)[:5], random_positions(POSE_COUNT)[:5])
         monkeypatch.setattr(f"{RecordingWriter.__module__}.write_index", fail_to_write)
-        writer.append(random_poses(POSE_COUNT)[5:], random_residuals(POSE_COUNT)[5:])
+        writer.append(random_poses(POSE_COUNT)[5:], random_positions(POSE_COUNT)[5:])
 
 
 def test_unsettled_poses_are_indexed_within_the_recording(tmp_path):
     rig = make_rig()
-    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer:
+    with RecordingWriter(tmp_path / "r", rig, recording_info(POSE_COUNT)) as writer:
         for start in (0, 6):
             batch = slice(start, start + 6)
-            writer.append(random_poses(POSE_COUNT)[batch], random_residuals(POSE_COUNT)[batch], unsettled=(1, 4))
+            writer.append(random_poses(POSE_COUNT)[batch], random_positions(POSE_COUNT)[batch], unsettled=(1, 4))
     assert read_index(tmp_path / "r")["unsettled"] == [1, 4, 7, 10]
 
 
-@pytest.mark.parametrize("name", ["residuals.npy", "pose_matrices.npy"])
+@pytest.mark.parametrize("name", ["positions.npy", "pose_matrices.npy"])
 @pytest.mark.parametrize("damage", ["shorter", "missing", "other header"])
 def test_resuming_without_the_complete_poses_is_refused(tmp_path, name, damage):
     record_limb(tmp_path / "r", POSE_COUNT, 10)
@@ -170,8 +167,8 @@ def test_resuming_without_the_complete_poses_is_refused(tmp_path, name, damage):
 
 def test_a_mesh_without_faces_is_recorded_and_read(tmp_path):
     rig = replace(make_rig(), face_starts=np.zeros(0, np.int32), face_vertices=np.zeros(0, np.int32))
-    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer:
-        writer.append(random_poses(POSE_COUNT), random_residuals(POSE_COUNT))
+    with RecordingWriter(tmp_path / "r", rig, recording_info(POSE_COUNT)) as writer:
+        writer.append(random_poses(POSE_COUNT), random_positions(POSE_COUNT))
     assert not {"faces", "corners"} & set(read_index(tmp_path / "r"))
     assert not list((tmp_path / "r").glob("face*"))
     assert len(read_recording(tmp_path / "r").rig.face_vertices) == 0
@@ -194,8 +191,8 @@ def test_a_recording_is_replaced_on_request(recording, index_text):
     check_recordable(recording, resume=False, overwrite=True)
     rig = make_rig()
     info = recording_info(POSE_COUNT - 2)
-    with RecordingWriter(recording, rig, partitions_of(rig), info, overwrite=True) as writer:
-        writer.append(random_poses(POSE_COUNT - 2), random_residuals(POSE_COUNT - 2))
+    with RecordingWriter(recording, rig, info, overwrite=True) as writer:
+        writer.append(random_poses(POSE_COUNT - 2), random_positions(POSE_COUNT - 2))
     assert file_bytes(recording) == {**file_bytes(expected_recording), "notes.txt": b"mine"}
 
 
@@ -236,7 +233,7 @@ def set_nested_value(index, *keys, value):
         (("rig", "file"), "other.blend", "rig.file"),
         (("rig", "fingerprint", "skin_weights"), "0", "rig.fingerprint.skin_weights"),
         (("joints", 1, "name"), "arm", "joints"),
-        (("partitions", 0, "influencing"), [2], "partitions"),
+        (("bones", "dependencies"), [2], "bones.dependencies"),
         (("poses",), 13, "poses"),
         (("blender",), "4.5.0", "blender"),
         (("extra",), 1, "extra"),
@@ -258,12 +255,12 @@ def test_resuming_another_recording_names_the_differences(tmp_path, keys, value,
     assert file_bytes(tmp_path / "r") == bytes_before
 
 
-@pytest.mark.parametrize("name", ["pose_matrices", "residuals"])
+@pytest.mark.parametrize("name", ["pose_matrices", "positions"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_non_finite_values_are_refused_with_the_pose(tmp_path, name, value):
-    rig, arrays = make_rig(), {"pose_matrices": random_poses(POSE_COUNT), "residuals": random_residuals(POSE_COUNT)}
+    rig, arrays = make_rig(), {"pose_matrices": random_poses(POSE_COUNT), "positions": random_positions(POSE_COUNT)}
     arrays[name][7, 1, 2] = value
-    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer:
+    with RecordingWriter(tmp_path / "r", rig, recording_info(POSE_COUNT)) as writer:
         writer.append(*(array[:5] for array in arrays.values()))
         with pytest.raises(FDDAError, match=rf"Pose 7 of the rig .* not numbers \({name}\)"):
             writer.append(*(array[5:10] for array in arrays.values()))

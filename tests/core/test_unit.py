@@ -15,7 +15,7 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .damage import assert_refused, edit_index
-from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
+from .limb import make_rig, random_poses, random_positions, record_limb, recording_info
 from .tiny_model import tiny_info
 
 INVALID_LENGTHS = (0, -0.01, float("nan"), float("inf"), "0.01", None, True, [0.01])
@@ -24,9 +24,9 @@ INVALID_LENGTHS = (0, -0.01, float("nan"), float("inf"), "0.01", None, True, [0.
 def record_in_unit(path, metres_per_unit: float, complete: int = 6, resume: bool = False):
     """Record the first `complete` of six poses of the limb in a unit, and return the folder."""
     rig = replace(make_rig(), metres_per_unit=metres_per_unit)
-    with RecordingWriter(path, rig, partitions_of(rig), recording_info(6), resume) as writer:
+    with RecordingWriter(path, rig, recording_info(6), resume) as writer:
         pose_slice = slice(writer.complete, complete)
-        writer.append(random_poses(6)[pose_slice], random_residuals(6)[pose_slice])
+        writer.append(random_poses(6)[pose_slice], random_positions(6)[pose_slice])
     return path
 
 
@@ -35,7 +35,7 @@ def test_a_recording_stores_its_unit(tmp_path):
     assert centimeters.rig.metres_per_unit == 0.01
     meters = read_recording(record_in_unit(tmp_path / "meters", 1.0))
     assert meters.rig.metres_per_unit == 1.0
-    for name in ("pose_matrices", "residuals"):
+    for name in ("pose_matrices", "positions"):
         assert np.array_equal(getattr(centimeters, name), getattr(meters, name))
 
 
@@ -66,7 +66,7 @@ def test_a_resumed_recording_keeps_its_unit(tmp_path, first_unit, resumed_unit):
 
 def test_an_extension_keeps_the_unit(tmp_path):
     with RecordingExtension(read_recording(record_in_unit(tmp_path / "recording", 0.01)), "model.onnx") as extension:
-        extension.append(random_poses(2), random_residuals(2))
+        extension.append(random_poses(2), random_positions(2))
     assert read_index(tmp_path / "recording")["metres_per_unit"] == 0.01
 
 

@@ -73,8 +73,9 @@ def make_models_of_two_meshes_together(folder: Path) -> Iterator[float]:
     yield from sidebar.press_button("fdda.record(")
     yield from wait_for_job("record", 120)
     read_index = extension_module("core.recording.index").read_index
-    pose_counts = [read_index(folder_of_file / f"{name}_recording")["complete"] for name in ("arm", "arm_sleeve")]
-    require(pose_counts == [40, 40], f"{pose_counts} poses are recorded")
+    indices = [read_index(folder_of_file / f"{name}_recording") for name in ("arm", "arm_sleeve")]
+    pose_counts = [index["sampling"]["sources"][0]["poses"] for index in indices]
+    require(pose_counts == [40, 40], f"{pose_counts} random poses are recorded")
     yield from sidebar.open_section("training")
     yield from sidebar.press_button("fdda.train(")
     yield from wait_for_job("train", 180)

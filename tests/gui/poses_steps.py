@@ -85,12 +85,13 @@ def record(folder: Path) -> Iterator[float]:
     yield from wait_until(lambda: job.state_of("record") and job.state_of("record").done, 30, "nothing is recorded")
     yield from save_screenshot(folder / "recording.png")
     sentence = job.state_of("record").sentence
-    require(sentence.startswith(("Step 1 of 2", "Step 2 of 2")), f"the progress is '{sentence}'")
+    require(sentence.startswith("Recording"), f"the progress is '{sentence}'")
     yield from wait_for_job("record", 90)
     yield from redraw_window()
     require_unkeyed_pose("Record")
     # The next step is offered where this one ends.
     yield from sidebar.find_button("fdda.train")
     index = extension_module("core.recording.index").read_index(folder / "work" / "arm_recording")
-    require(index["complete"] == POSE_COUNT, f"{index['complete']} poses are recorded")
+    poses = index["sampling"]["sources"][0]["poses"]
+    require(poses == POSE_COUNT and index["complete"] == index["poses"], f"{poses} random poses are recorded")
     require(bpy.data.objects["arm_rig"].animation_data.action is not None, "the recording has not restored the action")

@@ -8,8 +8,9 @@ import numpy as np
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
+
+from ..recordings import write_recording
 
 MAX_ANGLE = 0.9
 """Largest angle of every joint about x and about z, in both directions, radians."""
@@ -97,8 +98,14 @@ def write_chain(
     }
     info = chain_info(pose_count, seed)
     written_angles = angles[: pose_count if complete_count is None else complete_count]
-    with RecordingWriter(path, rig, make_partitions(rig, influencing), info) as writer:
-        writer.append(pose_chain(rig, written_angles), chain_residuals(rig, written_angles))
+    write_recording(
+        path,
+        rig,
+        make_partitions(rig, influencing),
+        info,
+        pose_chain(rig, written_angles),
+        chain_residuals(rig, written_angles),
+    )
     return rig
 
 

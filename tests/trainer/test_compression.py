@@ -13,8 +13,6 @@ from fdda_addon.core.formats.report import checkpoint_path
 from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.runtime.network import Network as ModelNetwork
 from trainer import compression
 from trainer.__main__ import main
@@ -27,6 +25,7 @@ from trainer.networks.loop import train
 from trainer.networks.networks import Curves, Network, TrainedPartition
 from trainer.preparation import PartitionData, partition_data, prepare_partition, prepare_partitions
 
+from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
 from .test_low_rank import INFLUENCING, JOINTS, POSES, VERTICES, sliding_residuals
@@ -138,8 +137,9 @@ def noisy_chain(tmp_path_factory):
     pattern = np.sin(7 * rig.rest_positions.astype(np.float64))
     residuals = chain_residuals(rig, angles) + 0.01 * rng.normal(size=(poses, 1, 1)) * pattern
     partitions = make_partitions(rig, {0: (1,), 1: (1, 2), 2: (2,)})
-    with RecordingWriter(folder / "recording", rig, partitions, chain_info(poses)) as writer:
-        writer.append(pose_chain(rig, angles), residuals.astype(np.float32))
+    write_recording(
+        folder / "recording", rig, partitions, chain_info(poses), pose_chain(rig, angles), residuals.astype(np.float32)
+    )
     return folder
 
 
@@ -168,7 +168,7 @@ def test_a_model_without_components_plays_and_its_training_continues(recording, 
     assert any(partition["dropped"] > 0 for partition in report["partitions"])
     # The linear fit remains.
     assert report["fdda"]["held_out"]["mean"] < 0.9 * report["linear"]["held_out"]["mean"]
-    rig = read_recording(recording).rig
+    rig = read_skinned(recording).rig
     poses = pose_chain(rig, chain_angles(20, len(rig.joints), 5))
     complete, linear = ModelNetwork(trained / "model.onnx").positions(poses), LinearSkinning(rig).positions(poses)
     assert distances(ModelNetwork(model).positions(poses), complete).mean() < distances(linear, complete).mean()
@@ -180,9 +180,15 @@ def test_a_model_without_components_plays_and_its_training_continues(recording, 
 
 def test_factorized_networks_predict_the_projected_residuals(tmp_path):
     rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
-    with RecordingWriter(tmp_path / "tube", rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
-        writer.append(pose_chain(rig, angles), sliding_residuals(rig, angles))
-    recording = read_recording(tmp_path / "tube")
+    write_recording(
+        tmp_path / "tube",
+        rig,
+        make_partitions(rig, INFLUENCING),
+        chain_info(POSES),
+        pose_chain(rig, angles),
+        sliding_residuals(rig, angles),
+    )
+    recording = read_skinned(tmp_path / "tube")
     split = split_recording(recording, CONFIG)
     data = partition_data(recording, make_inputs(recording.rig, recording.partitions))
     prepared, rng = prepare_partitions(data, split, TrainingConfig()), np.random.default_rng(0)

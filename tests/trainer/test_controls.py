@@ -16,8 +16,6 @@ from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
@@ -26,6 +24,7 @@ from trainer.data.split import split_recording
 from trainer.inputs.network_inputs import make_inputs
 from trainer.networks.confidence import measure_training_range
 
+from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS, run_page_code
 
@@ -62,10 +61,15 @@ def controlled_residuals(rig: Rig, angles: np.ndarray, values: np.ndarray) -> np
 
 def write_controlled_recording(path: Path, rig: Rig) -> Path:
     angles, values = controlled_poses(POSES, 0)
-    with RecordingWriter(
-        path, rig, make_partitions(rig, INFLUENCING, CONTROLS_BY_PARTITION), chain_info(POSES)
-    ) as writer:
-        writer.append(pose_chain(rig, angles), controlled_residuals(rig, angles, values), values)
+    write_recording(
+        path,
+        rig,
+        make_partitions(rig, INFLUENCING, CONTROLS_BY_PARTITION),
+        chain_info(POSES),
+        pose_chain(rig, angles),
+        controlled_residuals(rig, angles, values),
+        values,
+    )
     return path
 
 
@@ -112,7 +116,7 @@ def test_the_graph_has_the_controls_input_only_with_controls(model, trained):
 
 
 def test_metadata_has_the_ranges_of_the_training_poses(model, controlled_recording):
-    info, recording = read_model_info(model), read_recording(controlled_recording)
+    info, recording = read_model_info(model), read_skinned(controlled_recording)
     values = recording.controls[split_recording(recording, TrainingConfig()).training]
     assert [c.name for c in info.controls] == [c.name for c in (BULGE, PUFF, LOCKED)]
     assert [c.low for c in info.controls] == values.min(axis=0).tolist()
@@ -169,10 +173,10 @@ def test_a_shape_key_is_fitted_where_it_has_an_effect(tmp_path):
     angles, values = controlled_poses(POSES, 0)
     values = np.stack([values[:, 0], np.random.default_rng(1).uniform(0, 1, POSES)], axis=1).astype(np.float32)
     partitions = make_partitions(rig, INFLUENCING, {1: (0, 1), 2: (1,)})
-    with RecordingWriter(tmp_path / "recording", rig, partitions, chain_info(POSES)) as writer:
-        zeros = np.zeros((POSES, 1))
-        residuals = controlled_residuals(rig, angles, np.concatenate([values[:, :1], zeros, zeros], axis=1))
-        writer.append(pose_chain(rig, angles), residuals, values)
+    zeros = np.zeros((POSES, 1))
+    residuals = controlled_residuals(rig, angles, np.concatenate([values[:, :1], zeros, zeros], axis=1))
+    arrays = pose_chain(rig, angles), residuals, values
+    write_recording(tmp_path / "recording", rig, partitions, chain_info(POSES), *arrays)
     assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
     report = json.loads((tmp_path / "report.json").read_text())
     assert [p.get("linear_keys") for p in report["partitions"]] == [None, [BULGE.name], [BULGE.name]]

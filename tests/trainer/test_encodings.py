@@ -9,10 +9,10 @@ from dataclasses import replace
 import pytest
 
 from fdda_addon.core.mathematics.partition import make_partitions
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Joint
 
 from .. import systems
+from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import REPOSITORY
 
@@ -33,8 +33,9 @@ def recording(tmp_path):
     angles = chain_angles(60, 2, 0)
     path = tmp_path / "Aufnahme äöü"
     info = replace(chain_info(60), object_name="Ärmel")
-    with RecordingWriter(path, rig, make_partitions(rig, {0: (1,), 1: (1,)}), info) as writer:
-        writer.append(pose_chain(rig, angles), chain_residuals(rig, angles))
+    write_recording(
+        path, rig, make_partitions(rig, {0: (1,), 1: (1,)}), info, pose_chain(rig, angles), chain_residuals(rig, angles)
+    )
     return path
 
 

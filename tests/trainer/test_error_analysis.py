@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.mathematics.partition import make_partitions
-from fdda_addon.core.recording.writer import RecordingWriter
 from trainer.__main__ import main
 from trainer.report.error_analysis import (
     EXTREME_POSES,
@@ -22,6 +21,7 @@ from trainer.report.error_analysis import (
 )
 from trainer.report.page import render_html
 
+from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, write_chain
 
 
@@ -58,8 +58,14 @@ def test_dropped_components_are_the_cause_only_if_most_of_the_error_is_in_them(
     sizes = np.append(2.0, np.full(40, detail_mm / np.sqrt(40))) / 1000
     residuals = ((rng.normal(size=(poses, 41)) * sizes) @ patterns).reshape(poses, rig.vertex_count, 3)
     partitions = make_partitions(rig, {0: (1,), 1: (1,)})
-    with RecordingWriter(tmp_path / "recording", rig, partitions, chain_info(poses)) as writer:
-        writer.append(pose_chain(rig, angles), residuals.astype(np.float32))
+    write_recording(
+        tmp_path / "recording",
+        rig,
+        partitions,
+        chain_info(poses),
+        pose_chain(rig, angles),
+        residuals.astype(np.float32),
+    )
     options = ("--epochs", "60", "--tolerance-mm", str(tolerance_mm))
     assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *options]) == 0
     dropped = [p for p in json.loads((tmp_path / "report.json").read_text())["partitions"] if p["dropped"]]

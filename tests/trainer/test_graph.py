@@ -13,14 +13,13 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
 from trainer.__main__ import main
 from trainer.export import network_nodes
 from trainer.export.export import check_parity, measure, open_session, reference_positions
 from trainer.export.graph import build_graph
 from trainer.model import TrainedModel
 
+from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain, rotation
 from .conftest import QUICK_OPTIONS
 
@@ -112,8 +111,14 @@ def test_a_model_of_sheared_bones_agrees_with_pytorch(tmp_path):
     rig = replace(rig, rest_matrices=(slanted_scale @ rig.rest_matrices).astype(np.float32))
     poses = (slanted_scale @ pose_chain(chain_rig(), angles)).astype(np.float32)
     influencing = {0: (1,), 1: (1, 2), 2: (2,)}
-    with RecordingWriter(tmp_path / "recording", rig, make_partitions(rig, influencing), chain_info(120)) as writer:
-        writer.append(poses, chain_residuals(chain_rig(), angles))
+    write_recording(
+        tmp_path / "recording",
+        rig,
+        make_partitions(rig, influencing),
+        chain_info(120),
+        poses,
+        chain_residuals(chain_rig(), angles),
+    )
     assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
     assert read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2
     report = json.loads((tmp_path / "report.json").read_text())
@@ -186,7 +191,7 @@ class ShiftedSession:
 def test_a_difference_from_pytorch_is_refused_unless_the_error_is_far_larger(trained_model, recording):
     """A rig that bursts has errors of meters, and float32 rounds its residuals by millimeters."""
     session = ShiftedSession(open_session(build_graph(trained_model).SerializeToString()))
-    source = read_recording(recording)
+    source = read_skinned(recording)
     held_out = measure(session, source, np.arange(5), trained_model)
     assert held_out.difference == pytest.approx(3**0.5 * 1e-4, rel=0.01)
     with pytest.raises(TrainingError, match=r"differs from PyTorch by 0\.17\d mm, more than the allowed .* bursts"):

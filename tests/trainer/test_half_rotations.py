@@ -15,8 +15,7 @@ from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.formats.report import checkpoint_path
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
-from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
@@ -26,6 +25,7 @@ from trainer.fits.half_rotations import half_rotation_matrices, half_rotations_h
 from trainer.fits.joint_fit import JointFit, joint_regression
 from trainer.model import TrainedModel
 
+from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, rotation, write_chain
 from .conftest import QUICK_OPTIONS
 from .test_graph import check_agreement, collect_trained_models, constant_bytes
@@ -62,7 +62,7 @@ def multiply_quaternions(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 def write_volume_recording(
     path: Path, units_per_metre: float = 1.0, origin_distance: float = 0.0, slanted_scale: np.ndarray | None = None
-) -> Recording:
+) -> SkinnedRecording:
     """Write a recording of the chain with an armature that preserves volume."""
     plain_rig, slanted_scale = chain_rig(), np.eye(4) if slanted_scale is None else slanted_scale
     poses = pose_chain(plain_rig, chain_angles(POSES, 3, seed=2, range_scale=RANGE_SCALE))
@@ -79,13 +79,14 @@ def write_volume_recording(
         metres_per_unit=1 / units_per_metre,
     )
     residuals = LinearSkinning(rig).local_residuals(poses.astype(np.float32), positions)
-    with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
-        writer.append(poses.astype(np.float32), residuals)
-    return read_recording(path)
+    write_recording(
+        path, rig, make_partitions(rig, INFLUENCING), chain_info(POSES), poses.astype(np.float32), residuals
+    )
+    return read_skinned(path)
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Recording:
+def recording(tmp_path_factory) -> SkinnedRecording:
     return write_volume_recording(tmp_path_factory.mktemp("volumes") / "volume")
 
 
@@ -99,7 +100,7 @@ def model_and_path(recording, tmp_path_factory) -> tuple:
     return trained_models[0], path
 
 
-def half_rotations_are_selected(recording: Recording) -> bool:
+def half_rotations_are_selected(recording: SkinnedRecording) -> bool:
     return half_rotations_help(recording, split_recording(recording, TrainingConfig()).training)
 
 
@@ -183,7 +184,7 @@ def test_selection_does_not_depend_on_unit_and_position(tmp_path, recording, uni
 def test_a_rig_that_blends_matrices_has_no_half_rotations(tmp_path):
     """The cases are bulges that grow with the bend, skinning alone, and delta mush, which has surface frames."""
     write_chain(tmp_path / "chain")
-    bulges = read_recording(tmp_path / "chain")
+    bulges = read_skinned(tmp_path / "chain")
     assert not half_rotations_are_selected(bulges) and not half_rotations_are_selected(
         replace(bulges, residuals=0 * bulges.residuals)
     )

@@ -8,7 +8,6 @@ import onnx
 import pytest
 
 from fdda_addon.core.mathematics.partition import Partition, make_partitions
-from fdda_addon.core.recording.reader import read_recording
 from trainer.__main__ import main
 from trainer.inputs import network_inputs
 from trainer.inputs.controls import ControlFeatures
@@ -16,6 +15,7 @@ from trainer.inputs.joints import JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs, make_inputs
 from trainer.networks.confidence import MARGIN_RATIO, MIN_MARGINS, measure_training_range
 
+from ..recordings import read_skinned
 from .chain import chain_angles, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS, REPOSITORY
 
@@ -51,7 +51,7 @@ def test_a_block_is_added_as_the_documentation_says(recording, tmp_path, monkeyp
     monkeypatch.setattr(network_inputs, "BLOCKS", (*network_inputs.BLOCKS, module.LimbLengths))
     model = tmp_path / "model.onnx"
     assert main([str(recording), str(model), *QUICK_OPTIONS]) == 0, "the graph differs from the reference"
-    rig, partitions = read_recording(recording).rig, read_recording(recording).partitions
+    rig, partitions = read_skinned(recording).rig, read_skinned(recording).partitions
     offered = make_inputs(rig, partitions).columns
     assert [len(columns) for columns in offered] == [12 + 1, 12 + 12 + 1, 12]
     assert "limb_lengths" in {node.name for node in onnx.load(model).graph.node}

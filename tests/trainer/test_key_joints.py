@@ -2,18 +2,29 @@
 """Choice of key joints among joints that follow others, follow controls, stay still, or move freely."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.controls import Control
+from fdda_addon.core.errors import RecordingError, TrainingError
 from fdda_addon.core.joint_option import KEY_JOINTS_STAGE
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fitted_weights, read_key_joints
-from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, Rig
+from trainer.config import TrainingConfig
 from trainer.skin.choice import choose_key_joints
-from trainer.skin.job import fit_folder
+from trainer.skin.fit_poses import FitPoses
+from trainer.skin.split_deformation import split_deformation
+
+from ..recordings import alone_arrays, with_influences
 
 BONES, RING = 4, 16
 """Number of main joints of the chain, and of vertices around each joint."""
@@ -64,7 +75,8 @@ def chain_poses(pose_count: int = 160, followers: tuple[str, ...] = (), seed: in
     poses = np.stack(pose_matrices, axis=1).astype(np.float32)
     positions = LinearSkinning(rig).positions(poses)
     controls = slider[:, None].astype(np.float32)
-    return FitPoses(rig, poses, positions, controls, np.zeros(len(joints), bool), np.arange(len(joints)) < BONES)
+    roles = np.zeros(len(joints), bool), np.arange(len(joints)) < BONES
+    return FitPoses(rig, poses, positions, controls, *roles, pose_count)
 
 
 def _transforms(vectors: np.ndarray, offset: list[float]) -> np.ndarray:
@@ -88,8 +100,12 @@ def _skinned_rig(joints: tuple[Joint, ...], rest_matrices: np.ndarray, rng: np.r
 
 
 def choose(poses: FitPoses, requested: str = "auto"):
-    is_static = np.zeros(len(poses.rig.joints), bool)
-    return choose_key_joints(poses, len(poses.positions), requested, is_static, 1.0)
+    return choose_key_joints(replace(poses, random_count=min(len(poses.positions), poses.random_count)), requested)
+
+
+def needed_inputs(choice, vertices: slice) -> np.ndarray:
+    """Return (v, K + C) bool, the inputs from which the motion of vertices follows that removed joints cause."""
+    return choice.acts[vertices] @ choice.inputs[: choice.acts.shape[1]]
 
 
 def test_half_rotating_joints_follow_from_the_main_joints():
@@ -102,7 +118,7 @@ def test_half_rotating_joints_follow_from_the_main_joints():
         rotated = (joint - BONES + 1) % BONES
         if rotated in choice.joints:
             column = choice.joints.tolist().index(rotated)
-            assert choice.needed_inputs[RING * joint : RING * (joint + 1), column].all()
+            assert needed_inputs(choice, slice(RING * joint, RING * (joint + 1)))[:, column].all()
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.004])
@@ -132,7 +148,8 @@ def test_joints_that_follow_a_control_need_it_as_an_input():
     poses = chain_poses(followers=("slide",))
     choice = choose(poses)
     assert choice.joints.tolist() == list(range(BONES))
-    assert choice.needed_inputs[RING * BONES :, -1].all() and not choice.needed_inputs[: RING * BONES, -1].any()
+    needed = needed_inputs(choice, slice(None))
+    assert needed[RING * BONES :, -1].all() and not needed[: RING * BONES, -1].any()
     # Without the control, one sliding joint shows how far the others slide.
     assert len(choose(replace(poses, controls=np.zeros((len(poses.controls), 1)))).joints) == BONES + 1
 
@@ -195,15 +212,15 @@ def test_a_joint_that_only_actions_move_is_kept():
     matrices = poses.pose_matrices.copy()
     matrices[random_count:, moved] @= _transforms(np.array([[0.0, 0.3, 0.0]]), [0, 0, 0])[0].astype(np.float32)
     poses = replace(poses, pose_matrices=matrices)
-    choice = choose_key_joints(poses, random_count, "auto", np.zeros(2 * BONES, bool), 1.0)
+    choice = choose(replace(poses, random_count=random_count))
     assert choice.joints.tolist() == [*range(BONES), moved]
     assert choose(poses.subset(slice(0, random_count))).joints.tolist() == list(range(BONES))
 
 
 def test_a_bone_is_left_besides_the_static_joint():
     poses = chain_poses()
-    is_static = np.arange(BONES) == BONES - 1
-    choice = choose_key_joints(poses, len(poses.positions), "1", is_static, 1.0)
+    joints = (*poses.rig.joints[:-1], Joint(STATIC_JOINT, -1))
+    choice = choose(replace(poses, rig=replace(poses.rig, joints=joints)), "1")
     assert len(choice.joints) == 2 and BONES - 1 in choice.joints
 
 
@@ -253,31 +270,70 @@ def test_a_scale_of_zero_is_refused():
         choose(replace(poses, pose_matrices=matrices))
 
 
+def split(folder: Path, poses: FitPoses, random_count: int, **settings: object) -> tuple[SkinnedRecording, list]:
+    """Record poses, split their deformation, and return the result and the messages."""
+    sink, names = Sink(), poses.rig.joint_names
+    channels = tuple(Channel(names[joint], "rotation", 0, -1.0, 1.0) for joint in np.flatnonzero(poses.is_sampled))
+    counts = random_count, len(poses.positions) - random_count
+    sources = Source("random", counts[0]), Source("action", counts[1], "walk", (1, 1))
+    sampling = Sampling(0, 1.0, channels, tuple(source for source in sources if source.poses))
+    controls = (Control("shape_keys", 'key_blocks["Slide"].value', -1.0, 1.0),)
+    rig = replace(poses.rig, controls=controls)
+    info = RecordingInfo(len(poses.positions), 0, "chain.blend", "chain", "5.2.0", sampling)
+    with RecordingWriter(folder, rig, with_influences(info, rig)) as writer:
+        writer.append(poses.pose_matrices, poses.positions, poses.controls)
+        writer.append(*alone_arrays(rig, make_partitions(rig, {0: (len(names) - 1,)})))
+    return split_deformation(read_recording(folder), TrainingConfig(**settings), sink), sink.messages
+
+
 def test_weights_are_fitted_to_key_joints(tmp_path):
-    sink = Sink()
     poses = chain_poses(followers=("half", "still"))
-    names = [joint.name for joint in poses.rig.joints]
-    with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
-        for arrays in zip(poses.pose_matrices, poses.positions, poses.controls, strict=True):
-            writer.append(*arrays)
-    fit = fit_folder(tmp_path, "smooth", sink, joints="auto", random_poses=120)
-    joints, weights = read_fitted_weights(tmp_path, poses.rig)
-    key_joints, needed_inputs = read_key_joints(tmp_path, poses.rig)
-    assert fit.key_joints.joints == len(key_joints) < len(names)
-    assert set(np.unique(joints[weights > 0])) <= set(key_joints.tolist())
-    assert needed_inputs.shape == (poses.rig.vertex_count, len(key_joints))
-    assert sink.messages[-1][1]["fit"] == fit.to_json()
-    searches = [values for _, values in sink.messages if values.get("stage") == KEY_JOINTS_STAGE]
+    skinned, messages = split(tmp_path / "r", poses, 120, joints="auto")
+    names, rig = poses.rig.joint_names, skinned.rig
+    assert skinned.fit.key_joints.joints == len(rig.joints) == skinned.pose_matrices.shape[1] < len(names)
+    assert rig.fingerprint.has_key_joints and set(rig.joint_names) < set(names)
+    assert len(skinned.rows) == len(poses.positions) == skinned.info.poses
+    residuals = skinned.compute_residuals(np.arange(len(poses.positions)))
+    assert np.linalg.norm(residuals, axis=2).mean() < 0.02 * rig.size
+    # What the last, removed joint moves follows from the inputs that explain it.
+    explaining = [index for index, name in enumerate(rig.joint_names) if name == str(BONES - 1)]
+    assert names[-1] not in rig.joint_names and set(explaining) <= set(skinned.partitions[0].influencing)
+    searches = [values for _, values in messages if values.get("stage") == KEY_JOINTS_STAGE]
     assert {values["total"] for values in searches} == {len(names)}
     assert 0 <= min(values["done"] for values in searches) < max(values["done"] for values in searches) <= len(names)
+    assert messages[-1][1]["text"] == skinned.fit.sentence()
 
 
-def test_a_fit_without_removable_joints_writes_nothing(tmp_path):
-    sink = Sink()
+@pytest.mark.parametrize("fit_linear", ["", "hard"])
+def test_without_removable_joints_the_weights_are_the_own_or_fitted_ones(fit_linear, tmp_path):
     poses = chain_poses(followers=("free",))
-    with FitPosesWriter(tmp_path, poses.rig, len(poses.positions)) as writer:
-        for arrays in zip(poses.pose_matrices, poses.positions, strict=True):
-            writer.append(*arrays)
-    assert fit_folder(tmp_path, "smooth", sink, joints="auto", random_poses=160) is None
-    assert not (tmp_path / "fitted_joints.npy").exists()
-    assert sink.messages[-1][1]["key_joints"]["joints"] == 2 * BONES
+    skinned, messages = split(tmp_path / "r", poses, 160, joints="auto", fit_linear=fit_linear)
+    assert (skinned.fit.kind if skinned.fit else "") == fit_linear and skinned.key_joints.joints == 2 * BONES
+    assert np.array_equal(skinned.rig.skin_weights, poses.rig.skin_weights) == (not fit_linear)
+    assert skinned.key_joints.sentence() in [values.get("text") for _, values in messages]
+
+
+def test_too_few_random_poses_are_refused(tmp_path):
+    with pytest.raises(RecordingError, match="at least 40 random poses, and the recording has 30"):
+        split(tmp_path / "r", chain_poses(), 30, joints="auto")
+
+
+def test_a_rig_without_weights_needs_a_fit(tmp_path):
+    poses = chain_poses()
+    joints = (*poses.rig.joints, Joint(STATIC_JOINT, -1))
+    rest_matrices = np.concatenate([poses.rig.rest_matrices, np.eye(4, dtype=np.float32)[None]])
+    matrices = np.tile(np.eye(4, dtype=np.float32), (len(poses.positions), 1, 1, 1))
+    weights = np.eye(1, 4, dtype=np.float32).repeat(poses.rig.vertex_count, axis=0)
+    static = np.full_like(poses.rig.skin_joints, BONES)
+    bare = replace(poses.rig, joints=joints, rest_matrices=rest_matrices, skin_joints=static, skin_weights=weights)
+    poses = replace(
+        poses,
+        rig=bare,
+        pose_matrices=np.concatenate([poses.pose_matrices, matrices], axis=1),
+        is_dependency=np.zeros(BONES + 1, bool),
+        is_sampled=np.arange(BONES + 1) < BONES,
+    )
+    with pytest.raises(TrainingError, match=r"follow no bone by skin weights, .*--fit-linear smooth"):
+        split(tmp_path / "r", poses, 160)
+    skinned, _ = split(tmp_path / "fitted", poses, 160, fit_linear="smooth")
+    assert skinned.fit.held_out.rms_mm["fitted"] < 0.05 * skinned.fit.held_out.rms_mm["rig"]

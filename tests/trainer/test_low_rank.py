@@ -9,7 +9,6 @@ import pytest
 
 from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
 from trainer.__main__ import main
 from trainer.export.graph import build_graph
@@ -19,6 +18,7 @@ from trainer.fits.joint_fit import JointFit, JointRegression, joint_regression
 from trainer.fits.low_rank import TOLERANCE_RATIO, LowRankFactors, may_factorize
 from trainer.model import TrainedModel
 
+from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
 from .test_graph import check_agreement, collect_trained_models, run_graph
@@ -190,8 +190,14 @@ def test_independent_parameters_are_not_factorized(prepared):
 def trained_model(tmp_path_factory) -> TrainedModel:
     rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
     path = tmp_path_factory.mktemp("low_rank")
-    with RecordingWriter(path / "recording", rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
-        writer.append(pose_chain(rig, angles), sliding_residuals(rig, angles))
+    write_recording(
+        path / "recording",
+        rig,
+        make_partitions(rig, INFLUENCING),
+        chain_info(POSES),
+        pose_chain(rig, angles),
+        sliding_residuals(rig, angles),
+    )
     with pytest.MonkeyPatch.context() as monkeypatch:
         trained_models = collect_trained_models(monkeypatch)
         assert main([str(path / "recording"), str(path / "model.onnx"), *QUICK_OPTIONS]) == 0

@@ -12,12 +12,12 @@ from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.partition import Partition, main_joints, make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.fits.joint_fit import joint_regression, joints_on_path
 
+from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS, run_page_code
 
@@ -28,11 +28,14 @@ INFLUENCING = {0: (0, 1), 1: (0, 1, 2, 3), ABSORBING_JOINT: (2, 3), STATIC_JOINT
 
 
 def odd_rig() -> Rig:
-    """Create a chain of four joints; the vertices of its first tenth have no bone."""
+    """Create a chain of four joints; the vertices of its first tenth have no bone, and the last bone has 7."""
     rig = chain_rig(JOINTS)
     skin_joints, skin_weights = rig.skin_joints.copy(), rig.skin_weights.copy()
     has_no_bone = rig.rest_positions[:, 2] < 0.1
     skin_joints[has_no_bone], skin_weights[has_no_bone] = [STATIC_JOINT_INDEX, 0], [1, 0]
+    is_below_tip = main_joints(skin_joints, skin_weights) == MERGED_JOINT
+    is_below_tip &= rig.rest_positions[:, 2] < np.sort(rig.rest_positions[:, 2])[-7]
+    skin_joints[is_below_tip], skin_weights[is_below_tip] = [ABSORBING_JOINT, 0], [1, 0]
     rest_matrices = np.append(rig.rest_matrices, np.eye(4, dtype=np.float32)[None], axis=0)
     joints = (*rig.joints, Joint(STATIC_JOINT, -1))
     return replace(rig, joints=joints, rest_matrices=rest_matrices, skin_joints=skin_joints, skin_weights=skin_weights)
@@ -63,8 +66,14 @@ def smoothed(rig: Rig, poses: np.ndarray) -> np.ndarray:
 def model(tmp_path_factory) -> Path:
     folder, rig = tmp_path_factory.mktemp("odd"), odd_rig()
     partitions, poses = odd_partitions(rig), odd_poses(rig, POSES, 0)
-    with RecordingWriter(folder / "recording", rig, partitions, chain_info(POSES)) as writer:
-        writer.append(poses, LinearSkinning(rig, partitions).local_residuals(poses, smoothed(rig, poses)))
+    write_recording(
+        folder / "recording",
+        rig,
+        partitions,
+        chain_info(POSES),
+        poses,
+        LinearSkinning(rig, partitions).local_residuals(poses, smoothed(rig, poses)),
+    )
     assert main([str(folder / "recording"), str(folder / "model.onnx"), *QUICK_OPTIONS]) == 0
     return folder / "model.onnx"
 
@@ -98,7 +107,7 @@ def test_the_code_in_the_recording_format_page_runs(model):
     rig = odd_rig()
     pose = odd_poses(rig, POSES, 0)[:1]
     expected = distances(smoothed(rig, pose), LinearSkinning(rig).positions(pose)).mean() * 1000
-    shape, residual = run_page_code("Recording", model.parent).split(" mean residual ")
+    shape, residual = run_page_code("Recording", model.parent).split(" mean distance from linear skinning ")
     assert shape == "(90, 3)" and float(residual.removesuffix(" mm\n")) == pytest.approx(expected, rel=1e-4)
 
 

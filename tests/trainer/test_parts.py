@@ -12,7 +12,6 @@ from fdda_addon.core.controls import Control
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.runtime.network import Network
 from trainer import preparation
 from trainer.__main__ import main
@@ -20,6 +19,7 @@ from trainer.fits import parts
 from trainer.fits.joint_fit import JointFit
 from trainer.fits.parts import divide_partition
 
+from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK_OPTIONS
 
@@ -58,8 +58,8 @@ def divided(tmp_path, monkeypatch) -> Path:
     # The product of the first two keys is not linear.
     residuals[:, 1::2, 0] += 0.01 * values[:, :1] * values[:, 1:2]
     influences = {0: (), 1: (1,), 2: (2,)}, {joint: tuple(range(KEYS)) for joint in range(3)}
-    with RecordingWriter(tmp_path / "recording", rig, make_partitions(rig, *influences), chain_info(POSES)) as writer:
-        writer.append(poses, residuals, values)
+    arrays = poses, residuals, values
+    write_recording(tmp_path / "recording", rig, make_partitions(rig, *influences), chain_info(POSES), *arrays)
     assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
     np.savez(tmp_path / "truth", poses=poses, values=values, residuals=residuals)
     return tmp_path

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.mathematics.partition import Partition, make_partitions
-from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
@@ -16,6 +14,7 @@ from trainer.inputs.network_inputs import make_inputs
 from trainer.inputs.rotations import RotationFeatures
 from trainer.model import TrainedModel
 
+from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .test_graph import check_agreement, trained_model  # noqa: F401, the fixture
 
@@ -66,9 +65,15 @@ def fitted(tmp_path_factory) -> dict[str, np.ndarray]:
     matrices[:, 2, :3, 0] *= np.linspace(1, 1.1, poses)[:, None]
     path = tmp_path_factory.mktemp("rotations") / "recording"
     influencing = {0: (1,), 1: (1, 2), 2: (2, 3), 3: (3,)}
-    with RecordingWriter(path, rig, make_partitions(rig, influencing), chain_info(poses)) as writer:
-        writer.append(matrices.astype(np.float32), chain_residuals(rig, angles))
-    recording, config = read_recording(path), TrainingConfig()
+    write_recording(
+        path,
+        rig,
+        make_partitions(rig, influencing),
+        chain_info(poses),
+        matrices.astype(np.float32),
+        chain_residuals(rig, angles),
+    )
+    recording, config = read_skinned(path), TrainingConfig()
     return RotationFeatures.fit(recording, split_recording(recording, config), config)
 
 

@@ -1,38 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The fit of skin weights recovers the true weights, keeps its constraints, and improves poor weights."""
 
-import json
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.formats.messages import STOP_FILE_VARIABLE, Message, MessageType
-from fdda_addon.core.mathematics.skin_fit import SkinFit
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.arrays import array_header
-from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted_weights
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from trainer.skin.__main__ import main
-from trainer.skin.job import fit_folder, measure
+from trainer.skin.fit_poses import FitPoses, choose_fit_poses
 from trainer.skin.solver import fit_skin, simplex_weights
+from trainer.skin.split_deformation import measure_skin
 
-from .. import systems
 from .chain import rotation
-from .conftest import REPOSITORY
 
 JOINTS, VERTICES, POSES = 24, 300, 40
-
-
-class SilentSink:
-    def send(self, message_type: MessageType, **values) -> None:
-        pass
 
 
 def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES) -> np.ndarray:
@@ -100,13 +83,6 @@ def dense_weights(rig: Rig) -> np.ndarray:
     return weights
 
 
-def write_fit_folder(folder: Path, poses: FitPoses) -> Path:
-    with FitPosesWriter(folder, poses.rig, len(poses.positions)) as writer:
-        for matrices, positions in zip(poses.pose_matrices, poses.positions, strict=True):
-            writer.append(matrices, positions)
-    return folder
-
-
 @pytest.mark.parametrize(("influences", "origin_distance"), [(2, 0), (4, 0), (4, 1000)])
 def test_smooth_weights_are_recovered(influences, origin_distance):
     rig = random_rig(influences, origin_distance=origin_distance)
@@ -148,7 +124,7 @@ def test_five_joints_are_approximated_by_the_best_four():
     )
     poses = make_fit_poses(rig)
     heaviest = replace(rig, skin_joints=rig.skin_joints[:, :4], skin_weights=rig.skin_weights[:, :4] / np.float32(0.9))
-    fit_errors = measure(replace(poses, rig=heaviest), fit_rig(poses, "smooth"))
+    fit_errors = measure_skin(replace(poses, rig=heaviest), fit_rig(poses, "smooth"))
     assert fit_errors.rms_mm["fitted"] < 0.8 * fit_errors.rms_mm["rig"]
 
 
@@ -195,127 +171,33 @@ def test_static_vertices_follow_the_static_joint():
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
-def test_the_process_reports_the_errors(kind, tmp_path, capsys):
+def test_the_errors_are_measured_on_training_and_held_out_poses(kind):
     poses = make_fit_poses(random_rig(2), noise=0.002)
-    assert main([str(write_fit_folder(tmp_path, poses)), kind]) == 0
-    messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
-    assert messages[-2].values == {"done": VERTICES, "total": VERTICES}
-    fit = SkinFit.from_json(json.loads(json.dumps(messages[-1].values["fit"])))
-    assert (messages[-1].type, fit.kind, fit.poses) == (MessageType.FINISHED, kind, POSES)
-    for fit_errors in (fit.held_out, fit.training):
+    training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
+    fitted_rig = fit_rig(training, kind)
+    reports = []
+    for subset in (held_out, training):
+        reports.append(fit_errors := measure_skin(subset, fitted_rig))
         assert fit_errors.rms_mm["fitted"] < 0.8 * fit_errors.rms_mm["rig"]
-    joints, weights = read_fitted_weights(tmp_path, poses.rig)
-    fitted_skinning = LinearSkinning(replace(poses.rig, skin_joints=joints, skin_weights=weights))
-    # Every other pose is held out.
-    for fit_errors, pose_slice in ((fit.held_out, slice(1, None, 2)), (fit.training, slice(0, None, 2))):
-        distances = np.linalg.norm(
-            fitted_skinning.positions(poses.pose_matrices[pose_slice]) - poses.positions[pose_slice], axis=2
-        )
+        skinned = LinearSkinning(fitted_rig).positions(subset.pose_matrices)
+        distances = np.linalg.norm(skinned - subset.positions, axis=2)
         np.testing.assert_allclose(fit_errors.rms_mm["fitted"], 1000 * np.sqrt((distances**2).mean()), rtol=1e-4)
         np.testing.assert_allclose(fit_errors.max_mm["fitted"], 1000 * distances.max(), rtol=1e-4)
     if kind == "smooth":
         # The noise of √3 · 2 mm remains. Held-out poses have a slightly larger error.
-        assert 3.3 < fit.training.rms_mm["fitted"] < fit.held_out.rms_mm["fitted"] < 4
+        assert 3.3 < reports[1].rms_mm["fitted"] < reports[0].rms_mm["fitted"] < 4
 
 
-def test_a_stopped_fit_writes_nothing(tmp_path):
-    folder, stop_file = tmp_path / "poses", tmp_path / "stop"
-    folder.mkdir()
-    stop_file.touch()
-    before = set(write_fit_folder(folder, make_fit_poses(random_rig(2))).iterdir())
-    command = [sys.executable, "-m", "trainer.skin", str(folder), "smooth"]
-    environment = {**os.environ, STOP_FILE_VARIABLE: str(stop_file)}
-    process = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
-    assert process.returncode == 130 and Message.decode(process.stdout) == Message(MessageType.CANCELLED)
-    assert set(folder.iterdir()) == before and not stop_file.exists()
+@pytest.mark.parametrize(
+    ("pose_count", "vertex_count", "random_count", "expected"),
+    [(1000, 300, 0, (0, 300)), (1000, 300, 500, (200, 100)), (40, 300, 0, (0, 40)), (1000, 10**7, 0, (0, 10))],
+)
+def test_poses_of_a_fit_are_spaced_evenly(pose_count, vertex_count, random_count, expected):
+    chosen = choose_fit_poses(pose_count, vertex_count, random_count)
+    assert ((chosen < random_count).sum(), (chosen >= random_count).sum()) == expected
+    assert chosen[0] == 0 and chosen[-1] == pose_count - 1 and (np.diff(chosen) > 0).all()
 
 
-def test_a_missing_scipy_is_named(tmp_path):
-    code = (
-        "import sys; sys.modules['scipy'] = None; from trainer.skin.__main__ import main; sys.exit(main(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", code, str(write_fit_folder(tmp_path, make_fit_poses(random_rig(2)))), "smooth"]
-    process = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert process.returncode == 1
-    message = Message.decode(process.stdout)
-    assert message.type is MessageType.FAILED
-    assert message.values["text"].startswith("Fitting skin weights needs the Python package 'scipy', which ")
-    assert "numpy, scipy and jinja2 there, install the training environment" in message.values["text"]
-
-
-def damage_cases() -> Iterator:
-    def truncate(folder: Path) -> None:
-        content = (folder / "positions.npy").read_bytes()
-        (folder / "positions.npy").write_bytes(content[:-100])
-
-    def change_array(name: str, change_values) -> None:
-        def damage_folder(folder: Path) -> None:
-            np.save(folder / f"{name}.npy", change_values(np.load(folder / f"{name}.npy")), allow_pickle=False)
-
-        return damage_folder
-
-    def write_negative_count(folder: Path) -> None:
-        (folder / "parents.npy").write_bytes(array_header((-JOINTS,), np.int32) + bytes(100))
-
-    def write_pickle(folder: Path) -> None:
-        (folder / "parents.npy").write_bytes(array_header((JOINTS,), object) + b"cbuiltins\nprint\n(Vpoor\ntR.")
-
-    def add_nan(array: np.ndarray) -> np.ndarray:
-        array[3, 5, 1] = np.nan
-        return array
-
-    yield (
-        "missing",
-        lambda folder: (folder / "parents.npy").unlink(),
-        f"'parents.npy' cannot be read ({systems.NOT_FOUND}",
-    )
-    yield "truncated", truncate, "'positions.npy' is no array, or truncated"
-    yield (
-        "no array",
-        lambda folder: (folder / "positions.npy").write_bytes(b"\x93NUMPY\x01\x00"),
-        "'positions.npy' is no",
-    )
-    yield "negative", write_negative_count, "'parents.npy' is no array"
-    yield "pickled", write_pickle, "'parents.npy' holds something else"
-    yield (
-        "type",
-        change_array("skin_weights", lambda a: a.astype(np.float64)),
-        "'skin_weights.npy' holds something else",
-    )
-    yield "size", change_array("positions", lambda a: a[:, 1:]), "rest_positions has the shape (300, 3)"
-    yield "numbers", change_array("positions", add_nan), "positions holds values that are not numbers"
-    yield "few", change_array("pose_matrices", lambda a: a[:3]), "positions has the shape (40, 300, 3)"
-    yield "joints", change_array("skin_joints", lambda a: a + 99), "the skin weights name no joints"
-    yield "parents", change_array("parents", lambda a: a + 1), "a joint comes before its parent"
-    yield "flat", change_array("rest_matrices", lambda a: a * 0), "a rest matrix is singular"
-
-
-DAMAGED_FOLDERS = {name: (damage_folder, expected_text) for name, damage_folder, expected_text in damage_cases()}
-
-
-@pytest.mark.parametrize("name", DAMAGED_FOLDERS)
-def test_a_damaged_folder_is_refused(name, tmp_path, capsys):
-    damage_folder, expected_text = DAMAGED_FOLDERS[name]
-    damage_folder(write_fit_folder(tmp_path, make_fit_poses(random_rig(2))))
-    assert main([str(tmp_path), "smooth"]) == 1
-    output = capsys.readouterr()
-    text = Message.decode(output.out.splitlines()[-1]).values["text"]
-    assert text.startswith(f"The poses in '{tmp_path}' cannot be fitted: {expected_text}") and text.endswith(
-        "; record again."
-    )
-    assert output.err == text + "\n"
-
-
-def test_too_few_poses_are_refused(tmp_path):
-    with pytest.raises(RecordingError, match="they are 4, and a fit takes 10; record again"):
-        read_fit_poses(write_fit_folder(tmp_path, make_fit_poses(random_rig(2), poses=4)))
-
-
-def test_fitted_weights_of_another_rig_are_refused(tmp_path):
-    rig = random_rig(2)
-    fit_folder(write_fit_folder(tmp_path, make_fit_poses(rig)), "hard", SilentSink())
-    with pytest.raises(RecordingError, match=r"the fitted weights have the shapes \(300, 4\) and \(300, 4\)"):
-        read_fitted_weights(tmp_path, replace(rig, rest_positions=rig.rest_positions[1:]))
-    np.save(tmp_path / "fitted_weights.npy", np.full((VERTICES, 4), -0.25, np.float32))
-    with pytest.raises(RecordingError, match="the fitted weights are no weights"):
-        read_fitted_weights(tmp_path, rig)
+def test_too_few_poses_are_refused():
+    with pytest.raises(RecordingError, match="Skin weights are fitted to at least 10 poses, and the recording has 9"):
+        choose_fit_poses(9, 300)

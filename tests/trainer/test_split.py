@@ -10,11 +10,12 @@ import pytest
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.mathematics.poses import Margin
 from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
-from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from trainer.config import TrainingConfig
 from trainer.data.split import BLOCK_FRAMES, Split, split_recording
 from trainer.preparation import PartitionData, prepare_partition
 
+from ..recordings import read_skinned
 from .chain import write_chain
 
 CONFIG = TrainingConfig(seed=3)
@@ -22,13 +23,13 @@ PART_NAMES = ("training", "validation", "held_out")
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Recording:
+def recording(tmp_path_factory) -> SkinnedRecording:
     path: Path = tmp_path_factory.mktemp("split") / "chain"
     write_chain(path, 4)
-    return read_recording(path)
+    return read_skinned(path)
 
 
-def split(recording: Recording, *sources: Source, config: TrainingConfig = CONFIG) -> Split:
+def split(recording: SkinnedRecording, *sources: Source, config: TrainingConfig = CONFIG) -> Split:
     """Split a recording with some sources, and assert that each pose is in exactly one part."""
     sampling = replace(recording.info.sampling, sources=sources)
     result = split_recording(replace(recording, info=replace(recording.info, sampling=sampling)), config)

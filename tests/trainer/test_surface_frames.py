@@ -11,7 +11,8 @@ import pytest
 from fdda_addon.core.formats.report import checkpoint_path
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
@@ -22,23 +23,24 @@ from trainer.inputs.surface_frame_vectors import NO_SURFACE_FRAMES, SurfaceFrame
 from trainer.inputs.surface_frames import SurfaceFrameFeatures
 from trainer.networks.checkpoint import read_checkpoint
 
+from ..recordings import read_skinned
 from .chain import rotation, write_chain
 from .conftest import QUICK_OPTIONS
 from .tube import INFLUENCING, JOINTS, POSES, smoothed, write_tube
 
 
-def select_frames(recording: Recording) -> SurfaceFrames:
+def select_frames(recording: SkinnedRecording) -> SurfaceFrames:
     return select_surface_frames(recording, split_recording(recording, TrainingConfig()), tolerance_mm=0.04)
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Recording:
+def recording(tmp_path_factory) -> SkinnedRecording:
     return write_tube(tmp_path_factory.mktemp("tubes") / "tube")
 
 
 @pytest.fixture(scope="module")
 def surface_frames(recording) -> SurfaceFrameFeatures:
-    return SurfaceFrameFeatures(**vars(select_frames(recording)))
+    return SurfaceFrameFeatures(**vars(select_frames(skin_recording(read_recording(recording.path)))))
 
 
 def test_a_rig_that_smooths_has_surface_frames_in_every_partition(recording, surface_frames):
@@ -124,7 +126,7 @@ def test_a_rig_that_does_not_smooth_has_no_surface_frames(tmp_path):
 def test_chance_correlations_select_nothing(tmp_path):
     """Bulges that grow with the bend correlate with the rotation of the adjacent surface."""
     write_chain(tmp_path / "chain")
-    assert select_frames(read_recording(tmp_path / "chain")) is NO_SURFACE_FRAMES
+    assert select_frames(read_skinned(tmp_path / "chain")) is NO_SURFACE_FRAMES
 
 
 def test_a_rig_that_smooths_one_partition_has_no_surface_frames(tmp_path, recording):

@@ -12,18 +12,18 @@ from fdda_addon.core.formats.model import check_rig, read_model_info
 from fdda_addon.core.mathematics.features import joint_features
 from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
 from trainer.__main__ import main
 from trainer.config import ACTIVATIONS, TrainingConfig
 from trainer.data.split import split_recording
 
+from ..recordings import read_skinned
 from .chain import MAX_ANGLE, chain_angles, chain_residuals, pose_chain, write_chain
 
 
 @pytest.fixture(scope="module")
 def rig(recording) -> Rig:
-    return read_recording(recording).rig
+    return read_skinned(recording).rig
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_linear_skinning_moves_with_the_character(session, rig):
 
 
 def test_confidence_is_one_in_recorded_poses(session, recording):
-    confidence = run_model(session, np.array(read_recording(recording).pose_matrices))[1]
+    confidence = run_model(session, np.array(read_skinned(recording).pose_matrices))[1]
     assert (confidence == 1).all()
 
 
@@ -124,7 +124,7 @@ def test_a_joint_scaled_to_zero_gives_finite_positions(session, rig):
 
 
 def test_metadata_describes_rig_and_training(trained, recording, report):
-    info, source_recording = read_model_info(trained / "model.onnx"), read_recording(recording)
+    info, source_recording = read_model_info(trained / "model.onnx"), read_skinned(recording)
     check_rig(trained / "model.onnx", info, source_recording.rig)
     assert info.joints == source_recording.rig.joints and info.fingerprint == source_recording.rig.fingerprint
     assert [p.joint for p in info.partitions] == [p.joint for p in source_recording.partitions]
@@ -148,7 +148,7 @@ def test_the_graph_has_standard_operators_of_an_early_opset(trained):
 
 
 def test_the_report_has_the_errors_of_the_model(report, trained, recording, session):
-    source_recording = read_recording(recording)
+    source_recording = read_skinned(recording)
     assert sum(p["vertices"] for p in report["partitions"]) == source_recording.rig.vertex_count
     assert report["model_bytes"] == (trained / "model.onnx").stat().st_size
     held_out, linear = report["fdda"]["held_out"], report["linear"]["held_out"]
@@ -181,7 +181,7 @@ def test_a_rig_of_one_joint_is_exported(tmp_path):
 
 
 def test_the_report_has_the_surface_errors(report, recording, session, trained):
-    source_recording = read_recording(recording)
+    source_recording = read_skinned(recording)
     normals, edges = report["normals"], report["edges"]
     assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
     assert edges["fdda"]["across"] < edges["linear"]["across"]

@@ -90,23 +90,23 @@ def test_a_missing_recording_is_refused(tmp_path, capsys):
 def test_an_incomplete_recording_is_refused(tmp_path, capsys):
     write_chain(tmp_path / "half", pose_count=40, complete_count=13)
     text = run_failing_training([tmp_path / "half", tmp_path / "m.onnx"], capsys)
-    assert "is incomplete: 13 of 40 poses" in text and "--resume" in text
+    assert "is incomplete: 13 of 44 poses" in text and "--resume" in text
     assert not (tmp_path / "m.onnx").exists()
 
 
 def test_a_truncated_recording_is_refused(recording, tmp_path, capsys):
     path = copy_recording(recording, tmp_path)
-    content = (path / "residuals.npy").read_bytes()
-    (path / "residuals.npy").write_bytes(content[:-100])
-    assert "residuals.npy' cannot be used: it is truncated" in run_failing_training([path, tmp_path / "m.onnx"], capsys)
+    content = (path / "positions.npy").read_bytes()
+    (path / "positions.npy").write_bytes(content[:-100])
+    assert "positions.npy' cannot be used: it is truncated" in run_failing_training([path, tmp_path / "m.onnx"], capsys)
 
 
 def test_a_recording_with_nan_is_refused(recording, tmp_path, capsys):
     path = copy_recording(recording, tmp_path)
-    residuals = np.load(path / "residuals.npy")
-    residuals[17, 3, 1] = np.nan
-    np.save(path / "residuals.npy", residuals)
-    assert "holds values that are not numbers (residuals" in run_failing_training([path, tmp_path / "m.onnx"], capsys)
+    positions = np.load(path / "positions.npy")
+    positions[17, 3, 1] = np.nan
+    np.save(path / "positions.npy", positions)
+    assert "holds values that are not numbers (positions" in run_failing_training([path, tmp_path / "m.onnx"], capsys)
 
 
 def test_too_few_poses_are_refused(tmp_path, capsys):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.formats.report import checkpoint_path
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
 from trainer.__main__ import main
@@ -21,6 +22,7 @@ from trainer.networks.warm_start import initial_networks
 from trainer.preparation import partition_data, prepare_partition
 
 from .. import systems
+from ..recordings import read_skinned
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain
 from .conftest import QUICK_OPTIONS
 
@@ -36,7 +38,9 @@ def grown_recording(recording, tmp_path):
     angles = chain_angles(ADDED_POSES, 3, seed=5)
     angles[:, 2, 1] = 0
     with RecordingExtension(source, "model.onnx") as extension:
-        extension.append(pose_chain(source.rig, angles), chain_residuals(source.rig, angles))
+        matrices = pose_chain(source.rig, angles)
+        skinning = LinearSkinning(source.rig)
+        extension.append(matrices, skinning.complex_positions(matrices, chain_residuals(source.rig, angles)))
     return folder
 
 
@@ -49,7 +53,7 @@ def model(trained, tmp_path):
 
 
 def prepare_recording(path, config, checkpoint):
-    recording = read_recording(path)
+    recording = read_skinned(path)
     split = split_recording(recording, config)
     inputs = make_inputs(recording.rig, recording.partitions, checkpoint.input_states)
     data = partition_data(recording, inputs)
@@ -97,8 +101,8 @@ def test_a_warm_start_continues_the_training(grown_recording, model, trained):
 def test_refined_poses_become_training_poses_and_held_out_poses_stay(recording, grown_recording):
     config = TrainingConfig()
     before, after = (
-        split_recording(read_recording(recording), config),
-        split_recording(read_recording(grown_recording), config),
+        split_recording(read_skinned(recording), config),
+        split_recording(read_skinned(grown_recording), config),
     )
     assert np.array_equal(before.held_out, after.held_out) and np.array_equal(before.validation, after.validation)
     assert np.array_equal(after.training, [*before.training, *range(120, 120 + ADDED_POSES)])

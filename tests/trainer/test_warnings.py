@@ -16,12 +16,12 @@ from .conftest import QUICK_OPTIONS
 
 @pytest.fixture(scope="module")
 def suspicious_recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recording of the chain. Thirty of its 120 poses repeat an earlier pose, one of them with other residuals."""
+    """The recording of the chain. Thirty of its 120 poses repeat an earlier pose, one of them with other positions."""
     path = shutil.copytree(recording, tmp_path_factory.mktemp("suspicious") / "recording")
-    for name in ("pose_matrices", "residuals"):
+    for name in ("pose_matrices", "positions"):
         array = np.load(path / f"{name}.npy", mmap_mode="r+")
         array[20:51] = array[20]
-        if name == "residuals":
+        if name == "positions":
             array[50, :, 0] += 0.0005
         array.flush()
     return path

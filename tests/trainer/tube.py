@@ -5,10 +5,10 @@ import numpy as np
 
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 
+from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, pose_chain, rotation
 
 JOINTS, RING_COUNT, VERTICES_PER_RING, POSES = 3, 24, 12, 160
@@ -98,7 +98,7 @@ def write_tube(
     smooths: bool = True,
     sheared: bool = False,
     pose_count: int = POSES,
-) -> Recording:
+) -> SkinnedRecording:
     """Write a recording of the tube with delta mush; with `smooths` False, with bulges that depend on joint angles."""
     plain_rig, rig, angles = (
         tube(),
@@ -115,6 +115,12 @@ def write_tube(
         residuals = 0.01 * np.einsum("nj,jva->nva", np.sin(7 * angles[:, 1]), waves)
     matrices = matrices.astype(np.float64)
     matrices[:, :, :3, 3] = units_per_metre * (matrices[:, :, :3, 3] + origin_distance)
-    with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING), chain_info(pose_count)) as writer:
-        writer.append(matrices.astype(np.float32), (units_per_metre * residuals).astype(np.float32))
-    return read_recording(path)
+    write_recording(
+        path,
+        rig,
+        make_partitions(rig, INFLUENCING),
+        chain_info(pose_count),
+        matrices.astype(np.float32),
+        (units_per_metre * residuals).astype(np.float32),
+    )
+    return read_skinned(path)

@@ -7,7 +7,7 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording.index import RANDOM, REFINED, Source
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Fingerprint
 from fdda_addon.core.sentences.counts import format_count
 
@@ -53,7 +53,7 @@ def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_o
     return Split(np.sort(parts[2]), np.sort(parts[1]), np.sort(parts[0]))
 
 
-def split_recording(recording: Recording, config: TrainingConfig) -> Split:
+def split_recording(recording: SkinnedRecording, config: TrainingConfig) -> Split:
     """Split the poses of a recording.
 
     Random poses are split one by one. Frames of animation are split in blocks, because the error on a frame is too low
@@ -119,7 +119,7 @@ def _frame_blocks(sources: tuple[Source, ...]) -> list[list[int]]:
     return list(blocks.values())
 
 
-def holdout_fingerprint(recording: Recording, split: Split) -> str:
+def holdout_fingerprint(recording: SkinnedRecording, split: Split) -> str:
     """Return a digest of 16 hexadecimal digits of the validation and held-out poses.
 
     If it is equal for two splits, no held-out pose of one is a training pose of the other.

@@ -20,13 +20,20 @@ from fdda_addon.core.formats.model import (
     SKIN_KEY,
     read_model_info,
 )
-from fdda_addon.core.formats.model_info import LIMITS_KEY, OBJECT_KEY, ModelInfo, ModelPartition
+from fdda_addon.core.formats.model_info import (
+    FIT_KEY,
+    KEY_JOINTS_KEY,
+    LIMITS_KEY,
+    OBJECT_KEY,
+    ModelInfo,
+    ModelPartition,
+)
 from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, FLOAT32_ROUNDING_RATIO
 from fdda_addon.core.mathematics.metrics import distances, error_statistics
 from fdda_addon.core.mathematics.skin_fit import skin_to_text
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.mathematics.surface import Surface, SurfaceComparison, surface_errors, surface_json
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..blocks import block_slices
 from ..fits.half_rotations import regression_matrices
@@ -105,7 +112,7 @@ def open_session(model: bytes) -> onnxruntime.InferenceSession:
 
 
 def _evaluate(
-    session: onnxruntime.InferenceSession, recording: Recording, skinning: LinearSkinning, poses: np.ndarray
+    session: onnxruntime.InferenceSession, recording: SkinnedRecording, skinning: LinearSkinning, poses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Evaluate n poses of a recording.
 
@@ -116,13 +123,13 @@ def _evaluate(
     if recording.rig.controls:
         inputs[CONTROLS_INPUT] = np.array(recording.controls[poses])
     matrices = inputs[POSE_INPUT]
-    truth = skinning.complex_positions(matrices, np.array(recording.residuals[poses]))
-    return *session.run([POSITIONS_OUTPUT, CONFIDENCE_OUTPUT], inputs), skinning.positions(matrices), truth
+    outputs = session.run([POSITIONS_OUTPUT, CONFIDENCE_OUTPUT], inputs)
+    return *outputs, skinning.positions(matrices), recording.read_positions(poses)
 
 
 def measure(
     session: onnxruntime.InferenceSession,
-    recording: Recording,
+    recording: SkinnedRecording,
     poses: np.ndarray,
     trained_model: TrainedModel | None = None,
 ) -> Measurement:
@@ -155,7 +162,7 @@ def measure(
     return Measurement(fdda, linear, difference)
 
 
-def measure_surface(session: onnxruntime.InferenceSession, recording: Recording, poses: np.ndarray) -> dict:
+def measure_surface(session: onnxruntime.InferenceSession, recording: SkinnedRecording, poses: np.ndarray) -> dict:
     """Measure normals and edge lengths on at most `MAX_SURFACE_POSES` poses; returns the JSON of `surface_json`."""
     rig, rows = recording.rig, []
     if not len(rig.face_starts):
@@ -170,7 +177,7 @@ def measure_surface(session: onnxruntime.InferenceSession, recording: Recording,
     return surface_json(*(surface_errors(method_rows) for method_rows in zip(*rows, strict=True)))
 
 
-def check_parity(recording: Recording, held_out: Measurement) -> None:
+def check_parity(recording: SkinnedRecording, held_out: Measurement) -> None:
     """Check how far the exported model is from `reference_positions` on the held-out poses.
 
     Raises:
@@ -190,7 +197,11 @@ def check_parity(recording: Recording, held_out: Measurement) -> None:
 
 
 def _model_info(
-    recording: Recording, trained_model: TrainedModel, held_out: Measurement, training_info: dict, constant_bytes: int
+    recording: SkinnedRecording,
+    trained_model: TrainedModel,
+    held_out: Measurement,
+    training_info: dict,
+    constant_bytes: int,
 ) -> ModelInfo:
     """Create the metadata of a model; arguments as in `build_model`."""
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
@@ -218,6 +229,8 @@ def _model_info(
             **training_info,
             OBJECT_KEY: recording.info.object_name,
             LIMITS_KEY: recording.info.sampling.to_json()["limits"],
+            **({FIT_KEY: recording.fit.to_json()} if recording.fit else {}),
+            **({KEY_JOINTS_KEY: recording.key_joints.to_json()} if recording.key_joints else {}),
         },
         rig.metres_per_unit,
         constant_bytes,
@@ -242,7 +255,7 @@ class ExportedModel:
 
 
 def build_model(
-    recording: Recording, trained_model: TrainedModel, held_out_poses: np.ndarray, training_info: dict
+    recording: SkinnedRecording, trained_model: TrainedModel, held_out_poses: np.ndarray, training_info: dict
 ) -> ExportedModel:
     """Build the model, check it against the trained networks, and measure its errors; nothing is written.
 
@@ -263,7 +276,7 @@ def build_model(
     # The checksum comes first, so that a truncated file still has it.
     model.metadata_props.add(key=CHECKSUM_KEY, value=hashlib.sha256(model.graph.SerializeToString()).hexdigest())
     model.metadata_props.add(key=METADATA_KEY, value=info.to_json())
-    if recording.info.fit:
+    if recording.fit:
         skin = skin_to_text(recording.rig.skin_joints, recording.rig.skin_weights)
         model.metadata_props.add(key=SKIN_KEY, value=skin)
     return ExportedModel(model.SerializeToString(), info, held_out, session)

@@ -41,7 +41,7 @@ class _PartitionRows:
         self.index, self.partition_index = index, trained_model.partition_indices()[index]
         self.prepared = trained_model.prepared[index]
         self.joint, self.vertices = part.joint, part.vertices
-        self.skin = SkinBlock(self._rig, part)
+        self.skin = SkinBlock(self._rig, self.joint, self.vertices)
         is_half_rotation = self.prepared.fit.joints >= len(self._rig.joints)
         self.component_count = len(self.prepared.basis.components)
         self.controls = self.prepared.fit.controls

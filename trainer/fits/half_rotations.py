@@ -11,7 +11,7 @@ import numpy as np
 
 from fdda_addon.core.mathematics.features import joint_features
 from fdda_addon.core.mathematics.skinning import skin_matrices
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from .joint_fit import joint_regression
@@ -66,7 +66,7 @@ def regression_matrices(pose_matrices: np.ndarray, rig: Rig, use_half_rotations:
     return np.concatenate([skin, half_rotations.astype(np.float32)], axis=1)
 
 
-def half_rotations_help(recording: Recording, training: np.ndarray) -> bool:
+def half_rotations_help(recording: SkinnedRecording, training: np.ndarray) -> bool:
     """Return whether half-rotation features lower the error enough to justify their nodes in the graph.
 
     Args:
@@ -80,7 +80,7 @@ def half_rotations_help(recording: Recording, training: np.ndarray) -> bool:
     errors = np.zeros(2)
     for partition in recording.partitions:
         vertices = partition.vertices[:: -(-len(partition.vertices) // MAX_VERTICES_PER_PARTITION)]
-        residuals = np.array(recording.residuals[poses[:, None], vertices])
+        residuals = recording.compute_partition_residuals(partition, poses, vertices)
         for index, matrices in enumerate(candidates):
             _, remaining = joint_regression(rig, partition, matrices).fit(residuals, fitted_poses)
             mean_square = float((remaining[measured_poses].astype(np.float64) ** 2).mean())

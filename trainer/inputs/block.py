@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from ..config import TrainingConfig
@@ -60,7 +60,7 @@ class FeatureBlock(ABC):
     is_direct: ClassVar[bool] = False
 
     @classmethod
-    def fit(cls, recording: Recording, split: Split, config: TrainingConfig) -> State:
+    def fit(cls, recording: SkinnedRecording, split: Split, config: TrainingConfig) -> State:
         """Fit the block to a recording; returns its state, arrays that a checkpoint stores."""
         return {}
 

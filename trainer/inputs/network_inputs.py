@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from ..config import TrainingConfig
@@ -68,7 +68,7 @@ def _starts(blocks: Sequence[FeatureBlock]) -> list[int]:
     return np.cumsum([0, *(len(block.length_mask) for block in blocks)]).tolist()
 
 
-def fit_inputs(recording: Recording, split: Split, config: TrainingConfig) -> dict[str, State]:
+def fit_inputs(recording: SkinnedRecording, split: Split, config: TrainingConfig) -> dict[str, State]:
     """Fit all blocks to a recording; returns the state of each block by its name."""
     return {block.name: block.fit(recording, split, config) for block in BLOCKS}
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from ..config import TrainingConfig
@@ -58,7 +58,7 @@ class RotationFeatures(FeatureBlock):
     joints: np.ndarray
 
     @classmethod
-    def fit(cls, recording: Recording, split: Split, config: TrainingConfig) -> State:
+    def fit(cls, recording: SkinnedRecording, split: Split, config: TrainingConfig) -> State:
         rig, matrices = recording.rig, np.array(recording.pose_matrices[split.training])
         features = joint_features(matrices, rig.rest_matrices, rig.references)
         rotations = features.reshape(*features.shape[:2], VECTOR_SIZE, MATRIX_COLUMNS)[..., :VECTOR_SIZE]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdda_addon.core.mathematics.skinning import skin_matrices
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from ..data.split import Split
@@ -59,7 +59,7 @@ class _Candidate:
     residual: np.ndarray
 
 
-def select_surface_frames(recording: Recording, split: Split, tolerance_mm: float) -> SurfaceFrames:
+def select_surface_frames(recording: SkinnedRecording, split: Split, tolerance_mm: float) -> SurfaceFrames:
     """Select the vertices of each partition that explain most of its residuals, and fit their surface frames.
 
     Args:
@@ -85,7 +85,7 @@ def select_surface_frames(recording: Recording, split: Split, tolerance_mm: floa
         if regression.is_determined():
             column_space = regression.column_space()
             vertices = partition.vertices[is_usable[partition.vertices]]
-            residuals = np.asarray(recording.residuals[np.ix_(training, vertices)], np.float32)
+            residuals = recording.compute_partition_residuals(partition, training, vertices)
             candidates += _select_candidates(residuals, column_space, vertices, index, partition.joint, min_mean_square)
     to_local = np.linalg.inv(skin[:, :, :3, :3].astype(np.float64))
     candidates.sort(key=lambda candidate: -candidate.mean_square)

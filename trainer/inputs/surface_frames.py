@@ -17,7 +17,7 @@ import numpy as np
 
 from fdda_addon.core.formats.model import POSE_INPUT
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from ..blocks import block_slices
@@ -41,7 +41,7 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
     name = "surface_frames"
 
     @classmethod
-    def fit(cls, recording: Recording, split: Split, config: TrainingConfig) -> State:
+    def fit(cls, recording: SkinnedRecording, split: Split, config: TrainingConfig) -> State:
         surface_frames = select_surface_frames(recording, split, config.tolerance_mm)
         return dict(vars(surface_frames)) if len(surface_frames) else {}
 

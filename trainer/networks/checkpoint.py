@@ -19,7 +19,7 @@ from fdda_addon.core.rig import Fingerprint
 from ..inputs.block import State
 from .networks import Network
 
-VERSION = 3
+VERSION = 4
 INPUTS_PREFIX = "inputs/"
 """Prefix of the arrays of input states: inputs/BLOCK/ARRAY."""
 READ_ERRORS = (
@@ -61,6 +61,7 @@ class Checkpoint:
     Attributes:
         fingerprint: fingerprint of the rig.
         controls: names of the rig's controls.
+        deformation: digest of joints, partitions and influences (`data.skinned_recording.SkinnedRecording.digest`).
         holdout: fingerprint of the held-out and validation poses (`data.split.holdout_fingerprint`).
         hidden, activation: layers and activation of the networks, as in `TrainingConfig`.
         history: pose count and held-out error of this training and its predecessors, oldest first:
@@ -71,6 +72,7 @@ class Checkpoint:
 
     fingerprint: Fingerprint
     controls: tuple[str, ...]
+    deformation: str
     holdout: str
     hidden: tuple[int, ...]
     activation: str
@@ -143,6 +145,7 @@ def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
     return Checkpoint(
         Fingerprint.from_json(metadata["fingerprint"]),
         tuple(str(name) for name in metadata["controls"]),
+        str(metadata["deformation"]),
         str(metadata["holdout"]),
         hidden,
         activation,

@@ -102,7 +102,11 @@ def _counting_joints(spread: np.ndarray, rig: Rig, partitions: tuple[Partition, 
         # A joint without a reference joint carries the whole mesh.
         is_locked &= references >= 0
     for index, partition in enumerate(partitions):
-        adjacent = {partition.joint, references[partition.joint], *SkinBlock(rig, partition).joints.tolist()}
+        adjacent = {
+            partition.joint,
+            references[partition.joint],
+            *SkinBlock(rig, partition.joint, partition.vertices).joints.tolist(),
+        }
         adjacent |= set(np.flatnonzero(references == partition.joint).tolist())
         counts[index, [joint for joint in adjacent if joint >= 0 and is_locked[joint]]] = True
         counts[index, list(partition.influencing)] = True

@@ -13,7 +13,7 @@ import numpy as np
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.report import checkpoint_path
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..config import TrainingConfig
 from ..inputs.network_inputs import check_states
@@ -25,7 +25,9 @@ WARM_START_EPOCHS_RATIO, WARM_START_RATE_RATIO = 0.5, 0.3
 """Epochs and learning rate of a warm start, as parts of the settings."""
 
 
-def read_initial_checkpoint(model_path: Path, recording: Recording, holdout: str, config: TrainingConfig) -> Checkpoint:
+def read_initial_checkpoint(
+    model_path: Path, recording: SkinnedRecording, holdout: str, config: TrainingConfig
+) -> Checkpoint:
     """Read the checkpoint beside a model, and check that it fits; `holdout` as in `Checkpoint`.
 
     Raises:
@@ -41,6 +43,11 @@ def read_initial_checkpoint(model_path: Path, recording: Recording, holdout: str
         check_states(checkpoint.input_states, recording.rig)
     except (ValueError, KeyError) as error:
         raise TrainingError(f"The checkpoint '{path}' is damaged ({error}); train without --warm-start.") from error
+    if checkpoint.deformation != recording.digest():
+        raise TrainingError(
+            f"The checkpoint '{path}' is of other skin weights, joints or partitions; train with the same "
+            "--fit-linear, --joints, --min-partition-vertices and --influence-tolerance, or without --warm-start."
+        )
     if checkpoint.holdout != holdout:
         raise TrainingError(
             f"The checkpoint '{path}' is of another recording or seed, and may have been trained on poses that are "
@@ -63,7 +70,7 @@ def warm_start_config(config: TrainingConfig) -> TrainingConfig:
     )
 
 
-def checkpoint_parts(checkpoint: Checkpoint, recording: Recording) -> list[Partition]:
+def checkpoint_parts(checkpoint: Checkpoint, recording: SkinnedRecording) -> list[Partition]:
     """Return the parts of a checkpoint, which has the same rig.
 
     Raises:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fdda_addon.core.mathematics.metrics import error_statistics
 from fdda_addon.core.mathematics.partition import Partition
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..export.export import ExportedModel, Measurement
 from ..model import TrainedModel
@@ -20,7 +20,7 @@ HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
 
 
 def make_report(
-    recording: Recording,
+    recording: SkinnedRecording,
     trained_model: TrainedModel,
     exported: ExportedModel,
     training_errors: Measurement,

@@ -11,7 +11,7 @@ import numpy as np
 from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.mathematics.refinement import nearest_recorded_distances
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..data.split import Split
 from ..fits.half_rotations import regression_matrices
@@ -79,7 +79,7 @@ class ErrorAnalysis:
 
 
 def analyze_errors(
-    recording: Recording,
+    recording: SkinnedRecording,
     trained_model: TrainedModel,
     split: Split,
     held_out_errors: np.ndarray,
@@ -142,7 +142,7 @@ def _ratio(value: float, reference: float) -> float:
 
 
 def _most_extreme_joint(
-    recording: Recording,
+    recording: SkinnedRecording,
     partition: Partition,
     held_out_values: np.ndarray,
     training_values: np.ndarray,
@@ -175,7 +175,7 @@ def _most_extreme_joint(
 
 
 def _truncation_fraction(
-    recording: Recording,
+    recording: SkinnedRecording,
     partition: Partition,
     parts: list[tuple[Partition, PreparedPartition]],
     held_out_poses: np.ndarray,
@@ -192,7 +192,7 @@ def _truncation_fraction(
     """
     unique_poses, rows = np.unique(poses, return_inverse=True)
     pose_indices = held_out_poses[unique_poses]
-    remaining_residuals = recording.residuals[np.ix_(pose_indices, partition.vertices)].astype(np.float64)
+    remaining_residuals = recording.compute_partition_residuals(partition, pose_indices).astype(np.float64)
     pose_matrices, controls = (np.array(array[pose_indices]) for array in (recording.pose_matrices, recording.controls))
     for part, prepared in parts:
         rows_of_part = np.searchsorted(partition.vertices, part.vertices)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Chooses the key joints of a folder of poses, and finds what the motion of each vertex follows from."""
+"""Chooses the key joints of a recording, and finds what the motion of each vertex follows from."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,11 +9,10 @@ import numpy as np
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
 from fdda_addon.core.mathematics.partition import joints_with_weight, make_partitions
-from fdda_addon.core.mathematics.references import choose_references, has_reference_choice
 from fdda_addon.core.mathematics.skinning import are_invertible, skin_matrices
-from fdda_addon.core.recording.fit_folder import FitPoses
-from fdda_addon.core.rig import Rig
+from fdda_addon.core.rig import STATIC_JOINT, Rig
 
+from .fit_poses import FitPoses
 from .input_blocks import LENGTH_RATIO, InputBlocks
 from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments
 from .solver import fit_skin
@@ -25,34 +24,21 @@ MAX_REFERENCE_POSES = 48
 
 
 def choose_key_joints(
-    all_poses: FitPoses,
-    random_count: int,
-    requested: str,
-    static_joints: np.ndarray,
-    metres_per_unit: float,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    all_poses: FitPoses, requested: str, on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> KeyJoints:
     """Choose key joints by random poses.
 
     Joints that only frames of actions move are kept, because random poses do not show what they would follow from.
 
     Args:
-        all_poses: poses with J joints; random ones, and then frames of actions.
-        random_count: number of random poses; every other of these measures errors.
+        all_poses: poses with J joints; random ones, every other of which measures errors, then frames of actions.
         requested: "auto", or the number of key joints.
-        static_joints: (J,) bool, joints that are kept in any case.
-        metres_per_unit: as in `Rig`.
         on_progress: called often, with the number of decided joints and of those that may be removed.
 
     Raises:
         RecordingError: a joint has a scale of zero in some random pose.
     """
-    rig, pose_count = all_poses.rig, len(all_poses.pose_matrices)
-    # Drivers may read joints without skin weights.
-    is_fixed = ~joints_with_weight(rig.skin_joints, rig.skin_weights, len(rig.joints)).any(axis=0)
-    if has_reference_choice(rig, is_fixed):
-        compared = np.linspace(0, pose_count - 1, MAX_REFERENCE_POSES).round().astype(int)
-        all_poses = replace(all_poses, rig=choose_references(rig, is_fixed, all_poses.pose_matrices[compared]))
+    random_count = all_poses.random_count
     poses = all_poses.subset(slice(0, random_count))
     if not are_invertible(poses.pose_matrices).all():
         raise RecordingError(
@@ -63,9 +49,10 @@ def choose_key_joints(
     blocks = InputBlocks(poses)
     unseen_motions = _measure_unseen_motions(all_poses, random_count, moments)
     is_unseen = (blocks.widths[: len(moments)] == 0) & (unseen_motions > TOLERANCE_RATIO * poses.rig.size)
-    search = KeyJointSearch(poses, moments, blocks, static_joints, is_unseen)
+    is_static = np.array([name == STATIC_JOINT for name in poses.rig.joint_names])
+    search = KeyJointSearch(poses, moments, blocks, is_static, is_unseen)
     search.search(None if requested == AUTO else int(requested), on_progress)
-    return search.result(requested, acts, metres_per_unit)
+    return search.result(requested, acts, poses.rig.metres_per_unit)
 
 
 def _measure_vertices(poses: FitPoses) -> tuple[np.ndarray, np.ndarray]:

@@ -3,9 +3,8 @@
 
 import numpy as np
 
-from fdda_addon.core.recording.fit_folder import FitPoses
-
 from ..fits.least_squares import solve_ridge
+from .fit_poses import FitPoses
 
 BLOCK_COLUMNS = 6
 """Largest number of principal components of the features of an input."""

@@ -20,9 +20,9 @@ import numpy as np
 
 from fdda_addon.core.mathematics.key_joints import KeyJointReport
 from fdda_addon.core.mathematics.skinning import skin_matrices
-from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.rig import reference_order
 
+from .fit_poses import FitPoses
 from .input_blocks import MIN_SPREAD, InputBlocks, predict
 
 TOLERANCE_RATIO = 1e-4
@@ -45,14 +45,16 @@ class KeyJoints:
     Attributes:
         joints: (K,) indices of the key joints, ascending.
         weighted_joints: ascending, key joints that may have skin weights; the others are kept for their children alone.
-        needed_inputs: (V, K + C) bool, the key joints and controls from which the motion of a vertex follows that other
-            joints cause.
+        inputs: (J + C, K + C) bool, the key joints and controls from which the motion of each joint and control of the
+            rig follows; of a key joint and a control these are the joint or control itself.
+        acts: (V, J) bool, the vertices on which each joint acts that is no key joint.
         report: numbers of joints and errors.
     """
 
     joints: np.ndarray
     weighted_joints: np.ndarray
-    needed_inputs: np.ndarray
+    inputs: np.ndarray
+    acts: np.ndarray
     report: KeyJointReport
 
 
@@ -269,7 +271,7 @@ class KeyJointSearch:
     def result(self, requested: str, acts: np.ndarray, metres_per_unit: float) -> KeyJoints:
         """Return the joints that are left; `acts` is (V, J) bool, the vertices on which each joint acts."""
         joint_count = len(self._is_kept)
-        inputs, unexplained = np.zeros((joint_count, self._blocks.count), bool), np.zeros(joint_count)
+        inputs, unexplained = np.eye(self._blocks.count, dtype=bool), np.zeros(joint_count)
         is_independent = np.zeros(joint_count, bool)
         roots = [joint for joint in np.flatnonzero(self._is_kept).tolist() if self._blocks.parents[joint] < 0]
         differences = np.abs(self._skin[:, roots] - self._skin[:, roots[:1]])
@@ -281,7 +283,6 @@ class KeyJointSearch:
         joints = np.flatnonzero(self._is_kept)
         weighted_joints = joints[self._may_have_weights[joints]]
         columns = np.append(joints, np.arange(joint_count, self._blocks.count))
-        needed_inputs = (acts.astype(np.float32) @ inputs[:, columns].astype(np.float32)) > 0
         report = KeyJointReport(
             requested,
             len(joints),
@@ -291,7 +292,8 @@ class KeyJointSearch:
             tuple(self._names[joint] for joint in np.argsort(-unexplained) if is_independent[joint]),
             tuple(self._names[joint] for joint in np.flatnonzero(~self._is_kept & self._is_still)),
         )
-        return KeyJoints(joints, weighted_joints if len(weighted_joints) else joints, needed_inputs, report)
+        weighted_joints = weighted_joints if len(weighted_joints) else joints
+        return KeyJoints(joints, weighted_joints, inputs[:, columns], acts & ~self._is_kept, report)
 
 
 def _rms(motion: np.ndarray) -> float:

@@ -17,9 +17,9 @@ from scipy.optimize import nnls
 
 from fdda_addon.core.mathematics.skin_fit import INFLUENCES
 from fdda_addon.core.mathematics.skinning import skin_matrices
-from fdda_addon.core.recording.fit_folder import FitPoses
 
 from ..blocks import block_slices
+from .fit_poses import FitPoses
 
 RIG_CANDIDATES = 4
 """Number of candidate joints of a vertex that come from its weights in the rig, the heaviest first."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..mathematics.features import joint_features_in_metres
 from ..mathematics.partition import Partition
-from ..recording.reader import Recording
+from ..recording.skinned import SkinnedRecording
 from .residual_scan import ResidualScan
 from .warning import RecordingWarning, format_length, joint_name
 
@@ -63,7 +63,7 @@ class Flip:
     jump: float
 
 
-def check_flips(recording: Recording, scan: ResidualScan) -> list[RecordingWarning]:
+def check_flips(recording: SkinnedRecording, scan: ResidualScan) -> list[RecordingWarning]:
     """Return the warning "flips" about the partition with the largest jump."""
     flips = find_flips(recording, scan)
     if not flips:
@@ -89,7 +89,7 @@ def check_flips(recording: Recording, scan: ResidualScan) -> list[RecordingWarni
     return [RecordingWarning("flips", text)]
 
 
-def find_flips(recording: Recording, scan: ResidualScan) -> list[Flip]:
+def find_flips(recording: SkinnedRecording, scan: ResidualScan) -> list[Flip]:
     """Find the largest jump of each partition that has jumps."""
     rig, flips_found = recording.rig, []
     features = joint_features_in_metres(np.array(recording.pose_matrices[scan.poses]), rig)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..mathematics.skinning import skin_matrices
 from ..recording.index import ACTION, MIRRORED, STRIP
-from ..recording.reader import Recording
+from ..recording.skinned import SkinnedRecording
 from .warning import RecordingWarning, format_length, format_with_noun
 
 _SOURCE_LABELS = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}
@@ -26,13 +26,13 @@ POSE_BATCH = 100
 """Number of poses that are checked at once."""
 
 
-def check_poses(recording: Recording) -> list[RecordingWarning]:
+def check_poses(recording: SkinnedRecording) -> list[RecordingWarning]:
     """Return the warnings "duplicate-poses", "hidden-inputs" and "degenerate-poses"."""
     pairs = find_repeated_poses(recording)
     return [*_check_repeated(recording, pairs), *_check_contradictions(recording, pairs), *_check_collapsed(recording)]
 
 
-def find_repeated_poses(recording: Recording) -> np.ndarray:
+def find_repeated_poses(recording: SkinnedRecording) -> np.ndarray:
     """Find poses that equal an earlier pose.
 
     Returns:
@@ -52,7 +52,7 @@ def find_repeated_poses(recording: Recording) -> np.ndarray:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-def _check_repeated(recording: Recording, pairs: np.ndarray) -> list[RecordingWarning]:
+def _check_repeated(recording: SkinnedRecording, pairs: np.ndarray) -> list[RecordingWarning]:
     count = len(recording.pose_matrices)
     if len(pairs) <= MAX_REPEATED_RATIO * count:
         return []
@@ -64,7 +64,7 @@ def _check_repeated(recording: Recording, pairs: np.ndarray) -> list[RecordingWa
     return [RecordingWarning("duplicate-poses", text)]
 
 
-def _format_sources(recording: Recording, poses: np.ndarray) -> str:
+def _format_sources(recording: SkinnedRecording, poses: np.ndarray) -> str:
     """Describe the actions of poses: ", 30 of them of the action 'idle'"; empty where no pose is from an action."""
     sources = recording.info.sampling.sources
     source_indices = np.searchsorted(np.cumsum([source.poses for source in sources]), poses, side="right")
@@ -77,10 +77,10 @@ def _format_sources(recording: Recording, poses: np.ndarray) -> str:
     return "".join(f", {description}" for description in descriptions[:2])
 
 
-def _check_contradictions(recording: Recording, pairs: np.ndarray) -> list[RecordingWarning]:
+def _check_contradictions(recording: SkinnedRecording, pairs: np.ndarray) -> list[RecordingWarning]:
     tolerance, worst, contradictions = CONTRADICTION_RATIO * recording.rig.size, (0.0, 0, 0), 0
     for pose, first_pose in pairs[:: max(1, len(pairs) // MAX_COMPARED_PAIRS)].tolist():
-        difference = np.asarray(recording.residuals[pose]) - recording.residuals[first_pose]
+        difference = np.subtract(*recording.read_positions(np.array([pose, first_pose])))
         max_distance = float(np.sqrt(np.einsum("vc,vc->v", difference, difference).max(initial=0)))
         contradictions += max_distance > tolerance
         worst = max(worst, (max_distance, pose, first_pose))
@@ -94,7 +94,7 @@ def _check_contradictions(recording: Recording, pairs: np.ndarray) -> list[Recor
     return [RecordingWarning("hidden-inputs", text)]
 
 
-def _check_collapsed(recording: Recording) -> list[RecordingWarning]:
+def _check_collapsed(recording: SkinnedRecording) -> list[RecordingWarning]:
     rig = recording.rig
     skinning_joints = np.unique(
         np.concatenate([rig.skin_joints[rig.skin_weights > 0], [p.joint for p in recording.partitions]])

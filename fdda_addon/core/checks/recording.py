@@ -6,8 +6,8 @@ import numpy as np
 from ..controls import SHAPE_KEY_PATH
 from ..defaults import MIN_PARTITION_VERTICES
 from ..mathematics.features import float32_rounding, joint_features_in_metres
-from ..recording.reader import Recording
-from ..rig import STATIC_JOINT_LABEL, Rig
+from ..recording.skinned import SkinnedRecording
+from ..rig import Rig
 from ..sentences.counts import format_count
 from .flips import check_flips
 from .poses import check_poses
@@ -35,7 +35,7 @@ MAX_CORRELATED_POSES = 500
 """Largest number of poses over which correlations are computed."""
 
 
-def check_recording(recording: Recording) -> list[RecordingWarning]:
+def check_recording(recording: SkinnedRecording) -> list[RecordingWarning]:
     """Find mistakes in the rig and the poses of a recording.
 
     Residuals of at most `residual_scan.MAX_SCANNED_POSES` poses are read, so that the use of memory is limited for
@@ -65,18 +65,15 @@ def check_recording(recording: Recording) -> list[RecordingWarning]:
     return sorted(warnings, key=lambda warning: WARNING_NAMES.index(warning.name))
 
 
-def merges_sentence(index: dict, min_vertices: int) -> str:
-    """Describe the merged partitions: "1 partition of fewer than 8 vertices is merged: …".
+def merges_sentence(recording: SkinnedRecording, min_vertices: int) -> str:
+    """Describe the merged partitions: "1 partition of fewer than 8 vertices is merged: …"; empty where none are merged.
 
     Args:
-        index: index of the recording.
-        min_vertices: smallest number of vertices of a partition in the settings of the recording.
-
-    Returns:
-        The sentence; empty where no partitions were merged.
+        recording: the recording.
+        min_vertices: smallest number of vertices of a partition in the settings of the training.
     """
-    names = [joint["name"] or STATIC_JOINT_LABEL for joint in index["joints"]]
-    merges = [f"'{names[j]}' into '{names[p['joint']]}'" for p in index["partitions"] for j in p.get("merged", ())]
+    names = [joint_name(recording.rig, joint) for joint in range(len(recording.rig.joints))]
+    merges = [f"'{names[joint]}' into '{names[p.joint]}'" for p in recording.partitions for joint in p.merged]
     if not merges:
         return ""
     verb = "is" if len(merges) == 1 else "are"
@@ -100,7 +97,7 @@ def compute_bone_lengths(rig: Rig) -> np.ndarray:
     return np.where(np.isfinite(child_distances), child_distances, parent_distances)
 
 
-def _check_large_residuals(recording: Recording, scan: ResidualScan) -> list[RecordingWarning]:
+def _check_large_residuals(recording: SkinnedRecording, scan: ResidualScan) -> list[RecordingWarning]:
     """Warn about residuals that are larger than the bones; residuals should be small corrections of linear skinning."""
     rig, bone_lengths = recording.rig, compute_bone_lengths(recording.rig)
     large_residuals = []
@@ -112,7 +109,7 @@ def _check_large_residuals(recording: Recording, scan: ResidualScan) -> list[Rec
             large_residuals.append((rms / size, rms, size, joint_name(rig, partition.joint)))
     advice = (
         "linear skinning is no start there; look at the skin weights and whether mesh and armature match in the rest "
-        "pose, or record with --fit-linear smooth."
+        "pose, or have weights fitted (--fit-linear smooth)."
     )
     if large_residuals:
         _, rms, size, name = max(large_residuals)
@@ -133,7 +130,7 @@ def _check_large_residuals(recording: Recording, scan: ResidualScan) -> list[Rec
     return [RecordingWarning("large-residuals", text)]
 
 
-def _check_controls(recording: Recording) -> list[RecordingWarning]:
+def _check_controls(recording: SkinnedRecording) -> list[RecordingWarning]:
     influencing = {control for partition in recording.partitions for control in partition.controls}
     controls = recording.rig.controls
     constant_controls = {control for control in range(len(controls)) if np.ptp(recording.controls[:, control]) == 0}
@@ -172,7 +169,7 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
     return [*warnings, RecordingWarning("dead-controls", text[0].upper() + text[1:])]
 
 
-def _check_joints(recording: Recording) -> list[RecordingWarning]:
+def _check_joints(recording: SkinnedRecording) -> list[RecordingWarning]:
     """Warn about sampled joints that change no residual, and neither skin a vertex nor have a descendant that does.
 
     The channels of a joint may be controls, whose effect is then that of the controls.
@@ -211,7 +208,7 @@ def _bone_path(name: str) -> str:
     return 'pose.bones["{}"]'.format(name.replace("\\", "\\\\").replace('"', '\\"'))
 
 
-def _moves_others(recording: Recording, joint: int, sampled_names: set[str]) -> bool:
+def _moves_others(recording: SkinnedRecording, joint: int, sampled_names: set[str]) -> bool:
     """Return whether joints that are not sampled follow a joint, through constraints for example."""
     rig = recording.rig
     driven_joints = [index for index, other_joint in enumerate(rig.joints) if other_joint.name not in sampled_names]
@@ -219,7 +216,7 @@ def _moves_others(recording: Recording, joint: int, sampled_names: set[str]) -> 
     return _are_related(features[:, joint], features[:, driven_joints].reshape(len(poses), -1))
 
 
-def _sampled_features(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+def _sampled_features(recording: SkinnedRecording) -> tuple[np.ndarray, np.ndarray]:
     """Return (n,) indices of evenly spaced poses and their (n, J, 12) joint features."""
     rig, pose_count = recording.rig, len(recording.pose_matrices)
     poses = np.unique(np.linspace(0, pose_count - 1, MAX_CORRELATED_POSES).round().astype(np.int64))
@@ -242,7 +239,7 @@ def _are_related(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def _check_still_vertices(
-    recording: Recording, scan: ResidualScan, moving_joints: np.ndarray
+    recording: SkinnedRecording, scan: ResidualScan, moving_joints: np.ndarray
 ) -> list[RecordingWarning]:
     rig = recording.rig
     follows_moving_joint = ((rig.skin_weights > 0) & moving_joints[rig.skin_joints]).any(axis=1)
@@ -259,7 +256,7 @@ def _check_still_vertices(
     return [RecordingWarning("still-vertices", text)]
 
 
-def _check_small_partitions(recording: Recording) -> list[RecordingWarning]:
+def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarning]:
     small_partitions = [
         partition for partition in recording.partitions if len(partition.vertices) < MIN_PARTITION_VERTICES
     ]
@@ -269,7 +266,7 @@ def _check_small_partitions(recording: Recording) -> list[RecordingWarning]:
     min_vertex_count = min(len(partition.vertices) for partition in small_partitions)
     text = (
         f"{format_with_noun(names, 'partition')} {'has' if len(small_partitions) == 1 else 'have'} fewer than "
-        f"{MIN_PARTITION_VERTICES} vertices (the smallest {min_vertex_count}), and a network each: record with "
+        f"{MIN_PARTITION_VERTICES} vertices (the smallest {min_vertex_count}), and a network each: train with "
         f"--min-partition-vertices {MIN_PARTITION_VERTICES} to merge them into others."
     )
     return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]

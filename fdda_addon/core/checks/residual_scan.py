@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..mathematics.partition import Partition
-from ..recording.reader import Recording
+from ..recording.skinned import SkinnedRecording
 
 MAX_SCANNED_POSES = 1000
 MAX_KEPT_VERTICES, MAX_KEPT_IN_PARTITION, MIN_KEPT_IN_PARTITION = 8000, 48, 8
@@ -36,9 +36,9 @@ class ResidualScan:
     residuals: tuple[np.ndarray, ...]
 
 
-def scan_residuals(recording: Recording) -> ResidualScan:
+def scan_residuals(recording: SkinnedRecording) -> ResidualScan:
     """Read the residuals of evenly spaced poses, one pose in memory at a time."""
-    pose_count, rig = len(recording.residuals), recording.rig
+    pose_count, rig = len(recording.rows), recording.rig
     poses = np.unique(np.linspace(0, pose_count - 1, min(pose_count, MAX_SCANNED_POSES)).round().astype(np.int64))
     vertices_per_partition = min(
         MAX_KEPT_IN_PARTITION, max(MIN_KEPT_IN_PARTITION, MAX_KEPT_VERTICES // len(recording.partitions))
@@ -52,9 +52,9 @@ def scan_residuals(recording: Recording) -> ResidualScan:
     largest = np.full(rig.vertex_count, -1, np.float32)
     change = np.zeros(rig.vertex_count, np.float32)
     largest_pose = np.zeros(rig.vertex_count, np.int64)
-    first_residuals = np.array(recording.residuals[0])
+    first_residuals = recording.compute_residuals(poses[:1])[0]
     for row, pose in enumerate(poses):
-        residuals = np.array(recording.residuals[pose])
+        residuals = recording.compute_residuals(poses[row : row + 1])[0]
         kept_residuals[row] = residuals[all_vertices]
         squared_lengths = np.einsum("vc,vc->v", residuals, residuals)
         sum_of_squares += squared_lengths

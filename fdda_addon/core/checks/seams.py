@@ -12,7 +12,7 @@ import numpy as np
 
 from ..mathematics.partition import main_joints
 from ..mathematics.surface import adjacent_corners
-from ..recording.reader import Recording
+from ..recording.skinned import SkinnedRecording
 from ..rig import Rig
 from .warning import RecordingWarning, format_length
 
@@ -28,10 +28,10 @@ MAX_POSES = 50
 """Number of poses in which the gaps are measured."""
 
 
-def check_seams(recording: Recording) -> list[RecordingWarning]:
+def check_seams(recording: SkinnedRecording) -> list[RecordingWarning]:
     """Return the warnings of `find_open_seams` for evenly spaced poses of a recording."""
-    poses = np.unique(np.linspace(0, len(recording.residuals) - 1, MAX_POSES).round().astype(np.int64))
-    return find_open_seams(recording.rig, (np.array(recording.residuals[pose]) for pose in poses))
+    poses = np.unique(np.linspace(0, len(recording.rows) - 1, MAX_POSES).round().astype(np.int64))
+    return find_open_seams(recording.rig, (recording.compute_residuals(np.array([pose]))[0] for pose in poses))
 
 
 def find_open_seams(rig: Rig, residuals: Iterable[np.ndarray]) -> list[RecordingWarning]:

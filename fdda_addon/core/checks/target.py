@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks of a recorded target: hysteresis, frames in which it jumps or is frozen, wrong scale or location."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ..mathematics.skinning import LinearSkinning
+from ..mathematics.metrics import distances
 from ..recording.index import ACTION, STRIP, Source
-from ..recording.reader import Recording
+from ..recording.skinned import SkinnedRecording
 from ..sentences.counts import format_count
 from .warning import RecordingWarning, format_length, format_list
 
@@ -29,39 +29,38 @@ MAX_SCALE, MAX_OFFSET_RATIO = 1.5, 0.25
 the rig's size."""
 
 
-def check_target(recording: Recording) -> list[RecordingWarning]:
+def check_target(recording: SkinnedRecording) -> list[RecordingWarning]:
     """Return the warnings "hysteresis", "frame-jumps", "frozen-frames" and "target-place"; empty without a target."""
     if recording.info.target is None:
         return []
-    skinning = LinearSkinning(recording.rig, recording.partitions)
-    return [
-        *_check_repeatability(recording),
-        *_check_frames(recording, skinning),
-        *_check_location(recording, skinning),
-    ]
+    return [*_check_repeatability(recording), *_check_frames(recording), *_check_location(recording)]
 
 
-def _check_repeatability(recording: Recording) -> list[RecordingWarning]:
+def _check_repeatability(recording: SkinnedRecording) -> list[RecordingWarning]:
     repeatability = recording.info.repeatability
-    if repeatability is None or repeatability.distance_mm["mean"] <= MAX_DISTANCE_RATIO * repeatability.linear_mm:
+    if repeatability is None:
+        return []
+    pairs = _iterate_positions(recording, repeatability.poses)
+    linear_mm = 1000 * float(np.mean([distances(*pair, recording.rig.metres_per_unit).mean() for pair in pairs]))
+    if repeatability.distance_mm["mean"] <= MAX_DISTANCE_RATIO * linear_mm:
         return []
     text = (
         f"The target is {repeatability.distance_mm['mean']:.2g} mm from itself when the same pose is reached from "
         f"another direction, on average over {len(repeatability.poses)} poses, and linear skinning is "
-        f"{repeatability.linear_mm:.2g} mm off: no model can be closer; hold poses for more frames or play actions "
+        f"{linear_mm:.2g} mm off: no model can be closer; hold poses for more frames or play actions "
         "slower, damp the simulation, or leave folds to another mesh."
     )
     return [RecordingWarning("hysteresis", text)]
 
 
-def _check_frames(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
+def _check_frames(recording: SkinnedRecording) -> list[RecordingWarning]:
     """Warn about frames of actions in which the target jumps or is frozen."""
     jumps, frozen = [], []
     first_pose = 0
     for source in recording.info.sampling.sources:
         if source.kind in (ACTION, STRIP) and source.poses > 2:
             target_motions, linear_motions = _largest_motions(
-                recording, skinning, first_pose, min(source.poses, MAX_CHECKED_FRAMES)
+                recording, first_pose, min(source.poses, MAX_CHECKED_FRAMES)
             )
             size = recording.rig.size
             frozen_frames = (
@@ -104,9 +103,7 @@ def _frame_label(source: Source, frame_index: int) -> str:
     return f"{source.name} {source.frames[0] + frame_index}"
 
 
-def _largest_motions(
-    recording: Recording, skinning: LinearSkinning, first_pose: int, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _largest_motions(recording: SkinnedRecording, first_pose: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Measure the largest motion of a vertex between consecutive frames.
 
     Returns:
@@ -114,7 +111,7 @@ def _largest_motions(
         skinning. All are in mesh units.
     """
     target_motions, linear_motions, previous = [], [], None
-    for positions, skinned in _iterate_positions(recording, skinning, range(first_pose, first_pose + count)):
+    for positions, skinned in _iterate_positions(recording, range(first_pose, first_pose + count)):
         current = positions, skinned
         if previous is not None:
             target_offsets, linear_offsets = positions - previous[0], skinned - previous[1]
@@ -124,24 +121,23 @@ def _largest_motions(
     return np.array(target_motions), np.array(linear_motions)
 
 
-def _iterate_positions(
-    recording: Recording, skinning: LinearSkinning, poses: range
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _iterate_positions(recording: SkinnedRecording, poses: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield (V, 3) positions of the target and of linear skinning, mesh-object space, mesh units."""
     for pose in poses:
-        matrices = np.array(recording.pose_matrices[pose])[None]
-        residuals = np.array(recording.residuals[pose])[None]
-        yield skinning.complex_positions(matrices, residuals)[0], skinning.positions(matrices)[0]
+        yield (
+            recording.read_positions(np.array([pose]))[0],
+            recording.skinning.positions(recording.pose_matrices[[pose]])[0],
+        )
 
 
 def _max_length(offsets: np.ndarray) -> float:
     return float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max()))
 
 
-def _check_location(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
+def _check_location(recording: SkinnedRecording) -> list[RecordingWarning]:
     poses = range(0, len(recording.pose_matrices), max(1, len(recording.pose_matrices) // MAX_COMPARED_POSES))
     scales, offsets = [], []
-    for positions, skinned in _iterate_positions(recording, skinning, poses):
+    for positions, skinned in _iterate_positions(recording, poses):
         centers = positions.mean(axis=0), skinned.mean(axis=0)
         extents = [np.sqrt(((vertices - center) ** 2).sum(axis=1).mean()) for vertices, center in
                    zip((positions, skinned), centers, strict=True)]  # fmt: skip

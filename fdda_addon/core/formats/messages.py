@@ -21,10 +21,11 @@ class MessageType(enum.Enum):
     STARTED = "started"
     """partitions: int, poses: int, vertices: int, device: str."""
     PREPARING = "preparing"
-    """done: int, total: int (partitions whose principal components are computed)."""
+    """stage: str, done: int, total: int: "key joints" (decided joints), "fit" (vertices with fitted skin weights), or
+    "partitions" (whose principal components are computed)."""
     PROGRESS = "progress"
     """epoch: int, epochs: int, training_mm: float, validation_mm: float (mean errors of the training and the validation
-    poses). A fit of skin weights has other keys: done: int, total: int (vertices)."""
+    poses)."""
     PARTITION_FINISHED = "partition_finished"
     """joint: str, basis: int, held_out_mm: float (mean error of the held-out poses)."""
     LOG = "log"
@@ -38,8 +39,7 @@ class MessageType(enum.Enum):
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
     verdict: str, "met", "missed" or "exhausted", where there is a goal. For several models, `model` is their folder,
-    the errors are the largest ones, and `models` is their number. A fit of skin weights has other keys:
-    seconds: float, fit: dict (`SkinFit.to_json`)."""
+    the errors are the largest ones, and `models` is their number."""
     CANCELLED = "cancelled"
     """No keys. The trainer was asked to stop and wrote no model."""
     FAILED = "failed"

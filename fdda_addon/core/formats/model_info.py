@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from ..controls import Control, read_controls
+from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import Partition, make_partitions
 from ..mathematics.poses import Channel
+from ..mathematics.skin_fit import SkinFit
 from ..rig import Fingerprint, Joint, Rig, read_joints
 from ..unit import read_unit, unit_to_json
 
@@ -17,6 +19,9 @@ MAX_METADATA_LENGTH = 16 << 20
 """Largest number of characters of the metadata."""
 LIMITS_KEY = "limits"
 """Key in `ModelInfo.training` for the range of motion."""
+FIT_KEY, KEY_JOINTS_KEY = "fit", "key_joints"
+"""Keys in `ModelInfo.training` for the fit of the skin weights (`SkinFit`) and the choice of key joints
+(`KeyJointReport`), where there was one."""
 OBJECT_KEY = "object"
 """Key in `ModelInfo.training` for the name of the recorded mesh object."""
 
@@ -99,6 +104,15 @@ class ModelInfo:
         """Number of poses of the recording, including held-out poses; 0 where unknown."""
         counts = [self.training.get(f"{subset}_poses") for subset in ("training", "validation", "held_out")]
         return sum(counts) if all(type(count) is int for count in counts) else 0
+
+    @property
+    def skin_sentence(self) -> str:
+        """Sentences about fitted skin weights and key joints; empty for the rig's own weights and all joints."""
+        if FIT_KEY in self.training:
+            return SkinFit.from_json(self.training[FIT_KEY]).sentence()
+        if KEY_JOINTS_KEY in self.training:
+            return KeyJointReport.from_json(self.training[KEY_JOINTS_KEY]).sentence()
+        return ""
 
     @property
     def object_name(self) -> str:
@@ -187,6 +201,7 @@ def _read_info(value: dict) -> ModelInfo:
         raise ValueError(f"its constants are said to take {info.constant_bytes} bytes")
     if not isinstance(info.training.get(LIMITS_KEY, []), list) or not all(info.limits):
         raise ValueError("its range of motion cannot be read")
+    info.skin_sentence  # noqa: B018 - raises an error if the metadata is damaged
     if not np.isfinite([*info.held_out_mm.values()]).all():
         raise ValueError("its errors are not numbers")
     return info

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ..joint_option import AUTO, parse_joints
-from ..rig import KEY_JOINTS_PREFIX, Fingerprint, Joint, Rig
-from .partition import Partition
+from ..rig import KEY_JOINTS_PREFIX, STATIC_JOINT, Fingerprint, Joint, Rig
 
 MAX_NAMED_JOINTS = 3
 
@@ -116,6 +115,55 @@ def select_joints(rig: Rig, joints: tuple[Joint, ...]) -> Rig:
     )
 
 
+def joints_with_indices(rig: Rig, indices: Iterable[int]) -> tuple[Joint, ...]:
+    """Return some joints of a rig; the parent of each is its nearest ancestor among them.
+
+    Args:
+        rig: the rig.
+        indices: ascending indices of the joints.
+    """
+    new_indices = {joint: index for index, joint in enumerate(indices)}
+    joints = []
+    for joint in new_indices:
+        parent = rig.joints[joint].parent
+        while parent >= 0 and parent not in new_indices:
+            parent = rig.joints[parent].parent
+        joints.append(Joint(rig.joints[joint].name, new_indices.get(parent, -1)))
+    return tuple(joints)
+
+
+def find_unread_bones(
+    sources: dict[str, list[str]], controlled: Iterable[str], rig: Rig, joint_names: Iterable[str]
+) -> list[str]:
+    """Find the bones whose changes move the mesh without moving what a model reads.
+
+    These are the bones with skin weights that are no joints, and the bones that move these alone.
+
+    Args:
+        sources, controlled: as in `RecordedBones`.
+        rig: the rig with its own skin weights and all joints.
+        joint_names: names of the joints of the model.
+
+    Returns:
+        Names in alphabetical order.
+    """
+
+    def with_sources(names: Iterable[str]) -> set[str]:
+        found, queue = set(), [name for name in names if name in sources]
+        while queue:
+            name = queue.pop()
+            if name not in found:
+                found.add(name)
+                queue += [source for source in sources[name] if source in sources]
+        return found
+
+    weighted = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
+    joints = set(joint_names)
+    followers = weighted - joints - {STATIC_JOINT}
+    visible = with_sources({*joints, *controlled})
+    return sorted(followers | (with_sources(followers) - visible))
+
+
 def _digest_weights(rig: Rig) -> str:
     """Hash the skin weights of a rig, so that the hash does not depend on joints without weights and on their order."""
     vertices, slots = np.nonzero(rig.skin_weights > 0)
@@ -127,31 +175,3 @@ def _digest_weights(rig: Rig) -> str:
     names_digest = Fingerprint.digest_text("\0".join(names))
     digest = Fingerprint.digest(vertices[order].astype(np.int32), ranks_of_joints[order], weights[order])
     return Fingerprint.digest_text(names_digest + digest)
-
-
-def add_influences(
-    partitions: tuple[Partition, ...], needed_inputs: np.ndarray, joint_count: int
-) -> tuple[Partition, ...]:
-    """Add inputs to the influences of partitions.
-
-    Args:
-        partitions: of a rig with `joint_count` joints.
-        needed_inputs: (V, J + C) bool, the joints and controls from which the motion of a vertex follows.
-        joint_count: J.
-    """
-
-    def merge(known: tuple[int, ...], added: Iterable[int]) -> tuple[int, ...]:
-        return tuple(sorted({*known, *added}))
-
-    result = []
-    for partition in partitions:
-        needed = needed_inputs[partition.vertices].any(axis=0)
-        joints, controls = np.flatnonzero(needed[:joint_count]), np.flatnonzero(needed[joint_count:])
-        result.append(
-            replace(
-                partition,
-                influencing=merge(partition.influencing, joints.tolist()),
-                controls=merge(partition.controls, controls.tolist()),
-            )
-        )
-    return tuple(result)

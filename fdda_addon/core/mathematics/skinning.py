@@ -46,30 +46,42 @@ def are_invertible(matrices: np.ndarray) -> np.ndarray:
 
 
 class SkinBlock:
-    """Linear skinning of one partition, expressed as one constant matrix.
+    """Linear skinning of some vertices that share a main joint, expressed as one constant matrix.
 
-    Let S be the horizontally stacked skin matrices of the partition's joints. `S @ weighted_rest` skins all vertices:
+    Let S be the horizontally stacked skin matrices of the vertices' joints. `S @ weighted_rest` skins all vertices:
     one matrix product replaces a gather for each skin weight.
 
     Attributes:
-        joints: (Jp,) int32, joints with a weight in the partition.
+        main_joint: the main joint.
+        joints: (Jp,) int32, joints with a weight on a vertex.
         weighted_rest: (4 Jp, Vp) float32, w_vj (x_v, 1), mesh units.
     """
 
-    def __init__(self, rig: Rig, partition: Partition):
-        skin_joints = rig.skin_joints[partition.vertices]
-        skin_weights = rig.skin_weights[partition.vertices]
+    def __init__(self, rig: Rig, main_joint: int, vertices: np.ndarray):
+        self.main_joint = main_joint
+        skin_joints, skin_weights = rig.skin_joints[vertices], rig.skin_weights[vertices]
         self.joints = np.unique(skin_joints[skin_weights > 0]).astype(np.int32)
-        dense_weights = np.zeros((len(self.joints), len(partition.vertices)), np.float32)
+        dense_weights = np.zeros((len(self.joints), len(vertices)), np.float32)
         for slot in range(skin_joints.shape[1]):
             vertices_in_slot = np.flatnonzero(skin_weights[:, slot] > 0)
             dense_weights[np.searchsorted(self.joints, skin_joints[vertices_in_slot, slot]), vertices_in_slot] += (
                 skin_weights[vertices_in_slot, slot]
             )
         homogeneous_rest = np.concatenate(
-            [rig.rest_positions[partition.vertices], np.ones((len(partition.vertices), 1), np.float32)], axis=1
+            [rig.rest_positions[vertices], np.ones((len(vertices), 1), np.float32)], axis=1
         )
-        self.weighted_rest = (dense_weights[:, None, :] * homogeneous_rest.T[None]).reshape(-1, len(partition.vertices))
+        self.weighted_rest = (dense_weights[:, None, :] * homogeneous_rest.T[None]).reshape(-1, len(vertices))
+
+    def skin(self, skin: np.ndarray) -> np.ndarray:
+        """Skin the vertices with (N, J, 3, 4) skin matrices; returns (N, Vp, 3), mesh units."""
+        # One product per pose: in one product for all poses, the last bits would depend on the number of poses.
+        rows = skin[:, self.joints].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
+        return (rows @ self.weighted_rest).transpose(0, 2, 1)
+
+    def subtract_from(self, positions: np.ndarray, skin: np.ndarray) -> None:
+        """Turn (N, Vp, 3) positions into local residuals, in place; `skin` as in `LinearSkinning.local_residuals`."""
+        positions -= self.skin(skin)
+        positions[:] = positions @ np.linalg.inv(skin[:, self.main_joint, :, :3]).transpose(0, 2, 1)
 
 
 class LinearSkinning:
@@ -78,7 +90,7 @@ class LinearSkinning:
     def __init__(self, rig: Rig, partitions: tuple[Partition, ...] | None = None):
         self.rig = rig
         self.partitions = make_partitions(rig) if partitions is None else partitions
-        self._blocks = [SkinBlock(rig, partition) for partition in self.partitions]
+        self._blocks = [SkinBlock(rig, partition.joint, partition.vertices) for partition in self.partitions]
         # One gather of all vertices, sorted by partition, is far cheaper than one gather per partition.
         self._order = np.concatenate([partition.vertices for partition in self.partitions])
         self._inverse_order = np.argsort(self._order)
@@ -94,8 +106,8 @@ class LinearSkinning:
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         ordered = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
-        for _, block, values in self._iterate_partitions(ordered):
-            values[:] = _skinned_positions(skin, block)
+        for block, values in self._iterate_blocks(ordered):
+            values[:] = block.skin(skin)
         return np.take(ordered, self._inverse_order, axis=1)
 
     def local_residuals(self, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -112,18 +124,16 @@ class LinearSkinning:
             RigError: a joint has a scale of zero in some pose.
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
+        ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
         try:
-            inverse_skin = np.linalg.inv(skin[:, :, :, :3])
+            for block, values in self._iterate_blocks(ordered):
+                block.subtract_from(values, skin)
         except np.linalg.LinAlgError as error:
             smallest_volumes = np.abs(np.linalg.det(pose_matrices[:, :, :3, :3].astype(np.float64))).min(axis=0)
             raise RigError(
                 f"Bone '{self.rig.joint_names[int(smallest_volumes.argmin())]}' has a scale of zero in some pose; "
                 "look for the key, constraint or driver that sets it."
             ) from error
-        ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
-        for partition, block, values in self._iterate_partitions(ordered):
-            values -= _skinned_positions(skin, block)
-            values[:] = values @ inverse_skin[:, partition.joint].transpose(0, 2, 1)
         return np.take(ordered, self._inverse_order, axis=1)
 
     def complex_positions(self, pose_matrices: np.ndarray, local_residuals: np.ndarray) -> np.ndarray:
@@ -138,22 +148,15 @@ class LinearSkinning:
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         ordered = np.take(np.asarray(local_residuals, np.float32), self._order, axis=1)
-        for partition, block, values in self._iterate_partitions(ordered):
-            values[:] = values @ skin[:, partition.joint, :, :3].transpose(0, 2, 1)
-            values += _skinned_positions(skin, block)
+        for block, values in self._iterate_blocks(ordered):
+            values[:] = values @ skin[:, block.main_joint, :, :3].transpose(0, 2, 1)
+            values += block.skin(skin)
         return np.take(ordered, self._inverse_order, axis=1)
 
-    def _iterate_partitions(self, ordered: np.ndarray) -> Iterator[tuple[Partition, SkinBlock, np.ndarray]]:
-        """Yield each partition with its view into an (N, V, 3) array sorted by partition."""
+    def _iterate_blocks(self, ordered: np.ndarray) -> Iterator[tuple[SkinBlock, np.ndarray]]:
+        """Yield each block with its view into an (N, V, 3) array sorted by partition."""
         start = 0
-        for partition, block in zip(self.partitions, self._blocks, strict=True):
-            yield partition, block, ordered[:, start : start + len(partition.vertices)]
-            start += len(partition.vertices)
-
-
-def _skinned_positions(skin: np.ndarray, block: SkinBlock) -> np.ndarray:
-    """Skin a partition with (N, J, 3, 4) skin matrices; returns (N, Vp, 3), mesh units."""
-    # One product per pose: in one product for all poses, the last bits would depend on the number of poses. A resumed
-    # recording must have the same bytes as an uninterrupted recording.
-    rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
-    return (rows @ block.weighted_rest).transpose(0, 2, 1)
+        for block in self._blocks:
+            vertex_count = block.weighted_rest.shape[1]
+            yield block, ordered[:, start : start + vertex_count]
+            start += vertex_count

@@ -5,6 +5,7 @@ import io
 import math
 import os
 import tokenize
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,7 +21,7 @@ MAX_VALUE = 1e12
 """Largest absolute value of an element; sums of squares of larger values may overflow."""
 CHECK_CHUNK_BYTES = 64 << 20
 """Size of the chunks in which arrays are checked for invalid values."""
-POSE_MATRICES = "pose_matrices"
+POSE_MATRICES, POSITIONS = "pose_matrices", "positions"
 SINGULAR_JOINTS = "joints that have shrunk to nothing"
 _VALUE_CHECKS = {
     "values that are not numbers": np.isfinite,
@@ -49,7 +50,7 @@ def array_shapes(
         "skin_joints": ((vertices, influences), np.int32),
         "skin_weights": ((vertices, influences), np.float32),
         POSE_MATRICES: ((poses, joints, 4, 4), np.float32),
-        "residuals": ((poses, vertices, 3), np.float32),
+        POSITIONS: ((poses, vertices, 3), np.float32),
         **(control_arrays if controls else {}),
         **(face_arrays if faces else {}),
     }
@@ -57,16 +58,16 @@ def array_shapes(
 
 ARRAY_NAMES = tuple(array_shapes(1, 1, 1, 1, faces=1, corners=1, controls=1))
 """Names of all arrays of a recording."""
-STREAMED_ARRAY_NAMES = (POSE_MATRICES, "residuals", "controls")
+STREAMED_ARRAY_NAMES = (POSE_MATRICES, POSITIONS, "controls")
 """Names of the arrays with one row per pose."""
 
 
 def streamed_arrays(
-    pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None, control_count: int
+    pose_matrices: np.ndarray, positions: np.ndarray, controls: np.ndarray | None, control_count: int
 ) -> dict[str, np.ndarray]:
     """Return the arrays with one row per pose, by name; `control_count` is the number of controls of the rig."""
     control_arrays = {"controls": controls} if control_count else {}
-    return {POSE_MATRICES: pose_matrices, "residuals": residuals, **control_arrays}
+    return {POSE_MATRICES: pose_matrices, POSITIONS: positions, **control_arrays}
 
 
 def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -> np.ndarray:
@@ -121,12 +122,13 @@ def read_array_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def find_invalid_pose(name: str, array: np.ndarray) -> tuple[int, str] | None:
+def find_invalid_pose(name: str, array: np.ndarray, alone_poses: range = range(0)) -> tuple[int, str] | None:
     """Find the first pose with values that cannot be trained on.
 
     Args:
         name: name of the array.
         array: (n, ...) values of n poses.
+        alone_poses: indices of the poses in which one input moves alone; a rig may have no positions there.
 
     Returns:
         The index of the pose and a description of its values; None where all poses are valid.
@@ -137,24 +139,40 @@ def find_invalid_pose(name: str, array: np.ndarray) -> tuple[int, str] | None:
         for description, check in _VALUE_CHECKS.items():
             if description != SINGULAR_JOINTS or name == POSE_MATRICES:
                 is_valid = check(chunk)
-                if not is_valid.all():
-                    return start + int(np.flatnonzero(~is_valid.reshape(len(chunk), -1).all(axis=1))[0]), description
+                if is_valid.all():
+                    continue
+                invalid = start + np.flatnonzero(~is_valid.reshape(len(chunk), -1).all(axis=1))
+                if name == POSITIONS:
+                    invalid = invalid[(invalid < alone_poses.start) | (invalid >= alone_poses.stop)]
+                if len(invalid):
+                    return int(invalid[0]), description
     return None
 
 
-def check_pose_values(arrays: dict[str, np.ndarray], first_pose: int) -> None:
+def check_pose_values(
+    arrays: dict[str, np.ndarray], first_pose: int, joint_names: Sequence[str], alone_poses: range = range(0)
+) -> None:
     """Check arrays of poses with `find_invalid_pose`.
 
     Args:
         arrays: the arrays by name.
         first_pose: index of the first pose of the arrays.
+        joint_names: names of the joints.
+        alone_poses: indices of the poses in which one input moves alone.
 
     Raises:
         RecordingError: a pose has invalid values.
     """
     for name, array in arrays.items():
-        if (invalid := find_invalid_pose(name, array)) is not None:
+        alone = range(alone_poses.start - first_pose, alone_poses.stop - first_pose)
+        if (invalid := find_invalid_pose(name, array, alone)) is not None:
             pose, description = invalid
+            if description == SINGULAR_JOINTS:
+                joint = int(are_invertible(array[pose]).argmin())
+                raise RecordingError(
+                    f"The bone '{joint_names[joint]}' has a scale of zero in pose {first_pose + pose}; look for the "
+                    "key, constraint or driver that sets it."
+                )
             raise RecordingError(
                 f"Pose {first_pose + pose} of the rig evaluates to {description} ({name}); look for a scale of zero "
                 "or a broken driver."

@@ -12,10 +12,9 @@ import numpy as np
 
 from ..errors import DiskFullError
 from ..files.output import nearest_existing_folder
-from ..rig import STATIC_JOINT_LABEL, Rig
+from ..rig import Rig
 from ..sentences.counts import format_count
 from .arrays import array_shapes
-from .reader import Recording
 
 MIN_SHOWN_BYTES = 10**6
 """Smaller sizes are shown as "less than 1 MB"."""
@@ -51,18 +50,6 @@ def recording_bytes(rig: Rig, poses: int) -> int:
         *(len(rig.face_starts), len(rig.face_vertices), len(rig.controls)),
     )
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
-
-
-def training_size_sentence(recording: Recording) -> str:
-    """Describe the disk space of a recording and the memory that its training needs."""
-    poses, rig = len(recording.pose_matrices), recording.rig
-    largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
-    vertices = len(largest.vertices)
-    return (
-        f"{poses:,} poses of {rig.vertex_count:,} vertices: {format_size(recording_bytes(rig, poses))} on the disk; "
-        f"residuals of the largest partition, '{rig.joints[largest.joint].name or STATIC_JOINT_LABEL}', of "
-        f"{vertices:,} vertices: {format_size(12 * poses * vertices)}, in memory two or three times."
-    )
 
 
 def check_disk_space(sizes: Iterable[tuple[Path, int]]) -> None:

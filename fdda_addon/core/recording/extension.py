@@ -66,20 +66,20 @@ class RecordingExtension:
             )
         return index
 
-    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None = None) -> None:
+    def append(self, pose_matrices: np.ndarray, positions: np.ndarray, controls: np.ndarray | None = None) -> None:
         """Append poses.
 
         Args:
             pose_matrices: (n, J, 4, 4), mesh-object space, mesh units.
-            residuals: (n, V, 3), local residuals, axes of the main joint, mesh units.
+            positions: (n, V, 3), mesh-object space, mesh units.
             controls: (n, C), where the rig has controls.
 
         Raises:
             OutputError: the disk is full or was disconnected; earlier poses stay complete.
             RecordingError: a value is not finite.
         """
-        arrays = streamed_arrays(pose_matrices, residuals, controls, len(self._index["controls"]))
-        check_pose_values(arrays, self.complete)
+        arrays = streamed_arrays(pose_matrices, positions, controls, len(self._index["controls"]))
+        check_pose_values(arrays, self.complete, [joint["name"] for joint in self._index["joints"]])
         previous_count = self.complete
         new_count = previous_count + len(pose_matrices)
         try:

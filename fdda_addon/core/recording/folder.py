@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import OutputError, RecordingError, os_error_text
-from ..mathematics.key_joints import select_joints
-from ..mathematics.skin_fit import weights_match
 from ..rig import Fingerprint, Rig, read_joints, rig_differences
 from .folder_check import is_available, is_recording, remove_recording_files
-from .index import INDEX_NAME, REFINED, find_different_keys, read_index, read_info
+from .index import ALONE, INDEX_NAME, REFINED, find_different_keys, read_index, read_info
 from .lock import RecordingLock
 
-SETTING_LABELS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "base skinning"}
+SETTING_LABELS = {"limits": "range of motion", "sources": "number of poses or actions"}
 """Labels of sampling keys in messages."""
 
 
@@ -42,7 +40,7 @@ class FolderContent:
         state: state of the folder.
         complete, poses: number of complete poses and of all poses of the recording.
         sentence: a sentence that describes a problem; may be empty.
-        measured_sentences: sentences about fitted weights and about the repeatability of the target.
+        measured_sentence: sentence about the repeatability of the target; may be empty.
         is_recording: whether the folder has a recording, possibly damaged, that can be removed.
     """
 
@@ -50,26 +48,23 @@ class FolderContent:
     complete: int = 0
     poses: int = 0
     sentence: str = ""
-    measured_sentences: tuple[str, ...] = ()
+    measured_sentence: str = ""
     is_recording: bool = False
 
 
-def read_folder(
-    path: Path, rig: Rig | None = None, sampling: dict | None = None, weights: tuple[str, str] | None = None
-) -> FolderContent:
+def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None) -> FolderContent:
     """Read the state of a recording folder.
 
     Args:
         path: the folder, which may be missing.
         rig: the rig to compare with; None skips the comparison.
         sampling: `Sampling.to_json` to compare with; None skips the comparison.
-        weights: options `fit_linear` and `joints` to compare with, as for `weights_match`; None skips the comparison.
     """
-    content = _read_content(path, rig, sampling, weights)
+    content = _read_content(path, rig, sampling)
     return replace(content, is_recording=content.state is not FolderState.FREE and is_recording(path))
 
 
-def _read_content(path: Path, rig: Rig | None, sampling: dict | None, weights: tuple[str, str] | None) -> FolderContent:
+def _read_content(path: Path, rig: Rig | None, sampling: dict | None) -> FolderContent:
     if not os.path.exists(path / INDEX_NAME):
         if not is_available(path):
             return FolderContent(FolderState.FOREIGN, sentence=f"'{path.name}' is not an empty folder; choose another.")
@@ -86,16 +81,13 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None, weights: t
             f"'{path.name}' holds a recording of another rig: {'; '.join(rig_clauses)}. Choose another "
             "folder, or remove it.",
         )
-    different_keys = find_different_keys(_without_refined(index["sampling"]), sampling) if sampling is not None else []
-    info = read_info(index)
-    fit = info.fit
-    if weights is not None and not weights_match(fit, *weights):
-        different_keys.append("fit")
+    different_keys = find_different_keys(_planned_sampling(index["sampling"]), sampling) if sampling is not None else []
     setting_names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in different_keys}))
     if pose_counts[0] == pose_counts[1]:
         sentence = f"It was recorded with other settings than those above: {setting_names}." if different_keys else ""
-        measured_sentences = tuple(report.sentence() for report in (fit, info.repeatability) if report)
-        return FolderContent(FolderState.COMPLETE, *pose_counts, sentence, measured_sentences)
+        repeatability = read_info(index).repeatability
+        measured_sentence = repeatability.sentence() if repeatability else ""
+        return FolderContent(FolderState.COMPLETE, *pose_counts, sentence, measured_sentence)
     if different_keys:
         return FolderContent(
             FolderState.OTHER,
@@ -113,16 +105,15 @@ def recordings_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if os.path.isfile(path / INDEX_NAME))
 
 
-def _without_refined(sampling: dict) -> dict:
-    """Return the JSON of a sampling without refined poses."""
-    return {**sampling, "sources": [source for source in sampling["sources"] if source["kind"] != REFINED]}
+def _planned_sampling(sampling: dict) -> dict:
+    """Return the JSON of a sampling without the poses that do not follow from the settings alone."""
+    sources = [source for source in sampling["sources"] if source["kind"] not in (ALONE, REFINED)]
+    return {**sampling, "sources": sources}
 
 
 def _rig_differences(index: dict, rig: Rig) -> list[str]:
     joints = read_joints(index["joints"])
     fingerprint = Fingerprint.from_json(index["rig"]["fingerprint"])
-    if fingerprint.has_key_joints and {joint.name for joint in joints} <= set(rig.joint_names):
-        rig = select_joints(rig, joints)
     # The rest matrices are in an array; they are compared when the recording is used.
     return rig_differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
 

@@ -3,22 +3,23 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ..controls import read_controls
 from ..errors import OutputError, RecordingError, os_error_text
 from ..files.input_file import read_input
 from ..files.output import atomic_write, to_json_text
-from ..mathematics.poses import Channel, Margin
-from ..mathematics.skin_fit import SkinFit
+from ..mathematics.poses import CONTROL, Channel, Margin
 from ..mathematics.surface import MIN_CORNERS
 from ..rig import Fingerprint, read_joints, read_name
 from ..unit import read_unit
+from .bones import RecordedBones
 from .target import RecordedTarget, Repeatability
 
 FORMAT = "fdda-recording"
-VERSION = 1
+VERSION = 2
 INDEX_NAME = "recording.json"
 MAX_INDEX_BYTES = 16 << 20
 """Largest size of an index."""
@@ -31,7 +32,13 @@ REFINED = "refined"
 """Kind of source for poses that a refinement added where a model had large errors.
 
 They do not represent the range of motion and are never held out."""
-SOURCE_KINDS = (RANDOM, ACTION, STRIP, MIRRORED, REFINED)
+ALONE = "alone"
+"""Kind of source for poses in which one input moves alone from a base pose (`AloneMoves`).
+
+They show what each input influences; nothing is trained on them."""
+SOURCE_KINDS = (RANDOM, ACTION, STRIP, MIRRORED, ALONE, REFINED)
+JOINT = "joint"
+"""Kind of an input that is a joint; the other kind is `CONTROL`."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +46,10 @@ class Source:
     """The origin of a run of consecutive poses in a recording.
 
     Attributes:
-        kind: `RANDOM`, `ACTION`, `STRIP`, `MIRRORED` or `REFINED`.
+        kind: one of `SOURCE_KINDS`.
         poses: number of poses.
         name: name of the action or strip, also for mirrored frames; file name of the model for refined poses; empty for
-            random poses.
+            others.
         frames: first frame of the action or strip, and number of frames between poses; (0, 0) for other poses.
     """
 
@@ -73,6 +80,61 @@ class Sampling:
 
 
 @dataclass(frozen=True)
+class AloneMoves:
+    """The poses in which one input moves alone: for each base pose, the pose itself, then one pose for each input.
+
+    Poses in which a shape key moves from the first base pose follow: a key moves the same vertices in all poses.
+
+    Attributes:
+        bases: number of base poses, the rest pose first.
+        inputs: kind, and indices of the joint or of the controls that move together, of each input.
+        keys: indices of the controls that are values of shape keys.
+        undetectable: indices of the controls that cannot be moved alone, so that they may influence all vertices.
+    """
+
+    bases: int
+    inputs: tuple[tuple[str, tuple[int, ...]], ...]
+    keys: tuple[int, ...] = ()
+    undetectable: tuple[int, ...] = ()
+
+    @property
+    def first_key_pose(self) -> int:
+        """Return the index of the first pose, among these poses, in which a shape key moves."""
+        return self.bases * (len(self.inputs) + 1)
+
+    @property
+    def poses(self) -> int:
+        """Return the number of poses."""
+        return self.first_key_pose + len(self.keys)
+
+    def to_json(self) -> dict:
+        inputs = [[kind, *indices] for kind, indices in self.inputs]
+        return {
+            "bases": self.bases,
+            "inputs": inputs,
+            "keys": list(self.keys),
+            "undetectable": list(self.undetectable),
+        }
+
+    @staticmethod
+    def from_json(value: dict, joints: int, controls: int) -> "AloneMoves":
+        """Read the JSON of `to_json`, given the numbers of joints and controls.
+
+        Raises:
+            KeyError, TypeError, ValueError: the JSON is damaged.
+        """
+        if type(value["bases"]) is not int or value["bases"] < 1:
+            raise ValueError(f"inputs move from {value['bases']!r} base poses")
+        inputs = tuple((kind, tuple(indices)) for kind, *indices in value["inputs"])
+        others = tuple(value["keys"]), tuple(value["undetectable"])
+        for kind, indices in (*inputs, *((CONTROL, indices) for indices in others)):
+            if kind not in (JOINT, CONTROL) or (kind == JOINT and len(indices) != 1):
+                raise ValueError(f"a moved input is {kind!r} {indices!r}")
+            _check_indices(list(indices), kind, joints if kind == JOINT else controls, "a moved input")
+        return AloneMoves(value["bases"], inputs, *others)
+
+
+@dataclass(frozen=True)
 class RecordingInfo:
     """Pose counts and origin of a recording, from `recording.json`.
 
@@ -81,10 +143,11 @@ class RecordingInfo:
         rig_file, object_name: names of the .blend file and of the mesh object.
         blender: version of Blender.
         sampling: sampling of the poses.
-        fit: fit of the skin weights; None where they are the rig's own.
+        bones: the bones of the rig.
         target: target whose surface was recorded; None where the rig itself was recorded.
         unsettled: ascending indices of the poses in which the target did not come to rest.
         repeatability: repeatability of the target; None where it was not measured.
+        alone: the poses in which one input moves alone; None where the target depends on time.
     """
 
     poses: int
@@ -93,10 +156,26 @@ class RecordingInfo:
     object_name: str
     blender: str
     sampling: Sampling
-    fit: SkinFit | None = None
+    bones: RecordedBones = field(default_factory=RecordedBones)
     target: RecordedTarget | None = None
     unsettled: tuple[int, ...] = ()
     repeatability: Repeatability | None = None
+    alone: AloneMoves | None = None
+
+    @property
+    def alone_poses(self) -> range:
+        """Return the indices of the poses in which one input moves alone."""
+        return alone_poses(self.sampling.sources)
+
+
+def alone_poses(sources: Sequence[Source]) -> range:
+    """Return the indices of the poses in which one input moves alone."""
+    start = 0
+    for source in sources:
+        if source.kind == ALONE:
+            return range(start, start + source.poses)
+        start += source.poses
+    return range(0)
 
 
 def read_index(path: Path) -> dict:
@@ -153,26 +232,23 @@ def _check_index(index: dict) -> None:
         if not isinstance(text, str):
             raise TypeError(f"{text!r} is not a string")
     joint_count = len(read_joints(index["joints"]))
-    if not isinstance(index["partitions"], list):
-        raise TypeError("its partitions are not a list")
-    for partition in index["partitions"]:
-        _check_indices([partition["joint"]], "joint", joint_count)
-        _check_indices(partition["influencing"], "joint", joint_count)
-        _check_indices(partition.get("merged", []), "joint", joint_count)
-        _check_indices(partition.get("controls", []), "control", len(controls))
     Fingerprint.from_json(index["rig"]["fingerprint"])
     read_unit(index)
-    if "fit" in index:
-        SkinFit.from_json(index["fit"])
+    RecordedBones.from_json(index["bones"], joint_count)
     if "target" in index:
         RecordedTarget.from_json(index["target"])
     if "repeatability" in index:
         Repeatability.from_json(index["repeatability"], index["complete"])
     _check_indices(index.get("unsettled", []), "unsettled pose", index["complete"], "it")
-    _read_sampling(index["sampling"])
+    alone_counts = [source.poses for source in _read_sampling(index["sampling"]).sources if source.kind == ALONE]
+    expected_counts = []
+    if "alone" in index:
+        expected_counts = [AloneMoves.from_json(index["alone"], joint_count, len(controls)).poses]
+    if alone_counts != expected_counts:
+        raise ValueError(f"it has {alone_counts} poses in which one input moves alone, not {expected_counts}")
 
 
-def _check_indices(values: list, noun: str, count: int, owner: str = "a partition") -> None:
+def _check_indices(values: list, noun: str, count: int, owner: str) -> None:
     """Raise TypeError or ValueError where values are not a list of distinct indices below a count."""
     if not isinstance(values, list):
         raise TypeError(f"{owner} has {noun}s that are not a list")
@@ -220,10 +296,13 @@ def read_info(index: dict) -> RecordingInfo:
         index["rig"]["object"],
         index["blender"],
         _read_sampling(index["sampling"]),
-        SkinFit.from_json(index["fit"]) if "fit" in index else None,
+        RecordedBones.from_json(index["bones"], len(index["joints"])),
         RecordedTarget.from_json(index["target"]) if "target" in index else None,
         tuple(index.get("unsettled", ())),
         Repeatability.from_json(index["repeatability"], index["complete"]) if "repeatability" in index else None,
+        AloneMoves.from_json(index["alone"], len(index["joints"]), len(index["controls"]))
+        if "alone" in index
+        else None,
     )
 
 

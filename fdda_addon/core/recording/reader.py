@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reading of a recording, a folder of poses and local residuals. docs/formats.md describes the format.
+"""Reading of a recording, a folder of poses and positions. docs/formats.md describes the format.
 
 `recording.json` has the number of complete poses. An array file may have more rows; the further rows are never read.
 """
@@ -11,7 +11,6 @@ import numpy as np
 
 from ..controls import read_controls
 from ..errors import RecordingError
-from ..mathematics.partition import Partition, make_partitions
 from ..mathematics.skin_fit import are_skin_weights
 from ..mathematics.skinning import are_invertible
 from ..mathematics.surface import are_faces
@@ -31,19 +30,17 @@ class Recording:
     Attributes:
         path: the folder.
         info: pose counts and origin.
-        rig: the recorded rig.
-        partitions: partitions of the mesh with their influences.
+        rig: the recorded rig, with its own skin weights and all joints.
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
-        residuals: (N, V, 3) float32, local residuals, axes of the main joint, mesh units.
+        positions: (N, V, 3) float32, mesh-object space, mesh units. They may be not finite in `info.alone_poses`.
         controls: (N, C) float32, values of the controls of the rig, each in the unit of its property.
     """
 
     path: Path
     info: RecordingInfo
     rig: Rig
-    partitions: tuple[Partition, ...]
     pose_matrices: np.ndarray
-    residuals: np.ndarray
+    positions: np.ndarray
     controls: np.ndarray
 
 
@@ -59,7 +56,7 @@ def read_recording(path: Path) -> Recording:
     if not poses:
         raise _incomplete_error(path, 0, 0)
     for name in STREAMED_ARRAY_NAMES:
-        check_poses(path, name, getattr(recording, name))
+        check_poses(path, name, getattr(recording, name), recording.info.alone_poses)
     if sum(source.poses for source in recording.info.sampling.sources) != poses:
         raise RecordingError(
             f"The index of '{path}' is damaged: its sources do not add up to its {poses} poses; record again."
@@ -93,10 +90,7 @@ def open_recording(path: Path) -> Recording:
     if not are_faces(rig.face_starts, rig.face_vertices, rig.vertex_count):
         raise RecordingError(f"The faces of '{path}' are damaged; record again.")
     arrays.setdefault("controls", np.zeros((index["poses"], 0), np.float32))
-    partitions = read_partitions(rig, index["partitions"])
-    if [p.joint for p in partitions] != [p["joint"] for p in index["partitions"]]:
-        raise RecordingError(f"The partitions of '{path}' contradict its skin weights; record again.")
-    return Recording(path, read_info(index), rig, partitions, *(arrays[name] for name in STREAMED_ARRAY_NAMES))
+    return Recording(path, read_info(index), rig, *(arrays[name] for name in STREAMED_ARRAY_NAMES))
 
 
 def _incomplete_error(path: Path, complete: int, poses: int) -> RecordingError:
@@ -105,55 +99,13 @@ def _incomplete_error(path: Path, complete: int, poses: int) -> RecordingError:
     )
 
 
-def read_recorded_skin(path: Path, index: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Read the skin weights of a recording, complete or not; `index` is from `read_index`.
-
-    Returns:
-        (V, I) int32 joints and (V, I) float32 weights.
-
-    Raises:
-        RecordingError: the skin weights are missing or damaged.
-    """
-    shape = index["vertices"], index["influences"]
-    joints, weights = (
-        np.array(open_array(path / f"{name}.npy", shape, dtype))
-        for name, dtype in (("skin_joints", np.int32), ("skin_weights", np.float32))
-    )
-    if not are_skin_weights(joints, weights, len(index["joints"])):
-        raise RecordingError(f"The skin weights of '{path}' are damaged; record again.")
-    return joints, weights
-
-
-def partitions_to_json(partitions: tuple[Partition, ...]) -> list[dict]:
-    """Return the JSON of partitions for `recording.json`."""
-    return [
-        {
-            "joint": partition.joint,
-            "influencing": list(partition.influencing),
-            **({"controls": list(partition.controls)} if partition.controls else {}),
-            **({"merged": list(partition.merged)} if partition.merged else {}),
-        }
-        for partition in partitions
-    ]
-
-
-def read_partitions(rig: Rig, values: list[dict]) -> tuple[Partition, ...]:
-    """Make the partitions of a rig from their JSON (`partitions_to_json`)."""
-    return make_partitions(
-        rig,
-        {value["joint"]: tuple(value["influencing"]) for value in values},
-        {value["joint"]: tuple(value.get("controls", ())) for value in values},
-        {joint: value["joint"] for value in values for joint in value.get("merged", ())},
-    )
-
-
-def check_poses(path: Path, name: str, array: np.ndarray) -> None:
-    """Check an array of poses with `find_invalid_pose`, which describes `name` and `array`.
+def check_poses(path: Path, name: str, array: np.ndarray, alone_poses: range) -> None:
+    """Check an array of poses with `find_invalid_pose`, which describes the arguments.
 
     Raises:
         RecordingError: a pose has invalid values.
     """
-    if (invalid := find_invalid_pose(name, array)) is not None:
+    if (invalid := find_invalid_pose(name, array, alone_poses)) is not None:
         pose, description = invalid
         raise RecordingError(f"The recording '{path}' holds {description} ({name}, pose {pose}); record again.")
 
@@ -167,9 +119,10 @@ def check_resumable(path: Path) -> None:
     index = read_index(path)
     if not index["complete"]:
         return
+    alone_poses = read_info(index).alone_poses
     for name, (shape, dtype) in _index_array_shapes(index).items():
         if name in STREAMED_ARRAY_NAMES:
-            check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype, index["complete"]))
+            check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype, index["complete"]), alone_poses)
         else:
             open_array(path / f"{name}.npy", shape, dtype)
 

@@ -69,15 +69,13 @@ class Repeatability:
     Attributes:
         poses: indices of the poses.
         distance_mm: distance of the vertices by name of a statistic: mean, rms, p99, p999 (99.9 %) and max, mm.
-        linear_mm: mean distance of the target from linear skinning in these poses, mm.
     """
 
     poses: tuple[int, ...]
     distance_mm: dict[str, float]
-    linear_mm: float
 
     def to_json(self) -> dict:
-        return {"poses": list(self.poses), "distance_mm": self.distance_mm, "linear_mm": self.linear_mm}
+        return {"poses": list(self.poses), "distance_mm": self.distance_mm}
 
     @staticmethod
     def from_json(value: dict, poses: int) -> "Repeatability":
@@ -88,11 +86,11 @@ class Repeatability:
             poses: number of poses of the recording.
         """
         repeatability = Repeatability(
-            tuple(value["poses"]), {name: value["distance_mm"][name] for name in STATISTIC_NAMES}, value["linear_mm"]
+            tuple(value["poses"]), {name: value["distance_mm"][name] for name in STATISTIC_NAMES}
         )
         if not repeatability.poses or not all(type(pose) is int and 0 <= pose < poses for pose in repeatability.poses):
             raise ValueError("its repeated poses are none of its poses")
-        for distance in (*repeatability.distance_mm.values(), repeatability.linear_mm):
+        for distance in repeatability.distance_mm.values():
             if type(distance) not in (int, float) or not 0 <= distance < math.inf:
                 raise ValueError(f"repeated poses are {distance!r} mm apart")
         return repeatability
@@ -102,6 +100,5 @@ class Repeatability:
         count = format_count(len(self.poses), "pose")
         return (
             f"The same pose from two directions: {self.distance_mm['mean']:.3g} mm apart on average, "
-            f"{self.distance_mm['max']:.3g} mm at most ({count}); linear skinning is {self.linear_mm:.3g} mm off. No "
-            "model can be closer than that."
+            f"{self.distance_mm['max']:.3g} mm at most ({count}). No model can be closer than that."
         )

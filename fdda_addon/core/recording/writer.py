@@ -15,7 +15,6 @@ import numpy as np
 from ..errors import OutputError, RecordingError, os_error_text
 from ..files.input_file import open_input
 from ..files.open_files import remove_file
-from ..mathematics.partition import Partition
 from ..rig import Rig, rest_matrices_match
 from ..unit import read_unit, unit_to_json
 from .arrays import (
@@ -30,7 +29,7 @@ from .arrays import (
 from .folder_check import check_folder, remove_recording_files, remove_temporary_files
 from .index import FORMAT, INDEX_NAME, VERSION, RecordingInfo, find_different_keys, read_index, write_index
 from .lock import RecordingLock
-from .reader import check_poses, partitions_to_json
+from .reader import check_poses
 from .target import Repeatability
 
 MUTABLE_KEYS = ("complete", "unsettled", "repeatability")
@@ -49,7 +48,6 @@ class RecordingWriter:
         self,
         path: Path,
         rig: Rig,
-        partitions: tuple[Partition, ...],
         info: RecordingInfo,
         resume: bool = False,
         overwrite: bool = False,
@@ -58,7 +56,7 @@ class RecordingWriter:
 
         Args:
             path: the folder, which is created where it is missing.
-            rig, partitions: rig and partitions to record.
+            rig: rig to record.
             info: origin and number of poses of the recording; `complete` is ignored.
             resume: continue the recording at `path`.
             overwrite: remove the recording at `path` first.
@@ -68,7 +66,7 @@ class RecordingWriter:
                 another rig or other settings, or another process writes it.
             OutputError: the folder cannot be written.
         """
-        self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
+        self.path, self.rig, self.info = path, rig, info
         self.complete = 0
         self.unsettled: list[int] = []
         self.repeatability: Repeatability | None = None
@@ -148,7 +146,7 @@ class RecordingWriter:
             end_offset = len(header) + self.complete * row_bytes
             if self.complete:
                 self._check_array(path, header, end_offset)
-                check_poses(self.path, name, open_array(path, shape, dtype, self.complete))
+                check_poses(self.path, name, open_array(path, shape, dtype, self.complete), self.info.alone_poses)
             self._files[name] = file = open_input(path, "r+b" if self.complete else "x+b", follow_links=False)
             file.write(header)
             file.truncate(end_offset)
@@ -194,8 +192,8 @@ class RecordingWriter:
             },
             "joints": [joint.to_json() for joint in self.rig.joints],
             "controls": [control.to_json() for control in self.rig.controls],
-            "partitions": partitions_to_json(self.partitions),
-            **({"fit": info.fit.to_json()} if info.fit else {}),
+            "bones": json.loads(json.dumps(info.bones.to_json())),
+            **({"alone": info.alone.to_json()} if info.alone else {}),
             **({"target": info.target.to_json()} if info.target else {}),
             **({"unsettled": list(self.unsettled)} if self.unsettled else {}),
             **({"repeatability": self.repeatability.to_json()} if self.repeatability else {}),
@@ -214,7 +212,7 @@ class RecordingWriter:
     def append(
         self,
         pose_matrices: np.ndarray,
-        residuals: np.ndarray,
+        positions: np.ndarray,
         controls: np.ndarray | None = None,
         unsettled: Sequence[int] = (),
     ) -> None:
@@ -222,7 +220,7 @@ class RecordingWriter:
 
         Args:
             pose_matrices: (n, J, 4, 4), mesh-object space, mesh units.
-            residuals: (n, V, 3), local residuals, axes of the main joint, mesh units.
+            positions: (n, V, 3), mesh-object space, mesh units.
             controls: (n, C), where the rig has controls.
             unsettled: indices, among the poses appended here, of those in which the target did not come to rest.
 
@@ -230,8 +228,8 @@ class RecordingWriter:
             OutputError: the disk is full or was disconnected; earlier poses stay complete.
             RecordingError: a value is not finite.
         """
-        arrays = streamed_arrays(pose_matrices, residuals, controls, len(self.rig.controls))
-        check_pose_values(arrays, self.complete)
+        arrays = streamed_arrays(pose_matrices, positions, controls, len(self.rig.controls))
+        check_pose_values(arrays, self.complete, self.rig.joint_names, self.info.alone_poses)
         previous_counts = self.complete, self.unsettled
         try:
             for name, array in arrays.items():

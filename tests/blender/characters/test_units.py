@@ -21,8 +21,10 @@ from blend_fixtures.characters.transforms import (
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.mathematics.skin_fit import SkinFit
 from fdda_addon.core.progress import run_job
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.evaluation import heat_map, last_evaluation
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
@@ -135,7 +137,7 @@ def test_files_say_their_unit_and_hold_units(characters, name):
     assert own.rig.metres_per_unit == pytest.approx(unit, rel=1e-6)
     if name != FAR_AWAY:
         np.testing.assert_allclose(unit * own.rig.rest_positions, meters.rig.rest_positions, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(unit * own.residuals, meters.residuals, atol=1e-4)
+    np.testing.assert_allclose(unit * own.positions, meters.positions, atol=1e-4)
 
 
 def test_files_of_a_character_in_metres_say_nothing(characters):
@@ -145,10 +147,10 @@ def test_files_of_a_character_in_metres_say_nothing(characters):
 
 
 def test_the_gain_of_fitted_weights_is_in_millimetres(characters, tmp_path):
-    for name in (IN_METRES, IN_CENTIMETRES):
-        options = ("--poses", 20, "--fit-linear", "hard")
-        assert run("record", characters[name].rig, tmp_path / name, *options) == 0
-    fits = [read_recording(tmp_path / name).info.fit for name in (IN_METRES, IN_CENTIMETRES)]
+    models = [tmp_path / name / "model.onnx" for name in (IN_METRES, IN_CENTIMETRES)]
+    for name, model in zip((IN_METRES, IN_CENTIMETRES), models, strict=True):
+        train(characters[name].recording, model, "--epochs", 1, "--fit-linear", "hard")
+    fits = [SkinFit.from_json(read_model_info(model).training["fit"]) for model in models]
     for way, rms in fits[0].held_out.rms_mm.items():
         assert fits[1].held_out.rms_mm[way] == pytest.approx(rms, rel=AGREE)
         assert fits[1].held_out.max_mm[way] == pytest.approx(fits[0].held_out.max_mm[way], rel=AGREE)
@@ -156,7 +158,9 @@ def test_the_gain_of_fitted_weights_is_in_millimetres(characters, tmp_path):
 
 @pytest.mark.parametrize("name", BUILDERS)
 def test_nothing_is_suspicious_about_a_unit(characters, name):
-    assert "units" not in [warning.name for warning in check_recording(read_recording(characters[name].recording))]
+    assert "units" not in [
+        warning.name for warning in check_recording(skin_recording(read_recording(characters[name].recording)))
+    ]
 
 
 @pytest.mark.parametrize("name", BUILDERS)

@@ -88,14 +88,14 @@ def test_a_mesh_without_vertices_is_refused(refusal, verb, tmp_path):
     assert "The mesh of 'elbow' has no vertices" in refusal(*verb(path))
 
 
-def truncate_residuals(path) -> None:
-    (path / "residuals.npy").write_bytes((path / "residuals.npy").read_bytes()[:-50])
+def truncate_positions(path) -> None:
+    (path / "positions.npy").write_bytes((path / "positions.npy").read_bytes()[:-50])
 
 
 def write_nan(path) -> None:
-    array = np.load(path / "residuals.npy")
+    array = np.load(path / "positions.npy")
     array[3, 2, 1] = np.nan
-    np.save(path / "residuals.npy", array)
+    np.save(path / "positions.npy", array)
 
 
 def slow_case(damage, words: str, case_name: str):
@@ -115,15 +115,15 @@ def index_changer(**values):
     ("damage", "words"),
     [
         slow_case(
-            index_changer(complete=40), "is incomplete: 40 of 150 poses; finish it with record --resume", "incomplete"
+            index_changer(complete=40), "is incomplete: 40 of 162 poses; finish it with record --resume", "incomplete"
         ),
-        slow_case(truncate_residuals, "residuals.npy' cannot be used: it is truncated: ", "truncated"),
+        slow_case(truncate_positions, "positions.npy' cannot be used: it is truncated: ", "truncated"),
         slow_case(
             index_changer(version=2),
             "is a recording of version 2 and this add-on reads version 1; record again",
             "version",
         ),
-        pytest.param(write_nan, "holds values that are not numbers (residuals, pose 3); record again", id="NaN"),
+        pytest.param(write_nan, "holds values that are not numbers (positions, pose 3); record again", id="NaN"),
     ],
 )
 def test_training_on_a_damaged_recording_is_refused(refusal, elbow_files, tmp_path, damage, words):

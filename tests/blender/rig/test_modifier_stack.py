@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import stacks
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.rig_check import check_recordable_rig
@@ -27,7 +29,8 @@ MOVES = 0.001
 
 def residuals(rig: SceneRig, folder: Path) -> np.ndarray:
     drain(record(rig, folder / "recording", FEW_POSES))
-    return np.load(folder / "recording" / "residuals.npy")
+    skinned = skin_recording(read_recording(folder / "recording"))
+    return skinned.compute_residuals(np.arange(len(skinned.rows)))
 
 
 def shown(rig: SceneRig) -> list[tuple]:

@@ -128,12 +128,8 @@ def test_a_trainer_that_fails_is_reported(train_refusal, tmp_path, monkeypatch, 
     assert text == start if start.endswith(("again.", "wait.", "Enough.")) else text.startswith(start)
 
 
-@pytest.mark.parametrize("verb", ["train", "record"])
-def test_a_missing_temporary_folder_is_reported(refusal, elbow_files, tmp_path, monkeypatch, verb):
-    arguments = {
-        "train": ["train", elbow_files.recording, tmp_path / "m.onnx"],
-        "record": ["record", elbow_files.rig, tmp_path / "r", "--poses", 20, "--fit-linear", "hard"],
-    }[verb]
+def test_a_missing_temporary_folder_is_reported(refusal, elbow_files, tmp_path, monkeypatch):
+    arguments = ["train", elbow_files.recording, tmp_path / "m.onnx"]
     with monkeypatch.context() as patch:
         patch.setattr(tempfile, "tempdir", None)
         patch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "none")])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.checks.flips import find_similar_poses
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..good_recording import (
     BONE_LENGTH,
@@ -20,7 +20,7 @@ from ..good_recording import (
 )
 
 
-def flipping_recording(pose_count: int, half_rotations: float, jump_metres: float, seed: int = 0) -> Recording:
+def flipping_recording(pose_count: int, half_rotations: float, jump_metres: float, seed: int = 0) -> SkinnedRecording:
     """Return the tube with a lower joint that rotates by up to `half_rotations` times 180 degrees.
 
     Past 180 degrees the residuals near the joint jump by `jump_metres`.
@@ -74,7 +74,7 @@ def test_a_fast_change_by_another_joint_is_no_flip():
 
 
 @pytest.fixture
-def dense_recording() -> Recording:
+def dense_recording() -> SkinnedRecording:
     """A recording of 1,000 poses, so that each pose has neighbors in all inputs of its partition."""
     return good_recording(1000)
 

@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.checks.seams import check_seams
 from fdda_addon.core.mathematics.partition import make_partitions
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..good_recording import RING_COUNT, VERTICES_PER_RING, single_warning_text, warning_texts, with_rig
 
@@ -26,7 +26,7 @@ def tube_faces(step: int) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture
-def cut_recording(clean_recording) -> Recording:
+def cut_recording(clean_recording) -> SkinnedRecording:
     """A recording in which each of the first 40 vertices lies on one of the last 40, and moves with it.
 
     Each quad has vertices of its own.

@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.checks.target import check_target, unsettled_sentence
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import ACTION, Source
-from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.recording.target import RecordedTarget, Repeatability
 
 from ..good_recording import good_recording, with_positions
@@ -19,7 +19,7 @@ TARGET = RecordedTarget("flesh", "frames")
 
 
 @pytest.fixture
-def swinging_recording() -> Recording:
+def swinging_recording() -> SkinnedRecording:
     """A recording of an action from frame 5 on: the joints swing smoothly, and the target bulges with them."""
     angles = 0.6 * np.sin(np.linspace(0, 6, FRAME_COUNT))[:, None] * np.ones(4)
     recording = good_recording(angles=angles)
@@ -31,13 +31,13 @@ def swinging_recording() -> Recording:
     return replace(recording, info=replace(recording.info, sampling=sampling, target=TARGET))
 
 
-def target_positions(recording: Recording) -> np.ndarray:
+def target_positions(recording: SkinnedRecording) -> np.ndarray:
     """Return the (N, V, 3) recorded positions of the target."""
     skinning = LinearSkinning(recording.rig, recording.partitions)
     return skinning.complex_positions(recording.pose_matrices, recording.residuals)
 
 
-def single_warning_text(recording: Recording, name: str) -> str:
+def single_warning_text(recording: SkinnedRecording, name: str) -> str:
     """Check that the target causes one warning, of this name, and return its text."""
     (warning,) = check_target(recording)
     assert warning.name == name
@@ -81,20 +81,24 @@ def test_a_target_in_other_units_or_at_another_location_is_reported(factor, offs
 
 
 def test_a_low_repeatability_is_reported(swinging_recording):
-    def with_repeatability(mean: float) -> Recording:
+    def with_repeatability(mean: float) -> SkinnedRecording:
         """Return the recording with a mean repeatability in millimeters."""
         statistics = {"mean": mean, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
         return replace(
             swinging_recording,
-            info=replace(swinging_recording.info, repeatability=Repeatability((1, 2), statistics, 5.0)),
+            info=replace(swinging_recording.info, repeatability=Repeatability((1, 2), statistics)),
         )
 
-    assert check_target(with_repeatability(0.9)) == []
-    assert single_warning_text(with_repeatability(1.1), "hysteresis").startswith(
-        "The target is 1.1 mm from itself when the same pose is"
+    linear_mm = 1000 * np.linalg.norm(swinging_recording.residuals[[1, 2]], axis=2).mean()
+    assert check_target(with_repeatability(0.19 * linear_mm)) == []
+    mean = 0.21 * linear_mm
+    assert single_warning_text(with_repeatability(mean), "hysteresis").startswith(
+        f"The target is {mean:.2g} mm from itself when the same pose is"
     )
     sentence = with_repeatability(1.1).info.repeatability.sentence()
-    assert sentence.startswith("The same pose from two directions: 1.1 mm apart on average, 4 mm at most (2 poses);")
+    assert sentence.startswith(
+        "The same pose from two directions: 1.1 mm apart on average, 4 mm at most (2 poses). No model"
+    )
 
 
 def test_sentence_about_unsettled_poses():
@@ -105,9 +109,9 @@ def test_sentence_about_unsettled_poses():
 
 def test_repeatability_is_read_back_from_json():
     statistics = {"mean": 0.5, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
-    repeatability = Repeatability((1, 2), statistics, 5.0)
+    repeatability = Repeatability((1, 2), statistics)
     assert Repeatability.from_json(repeatability.to_json(), 3) == repeatability
-    for change in ({"poses": []}, {"poses": [3]}, {"distance_mm": statistics | {"max": -1}}, {"linear_mm": "5"}):
+    for change in ({"poses": []}, {"poses": [3]}, {"distance_mm": statistics | {"max": -1}}):
         with pytest.raises((ValueError, TypeError)):
             Repeatability.from_json(repeatability.to_json() | change, 3)
 

@@ -18,7 +18,7 @@ from fdda_addon.core.recording.writer import RecordingWriter
 
 from ... import systems
 from ..conftest import SMALL_DISK_BYTES
-from ..limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
+from ..limb import make_rig, random_poses, random_positions, record_limb, recording_info
 
 ROOT = Path(__file__).resolve().parents[3]
 FULL_DISK_ERROR = "No space left on device"
@@ -72,13 +72,13 @@ def _no_space_reservation(monkeypatch):
 @pytest.mark.usefixtures("_no_space_reservation")
 def test_a_disk_that_fills_up_during_a_recording_leaves_complete_poses(small_disk, tmp_path):
     path, rig, poses = small_disk / "recording", make_rig(), 100
-    matrices, residuals = random_poses(poses), random_residuals(poses)
+    matrices, residuals = random_poses(poses), random_positions(poses)
     ballast = small_disk / "ballast"
     with (
         pytest.raises(
             OutputError, match=rf"Cannot write the recording .*: {FULL_DISK_ERROR}; 20 of 100 poses are complete, cont"
         ),
-        RecordingWriter(path, rig, partitions_of(rig), recording_info(poses)) as writer,
+        RecordingWriter(path, rig, recording_info(poses)) as writer,
     ):
         writer.append(matrices[:20], residuals[:20])
         ballast.write_bytes(b"x" * (os.statvfs(small_disk).f_bavail - 4) * 4096)
@@ -91,7 +91,7 @@ def test_a_disk_that_fills_up_during_a_recording_leaves_complete_poses(small_dis
     for file in path.iterdir():
         (elsewhere / file.name).write_bytes(file.read_bytes())
     record_limb(elsewhere, poses, resume=True)
-    assert (read_recording(elsewhere).residuals == residuals).all()
+    assert (read_recording(elsewhere).positions == residuals).all()
 
 
 WRITE_WITH_SIZE_LIMIT = """

@@ -19,7 +19,7 @@ from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
-from ..limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
+from ..limb import make_rig, random_poses, random_positions, record_limb, recording_info
 
 windows_only = pytest.mark.skipif(sys.platform != "win32", reason="Only on Windows, an open file cannot be replaced.")
 READ_REPEATEDLY = """
@@ -107,10 +107,10 @@ def test_a_file_that_stays_open_is_not_replaced_and_new_files_are_kept(tmp_path,
 
 
 def test_a_recording_whose_index_stays_open_can_be_resumed(tmp_path, refuse_renames):
-    rig, matrices, residuals = make_rig(), random_poses(12), random_residuals(12)
+    rig, matrices, residuals = make_rig(), random_poses(12), random_positions(12)
     with (
         pytest.raises(OutputError, match=r"another program has it open; 4 of 12 poses are complete, continue with"),
-        RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(12)) as writer,
+        RecordingWriter(tmp_path / "r", rig, recording_info(12)) as writer,
     ):
         writer.append(matrices[:4], residuals[:4])
         refuse_renames({"recording.json": 10**9})
@@ -119,7 +119,7 @@ def test_a_recording_whose_index_stays_open_can_be_resumed(tmp_path, refuse_rena
     assert read_index(tmp_path / "r")["complete"] == 4
     assert [path.name for path in (tmp_path / "r").glob("*.json")] == ["recording.json"]
     record_limb(tmp_path / "r", 12, resume=True)
-    assert np.array_equal(read_recording(tmp_path / "r").residuals, residuals)
+    assert np.array_equal(read_recording(tmp_path / "r").positions, residuals)
 
 
 @windows_only
@@ -136,13 +136,13 @@ def test_a_file_is_replaced_while_another_process_reads_it_repeatedly(tmp_path, 
 @windows_only
 def test_a_recording_is_written_while_another_process_reads_it_repeatedly(tmp_path, start_reader):
     rig, poses = make_rig(), 60
-    matrices, residuals = random_poses(poses), random_residuals(poses)
-    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(poses)) as writer:
-        start_reader(0.02, *(tmp_path / "r" / name for name in ("recording.json", "residuals.npy")))
+    matrices, residuals = random_poses(poses), random_positions(poses)
+    with RecordingWriter(tmp_path / "r", rig, recording_info(poses)) as writer:
+        start_reader(0.02, *(tmp_path / "r" / name for name in ("recording.json", "positions.npy")))
         for pose_index in range(poses):
             writer.append(matrices[pose_index : pose_index + 1], residuals[pose_index : pose_index + 1])
             assert read_index(tmp_path / "r")["complete"] == pose_index + 1
-    assert np.array_equal(read_recording(tmp_path / "r").residuals, residuals)
+    assert np.array_equal(read_recording(tmp_path / "r").positions, residuals)
 
 
 @windows_only
@@ -155,8 +155,8 @@ def test_a_memory_mapped_recording_is_neither_removed_nor_replaced(tmp_path, mon
     check_recordable(tmp_path / "r", resume=False, overwrite=True)
     rig = make_rig()
     with pytest.raises(OutputError, match="another program has it open"):
-        RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(12), overwrite=True)
-    assert np.array_equal(mapped_recording.residuals, read_recording(tmp_path / "r").residuals)
+        RecordingWriter(tmp_path / "r", rig, recording_info(12), overwrite=True)
+    assert np.array_equal(mapped_recording.positions, read_recording(tmp_path / "r").positions)
     del mapped_recording
     remove_recording(tmp_path / "r")
     assert not (tmp_path / "r").exists()

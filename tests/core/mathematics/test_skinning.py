@@ -7,7 +7,7 @@ import pytest
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
 
-from ..limb import JOINTS, VERTEX_COUNT, make_rig, partitions_of, random_poses, random_residuals, random_transforms
+from ..limb import JOINTS, VERTEX_COUNT, make_rig, partitions_of, random_poses, random_positions, random_transforms
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_local_residuals_are_in_the_space_of_the_main_joint(rig):
 
 
 def test_complex_positions_invert_local_residuals(rig):
-    skinning, poses, local_residuals = LinearSkinning(rig, partitions_of(rig)), random_poses(5), random_residuals(5)
+    skinning, poses, local_residuals = LinearSkinning(rig, partitions_of(rig)), random_poses(5), random_positions(5)
     positions = skinning.complex_positions(poses, local_residuals)
     assert np.abs(positions - skinning.positions(poses)).max() > 1e-3
     np.testing.assert_allclose(skinning.local_residuals(poses, positions), local_residuals, atol=2e-6)
@@ -71,7 +71,7 @@ def test_complex_positions_invert_local_residuals(rig):
 
 def test_local_residuals_do_not_depend_on_the_motion_of_the_whole_rig(rig):
     """Rotating, scaling and moving everything changes the residuals, but not the local residuals."""
-    skinning, poses, local_residuals = LinearSkinning(rig), random_poses(4), random_residuals(4)
+    skinning, poses, local_residuals = LinearSkinning(rig), random_poses(4), random_positions(4)
     positions = skinning.complex_positions(poses, local_residuals)
     motion = random_transforms(np.random.default_rng(9))
     moved_poses = (motion @ poses).astype(np.float32)
@@ -102,7 +102,7 @@ def test_the_batch_size_does_not_change_the_bits_of_a_pose(rig, count):
 def test_skin_block_lists_the_joints_with_weight(rig):
     for partition in partitions_of(rig):
         joints, weights = rig.skin_joints[partition.vertices], rig.skin_weights[partition.vertices]
-        block = SkinBlock(rig, partition)
+        block = SkinBlock(rig, partition.joint, partition.vertices)
         assert block.joints.tolist() == sorted(set(joints[weights > 0].tolist()))
         assert block.weighted_rest.shape == (4 * len(block.joints), len(partition.vertices))
         # Every fourth row contains the weights of a joint.

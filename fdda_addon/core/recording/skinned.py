@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A recording that is split into linear skinning and residuals, which are computed when they are read."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ..defaults import MIN_PARTITION_VERTICES
+from ..mathematics.key_joints import KeyJointReport
+from ..mathematics.partition import (
+    INFLUENCE_TOLERANCE,
+    Partition,
+    assume_nearby_influences,
+    make_merged_partitions,
+)
+from ..mathematics.skin_fit import SkinFit
+from ..mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
+from ..rig import Fingerprint, Rig
+from .index import ALONE, RecordingInfo
+from .influences import add_influences, detect_influences
+from .reader import Recording
+
+BLOCK_ELEMENTS = 1 << 22
+"""Maximum number of array elements of a block of poses."""
+
+
+@dataclass(frozen=True)
+class SkinnedRecording:
+    """The poses of a recording, its linear skinning, and its partitions with their influences.
+
+    Poses in which one input was moved alone are left out, also from `info`.
+
+    Attributes:
+        path: the folder of the recording.
+        info: pose counts and origin.
+        rig: the rig with the joints and the skin weights of the model.
+        partitions: partitions of the mesh.
+        pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
+        controls: (N, C) float32, values of the controls of the rig, each in the unit of its property.
+        recorded_positions: (M, V, 3) float32 memory map of all recorded poses, mesh-object space, mesh units.
+        rows: (N,) int64, rows of the poses in `recorded_positions`.
+        fit: fit of the skin weights; None where they are the rig's own.
+        key_joints: choice of key joints; None where the model reads all joints without a choice.
+    """
+
+    path: Path
+    info: RecordingInfo
+    rig: Rig
+    partitions: tuple[Partition, ...]
+    pose_matrices: np.ndarray
+    controls: np.ndarray
+    recorded_positions: np.ndarray
+    rows: np.ndarray
+    fit: SkinFit | None = None
+    key_joints: KeyJointReport | None = None
+
+    @cached_property
+    def skinning(self) -> LinearSkinning:
+        """Linear skinning of the rig."""
+        return LinearSkinning(self.rig, self.partitions)
+
+    def digest(self) -> str:
+        """Hash what networks depend on besides the rig: kind of the fit, joints, partitions and influences.
+
+        Fitted weights are left out: another number of threads changes their last digits.
+        """
+        partitions = [(p.joint, p.influencing, p.controls, p.merged, len(p.vertices)) for p in self.partitions]
+        return Fingerprint.digest_text(repr((self.fit and self.fit.kind, self.rig.joint_names, partitions)))
+
+    def read_positions(self, poses: np.ndarray) -> np.ndarray:
+        """Read the (n, V, 3) float32 positions of n poses, mesh-object space, mesh units."""
+        return np.array(self.recorded_positions[self.rows[poses]])
+
+    def compute_residuals(self, poses: np.ndarray) -> np.ndarray:
+        """Compute the (n, V, 3) float32 local residuals of n poses, axes of the main joints, mesh units."""
+        return self.skinning.local_residuals(self.pose_matrices[poses], self.read_positions(poses))
+
+    def compute_partition_residuals(
+        self, partition: Partition, poses: np.ndarray | None = None, vertices: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Compute the local residuals of one partition, a block of poses at a time.
+
+        Args:
+            partition: the partition.
+            poses: (n,) indices of poses; None for all.
+            vertices: (v,) indices of some of its vertices; None for all.
+
+        Returns:
+            (n, v, 3) float32, axes of the main joint, mesh units.
+        """
+        poses = np.arange(len(self.rows)) if poses is None else poses
+        vertices = partition.vertices if vertices is None else vertices
+        block = SkinBlock(self.rig, partition.joint, vertices)
+        residuals = np.empty((len(poses), len(vertices), 3), np.float32)
+        size = max(1, BLOCK_ELEMENTS // max(3 * len(vertices), 16 * len(self.rig.joints)))
+        for start in range(0, len(poses), size):
+            rows = slice(start, start + size)
+            residuals[rows] = self.recorded_positions[np.ix_(self.rows[poses[rows]], vertices)]
+            skin = skin_matrices(self.pose_matrices[poses[rows]], self.rig.rest_matrices)[:, :, :3]
+            block.subtract_from(residuals[rows], skin)
+        return residuals
+
+
+def skin_recording(
+    recording: Recording,
+    rig: Rig | None = None,
+    joints: np.ndarray | None = None,
+    follow: Callable[[Partition, np.ndarray], np.ndarray] = lambda partition, influences: influences,
+    min_partition_vertices: int = MIN_PARTITION_VERTICES,
+    influence_tolerance: float = INFLUENCE_TOLERANCE,
+    note: Callable[[str], None] = lambda text: None,
+) -> SkinnedRecording:
+    """Split a recording into linear skinning and residuals, and find partitions and their influences.
+
+    The result depends on no refined pose, so that a training can be continued on a recording that has grown.
+
+    Args:
+        recording: a recording with J joints and C controls.
+        rig: the rig with K of the joints and the skin weights of linear skinning; None for the recorded rig.
+        joints: (K,) indices of these joints in the recording; None for all.
+        follow: returns the (K + C,) bool inputs of the model from which a partition follows, for the partition and
+            the (J + C,) bool inputs of the recording that influence it.
+        min_partition_vertices: partitions with fewer vertices are merged into others; 0 to merge no partitions.
+        influence_tolerance: as in `detect_influences`.
+        note: receives a note about positions that are not finite.
+    """
+    rig = recording.rig if rig is None else rig
+    joints = np.arange(len(rig.joints)) if joints is None else joints
+    partitions = make_merged_partitions(rig, min_partition_vertices)
+    influences = np.zeros((len(partitions), len(recording.rig.joints) + len(rig.controls)), bool)
+    if recording.info.alone is None:
+        # A target that depends on time does not follow a moved joint immediately: influences cannot be detected.
+        partitions = assume_nearby_influences(rig, partitions)
+    else:
+        influences, text = detect_influences(recording, rig, joints, partitions, influence_tolerance)
+        if text:
+            note(text)
+    info, rows = recording.info, np.delete(np.arange(recording.info.poses), recording.info.alone_poses)
+    sources = tuple(source for source in info.sampling.sources if source.kind != ALONE)
+    return SkinnedRecording(
+        recording.path,
+        replace(info, poses=len(rows), complete=len(rows), sampling=replace(info.sampling, sources=sources)),
+        rig,
+        tuple(
+            add_influences(p, follow(p, inputs), len(joints)) for p, inputs in zip(partitions, influences, strict=True)
+        ),
+        np.array(recording.pose_matrices[rows])[:, joints],
+        np.array(recording.controls[rows]),
+        recording.positions,
+        rows,
+    )

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Checks of a mesh before its first pose is recorded: cuts, controls, the target, and what changes with the frame."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+
+import bpy
+import numpy as np
+
+from ..core.checks.seams import find_open_seams
+from ..core.errors import RigError
+from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
+from ..core.mathematics.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE
+from ..core.mathematics.skinning import LinearSkinning
+from ..core.progress import Progress
+from ..core.recording.target import SIMULATION
+from ..poses.clip_player import ClipPlayer
+from ..scene.armature import clear_pose
+from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control
+from .plan import RecordedMesh
+from .pose_plan import PosePlan
+
+MAX_TARGET_POSES, MAX_SEAM_POSES = 20, 10
+"""Number of poses in which the motion of a target is compared, and the gaps of a mesh with cuts are measured."""
+MIN_RIG_MOTION_RATIO, MAX_STILL_TARGET_RATIO = 0.02, 1e-5
+"""Ratios of the rig's size. A target does not follow the rig if it moves by less than the second ratio while the rig
+moves by more than the first ratio."""
+POSE_TOLERANCE = 1e-5
+"""Largest difference between matrices and controls of poses that count as equal (no unit, or mesh units)."""
+MIN_CHECKED_WIDTH = 10.0
+"""Width of the ranges of controls that are checked. Nearly all numbers that are made for animation have narrower
+ranges."""
+VALUE_COUNT = 17
+"""Number of values of a control at which the surface is compared."""
+MAX_CHANGE_RATIO = 1 / 8
+"""A range saturates if the surface changes in at most this part of it."""
+
+
+def check_target_moves(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
+    """Check that a target moves in poses in which the rig moves.
+
+    A simulation is checked in its first frames, other targets in poses that are far apart. Poses that are held settle,
+    so the check also measures how long settling takes. The motion of a rig without skin weights is unknown.
+
+    Yields:
+        Progress of the stage "target".
+
+    Raises:
+        RigError: the target does not move.
+    """
+    if not mesh.rig.has_weights:
+        return
+    skinning, size, target = LinearSkinning(mesh.rig), mesh.rig.size, plan.pose_setter.target
+    is_simulation = target.follows == SIMULATION
+    spread_indices = sorted(
+        {int(number * GOLDEN_RATIO * plan.total) % plan.total for number in range(MAX_TARGET_POSES)}
+    )
+    pose_indices = (
+        range(min(plan.total, 2 if plan.pose_setter.is_settling else plan.total)) if is_simulation else spread_indices
+    )
+    first_positions, rig_motion, target_motion = None, 0.0, 0.0
+    with closing(plan.show_poses(player, pose_indices)) as poses:
+        for checked_count, _ in enumerate(poses, 1):
+            pose_matrices, positions, _ = mesh.evaluator.evaluate()
+            skinned_positions = skinning.positions(pose_matrices[None])[0]
+            if first_positions is None:
+                first_positions = skinned_positions, positions
+            rig_motion = max(rig_motion, float(np.abs(skinned_positions - first_positions[0]).max()))
+            target_motion = max(target_motion, float(np.abs(positions - first_positions[1]).max()))
+            yield Progress("target", min(checked_count, len(pose_indices)), len(pose_indices))
+            if target_motion > MAX_STILL_TARGET_RATIO * size and rig_motion > MIN_RIG_MOTION_RATIO * size:
+                break
+            if is_simulation and rig_motion > 10 * MIN_RIG_MOTION_RATIO * size:
+                break
+    player.stop()
+    if rig_motion > MIN_RIG_MOTION_RATIO * size and target_motion <= MAX_STILL_TARGET_RATIO * size:
+        raise RigError(
+            f"The target '{target.name}' does not move while '{mesh.name}' does, by "
+            f"{rig_motion * mesh.rig.metres_per_unit * 1000:.0f} mm; look whether its modifiers are on and its cache "
+            "is that of this action, or choose another target."
+        )
+
+
+def check_follows_pose(meshes: Sequence[RecordedMesh], plan: PosePlan, player: ClipPlayer) -> float:
+    """Check that the surfaces of meshes do not change between frames while pose and controls are the same.
+
+    Two poses of the plan are held in the first, middle and last frame of the scene. Poses that change with the frame
+    are skipped.
+
+    Args:
+        meshes: the meshes that are evaluated together, prepared by `temporary_rig_states`.
+        plan: plan of the poses.
+        player: player of the clips of the plan.
+
+    Returns:
+        The mean time of an evaluation of all meshes, seconds.
+
+    Raises:
+        RigError: a surface differs between frames.
+    """
+    scene, start_time, evaluation_count = bpy.context.scene, time.perf_counter(), 0
+    frame, subframe = scene.frame_current, scene.frame_subframe
+    other_frames = {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end} - {frame}
+    try:
+        for pose_index in {plan.total // 3, plan.total - 1}:
+            with closing(plan.show_poses(player, {pose_index})) as poses:
+                next(poses)
+                clip_frame, first_evaluations = player.current_clip_frame, None
+                for checked_frame in (frame, *sorted(other_frames)):
+                    player.set_clip_frame(clip_frame, checked_frame)
+                    evaluations = [mesh.evaluator.evaluate() for mesh in meshes]
+                    evaluation_count += 1
+                    first_evaluations = first_evaluations or evaluations
+                    for mesh, *pair in zip(meshes, first_evaluations, evaluations, strict=True):
+                        _compare_surfaces(mesh, (frame, checked_frame), *pair)
+    finally:
+        player.stop()
+        player.reset_pose()
+        scene.frame_set(frame, subframe=subframe)
+    return (time.perf_counter() - start_time) / evaluation_count
+
+
+def _compare_surfaces(
+    mesh: RecordedMesh, frames: tuple[int, int], first: Sequence[np.ndarray], other: Sequence[np.ndarray]
+) -> None:
+    """Raise a RigError if the positions of two evaluations differ, and pose matrices and controls do not."""
+    if not all(np.allclose(first[index], other[index], rtol=POSE_TOLERANCE, atol=POSE_TOLERANCE) for index in (0, 2)):
+        return
+    largest_difference = float(np.linalg.norm(first[1] - other[1], axis=1).max())
+    mesh_object = mesh.scene_rig.mesh_object
+    extent = max(float(np.abs(mesh.rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
+    if largest_difference > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
+        raise RigError(
+            f"The surface of '{mesh.name}' differs by {largest_difference * mesh.rig.metres_per_unit * 1000:.2g} mm "
+            f"between frames {frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; find "
+            "the keys, drivers, Geometry Nodes or constraint targets that depend on the frame, and make them controls "
+            "or switch them off."
+        )
+
+
+def check_seams(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> str:
+    """Return a sentence if cuts of a mesh open in poses that are far apart; empty if not.
+
+    Args:
+        mesh: the mesh, prepared by `temporary_rig_states`.
+        plan: plan of the poses.
+        player: player of the clips of the plan.
+    """
+    skinning = LinearSkinning(mesh.rig)
+    pose_indices = set(np.linspace(0, plan.total - 1, MAX_SEAM_POSES).round().astype(int).tolist())
+
+    def evaluate_residuals() -> Iterator[np.ndarray]:
+        with closing(plan.show_poses(player, pose_indices)) as poses:
+            for _ in poses:
+                pose_matrices, positions, _ = mesh.evaluator.evaluate()
+                yield skinning.local_residuals(pose_matrices[None], positions[None])[0]
+
+    with closing(evaluate_residuals()) as residuals:
+        warnings = find_open_seams(mesh.rig, residuals)
+    player.stop()
+    clear_pose(mesh.scene_rig.armature_object)
+    player.restore_numbers()
+    return f"{mesh.name}: {warnings[0]}" if warnings else ""
+
+
+def check_saturation(mesh: RecordedMesh) -> str:
+    """Return a sentence about the controls whose effect ends far inside their ranges; empty if there is none.
+
+    Random poses would hardly ever show the values between the two ends of the effect.
+
+    Args:
+        mesh: the mesh in its rest pose, prepared by `temporary_rig_states`.
+    """
+    scene_rig, sentences = mesh.scene_rig, []
+    for control in mesh.rig.controls:
+        owner, (low, high) = owner_of(scene_rig, control.owner), (control.low, control.high)
+        if high - low < MIN_CHECKED_WIDTH or not can_be_set(control.name) or is_driven(owner, control.path):
+            continue
+        previous_value = number_at(owner, control.path)
+        # Each step finds the part of the range with the effect, until it fills its part.
+        while True:
+            compared = np.linspace(low, high, VALUE_COUNT)
+            surfaces = []
+            for value in compared.tolist():
+                set_control(scene_rig, control.name, value)
+                surfaces.append(mesh.evaluator.evaluate()[1])
+            moves = np.linalg.norm(np.diff(surfaces, axis=0), axis=2).max(axis=1)
+            changed = np.flatnonzero(moves > INFLUENCE_TOLERANCE * mesh.rig.size)
+            if len(changed):
+                low, high = float(compared[changed[0]]), float(compared[changed[-1] + 1])
+            if not 0 < len(changed) <= MAX_CHANGE_RATIO * (VALUE_COUNT - 1) or high - low < 1:
+                break
+        set_control(scene_rig, control.name, previous_value)
+        if high - low < MAX_CHANGE_RATIO * (control.high - control.low):
+            sentences.append(
+                f"The surface of '{mesh.name}' changes only between {low:.3g} and {high:.3g} in the range "
+                f"{control.low:g} to {control.high:g} of '{control.name}'. Give the range that is used: --control "
+                f"'{control.name}={low:.3g}:{high:.3g}', or Soft Min and Soft Max of the property."
+            )
+    return " ".join(sentences)

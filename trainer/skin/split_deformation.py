@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Splits the recorded deformation into linear skinning and residuals: all steps up to partitions and influences."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.formats.messages import MessageType
+from fdda_addon.core.joint_option import ALL, KEY_JOINTS_STAGE
+from fdda_addon.core.mathematics.key_joints import find_unread_bones, joints_with_indices, select_joints
+from fdda_addon.core.mathematics.metrics import distances
+from fdda_addon.core.mathematics.partition import Partition
+from fdda_addon.core.mathematics.references import choose_references
+from fdda_addon.core.mathematics.skin_fit import DEFAULT_KIND, FitReport, SkinFit
+from fdda_addon.core.mathematics.skinning import LinearSkinning
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
+from fdda_addon.core.rig import Rig
+
+from ..blocks import block_slices
+from ..config import TrainingConfig
+from ..progress import MessageSink
+from .choice import choose_key_joints
+from .fit_poses import FitPoses, read_fit_poses
+from .key_joints import KeyJoints
+from .solver import fit_skin
+
+FIT_STAGE = "fit"
+"""Stage of the message `PREPARING` in which skin weights are fitted to vertices."""
+REFERENCE_POSES = 48
+"""Number of poses by which the reference joints of a rig with fitted weights are chosen."""
+
+
+def split_deformation(recording: Recording, config: TrainingConfig, sink: MessageSink) -> SkinnedRecording:
+    """Split the deformation of a recording, with the settings `fit_linear`, `joints` and those of partitions.
+
+    Args:
+        recording: the recording.
+        config: settings of the training.
+        sink: receives the progress and the results of the fit.
+
+    Raises:
+        RecordingError: there are too few poses for a fit.
+        TrainingError: the rig has no skin weights, and none are fitted.
+    """
+    rig, joint_count = recording.rig, len(recording.rig.joints)
+    joints, choice, fit = np.arange(joint_count), None, None
+    has_key_joints = config.joints != ALL
+    if has_key_joints or config.fit_linear:
+        poses = read_fit_poses(recording, has_key_joints)
+        if has_key_joints:
+            choice = choose_key_joints(
+                poses,
+                config.joints,
+                lambda done, total: sink.send(MessageType.PREPARING, stage=KEY_JOINTS_STAGE, done=done, total=total),
+            )
+        removes_joints = choice is not None and len(choice.joints) < joint_count
+        if choice and not removes_joints:
+            sink.send(MessageType.LOG, text=choice.report.sentence())
+        if removes_joints or config.fit_linear:
+            kind, weighted = config.fit_linear or DEFAULT_KIND, choice.weighted_joints if removes_joints else joints
+            training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
+            fitted_joints, weights = fit_skin(
+                training.with_joints(weighted) if removes_joints else training,
+                kind,
+                lambda done: sink.send(MessageType.PREPARING, stage=FIT_STAGE, done=done, total=rig.vertex_count),
+            )
+            rig = replace(rig, skin_joints=weighted[fitted_joints].astype(np.int32), skin_weights=weights)
+            reports = measure_skin(held_out, rig), measure_skin(training, rig)
+            fit = SkinFit(kind, len(poses.positions), *reports, choice.report if removes_joints else None)
+            sink.send(MessageType.LOG, text=fit.sentence())
+            if removes_joints:
+                joints, rig = choice.joints, keep_key_joints(recording, rig, choice)
+            rig = _choose_references(recording, rig, joints, poses)
+    if fit is None:
+        check_has_weights(recording)
+
+    def follow(partition: Partition, influences: np.ndarray) -> np.ndarray:
+        if len(joints) == joint_count:
+            return influences
+        influences[:joint_count] |= choice.acts[partition.vertices].any(axis=0)
+        return influences @ choice.inputs
+
+    skinned = skin_recording(
+        recording,
+        rig,
+        joints,
+        follow,
+        config.min_partition_vertices,
+        config.influence_tolerance,
+        lambda text: sink.send(MessageType.LOG, text=text),
+    )
+    return replace(skinned, fit=fit, key_joints=choice.report if choice else None)
+
+
+def keep_key_joints(recording: Recording, fitted_rig: Rig, choice: KeyJoints) -> Rig:
+    """Return a rig with its key joints alone; its fingerprint describes the bones that follow these."""
+    own_rig = recording.rig
+    key_rig = select_joints(own_rig, joints_with_indices(own_rig, choice.joints.tolist()))
+    bones = recording.info.bones
+    unread = {
+        name: bones.settings[name]
+        for name in find_unread_bones(bones.sources, bones.controlled, own_rig, key_rig.joint_names)
+        if name in bones.settings
+    }
+    indices = np.zeros(len(own_rig.joints), np.int32)
+    indices[choice.joints] = np.arange(len(choice.joints))
+    return replace(
+        key_rig,
+        skin_joints=indices[fitted_rig.skin_joints],
+        skin_weights=fitted_rig.skin_weights,
+        fingerprint=replace(
+            key_rig.fingerprint, deformation=key_rig.fingerprint.deformation | {"unread_bones": unread}
+        ),
+    )
+
+
+def _choose_references(recording: Recording, rig: Rig, joints: np.ndarray, poses: FitPoses) -> Rig:
+    """Choose the reference joints of a rig with fitted weights; `joints` are the indices of its joints."""
+    rig = replace(rig, joints=tuple(replace(joint, reference=None) for joint in rig.joints))
+    compared = np.linspace(0, len(poses.positions) - 1, REFERENCE_POSES).round().astype(int)
+    is_fixed = np.isin(joints, recording.info.bones.fixed)
+    return choose_references(rig, is_fixed, poses.pose_matrices[np.unique(compared)][:, joints])
+
+
+def check_has_weights(recording: Recording) -> None:
+    """Check that vertices of the rig have weights on deforming bones.
+
+    Raises:
+        TrainingError: no vertex follows a bone.
+    """
+    if not recording.rig.has_weights:
+        raise TrainingError(
+            f"The vertices of '{recording.info.object_name}' follow no bone by skin weights, so there is no linear "
+            "skinning to learn from; have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint "
+            "weights and record again."
+        )
+
+
+def measure_skin(poses: FitPoses, fitted: Rig) -> FitReport:
+    """Measure the errors of linear skinning with the rig's own and with the fitted weights."""
+    rms, maxima = {}, {}
+    for name, rig in (("rig", poses.rig), ("fitted", fitted)):
+        skinning, squares, maximum = LinearSkinning(rig), 0.0, 0.0
+        for block in block_slices(len(poses.positions), 3 * fitted.vertex_count):
+            positions = skinning.positions(poses.pose_matrices[block])
+            errors = distances(positions, poses.positions[block], fitted.metres_per_unit).astype(np.float64)
+            squares, maximum = squares + float((errors**2).sum()), max(maximum, float(errors.max()))
+        rms[name] = 1000 * (squares / (len(poses.positions) * fitted.vertex_count)) ** 0.5
+        maxima[name] = 1000 * maximum
+    return FitReport(rms, maxima)
