@@ -14,7 +14,6 @@ import bpy
 import numpy as np
 
 from blend_fixtures.elbow import ACTION, FRAMES
-from fdda_addon.core.formats.point_cache import PointCacheWriter
 from fdda_addon.scene.mesh import evaluated_positions
 
 from .base import bulge, tube
@@ -53,11 +52,8 @@ def target_pc2() -> None:
     """Build the target as a copy whose Mesh Cache modifier plays a .pc2 file of its action."""
     flesh = target_copy()
     path = _cache_folder() / "flesh.pc2"
-    with open(path, "wb") as file:
-        writer = PointCacheWriter(file, len(flesh.data.vertices), 1, FRAMES)
-        for positions in _positions_by_frame(flesh):
-            writer.append(positions[None])
-        writer.finish()
+    header = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, len(flesh.data.vertices), 1.0, 1.0, FRAMES)
+    path.write_bytes(header + b"".join(positions.astype("<f4").tobytes() for positions in _positions_by_frame(flesh)))
     _play_file(flesh, path, "PC2")
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bakes the output of a model to files that need no model: point caches, .blend files, shape keys."""
+"""Bakes the meshes as models deform them to Alembic and USD files, which play without models."""

@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`bake RIG.blend MODEL.onnx OUT`: bakes an action, deformed by the model, to a file that plays without the add-on."""
+"""`bake RIG.blend MODEL.onnx OUT`: bakes the meshes as models deform them to a file that plays without the add-on."""
 
 import argparse
 from pathlib import Path
 
-from ..baking.run import BakeSettings, bake, output_files
+from ..baking.export import write_bake
+from ..baking.run import BakeSettings, bake_file
+from ..core.files.stop_signals import exit_on_stop_signal
 from ..core.sentences.counts import format_count
-from .files import add_rig_options, open_rig
+from .files import add_rig_options
+from .folders import open_rigs
 from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
-    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model")
+    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument(
         "out",
         metavar="OUT",
         type=Path,
-        help="file to write: a .pc2 point cache, or a .blend file (a copy of RIG.blend with a .pc2 file next to it)",
+        help="file to write: Alembic (.abc), USD (.usd, .usdc, .usda), or a .blend file (a copy of RIG.blend with an "
+        ".abc file next to it)",
     )
     parser.add_argument(
         "--action", default="", metavar="NAME", help="action to bake (default: the animation of the scene)"
@@ -31,21 +35,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="frames to bake (default: the frames of the action, or else of the scene)",
     )
     parser.add_argument(
-        "--shape-keys", action="store_true", help="store the positions in the .blend file, as one shape key per frame"
+        "--samples", type=int, default=1, help="samples per frame, for motion blur of an .abc file (default 1)"
     )
     add_overwrite_option(parser)
+    # For the other Blender that exports.
+    parser.add_argument("--linear", action="append", default=[], help=argparse.SUPPRESS)
+    parser.add_argument("--write-to", type=Path, nargs="+", help=argparse.SUPPRESS)
 
 
 def run(options: argparse.Namespace) -> None:
-    # Check the outputs before a file is opened, which may take long.
     frames = tuple(options.frames) if options.frames else None
-    settings = BakeSettings(options.action, frames, options.shape_keys, options.overwrite)
-    output_files(options.out, settings, (options.rig, options.model))
-    scene_rig = open_rig(options)
+    settings = BakeSettings(options.action, frames, options.samples, options.overwrite, tuple(options.linear))
     with ProgressPrinter() as progress:
-        baked = progress.run(bake(scene_rig, options.model, options.out, settings))
-    animation_name = settings.action or "the scene"
-    for path in baked.files[1:]:
-        print(f"{path}: the positions, to be kept beside {options.out.name}")
-    frame_text = format_count(len(baked.frames), "frame")
-    print(f"{options.out}: {frame_text} of {animation_name} ({baked.frames[0]} to {baked.frames[-1]})")
+        if not options.write_to:
+            print(progress.run(bake_file(options.rig, options.model, options.out, settings, options.object)), end="")
+            return
+        # The process that started this one removes the files.
+        exit_on_stop_signal()
+        rigs_and_models = list(open_rigs(options).values())
+        baked_frames = write_bake(
+            rigs_and_models,
+            options.out,
+            options.write_to,
+            settings,
+            lambda done, total: progress.show("frames", done, total),
+        )
+    if len(options.write_to) > 1:
+        print(f"{options.out.with_suffix('.abc')}: the positions, to be kept beside {options.out.name}")
+    names = ", ".join(f"'{scene_rig.mesh_object.name}'" for scene_rig, _ in rigs_and_models)
+    frame_text = format_count(len(baked_frames), "frame")
+    print(
+        f"{options.out}: {names} in {frame_text} of {settings.action or 'the scene'} ({baked_frames[0]} to "
+        f"{baked_frames[-1]})"
+    )

@@ -8,11 +8,9 @@ import bpy
 
 from ..core.errors import OutputError, RigError
 from ..core.files.temporary import temporary_folder
-from ..core.formats.model import read_model
 from ..core.progress import Job
-from ..fast_rig.process import VerbProcess
-from ..runtime import packed_model
-from ..runtime.model_files import model_path
+from ..jobs.verb_process import VerbProcess
+from ..runtime.model_files import write_models
 from ..scene.scene_rig import SceneRig, armature_of
 from .job import FileJobOperator
 from .rig_operator import NEEDS_MODEL
@@ -72,7 +70,7 @@ class FDDA_OT_fast_rig(FileJobOperator, bpy.types.Operator):
             if o.type == "MESH" and o.fdda.is_bound and armature_of(o) == scene_rig.armature_object
         ]
         with temporary_folder() as folder:
-            model = _write_models(mesh_objects, folder)
+            model = write_models(mesh_objects, folder)
             names = [f"--object={mesh_objects[0].name}"] if len(mesh_objects) == 1 else []
             arguments = [bpy.data.filepath, str(model), out, *names, "--controls", *choices]
             with VerbProcess("fast-rig", arguments) as process:
@@ -102,25 +100,6 @@ class FDDA_OT_fast_rig(FileJobOperator, bpy.types.Operator):
             raise RigError(f"'{mesh_object.name}' comes from a library; open the file of the character.")
         if not bpy.data.filepath:
             raise RigError("Save the .blend file first: the fast rig is made from the saved file.")
-
-
-def _write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
-    """Return the file of the only model, or write the models of several meshes into a folder and return it.
-
-    A packed model has no file that could be read.
-
-    Raises:
-        ModelError: a model cannot be read.
-        OSError: a file cannot be written.
-    """
-    for index, mesh_object in enumerate(mesh_objects):
-        binding = mesh_object.fdda
-        data = packed_model.read(binding.packed) if binding.packed else read_model(model_path(mesh_object))[1]
-        # Clean names of different objects may be equal.
-        file = folder / str(index) / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
-        file.parent.mkdir()
-        file.write_bytes(data)
-    return file if len(mesh_objects) == 1 else folder
 
 
 CLASSES = (FDDA_OT_fast_rig,)

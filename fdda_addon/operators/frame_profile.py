@@ -9,7 +9,7 @@ import bpy
 from ..core.errors import FDDAError
 from ..core.files.temporary import temporary_folder
 from ..core.progress import Job
-from ..fast_rig.process import VerbProcess
+from ..jobs.verb_process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements
 from ..timing.fast_rig_saving import FastRigSaving

@@ -198,10 +198,13 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         row.active = session.bake_use_frames
         row.prop(session, "bake_start")
         row.prop(session, "bake_end")
-        button = body.operator("fdda.bake", text="Bake…", icon="EXPORT")
+        samples = column.row()
+        samples.active = session.bake_format != ".usdc"
+        samples.prop(session, "bake_samples")
+        button = draw_button(body, context, "fdda.bake", "Bake…", "EXPORT")
         button.action, button.use_frames = session.bake_action, session.bake_use_frames
         button.frame_start, button.frame_end = session.bake_start, session.bake_end
-        button.shape_keys, button.point_cache = session.bake_format == "KEYS", session.bake_format == "PC2"
+        button.suffix, button.samples = session.bake_format, session.bake_samples if samples.active else 1
 
 
 CLASSES = (FDDA_PT_playback,)

@@ -70,9 +70,9 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
         name="Format",
         description="File to bake to",
         items=(
-            ("BLEND", ".blend with Point Cache", "A copy of this file, in which the mesh plays a .pc2 file next to it"),
-            ("KEYS", ".blend with Shape Keys", "A copy of this file, in which the mesh has one shape key per frame"),
-            ("PC2", "Point Cache", "A .pc2 file alone"),
+            (".blend", ".blend with Alembic", "A copy of this file, in which the meshes play an .abc file next to it"),
+            (".abc", "Alembic", "An .abc file alone"),
+            (".usdc", "USD", "A .usdc file"),
         ),
     )
     bake_action: StringProperty(
@@ -83,6 +83,9 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
     bake_use_frames: BoolProperty(name="Frame Range", description="Bake these frames instead of all of the action")
     bake_start: IntProperty(name="Start", description="First frame to bake", default=1)
     bake_end: IntProperty(name="End", description="Last frame to bake", default=250)
+    bake_samples: IntProperty(
+        name="Samples", description="Samples per frame, for motion blur of an Alembic file", default=1, min=1
+    )
 
     bone_index: IntProperty(
         name="Bone", description="Active bone of the armature", get=_active_bone_index, set=_set_active_bone

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import ModelError, os_error_text
+from ..core.formats.model import read_model
 from ..scene.folder_trust import is_trusted
 from ..scene.stored_paths import absolute_path, path_owner, resolve_path
 from . import packed_model
@@ -92,3 +93,22 @@ def allowed_path(mesh_object: bpy.types.Object, stored_path: str) -> Path:
 def allow_path(model_path: Path) -> None:
     """Allow loading a model that the user chose in this session from any folder."""
     session.chosen_paths.add(model_path.resolve())
+
+
+def write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
+    """Return the file of the only model, or write the models of several meshes into a folder and return it.
+
+    A packed model has no file that could be read.
+
+    Raises:
+        ModelError: a model cannot be read.
+        OSError: a file cannot be written.
+    """
+    for index, mesh_object in enumerate(mesh_objects):
+        binding = mesh_object.fdda
+        data = packed_model.read(binding.packed) if binding.packed else read_model(model_path(mesh_object))[1]
+        # Clean names of different objects may be equal.
+        file = folder / str(index) / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
+        file.parent.mkdir()
+        file.write_bytes(data)
+    return file if len(mesh_objects) == 1 else folder

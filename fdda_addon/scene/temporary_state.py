@@ -97,11 +97,12 @@ def temporary_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
         for scene_object in (o for o in objects if o.animation_data is not None):
             animation = scene_object.animation_data
             curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
-            hiding_curves = [curve for curve in (*curves, *animation.drivers) if curve.data_path == "hide_viewport"]
-            if hiding_curves:
+            for path in ("hide_viewport", "hide_render"):
+                hiding_curves = [curve for curve in (*curves, *animation.drivers) if curve.data_path == path]
                 for curve in hiding_curves:
                     stack.enter_context(temporary_attributes(curve, mute=True))
-                stack.enter_context(temporary_attributes(scene_object, hide_viewport=False))
+                if hiding_curves:
+                    stack.enter_context(temporary_attributes(scene_object, **{path: False}))
         yield
 
 

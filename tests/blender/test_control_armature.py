@@ -17,7 +17,7 @@ from fdda_addon.scene.action_slots import active_action, dependencies, slots_of_
 from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
-from .baked_files import predicted_in_frames, read_pc2
+from .baked_files import predicted_in_frames, read_baked
 from .conftest import ELBOW_RIG, run
 from .figure import FRAMES, WAVE, add_wave, build_figure
 from .poses.test_animation_poses import mirrored, positions_in_frames, positions_of, record_and_read
@@ -99,7 +99,7 @@ def test_an_action_of_a_control_armature_is_recorded(connect, tmp_path):
 
 def test_a_control_armature_is_baked_and_evaluated(elbow_files, tmp_path):
     rig_file = save_elbow(tmp_path / "rig.blend", add_control_armature)
-    assert run("bake", rig_file, elbow_files.model, tmp_path / "wave.pc2", "--action", ACTION) == 0
+    assert run("bake", rig_file, elbow_files.model, tmp_path / "wave.abc", "--action", ACTION) == 0
     bpy.ops.wm.open_mainfile(filepath=str(rig_file))
     rig, control = find_rig(), bpy.data.objects["control"]
     evaluation = drain(evaluate_action(rig, elbow_files.model, ACTION)).held_out
@@ -113,9 +113,9 @@ def test_a_control_armature_is_baked_and_evaluated(elbow_files, tmp_path):
     control.pose.bones[0].location = (0, 0, 0)
     expected = predicted_in_frames(range(1, 31), elbow_files.model)
     assert np.ptp(expected, axis=0).max() > 0.1
-    assert np.abs(read_pc2(tmp_path / "wave.pc2")[2] - expected).max() < 1e-6
     np.testing.assert_allclose(evaluation.positions, positions_in_frames(rig, range(1, 31)), atol=1e-5)
     assert run("benchmark", rig_file, elbow_files.model, "--frames", 3, "--json", tmp_path / "times.json") == 0
+    assert np.abs(read_baked(tmp_path / "wave.abc", range(1, 31)) - expected).max() < 1e-6
 
 
 def test_strips_and_mirrored_frames_of_a_control_armature(tmp_path):

@@ -51,7 +51,7 @@ def open_the_bound_file(folder: Path) -> Iterator[float]:
 
 def bake_asks_each_time(folder: Path) -> Iterator[float]:
     """Press Bake… before and after a bake: both times it opens the file browser, and canceling keeps the first bake."""
-    baked_file = folder / "work" / "alone" / "first.pc2"
+    baked_file = folder / "work" / "alone" / "first.abc"
     bpy.context.scene.frame_end = 5
     yield from sidebar.open_section("playback")
     yield from sidebar.open_subpanel("use_in_render", "fdda.bake(", across_above=0.7)

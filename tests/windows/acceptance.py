@@ -76,5 +76,7 @@ def test_verbs_from_the_rig_to_a_bake(folder: Path):
     run_verb(folder, "bake", rig, model, folder / "baked.blend", "--frames", 1, 5)
     bpy.ops.wm.open_mainfile(filepath=str(folder / "baked.blend"))
     assert any(
-        modifier.type == "MESH_CACHE" for scene_object in bpy.data.objects for modifier in scene_object.modifiers
+        modifier.type == "MESH_SEQUENCE_CACHE"
+        for scene_object in bpy.data.objects
+        for modifier in scene_object.modifiers
     )

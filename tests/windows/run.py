@@ -36,7 +36,7 @@ OUTCOME_BY_TAG = {"error": "failed", "failure": "failed", "skipped": "skipped"}
 BLENDER = (
     "test_recording.py",
     "cli/test_overwriting.py",
-    "baking/test_baked_files.py",
+    "baking/test_baking.py",
     "cli/test_encodings.py",
     "cli/test_documents.py",
     "cli/test_command_process.py",

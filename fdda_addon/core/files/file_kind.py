@@ -48,4 +48,6 @@ RECORDING = FileKind("the index of a recording", rb'\s*\{\s*"format":\s*"fdda-re
 PICTURE = FileKind("a PNG picture", rb"\x89PNG\r\n")
 VIDEO = FileKind("a video", rb".{4}ftyp|\x1a\x45\xdf\xa3")
 """The signatures of MPEG-4 and of Matroska, which WebM files use."""
-POINT_CACHE = FileKind("a point cache", rb"POINTCACHE2\0")
+ALEMBIC = FileKind("an Alembic file", rb"Ogawa|\x89HDF")
+"""The signatures of Ogawa and of HDF5."""
+USD = FileKind("a USD file", rb"PXR-USDC|#usda")

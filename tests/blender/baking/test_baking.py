@@ -1,147 +1,202 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Baking writes the model's positions, and restores the scene."""
+"""Baked files show in every frame what the model showed, also without the add-on; a bake that fails writes nothing."""
+
+import shutil
+import subprocess
+import sys
 
 import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.baking.run import MAX_BATCH_FRAMES, BakeSettings, bake
-from fdda_addon.scene.scene_rig import find_rig
+from fdda_addon.baking.export import write_bake
+from fdda_addon.baking.run import BakeSettings, bake_file
+from fdda_addon.core.progress import Progress
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig
 
-from ..baked_files import POSITION_TOLERANCE, predicted_in_frames, predicted_wave, read_pc2
-from ..conftest import ELBOW, ELBOW_RIG, evaluated_positions, run
-from ..refusals import file_contents, save_elbow
-from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state
+from ..baked_files import import_baked, shown_by_model, world_positions
+from ..conftest import ELBOW, ELBOW_RIG, run
+from ..refusals import file_contents, limited_file_size, save_elbow
 
-
-@pytest.fixture(scope="module")
-def wave_positions(elbow_files) -> np.ndarray:
-    """Return the model's positions (F, V, 3) in all frames of the elbow's action."""
-    return predicted_wave(elbow_files)
-
-
-def test_baking_more_frames_than_a_batch(elbow_files, tmp_path):
-    frames = range(-9, 3 * MAX_BATCH_FRAMES)
-    out = tmp_path / "long.pc2"
-    assert run("bake", elbow_files.rig, elbow_files.model, out, "--frames", frames[0], frames[-1]) == 0
-    start, _, positions = read_pc2(out)
-    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
-    assert start == -9 and len(positions) == len(frames)
-    assert np.abs(positions - predicted_in_frames(frames, elbow_files.model)).max() < 1e-6
+TOLERANCE = 1e-4
+"""Largest distance of a baked position, as a ratio of the size of the mesh."""
 
 
-def test_bake_prints_its_files_and_frames(elbow_files, tmp_path, capfd):
-    out = tmp_path / "a.blend"
-    assert run("bake", elbow_files.rig, elbow_files.model, out, "--action", "elbow_wave", "--frames", 3, 7) == 0
-    captured = capfd.readouterr()
-    assert captured.out.splitlines() == [
-        f"{tmp_path / 'a.pc2'}: the positions, to be kept beside a.blend",
-        f"{out}: 5 frames of elbow_wave (3 to 7)",
-    ]
-    assert captured.err.splitlines()[-1].startswith("frames: 5 of 5, ")
-    assert run("bake", elbow_files.rig, elbow_files.model, tmp_path / "b.pc2") == 0
-    assert capfd.readouterr().out == f"{tmp_path / 'b.pc2'}: 30 frames of the scene (1 to 30)\n"
-    assert run("bake", elbow_files.rig, elbow_files.model, tmp_path / "c.pc2", "--frames", 4, 4) == 0
-    assert capfd.readouterr().out == f"{tmp_path / 'c.pc2'}: 1 frame of the scene (4 to 4)\n"
+def assert_shown(positions: np.ndarray, expected: np.ndarray) -> None:
+    size = np.ptp(expected[0], axis=0).max()
+    assert positions.shape == expected.shape
+    assert np.abs(positions - expected).max() < TOLERANCE * size < 0.01 < np.ptp(expected, axis=0).max()
 
 
-def add_other_animation(rig) -> None:
-    """Give the armature another active action that moves it, and an NLA strip with the action `elbow_wave`."""
+def move_far_away(rig: SceneRig) -> None:
     armature_object = rig.armature_object
-    animation = armature_object.animation_data
-    animation.action = bpy.data.actions.new("other")
-    for frame, angle in ((5, 0.2), (12, 1.4)):
-        armature_object.pose.bones["lower"].rotation_euler[0] = angle
-        armature_object.pose.bones["lower"].keyframe_insert("rotation_euler", index=0, frame=frame)
-        armature_object.location[2] = angle
-        armature_object.keyframe_insert("location", frame=frame)
-    track = animation.nla_tracks.new()
-    track.strips.new("wave", 1, bpy.data.actions["elbow_wave"])
-    track.strips[0].use_auto_blend = False
+    armature_object.location, armature_object.rotation_euler = (100, -100, 50), (0.3, 0.1, 0.2)
+    armature_object.scale = (1.2, 0.7, 1.0)
+    bpy.context.scene.unit_settings.scale_length = 0.01
 
 
-def test_without_an_action_the_animation_of_the_scene_is_baked(elbow_files, wave_positions, tmp_path):
-    """Bake the active action with the NLA, then the action `elbow_wave` alone."""
-    rig = save_elbow(tmp_path / "rig.blend", add_other_animation)
-    assert run("bake", rig, elbow_files.model, tmp_path / "scene.pc2", "--frames", 5, 12) == 0
-    assert run("bake", rig, elbow_files.model, tmp_path / "action.blend", "--action", "elbow_wave") == 0
+def stretch_time(rig: SceneRig) -> None:
+    bpy.context.scene.render.frame_map_new, bpy.context.scene.frame_end = 170, 51
+
+
+def subdivide(rig: SceneRig) -> None:
+    modifier = rig.mesh_object.modifiers.new("Finer", "SUBSURF")
+    modifier.levels = modifier.render_levels = 1
+    modifier.use_pin_to_last = True
+
+
+def play_strip(rig: SceneRig) -> None:
+    """Play the action in a slower strip, outside of the scene's frames, with other names and where renders hide it."""
+    animation = rig.armature_object.animation_data
+    strip = animation.nla_tracks.new().strips.new("wave", 101, animation.action)
+    strip.scale, animation.action = 1.5, None
+    rig.mesh_object.name, rig.mesh_object.data.name, rig.armature_object.name = "é l.bow/1:x", "mésh.001", "rïg 1"
+    for frame in (101, 104):
+        rig.mesh_object.hide_render = frame > 101
+        rig.mesh_object.keyframe_insert("hide_render", frame=frame)
+
+
+@pytest.mark.parametrize(
+    ("change", "out", "options", "frames"),
+    [
+        (move_far_away, "a.abc", ["--samples", 4], [1, 9, 9.25, 30]),
+        (stretch_time, "a.usdc", [], [1, 26, 51]),
+        (stretch_time, "a.blend", ["--samples", 2], [-3, 1, 4.5, 26, 51]),
+        (subdivide, "a.usda", ["--action", "elbow_wave"], [1, 9, 30]),
+        (subdivide, "a.blend", ["--action", "elbow_wave"], [1, 9, 30]),
+        (play_strip, "a.abc", [], [101, 120, 144]),
+        (play_strip, "a.blend", [], [101, 120, 144]),
+    ],
+)
+def test_a_baked_file_shows_the_model_in_every_frame(elbow_files, tmp_path, change, out, options, frames):
+    rig, out = save_elbow(tmp_path / "rig.blend", change), tmp_path / out
+    expected = shown_by_model(rig, elbow_files.model, frames)
+    name = next(o.name for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound)
+    assert run("bake", rig, elbow_files.model, out, *options) == 0
+    if out.suffix == ".blend":
+        bpy.ops.wm.open_mainfile(filepath=str(out))
+        mesh_object = bpy.data.objects[name]
+        kept = ["SUBSURF"] if change is subdivide else []
+        assert [modifier.type for modifier in mesh_object.modifiers] == ["MESH_SEQUENCE_CACHE", *kept]
+        assert [o.type for o in bpy.data.objects].count("MESH") == 1 and not mesh_object.fdda.is_bound
+        assert bpy.context.scene.frame_start, bpy.context.scene.frame_end == (max(frames[0], 1), frames[-1])
+    else:
+        (mesh_object,) = import_baked(out).values()
+    assert_shown(world_positions(mesh_object, frames), expected)
+
+
+CODE_WITHOUT_ADD_ON = """
+import sys, bpy, numpy as np
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+mesh_object = bpy.data.objects["elbow"]
+assert not hasattr(mesh_object, "fdda") and not any("fdda" in name for name in sys.modules)
+bpy.context.scene.frame_set(12)
+mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+np.save(sys.argv[2], [vertex.co[:] for vertex in mesh.vertices])
+"""
+
+
+@pytest.mark.parametrize("is_overridden", [False, True], ids=["linked", "overridden"])
+def test_a_linked_character_is_baked_to_a_folder_that_is_moved(elbow_files, tmp_path, is_overridden, capfd):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    (tmp_path / "in").mkdir()
+    rig, out = tmp_path / "in" / "shot.blend", tmp_path / "out" / "a.blend"
+    save_copy(rig)
     bpy.ops.wm.open_mainfile(filepath=str(rig))
-    expected = predicted_in_frames(range(5, 13), elbow_files.model)
-    _, _, scene_positions = read_pc2(tmp_path / "scene.pc2")
-    assert np.abs(scene_positions - expected).max() < 1e-6
-    assert np.abs(scene_positions - wave_positions[4:12]).max() > 0.01
-    assert np.abs(read_pc2(tmp_path / "action.pc2")[2] - wave_positions).max() < 1e-6
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "action.blend"))
-    animation = bpy.data.objects[ELBOW_RIG].animation_data
-    assert animation.action.name == "elbow_wave" and not animation.use_nla
+    with bpy.data.libraries.load(str(elbow_files.rig), link=True) as (_, into):
+        into.objects = [ELBOW, ELBOW_RIG]
+    for linked in list(into.objects):
+        bpy.context.scene.collection.objects.link(linked)
+    if is_overridden:
+        for linked in list(into.objects):
+            linked.override_create(remap_local_usages=True)
+    save_copy(rig)
+    out.parent.mkdir()
+    capfd.readouterr()
+    assert run("bake", rig, elbow_files.model, out, "--frames", 1, 12) == 0
+    assert capfd.readouterr().out.splitlines() == [
+        f"{out.with_suffix('.abc')}: the positions, to be kept beside a.blend",
+        f"{out}: 'elbow' in 12 frames of the scene (1 to 12)",
+    ]
+    assert sorted(file_contents(out.parent)) == ["a.abc", "a.blend"]
+    moved, positions = shutil.move(out.parent, tmp_path / "in" / "moved"), tmp_path / "positions.npy"
+    command = [sys.executable, "-I", "-c", CODE_WITHOUT_ADD_ON, moved / "a.blend", positions]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    (expected,) = shown_by_model(elbow_files.rig, elbow_files.model, [12])
+    assert np.abs(np.load(positions) - expected).max() < 1e-5
 
 
-@pytest.mark.parametrize(("old", "new"), [(100, 200), (100, 50), (90, 200)])
-def test_a_bake_of_stretched_time_shows_the_model_in_every_frame(elbow_files, tmp_path, old, new):
-    def stretch(_rig) -> None:
-        render = bpy.context.scene.render
-        render.frame_map_old, render.frame_map_new = old, new
-
-    rig = save_elbow(tmp_path / "rig.blend", stretch)
-    for out, options in (("cache.blend", []), ("keys.blend", ["--shape-keys"])):
-        arguments = ["--action", "elbow_wave", *options]
-        assert run("bake", rig, elbow_files.model, tmp_path / out, *arguments) == 0
-    frames = range(-3, 5 + 30 * new // old)
-    bpy.ops.wm.open_mainfile(filepath=str(rig))
-    expected = predicted_in_frames(frames, elbow_files.model)
-    assert np.ptp(expected, axis=0).max() > 0.1
-    for out in ("cache.blend", "keys.blend"):
-        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / out))
-        for frame, positions in zip(frames, expected, strict=True):
-            bpy.context.scene.frame_set(frame)
-            assert np.abs(evaluated_positions(bpy.data.objects[ELBOW]) - positions).max() < POSITION_TOLERANCE
-
-
-def test_a_baked_bound_file_is_not_bound(elbow_files, wave_positions, tmp_path):
-    """Baking removes the binding, so the add-on ignores the file."""
-    assert run("bake", elbow_files.bound, elbow_files.model, tmp_path / "a.blend") == 0
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    mesh_object = bpy.data.objects[ELBOW]
-    assert not mesh_object.fdda.is_bound and [m.type for m in mesh_object.modifiers] == ["MESH_CACHE"]
-    assert len(bpy.data.objects) == 2
-    bpy.context.scene.frame_set(17)
-    assert np.abs(evaluated_positions(mesh_object) - wave_positions[16]).max() < POSITION_TOLERANCE
+def test_all_meshes_of_a_character_are_baked_to_one_file(elbow_files, tmp_path):
+    """The names of the meshes differ only in what Alembic does not allow."""
+    rigs, names = [], ("el.bow", "el bow", "el_bow")
+    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
+    for name in names:
+        mesh_object = bpy.data.objects[ELBOW].copy()
+        mesh_object.name = name
+        bpy.context.scene.collection.objects.link(mesh_object)
+        rigs.append((SceneRig(mesh_object, bpy.data.objects[ELBOW_RIG]), elbow_files.model))
+    rigs[1][0].mesh_object.fdda.strength = 0.0
+    bpy.data.objects.remove(bpy.data.objects[ELBOW])
+    outs = tmp_path / "a.blend", tmp_path / "a.abc"
+    assert write_bake(rigs, outs[0], outs, BakeSettings(frames=(-2, 12)), lambda *_: None) == range(-2, 13)
+    assert set(import_baked(outs[1])) == {"el_bow", "el_bow_", "el_bow__"}
+    bpy.ops.wm.open_mainfile(filepath=str(outs[0]))
+    full, linear, other = (world_positions(bpy.data.objects[name], [-2, 12]) for name in names)
+    assert np.abs(full - linear).max() > 1e-3 and (full == other).all()
+    assert_shown(full, shown_by_model(elbow_files.rig, elbow_files.model, [-2, 12]))
 
 
-class TestSceneRestoration:
-    @pytest.mark.parametrize("out", ["a.pc2", "a.blend", "keys.blend"])
-    @pytest.mark.parametrize("action", ["elbow_wave", ""], ids=["action", "scene"])
-    def test_baking_restores_the_scene(self, unusual_rig, elbow_files, tmp_path, out, action):
-        bpy.data.objects[ELBOW].use_fake_user = True
-        before = scene_state(unusual_rig)
-        drain(
-            bake(unusual_rig, elbow_files.model, tmp_path / out, BakeSettings(action, (1, 12), out.startswith("keys")))
-        )
-        assert_same_state(before, scene_state(find_rig()))
-        assert bpy.data.objects[ELBOW].use_fake_user
-        if out == "a.blend":
-            bpy.ops.wm.open_mainfile(filepath=str(tmp_path / out))
-            assert sorted(o.name for o in bpy.data.objects) == [ELBOW, ELBOW_RIG]
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["a.pc2"], 2, "a.pc2' ends in neither .abc, .usd nor .blend; give it the extension of what to write."),
+        (["a.abc", "--frames", 9, 8], 2, "There is nothing to bake from frame 9 to 8; give the first frame first."),
+        (["a.abc", "--frames", 1, 2000000], 2, "Blender has frames up to 1048574, not from 1 to 2000000; give fewer."),
+        (["a.abc", "--samples", 0], 2, "A frame cannot have 0 samples; give 1 or more."),
+        (
+            ["a.usd", "--samples", 2],
+            2,
+            "USD files have one sample per frame; write an .abc file for more.",
+        ),
+        (["a.usd", "--frames", -3, 4], 1, "Blender writes USD files from frame 0 on, not from -3; write an .abc file."),
+        (["b/a.abc"], 1, "does not exist; create it first."),
+        (["a.abc", "--action", "jump"], 1, "The file has no action 'jump'; its actions: 'elbow_wave'."),
+    ],
+)
+@pytest.mark.one_blender_version
+def test_what_cannot_be_baked_is_refused(elbow_files, tmp_path, capfd, arguments, status, words):
+    out, *options = arguments
+    assert run("bake", elbow_files.rig, elbow_files.model, tmp_path / out, *options) == status
+    captured = capfd.readouterr()
+    assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
+    assert file_contents(tmp_path) == {}
 
-    def test_a_canceled_bake_leaves_no_files(self, unusual_rig, elbow_files, tmp_path):
-        before = scene_state(unusual_rig)
-        for index, name in enumerate(("a.pc2", "a.blend", "keys.blend")):
-            settings = BakeSettings("elbow_wave", shape_keys=name.startswith("keys"))
-            drain(bake(unusual_rig, elbow_files.model, tmp_path / name, settings), stop_after=3 + index)
-            assert_same_state(before, scene_state(unusual_rig))
-        assert file_contents(tmp_path) == {}
 
-    def test_objects_hidden_in_some_frames_are_baked_in_all_frames(self, elbow_files, wave_positions, tmp_path):
-        rig = fresh_elbow()
-        rig.mesh_object.parent = None
-        for scene_object in (rig.mesh_object, rig.armature_object):
-            for frame, hidden in ((1, False), (4, True)):
-                scene_object.hide_viewport = hidden
-                scene_object.keyframe_insert("hide_viewport", frame=frame)
-        bpy.context.scene.frame_set(2)
-        before = scene_state(rig)
-        drain(bake(rig, elbow_files.model, tmp_path / "a.pc2", BakeSettings(frames=(3, 30))))
-        assert_same_state(before, scene_state(rig))
-        assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - wave_positions[2:]).max() < 1e-6
-        bpy.context.scene.frame_set(5)
-        assert rig.mesh_object.hide_viewport and rig.armature_object.hide_viewport
+def test_a_model_of_another_rig_is_refused(refusal, elbow_files, tmp_path):
+    def move_vertex(rig):
+        rig.mesh_object.data.vertices[0].co.x += 0.01
+
+    rig = save_elbow(tmp_path / "rig.blend", move_vertex)
+    text = refusal("bake", rig, elbow_files.model, tmp_path / "a.abc")
+    assert f"The model '{elbow_files.model}' was trained for another rig: " in text
+
+
+@pytest.mark.parametrize("name", ["a.abc", "a.usdc", "a.usda"])
+def test_a_full_disk_leaves_the_old_files(refusal_on_a_full_disk, elbow_files, tmp_path, name):
+    """Blender ends where its Alembic exporter finds the disk full, and that of USD reports success."""
+    (tmp_path / name).write_bytes(b"")
+    with limited_file_size(30_000):
+        text = refusal_on_a_full_disk("bake", elbow_files.rig, elbow_files.model, tmp_path / name, status=75)
+    assert "may be full" in text
+
+
+def test_a_canceled_bake_leaves_no_files(elbow_files, tmp_path):
+    settings = BakeSettings(frames=(1, 100_000))
+    job = bake_file(elbow_files.rig, elbow_files.model, tmp_path / "a.blend", settings)
+    while not isinstance(next(job), Progress):
+        pass
+    assert len(file_contents(tmp_path)) == 2
+    job.close()
+    assert file_contents(tmp_path) == {}

@@ -86,11 +86,11 @@ def test_a_verb_refuses_to_overwrite_an_input_or_another_kind_of_file(place, cap
     assert Refusal(place, capfd)(*line.split()) == f"Cannot write '{Path(path)}': {words}"
 
 
-def test_the_point_cache_beside_a_baked_file_is_checked_too(place, capfd, monkeypatch):
+def test_the_alembic_file_beside_a_baked_file_is_checked_too(place, capfd, monkeypatch):
     monkeypatch.chdir(place)
-    (place / "out.pc2").write_text("mine")
+    (place / "out.abc").write_text("mine")
     text = Refusal(place, capfd)("bake", "rig.blend", "m.onnx", "out.blend")
-    assert text == f"Cannot write 'out.pc2': {IS_OTHER.format('a point cache')}"
+    assert text == f"Cannot write 'out.abc': {IS_OTHER.format('an Alembic file')}"
 
 
 def test_report_and_checkpoint_are_checked_too(place, capfd, monkeypatch):
@@ -151,7 +151,7 @@ def test_verbs_overwrite_what_they_wrote_before(place, monkeypatch):
         "evaluate rig.blend m.onnx --json e.json --poses 2 --heatmap e.png",
         "benchmark rig.blend m.onnx --json b.json --frames 2",
         "bake rig.blend m.onnx baked.blend --frames 1 2",
-        "bake rig.blend m.onnx baked.pc2 --frames 1 2",
+        "bake rig.blend m.onnx baked.usd --frames 1 2",
     )
     for verb in (*verbs, *verbs):
         assert done(verb), verb

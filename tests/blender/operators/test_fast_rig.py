@@ -11,10 +11,10 @@ import bpy
 import pytest
 
 from fdda_addon.core.progress import Progress
-from fdda_addon.fast_rig import process as verb_process
-from fdda_addon.fast_rig.process import VerbProcess
-from fdda_addon.jobs import job
-from fdda_addon.operators.fast_rig import FDDA_OT_fast_rig, _write_models
+from fdda_addon.jobs import job, verb_process
+from fdda_addon.jobs.verb_process import VerbProcess
+from fdda_addon.operators.fast_rig import FDDA_OT_fast_rig
+from fdda_addon.runtime.model_files import write_models
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, pose
 from ..refusals import refused
@@ -140,5 +140,5 @@ def test_meshes_whose_clean_names_are_equal_keep_their_models(saved, tmp_path_fa
     bpy.context.scene.collection.objects.link(other)
     mesh_object.name, other.name = "left arm", "left_arm"
     folder = tmp_path_factory.mktemp("models")
-    assert _write_models([mesh_object, other], folder) == folder
+    assert write_models([mesh_object, other], folder) == folder
     assert len(list(folder.glob("*/*.onnx"))) == 2

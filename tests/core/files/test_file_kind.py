@@ -28,7 +28,8 @@ FILES_BY_KIND = {
     ],
     file_kind.WARNINGS: [to_json_text({"warnings": []}).encode()],
     file_kind.PICTURE: [b"\x89PNG\r\n\x1a\n"],
-    file_kind.POINT_CACHE: [b"POINTCACHE2\0\x01\0\0\0"],
+    file_kind.ALEMBIC: [b"Ogawa\xff\0\x01", b"\x89HDF\r\n"],
+    file_kind.USD: [b"PXR-USDC\0\x08", b"#usda 1.0\n"],
 }
 UNKNOWN_FILES = [
     b"a note\n",

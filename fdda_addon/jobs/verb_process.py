@@ -9,7 +9,7 @@ from typing import Self
 
 import bpy
 
-from ..core.errors import FDDAError, os_error_text
+from ..core.errors import TRY_AGAIN, FDDAError, os_error_text
 from ..core.files.child_process import OutputLines, child_options, end_process
 from ..core.files.temporary import new_temporary_file
 from ..core.progress import Job, Progress
@@ -60,7 +60,7 @@ class VerbProcess:
         """Yield the progress of the verb, and return its output.
 
         Raises:
-            FDDAError: the verb has failed; its text is that of the verb.
+            FDDAError: the verb has failed; text and exit status are those of the verb.
         """
         error_text = ""
         while (line := self._lines.next()) is not None:
@@ -74,7 +74,12 @@ class VerbProcess:
             yield None
         if self._process.returncode:
             status = self._process.returncode
-            raise FDDAError(error_text or f"The other Blender ended with status {status}, without a result.")
+            error = FDDAError(
+                error_text
+                or f"The other Blender ended with status {status}, without a result; disk or memory may be full."
+            )
+            error.exit_status = status if error_text else TRY_AGAIN
+            raise error
         self._output.seek(0)
         return self._output.read()
 
