@@ -3,7 +3,7 @@
 
 import bpy
 
-from ..core.sentences.assessment import assess_evaluation
+from ..core.sentences.assessment import Assessment, PartErrors, assess_evaluation
 from ..core.sentences.counts import format_count
 from ..evaluation import heat_map, last_evaluation, markers, side_by_side
 from ..jobs import job
@@ -11,6 +11,7 @@ from ..models.entries import bound_model_name
 from ..scene.scene_rig import SceneRig
 from .bone_names import short_bone_name
 from .section import Section, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
+from .training import recording_warnings
 
 SHOWN_PARTITIONS = 5
 STATISTICS = (("Mean", "mean"), ("99.9 %", "p999"), ("Max", "max"))
@@ -29,8 +30,8 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
 
     @classmethod
     def has_warning(cls, context: bpy.types.Context) -> bool:
-        last = last_evaluation.get(panel_rig(context)[0].mesh_object)
-        return not assess_evaluation(last.total["fdda"], last.total["linear"]).is_good
+        rig = panel_rig(context)[0]
+        return not _assess(rig, last_evaluation.get(rig.mesh_object)).is_good
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, view = self.enabled_layout(), context.window_manager.fdda_view
@@ -106,7 +107,6 @@ def _draw_statistics(
     last: last_evaluation.LastEvaluation,
     rig: SceneRig,
 ) -> None:
-    bound = bound_model_name(rig.mesh_object)
     frames_text = f"{format_count(last.poses, 'frame')} of {last.name}"
     poses_text = frames_text if last.name else format_count(last.poses, "random pose")
     header, body = layout.panel("fdda_figures", default_closed=False)
@@ -118,7 +118,7 @@ def _draw_statistics(
     _draw_table_row(table, "", [label for label, _ in STATISTICS])
     for label, method in (("Model", "fdda"), ("Skinning", "linear")):
         _draw_table_row(table, label, [_format_mm(getattr(last.total[method], name)) for _, name in STATISTICS])
-    assessment = assess_evaluation(last.total["fdda"], last.total["linear"], bound == last.model)
+    assessment = _assess(rig, last)
     draw_wrapped(body, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
     for sentence in (*assessment.warnings, assessment.next_step):
         if sentence:
@@ -145,6 +145,19 @@ def _draw_statistics(
         name.operator("fdda.show_bone", text=text, icon=icon, emboss=False).bone = partition.joint
         for _, statistic in STATISTICS:
             row.label(text=_format_mm(getattr(partition.fdda, statistic)))
+
+
+def _assess(rig: SceneRig, last: last_evaluation.LastEvaluation) -> Assessment:
+    """Return what the errors of the last evaluation of a mesh mean."""
+    parts = [PartErrors(p.joint, p.fdda.mean, p.linear.mean) for p in last.partitions]
+    return assess_evaluation(
+        last.total["fdda"],
+        last.total["linear"],
+        rig.mesh_object.name,
+        parts,
+        recording_warnings(rig, last.model),
+        bound_model_name(rig.mesh_object) == last.model,
+    )
 
 
 def active_bone_name(context: bpy.types.Context, rig: SceneRig) -> str:

@@ -130,8 +130,8 @@ def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     if (assessment := read_assessment(trained.path)) is None:
         return
     draw_wrapped(layout, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
-    if not assessment.is_good:
-        draw_wrapped(layout, context, "What to do is in the section Training.", "BLANK1")
+    for warning in assessment.warnings:
+        draw_wrapped(layout, context, warning, "BLANK1")
 
 
 CLASSES = (FDDA_PT_rig,)

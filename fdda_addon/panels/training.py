@@ -209,6 +209,14 @@ def read_assessment(model: Path) -> Assessment | None:
     return computed_once(("assessment", path), (report,), lambda: assess_training(report))
 
 
+def recording_warnings(rig: SceneRig, model_name: str) -> list[dict]:
+    """Return the warnings about the recording of a model, if it is the trained model of a rig with this name."""
+    trained = find_trained_file(rig)
+    report = _read_report(report_path(trained.path)) if trained is not None else None
+    is_of_model = report is not None and report["model"].removesuffix(".onnx") == model_name
+    return report.get("warnings", []) if is_of_model else []
+
+
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
     report = _read_report(report_path(model))
     if report is None or report["model"] != model.name:

@@ -82,7 +82,7 @@ def train(folder: Path) -> Iterator[float]:
     fdda, linear = (report[deformation]["held_out"]["mean"] for deformation in ("fdda", "linear"))
     require(fdda < linear, f"the held-out error is {fdda} mm and the error of linear skinning {linear} mm")
     assessment = extension_module("core.assessment").assess_training(report)
-    require(assessment.sentence.startswith("Unseen poses: "), f"the verdict is '{assessment.sentence}'")
+    require(assessment.sentence.startswith("arm, unseen poses: "), f"the verdict is '{assessment.sentence}'")
     yield from redraw_window()
     yield from sidebar.find_button("fdda.bind")
 

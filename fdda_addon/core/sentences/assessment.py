@@ -19,6 +19,21 @@ MIN_OVERFIT_RATIO = 3.0
 """Ratio of the errors in unseen and in seen poses from which the model needs more poses."""
 MAX_UNNOTICED_RATIO = 0.3
 """Ratio of percentile 99.9 of the model to that of skinning alone up to which a model is good however well it fits."""
+MIN_VISIBLE_MM = 1.0
+"""Smallest mean error of a body part that counts as visible."""
+MAX_PART_RATIO = 5.0
+"""Largest ratio of the mean error of a body part to that of the whole mesh without a warning."""
+RECORDING_CAUSES = (
+    *("units", "axes", "open-seams", "hidden-inputs", "hysteresis", "flips", "target-place", "frozen-frames"),
+    *("frame-jumps", "degenerate-poses", "duplicate-poses", "large-residuals"),
+)
+"""Names of the warnings about a recording that explain large errors, the most likely cause first."""
+ADD_POSES = "press Add Poses at Worst Errors, then Continue Training"
+PART_REMEDIES = {
+    "components": "lower Detail (mm) under Advanced, and train again",
+    "steep": "seen poses have the same errors. Look for a flip of the rig there, and for inputs that the list lacks",
+}
+"""Remedies by the cause of the largest errors of a body part; for the others, more poses help."""
 LAST_EPOCHS = 5
 """Number of epochs whose mean is the last error; single epochs vary."""
 
@@ -51,6 +66,21 @@ class Assessment:
         return not self.warnings
 
 
+class PartErrors(NamedTuple):
+    """Errors of a body part, mm.
+
+    Attributes:
+        joint: name of its main joint; empty for no bone.
+        model, skinning: mean errors of the model and of skinning alone.
+        cause: cause of its largest errors (`trainer.report.error_analysis`); empty where unknown.
+    """
+
+    joint: str
+    model: float
+    skinning: float
+    cause: str = ""
+
+
 def assess_training(report: Mapping) -> Assessment:
     """Assess a training.
 
@@ -58,50 +88,99 @@ def assess_training(report: Mapping) -> Assessment:
         report: the content of `report.json`, as `core.formats.report.read_report` returns it.
     """
     model, skinning = (_held_out_errors(report, method) for method in ("fdda", "linear"))
-    warnings = []
+    parts = [
+        PartErrors(p["joint"], p["held_out"]["mean"], p["linear"]["mean"], p["largest_errors"]["cause"])
+        for p in report["partitions"]
+    ]
+    problems = []
     if skinning.mean < MIN_SKINNING_ERROR_MM:
-        warnings.append("Skinning alone already equals the rig, so a model brings nothing here.")
+        problems.append(("Skinning alone already equals the rig, so a model brings nothing here", ""))
     elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
-        warnings.append(
-            f"{_describe_no_gain(model.mean, skinning.mean)}: set Rotation Limits, raise Random Poses, and record "
-            "again."
-        )
+        remedy = "set Rotation Limits, raise Random Poses, and record again"
+        problems.append((_describe_no_gain(model.mean, skinning.mean), remedy))
+    elif part := _worst_part(parts, model.mean):
+        problems.append((_describe_part(part), PART_REMEDIES.get(part.cause, ADD_POSES)))
     elif tail := _unimproved_tail(model, skinning):
-        warnings.append(f"{tail}: press Add Poses at Worst Errors, then Continue Training.")
+        problems.append((tail, ADD_POSES))
     if overfit := _describe_overfitting(report, _ratio(model.p999, skinning.p999)):
-        warnings.append(f"{overfit}: the model needs more poses. Raise Random Poses or check more actions, and record.")
+        problems.append((overfit, "the model needs more poses. Raise Random Poses or check more actions, and record"))
+    warnings = _describe_problems(problems, report.get("warnings", ()))
     next_step = "" if warnings else "Next: bind the model, then compare it with the rig on an action."
-    return Assessment(f"Unseen poses: {describe_errors(model, skinning)}", tuple(warnings), next_step)
+    subject = f"{report['object']}, unseen poses" if report["object"] else "Unseen poses"
+    return Assessment(f"{subject}: {describe_errors(model, skinning)}", warnings, next_step)
 
 
 def assess_evaluation(
-    model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors", is_bound: bool = True
+    model: "ErrorStatistics | HeldOutErrors",
+    skinning: "ErrorStatistics | HeldOutErrors",
+    mesh_name: str,
+    parts: Sequence[PartErrors] = (),
+    recording_warnings: Sequence[Mapping] = (),
+    is_bound: bool = True,
 ) -> Assessment:
     """Assess the comparison of a model with its rig.
 
     Args:
         model, skinning: errors of the model and of skinning alone, over all vertices and poses.
+        mesh_name: name of the mesh object.
+        parts: errors of its body parts.
+        recording_warnings: warnings about the recording of the model, as in its report.
         is_bound: whether the compared model is still bound.
     """
-    warnings = []
+    problems = []
     if not is_bound:
-        warnings.append("Another model is bound now: press Evaluate again.")
+        problems.append(("Another model is bound now", "press Evaluate again"))
     elif skinning.mean < MIN_SKINNING_ERROR_MM and not _is_farther(model.mean, skinning.mean):
-        warnings.append(
-            "Skinning alone already equals the rig in these poses, so they do not show what the model does."
-        )
+        problem = "Skinning alone already equals the rig in these poses, so they do not show what the model does"
+        problems.append((problem, ""))
     elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
-        warnings.append(
-            f"{_describe_no_gain(model.mean, skinning.mean)}: these poses are unlike the recorded ones. Check this "
-            "action in Training Poses, record and train again."
+        remedy = "these poses are unlike the recorded ones. Check this action in Training Poses, record and train again"
+        problems.append((_describe_no_gain(model.mean, skinning.mean), remedy))
+    elif problem := _describe_part(_worst_part(parts, model.mean)) or _unimproved_tail(model, skinning):
+        remedy = (
+            "click a worst frame and open Confidence in This Pose. Below 100 %, widen the limits; else press Add Poses "
+            "at Worst Errors"
         )
-    elif tail := _unimproved_tail(model, skinning):
-        warnings.append(
-            f"{tail}: click a worst frame and open Confidence in This Pose. Below 100 %, widen the limits; else press "
-            "Add Poses at Worst Errors."
-        )
+        problems.append((problem, remedy))
+    warnings = _describe_problems(problems, recording_warnings if is_bound else ())
     next_step = "" if warnings else "Next: play the action, and look at the worst frames."
-    return Assessment(describe_errors(model, skinning), tuple(warnings), next_step)
+    return Assessment(f"{mesh_name}: {describe_errors(model, skinning)}", warnings, next_step)
+
+
+def _describe_problems(problems: Sequence[tuple[str, str]], recording_warnings: Sequence[Mapping]) -> tuple[str, ...]:
+    """Return a sentence for each problem with its remedy, or with the cause that the recording gives in its place.
+
+    Args:
+        problems: each problem and its remedy, without their ends; a problem without a remedy has no cause.
+        recording_warnings: warnings about the recording: "name" and "text".
+    """
+    causes = sorted(
+        (warning for warning in recording_warnings if warning["name"] in RECORDING_CAUSES),
+        key=lambda warning: RECORDING_CAUSES.index(warning["name"]),
+    )
+    if causes and any(remedy for _, remedy in problems):
+        cause = causes[0]["text"].removesuffix(".")
+        return (f"{problems[0][0]}. Likely cause: {cause}.", *(f"{problem}." for problem, _ in problems[1:]))
+    return tuple(f"{problem}: {remedy}." if remedy else f"{problem}." for problem, remedy in problems)
+
+
+def _worst_part(parts: Sequence[PartErrors], mean_mm: float) -> PartErrors | None:
+    """Return the body part whose error is visible, and far above the mean error or hardly below that of skinning."""
+    worst = max(parts, key=lambda part: part.model, default=None)
+    if worst is None or worst.model < MIN_VISIBLE_MM:
+        return None
+    is_outlier = worst.model > MAX_PART_RATIO * mean_mm or _ratio(worst.model, worst.skinning) > MAX_GOOD_RATIO
+    return worst if is_outlier else None
+
+
+def _describe_part(part: PartErrors | None) -> str:
+    """Return a sentence without its end about the worst body part; empty without one."""
+    if part is None:
+        return ""
+    return (
+        f"The body part of {repr(part.joint) if part.joint else 'no bone'} is {format_mm(part.model)} mm from the rig "
+        f"on average (skinning alone {format_mm(part.skinning)} mm)"
+    )
 
 
 def describe_errors(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:

@@ -13,6 +13,7 @@ import pytest
 
 from fdda_addon.core.mathematics.metrics import ErrorStatistics
 from fdda_addon.core.sentences.assessment import (
+    PartErrors,
     assess_evaluation,
     assess_training,
     farther_than_skinning_sentence,
@@ -24,7 +25,12 @@ REPORTS = Path(__file__).parents[1] / "reports"
 
 
 def read(name: str) -> dict:
-    return json.loads((REPORTS / f"{name}.json").read_text(encoding="utf-8"))
+    """Read a report; all its body parts have the errors of the whole mesh."""
+    report = json.loads((REPORTS / f"{name}.json").read_text(encoding="utf-8")) | {"object": "arm"}
+    for partition in report["partitions"]:
+        partition |= {"held_out": report["fdda"]["held_out"], "linear": report["linear"]["held_out"]}
+        partition["largest_errors"] = {"cause": "poses"}
+    return report
 
 
 def statistics(mean: float, p999: float, largest: float) -> ErrorStatistics:
@@ -35,7 +41,7 @@ def test_a_good_training_is_called_good_with_the_next_step():
     assessment = assess_training(read("arm_400_poses"))
     assert assessment.is_good and assessment.next_step.startswith("Next: bind the model")
     assert assessment.sentence == (
-        "Unseen poses: 0.032 mm from the rig on average, 78x closer than skinning alone (2.5 mm); at most 2.3 mm, "
+        "arm, unseen poses: 0.032 mm from the rig on average, 78x closer than skinning alone (2.5 mm); at most 2.3 mm, "
         "skinning alone 30.6 mm."
     )
 
@@ -96,19 +102,70 @@ def test_a_report_without_curves_is_assessed_by_its_errors():
 
 def test_an_evaluation_is_assessed_with_what_to_do_next():
     skinning = statistics(2.0, 20.0, 25.0)
-    good = assess_evaluation(statistics(0.1, 1.0, 2.0), skinning)
-    assert good.is_good and good.sentence.startswith("0.10 mm from the rig on average, 20x closer")
+    good = assess_evaluation(statistics(0.1, 1.0, 2.0), skinning, "body")
+    assert good.is_good and good.sentence.startswith("body: 0.10 mm from the rig on average, 20x closer")
     assert good.next_step == "Next: play the action, and look at the worst frames."
-    beyond = assess_evaluation(statistics(0.1, 1.0, 24.0), skinning)
+    beyond = assess_evaluation(statistics(0.1, 1.0, 24.0), skinning, "body")
     assert "open Confidence in This Pose" in beyond.warnings[0] and beyond.next_step == ""
-    unlike = assess_evaluation(statistics(1.9, 19.0, 24.0), skinning)
+    unlike = assess_evaluation(statistics(1.9, 19.0, 24.0), skinning, "body")
     assert unlike.warnings[0].startswith("The model is hardly closer than skinning alone: these poses are unlike")
-    worse = assess_evaluation(statistics(2.1, 19.0, 24.0), skinning)
+    worse = assess_evaluation(statistics(2.1, 19.0, 24.0), skinning, "body")
     assert worse.warnings[0].startswith("The model is farther from the rig than skinning alone: these poses are unlike")
-    other = assess_evaluation(statistics(0.1, 1.0, 2.0), skinning, is_bound=False)
+    other = assess_evaluation(statistics(0.1, 1.0, 2.0), skinning, "body", is_bound=False)
     assert other.warnings == ("Another model is bound now: press Evaluate again.",)
-    still = assess_evaluation(statistics(0.0, 0.0, 0.0), statistics(0.0, 0.0, 0.0))
+    still = assess_evaluation(statistics(0.0, 0.0, 0.0), statistics(0.0, 0.0, 0.0), "body")
     assert still.warnings[0].startswith("Skinning alone already equals the rig") and "inf" not in still.sentence
+
+
+@pytest.mark.parametrize(
+    ("held_out_mm", "linear_mm", "cause", "warning"),
+    [
+        # The mean over the arm is 0.032 mm.
+        (0.9, 1.0, "poses", ""),
+        (
+            5.0,
+            40.0,
+            "poses",
+            "The body part of 'palm' is 5.0 mm from the rig on average (skinning alone 40.0 mm): press Add Poses at "
+            "Worst Errors, then Continue Training.",
+        ),
+        (1.2, 1.3, "components", "1.2 mm from the rig on average (skinning alone 1.3 mm): lower Detail (mm)"),
+        (1.2, 1.3, "steep", "seen poses have the same errors. Look for a flip of the rig there"),
+    ],
+)
+def test_the_worst_body_part_is_judged_too(held_out_mm, linear_mm, cause, warning):
+    report = read("arm_400_poses")
+    report["partitions"][3] |= {
+        "joint": "palm",
+        "held_out": {"mean": held_out_mm},
+        "linear": {"mean": linear_mm},
+        "largest_errors": {"cause": cause},
+    }
+    assessment = assess_training(report)
+    assert assessment.is_good == (not warning) and warning in "".join(assessment.warnings)
+    parts = [PartErrors("palm", held_out_mm, linear_mm), PartErrors("", 0.01, 1.0)]
+    evaluation = assess_evaluation(statistics(0.032, 0.7, 2.3), statistics(2.5, 26.0, 30.6), "arm", parts)
+    assert evaluation.is_good == (not warning)
+    assert all("The body part of 'palm' is " in text for text in evaluation.warnings)
+
+
+def test_a_cause_in_the_recording_comes_before_more_poses():
+    seams = {"name": "open-seams", "text": "2,399 vertices come apart by up to 165 mm; merge them by distance."}
+    others = [{"name": "dead-joints", "text": "no cause"}, {"name": "large-residuals", "text": "a symptom."}]
+    report = read("arm_20_poses") | {"warnings": [*others, seams]}
+    report["linear"]["held_out"].update(mean=0.7)
+    assert assess_training(report).warnings == (
+        "The model is hardly closer than skinning alone. Likely cause: 2,399 vertices come apart by up to 165 mm; "
+        "merge them by distance.",
+        "The error in unseen poses is 24 times that in seen poses.",
+    )
+    evaluation = assess_evaluation(
+        statistics(1.9, 19.0, 24.0), statistics(2.0, 20.0, 25.0), "arm", (), report["warnings"]
+    )
+    assert "Likely cause: 2,399 vertices come apart" in evaluation.warnings[0]
+    # A good model needs no cause, and a warning that explains no errors is none.
+    assert assess_training(read("arm_400_poses") | {"warnings": [seams]}).is_good
+    assert "needs more poses" in assess_training(read("arm_20_poses") | {"warnings": others[:1]}).warnings[0]
 
 
 def test_a_model_that_is_farther_than_skinning_is_named():
@@ -124,11 +181,11 @@ def test_a_model_that_is_farther_than_skinning_is_named():
 def test_a_model_that_is_far_where_skinning_is_the_rig_is_named():
     exact = statistics(0.0, 0.0, 0.0)
     assert "5.0 instead of 0.000 mm" in farther_than_skinning_sentence(5.0, 0.0)
-    far = assess_evaluation(statistics(5.0, 20.0, 30.0), exact)
+    far = assess_evaluation(statistics(5.0, 20.0, 30.0), exact, "body")
     assert far.warnings[0].startswith("The model is farther from the rig than skinning alone: these poses are unlike")
     near = statistics(0.03, 0.1, 0.2)
     assert farther_than_skinning_sentence(near.mean, exact.mean) == ""
-    assert assess_evaluation(near, exact).warnings[0].startswith("Skinning alone already equals the rig")
+    assert assess_evaluation(near, exact, "body").warnings[0].startswith("Skinning alone already equals the rig")
 
 
 @pytest.mark.parametrize(
