@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import bpy
 
 from ..core.errors import RigError, WrongUsageError
-from ..rig.bone_paths import split_bone_path
+from ..rig.references import split_bone_path
 from ..scene.action_slots import curves_of_actions
 from ..scene.compatibility import is_bone_hidden
 

@@ -5,15 +5,13 @@ from collections.abc import Iterable, Iterator
 
 import bpy
 
+from ..rig.dependency_graph import DependencyGraph, Node
+from ..rig.references import add_bones, add_drivers, bones_of_modifier, deforming_bones, is_armature, references
 from ..rig.sources import Sources
 from ..scene.compatibility import accepts_slot, curves_of_slot, node_input
 from ..scene.node_groups import read_bone_names
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
-from .bone_reader import add_bones, bones_of_modifier, deforming_bones
-from .dependency_graph import DependencyGraph, Node
-from .driver_reader import add_drivers
-from .struct_reader import bone_node, datablock_node, is_armature, struct_needs
 
 _INVISIBLE_TYPES = {"ARMATURE", "LATTICE", "SPEAKER", "LIGHT_PROBE"}
 """Types of objects that no render shows."""
@@ -42,7 +40,7 @@ def read_graph(
     armatures, none = {armature_object, armature_object.data}, frozenset()
     shape_keys = {mesh_object.data.shape_keys for mesh_object in mesh_objects} - {None}
     for datablock, used in used_datablocks().items():
-        node = datablock_node(datablock)
+        node = Node(datablock)
         if isinstance(datablock, _UNFOLLOWED_TYPES):
             add_drivers(graph, datablock)
             continue
@@ -50,7 +48,7 @@ def read_graph(
             replaced = replaced_modifiers[datablock.name]
             modifiers = [m for m in datablock.modifiers if m.name not in replaced]
             replaced_needs = {n for name in replaced for n in _modifier_needs(datablock, datablock.modifiers[name])}
-            graph.add(node, *(set(map(datablock_node, used)) - replaced_needs))
+            graph.add(node, *(set(map(Node, used)) - replaced_needs))
             graph.add(node, *_object_needs(datablock, modifiers))
             add_drivers(graph, datablock, tuple(datablock.modifiers[name].path_from_id() for name in replaced))
             continue
@@ -62,7 +60,7 @@ def read_graph(
         if isinstance(datablock, bpy.types.Object):
             graph.add(node, *_object_needs(datablock, datablock.modifiers))
         elif any(map(is_armature, used)):
-            graph.add(node, *struct_needs(datablock))
+            graph.add(node, *references(datablock))
         if is_armature(datablock):
             # Any of these slots may be assigned later.
             slots = [(a, slot) for a in bpy.data.actions for slot in a.slots if accepts_slot(datablock, slot)]
@@ -70,9 +68,9 @@ def read_graph(
             animated = keyed | animated_paths(datablock)
             add_bones(graph, datablock, animated, straight if datablock == armature_object else none)
             if datablock != armature_object:
-                graph.add(node, *(Node(node.datablock, bone=bone.name) for bone in datablock.data.bones))
+                graph.add(node, *(Node(datablock, bone.name) for bone in datablock.data.bones))
         else:
-            graph.add(node, *map(datablock_node, used))
+            graph.add(node, *map(Node, used))
     return graph
 
 
@@ -128,30 +126,30 @@ def used_datablocks() -> dict[bpy.types.ID, set[bpy.types.ID]]:
 
 def _object_needs(scene_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[Node]:
     """Yield what an object needs, with the given modifiers; not its bones and drivers."""
-    yield from struct_needs(scene_object, "pose", "modifiers")
+    yield from references(scene_object, "pose", "modifiers")
     if is_armature(scene_object.parent) and scene_object.parent_type == "ARMATURE":
         yield from deforming_bones(scene_object, scene_object.parent)
     if scene_object.rigid_body is not None:
         # All rigid bodies may collide, and constraints connect them.
-        yield from (datablock_node(o) for o in bpy.data.objects if o.rigid_body or o.rigid_body_constraint)
+        yield from (Node(o) for o in bpy.data.objects if o.rigid_body or o.rigid_body_constraint)
     for modifier in modifiers:
         yield from _modifier_needs(scene_object, modifier)
 
 
 def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier) -> Iterator[Node]:
     """Yield the datablocks and bones that a modifier reads, except through drivers."""
-    yield from struct_needs(modifier)
+    yield from references(modifier)
     yield from bones_of_modifier(scene_object, modifier)
     if modifier.type in _COLLIDING_MODIFIERS:
-        yield from (datablock_node(o) for o in bpy.data.objects if _moves_simulations(o))
+        yield from (Node(o) for o in bpy.data.objects if _moves_simulations(o))
     if modifier.type == "NODES" and modifier.node_group is not None:
         for item in modifier.node_group.interface.items_tree:
             value = node_input(modifier, item.identifier) if item.item_type == "SOCKET" else None
             if isinstance(value, bpy.types.ID):
-                yield datablock_node(value)
+                yield Node(value)
         if bone_names := set(read_bone_names(modifier.node_group)):
             bones = ((o, bone.name) for o in bpy.data.objects if is_armature(o) for bone in o.data.bones)
-            yield from (bone_node(o, name) for o, name in bones if "" in bone_names or name in bone_names)
+            yield from (Node(o, name) for o, name in bones if "" in bone_names or name in bone_names)
 
 
 def _moves_simulations(scene_object: bpy.types.Object) -> bool:

@@ -11,9 +11,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ..rig.references import drivers_of
 from ..scene.arrays import COLOR_ELEMENT, VECTOR_ELEMENT, ElementProperty, read
 from ..scene.temporary_state import temporary_attributes, temporary_visibility
-from .driver_reader import drivers_of
 from .graph_reader import used_datablocks
 
 _ATTRIBUTE_ELEMENTS = {

@@ -7,11 +7,17 @@ from contextlib import contextmanager
 import bpy
 
 from ..core.errors import RigError
+from ..rig.dependency_graph import Node
+from ..rig.references import (
+    driven_node,
+    driver_references,
+    drivers_of,
+    is_segment_path,
+    references,
+    split_bone_path,
+)
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import temporary_attributes
-from .dependency_graph import Node
-from .driver_reader import bone_of_path, driven_node, driver_needs, drivers_of, is_segment_path
-from .struct_reader import bone_node, datablock_node, struct_needs
 
 
 def remove_bones(armature_object: bpy.types.Object, kept: set[Node]) -> list[str]:
@@ -20,12 +26,12 @@ def remove_bones(armature_object: bpy.types.Object, kept: set[Node]) -> list[str
     The kept bones keep their order, their transforms and their collections. `check_armature` tells whether this can be
     done.
     """
-    names = [bone.name for bone in armature_object.data.bones if bone_node(armature_object, bone.name) not in kept]
+    names = [bone.name for bone in armature_object.data.bones if Node(armature_object, bone.name) not in kept]
     if not names:
         return []
-    removed = {bone_node(armature_object, name) for name in names}
+    removed = {Node(armature_object, name) for name in names}
     for bone in armature_object.pose.bones:
-        for constraint in [c for c in bone.constraints if c.mute and not removed.isdisjoint(struct_needs(c))]:
+        for constraint in [c for c in bone.constraints if c.mute and not removed.isdisjoint(references(c))]:
             bone.constraints.remove(constraint)
     with _edit_mode(armature_object):
         edit_bones = armature_object.data.edit_bones
@@ -55,12 +61,13 @@ def remove_drivers(
     for datablock in list(bpy.data.user_map()):
         for owner, curve in drivers_of(datablock):
             node = driven_node(owner, curve.data_path)
-            bone_name = bone_of_path(curve.data_path)
+            bone_name = split_bone_path(owner, curve.data_path)[0]
             is_replaced = datablock in shape_keys or (datablock in mesh_objects and "modifiers[" in curve.data_path)
             if datablock in {armature_object, armature_object.data}:
-                is_replaced = is_segment_path(curve.data_path, straight)
-            sets_removed = bone_name and Node(datablock_node(datablock).datablock, bone=bone_name) in removed
-            reads_removed = any(not needed.driven_path and needed in removed for needed in driver_needs(curve.driver))
+                is_replaced = is_segment_path(datablock, curve.data_path, straight)
+            sets_removed = bone_name and Node(datablock, bone_name) in removed
+            needed = (node for node in driver_references(curve.driver) if not node.driven_path)
+            reads_removed = not removed.isdisjoint(needed)
             if sets_removed or (node not in kept and (is_replaced or reads_removed)):
                 owner.animation_data.drivers.remove(curve)
                 count += 1
@@ -69,7 +76,7 @@ def remove_drivers(
 
 def remove_objects(kept: set[Node]) -> list[str]:
     """Remove the objects of the scene that are not kept; return their names."""
-    removed = [o for o in bpy.context.scene.objects if datablock_node(o) not in kept]
+    removed = [o for o in bpy.context.scene.objects if Node(o) not in kept]
     names = [scene_object.name for scene_object in removed]
     bpy.data.batch_remove(removed)
     return names

@@ -7,16 +7,14 @@ from typing import NamedTuple
 import bpy
 
 from ..core.errors import RigError
+from ..rig.dependency_graph import Node
 from ..rig.modifier_stack import deforming_modifiers, recorded_modifiers
+from ..rig.references import bones_of_modifier, deforming_bones, drivers_of, is_armature
 from ..scene.action_slots import curves_of_actions
 from ..scene.controls import canonical_path
 from ..scene.scene_rig import SceneRig
-from .bone_reader import bones_of_modifier, deforming_bones
-from .dependency_graph import Node
-from .driver_reader import drivers_of
 from .graph_reader import read_graph, shown_objects
 from .pruning import check_armature, remove_bones, remove_drivers, remove_modifiers, remove_objects
-from .struct_reader import bone_node, datablock_node, is_armature
 
 
 def unread_curves(
@@ -34,7 +32,7 @@ def unread_curves(
         controls: names of the bones that animators see.
         kept: what is kept if all segments stay; the objects and bones that are not kept read no curve.
     """
-    readers = [o for o in bpy.data.objects if datablock_node(o) in kept]
+    readers = [o for o in bpy.data.objects if Node(o) in kept]
     read = {
         node
         for scene_object in readers
@@ -43,7 +41,7 @@ def unread_curves(
         )
     }
     bones = (bone for bone in armature_object.data.bones if bone.bbone_segments > 1)
-    return frozenset({b.name for b in bones if bone_node(armature_object, b.name) not in read} - set(controls))
+    return frozenset({b.name for b in bones if Node(armature_object, b.name) not in read} - set(controls))
 
 
 def _bones_with_read_curves(
@@ -61,12 +59,12 @@ def _bones_with_read_curves(
     if replaced is None and is_armature(scene_object.parent) and scene_object.parent_type == "ARMATURE":
         yield from deforming_bones(scene_object, scene_object.parent)
     bones = scene_object.pose.bones if scene_object.pose else ()
-    owners = [scene_object, *(bone for bone in bones if bone_node(scene_object, bone.name) in kept)]
+    owners = [scene_object, *(bone for bone in bones if Node(scene_object, bone.name) in kept)]
     for constraint in (constraint for owner in owners for constraint in owner.constraints):
         targets = constraint.targets if constraint.type == "ARMATURE" else ()
         if getattr(constraint, "use_bbone_shape", False):
             targets = [constraint]
-        yield from (bone_node(t.target, t.subtarget) for t in targets if t.target is not None)
+        yield from (Node(t.target, t.subtarget) for t in targets if t.target is not None)
 
 
 class Removed(NamedTuple):
@@ -114,8 +112,8 @@ def remove_unneeded(
                 _write_names(curve, datablock)
     shown = [*shown_objects(scene_rigs), armature_object, *(rig.mesh_object for rig in scene_rigs)]
     worlds = [scene.world for scene in bpy.data.scenes if scene.world is not None]
-    roots = [*map(datablock_node, (*shown, *bpy.data.scenes, *worlds)), *nodes]
-    roots += [bone_node(armature_object, name) for name in (*joint_names, *controls)]
+    roots = [*map(Node, (*shown, *bpy.data.scenes, *worlds)), *nodes]
+    roots += [Node(armature_object, name) for name in (*joint_names, *controls)]
     replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
     kept_with_curves = read_graph(scene_rigs, replaced).kept(roots)
     straight = unread_curves(armature_object, replaced, controls, kept_with_curves)
@@ -150,8 +148,7 @@ def _read_modifiers(mesh_object: bpy.types.Object, kept: set[Node]) -> set[str]:
     Raises:
         RigError: a driver reads if a modifier is on.
     """
-    key = datablock_node(mesh_object).datablock
-    paths = [node.driven_path for node in kept if node.datablock == key]
+    paths = [node.driven_path for node in kept if node.datablock == mesh_object]
     read = set()
     for modifier in mesh_object.modifiers:
         prefix = modifier.path_from_id()

@@ -11,7 +11,9 @@ from ..core.formats.model import read_model
 from ..core.progress import Job
 from ..core.rig import STATIC_JOINT
 from ..core.sentences.counts import format_count
+from ..rig.dependency_graph import Node
 from ..rig.modifier_stack import check_evaluable
+from ..rig.references import driven_node, split_bone_path
 from ..runtime import packed_model
 from ..runtime.binding import bind, unbind
 from ..runtime.model_files import network_of
@@ -29,12 +31,9 @@ from .compared_poses import (
     rig_size,
 )
 from .controls import control_bones, keyed_bones
-from .dependency_graph import Node
-from .driver_reader import bone_of_path, driven_node
 from .graph_reader import shown_objects
 from .object_values import differing_objects, driven_properties
 from .removal import Removed, remove_unneeded
-from .struct_reader import bone_node, datablock_node
 
 TOLERANCE = 1e-5
 """Largest accepted difference of a joint between full rig and fast rig, as a ratio of the size of the rig."""
@@ -211,9 +210,9 @@ def _model_nodes(scene_rigs: list[SceneRig]) -> list[Node]:
     for scene_rig in scene_rigs:
         for control in network_of(scene_rig.mesh_object).info.controls:
             owner = owner_of(scene_rig, control.owner)
-            nodes += [datablock_node(owner), driven_node(owner, control.path)]
-            if bone_name := bone_of_path(control.path):
-                nodes.append(bone_node(scene_rig.armature_object, bone_name))
+            nodes += [Node(owner), driven_node(owner, control.path)]
+            if bone_name := split_bone_path(owner, control.path)[0]:
+                nodes.append(Node(scene_rig.armature_object, bone_name))
     return nodes
 
 

@@ -21,7 +21,7 @@ from ..core.rig import STATIC_JOINT, Rig
 from ..poses.bone_channels import is_moved_by_constraints
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
-from ..rig.bone_paths import split_bone_path
+from ..rig.references import split_bone_path
 from ..rig.shape_keys import muted_key_drivers
 from ..scene.armature import Poser, clear_pose
 from ..scene.bone_transform import controls_by_bone

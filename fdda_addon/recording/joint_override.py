@@ -10,7 +10,7 @@ from mathutils import Matrix
 
 from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT, Joint, reference_order
-from ..rig.bone_paths import is_transform_channel, split_bone_path
+from ..rig.references import is_transform_channel, split_bone_path
 from ..scene.armature import PoseMatrixReader, rest_matrices
 from ..scene.scene_rig import MIN_VOLUME, SceneRig, is_flat
 

@@ -11,9 +11,9 @@ import numpy as np
 from ..core.mathematics.references import choose_references, has_reference_choice
 from ..core.rig import Rig
 from ..poses.clip_player import ClipPlayer
-from ..rig.bone_paths import split_bone_path
 from ..rig.pose_setter import DIRECT_POSE_SETTER
 from ..rig.reading import PoseReader
+from ..rig.references import split_bone_path
 from ..rig.sources import Sources
 from ..scene.armature import clear_pose
 from ..scene.scene_rig import SceneRig

@@ -12,7 +12,7 @@ from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
 from ..scene.action_slots import is_overridden
 from ..scene.controls import fcurve_target, make_control
 from ..scene.scene_rig import SceneRig
-from .bone_paths import is_transform_channel, split_bone_path
+from .references import is_transform_channel, split_bone_path
 from .sources import Sources
 
 _FOUR_COMPONENT_MODES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}

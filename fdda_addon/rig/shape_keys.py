@@ -14,7 +14,7 @@ from ..poses.bone_channels import is_moved_by_constraints
 from ..scene.arrays import COORDINATE_ELEMENT, KEY_VALUE_ELEMENT, read, write
 from ..scene.controls import canonical_path, owner_name
 from ..scene.scene_rig import SceneRig
-from .bone_paths import is_transform_channel, split_bone_path
+from .references import is_transform_channel, split_bone_path
 
 _KINDS = {"LOC": LOCATION, "ROT": ROTATION, "SCALE": SCALE}
 """Kinds of channels by the first part of the transform type of a driver variable."""

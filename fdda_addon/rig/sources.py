@@ -10,8 +10,8 @@ from ..core.controls import EVALUATION_TIME, SHAPE_KEY_PATH
 from ..scene.compatibility import node_input
 from ..scene.controls import canonical_path, fcurve_target, owner_name
 from ..scene.scene_rig import SceneRig
-from .bone_paths import is_transform_channel, split_bone_path
 from .modifier_stack import is_fdda_modifier
+from .references import deforming_bones, is_transform_channel, references, split_bone_path
 
 _MODIFIER_PATH = re.compile(r'modifiers\["(?P<name>(?:[^"\\]|\\.)*)"\](?P<rest>.*)')
 _CHANNEL_PATHS = {
@@ -69,8 +69,7 @@ class Sources:
         self._only_active, self._modifiers = modifiers is not None, frozenset(modifiers or ())
         carriers = [scene_rig.mesh_object, scene_rig.armature_object]
         for scene_object in carriers:
-            targets = [target for c in scene_object.constraints if not c.mute for target, _ in constraint_targets(c)]
-            carriers += [o for o in (scene_object.parent, *targets) if o is not None and o not in carriers]
+            carriers += [o for o in followed_objects(scene_object) if o not in carriers]
         self.carriers = set(carriers) - {scene_rig.mesh_object}
         self.objects: dict[bpy.types.Object, bool] = {}
         self.datablocks: dict[bpy.types.ID, str] = {}
@@ -161,7 +160,8 @@ class Sources:
             if parent.type == "ARMATURE" and scene_object.parent_type == "BONE":
                 self._add_bones(parent, [scene_object.parent_bone])
             elif parent.type == "ARMATURE" and scene_object.parent_type == "ARMATURE":
-                self._add_bones(parent, _deforming_bones(scene_object, parent), is_deforming=True)
+                names = (bone for _, bone, _ in deforming_bones(scene_object, parent))
+                self._add_bones(parent, names, is_deforming=True)
             else:
                 self._add_object(parent, uses_geometry=scene_object.parent_type not in {"OBJECT", "BONE"})
         self._follow_constraints(scene_object.constraints)
@@ -185,16 +185,16 @@ class Sources:
     def _follow_modifier(self, scene_object: bpy.types.Object, modifier: bpy.types.Modifier, path: str) -> None:
         reads_rig = getattr(modifier, "object", None) == self._rig.armature_object
         is_rig_skinning = scene_object == self._rig.mesh_object and reads_rig
+        for armature_object, bone, _ in references(modifier):
+            if bone:
+                self._add_bones(armature_object, [bone])
         for prop in modifier.bl_rna.properties:
             value = getattr(modifier, prop.identifier) if prop.type == "POINTER" else None
             if isinstance(value, bpy.types.Object):
-                subtarget = getattr(modifier, "subtarget", "")
                 if modifier.type == "ARMATURE":
                     # The weighted bones of the rig are joints in any case.
-                    names = () if is_rig_skinning else _deforming_bones(scene_object, value)
-                    self._add_bones(value, names, is_deforming=True)
-                elif value.type == "ARMATURE" and subtarget:
-                    self._add_bones(value, [subtarget])
+                    bones = () if is_rig_skinning else deforming_bones(scene_object, value)
+                    self._add_bones(value, (bone for _, bone, _ in bones), is_deforming=True)
                 else:
                     self._add_object(value, uses_geometry=modifier.type not in _TRANSFORM_MODIFIERS)
             elif isinstance(value, bpy.types.Collection):
@@ -230,12 +230,13 @@ class Sources:
         for constraint in constraints:
             if constraint.mute:
                 continue
-            for target, subtarget in constraint_targets(constraint):
-                if target.type == "ARMATURE" and subtarget:
-                    self._add_bones(target, [subtarget])
-                else:
-                    uses_geometry = constraint.type in _GEOMETRY_CONSTRAINTS or bool(subtarget)
-                    self._add_object(target, uses_geometry=uses_geometry)
+            has_subtarget = bool(getattr(constraint, "subtarget", "") or getattr(constraint, "pole_subtarget", ""))
+            for target, bone, _ in references(constraint):
+                if bone:
+                    self._add_bones(target, [bone])
+                elif isinstance(target, bpy.types.Object):
+                    uses_geometry = constraint.type in _GEOMETRY_CONSTRAINTS or has_subtarget
+                    self._add_object(target, uses_geometry=uses_geometry and target.type != "ARMATURE")
 
     def _follow_drivers(self, datablock: bpy.types.ID) -> None:
         animation = datablock.animation_data
@@ -296,16 +297,9 @@ def is_shape_key_value(mesh_object: bpy.types.Object, datablock: bpy.types.ID, p
     return path == EVALUATION_TIME or SHAPE_KEY_PATH.fullmatch(path) is not None
 
 
-def constraint_targets(constraint: bpy.types.Constraint) -> Iterator[tuple[bpy.types.Object, str]]:
-    """Yield the objects that a constraint reads, each with the name of a bone or a vertex group."""
-    owners = [(constraint, "target", "subtarget"), (constraint, "pole_target", "pole_subtarget")]
-    owners += [(target, "target", "subtarget") for target in getattr(constraint, "targets", ())]
-    for owner, target, subtarget in owners:
-        if (scene_object := getattr(owner, target, None)) is not None:
-            yield scene_object, getattr(owner, subtarget, "")
-
-
-def _deforming_bones(scene_object: bpy.types.Object, armature_object: bpy.types.Object) -> set[str]:
-    """Return the names of the bones of an armature that deform an object."""
-    groups = {group.name for group in scene_object.vertex_groups}
-    return {b.name for b in armature_object.data.bones if b.use_deform and (b.name in groups or not groups)}
+def followed_objects(scene_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
+    """Yield the parent of an object, and the objects that its constraints read."""
+    if scene_object.parent is not None:
+        yield scene_object.parent
+    nodes = (node for c in scene_object.constraints if not c.mute for node in references(c))
+    yield from (node.datablock for node in nodes if isinstance(node.datablock, bpy.types.Object))

@@ -17,7 +17,7 @@ from ..scene.scene_rig import SceneRig
 from .modifier_effects import time_dependence
 from .modifier_stack import ModifierStack, is_fdda_modifier
 from .other_armatures import check_other_armatures
-from .sources import TRANSFORM_PREFIXES, OwnedCurve, Sources, constraint_targets
+from .sources import TRANSFORM_PREFIXES, OwnedCurve, Sources, followed_objects
 
 
 def describe_missing_ranges(
@@ -90,8 +90,7 @@ def _follows(scene_object: bpy.types.Object, followed: set[bpy.types.Object]) ->
     for link in chain:
         if link in followed:
             return True
-        targets = [target for c in link.constraints if not c.mute for target, _ in constraint_targets(c)]
-        chain += [o for o in (link.parent, *targets) if o is not None and o not in chain]
+        chain += [o for o in followed_objects(link) if o not in chain]
     return False
 
 

@@ -19,15 +19,14 @@ from ..core.rig import Fingerprint, Rig
 from ..scene.bone_transform import controls_by_bone
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
-from .bone_paths import split_bone_path
 from .deformation import is_setting, json_value, read_driver, rounded
-from .sources import constraint_targets
+from .dependency_graph import DependencyGraph, Node
+from .references import add_bones, add_drivers, ik_chain, split_bone_path
 
 _INHERITANCE = ("use_inherit_rotation", "inherit_scale", "use_local_location", "use_relative_parent")
 _IK_PREFIXES = ("ik_", "lock_ik_", "use_ik_")
 _CONSTRAINT_LABELS = {"name", "type", "show_expanded", "is_override_data", "active", "enabled", "mute", "influence"}
 """Properties of constraints that have no effect, or that are read on their own."""
-_IK_TYPES = {"IK", "SPLINE_IK"}
 
 
 def describe_bones(
@@ -62,7 +61,8 @@ def read_unread_bones(scene_rig: SceneRig, names: Iterable[str]) -> dict[str, di
         bone_name, subpath = split_bone_path(armature_object, curve.data_path)
         if bone_name and not subpath.startswith('["'):
             drivers.setdefault(bone_name, []).append(curve)
-    animated, solved = animated_paths(armature_object), {b for _, chain in _ik_chains(armature_object) for b in chain}
+    animated = animated_paths(armature_object)
+    solved = {b for bone in bones for c in bone.constraints if not c.mute for b in ik_chain(bone, c)}
     return {
         name: _read_bone(scene_rig, bones[name], drivers.get(name, ()), animated, name in solved)
         for name in names
@@ -131,34 +131,20 @@ def _setting_names(type_name: str) -> tuple[str, ...]:
 
 def _sources_of_bones(armature_object: bpy.types.Object) -> dict[str, set[str]]:
     """Return the bones of the same armature that each bone reads: parent, targets, IK chains, drivers and handles."""
-    sources: dict[str, set[str]] = {}
+    graph = DependencyGraph()
+    add_bones(graph, armature_object, animated_paths(armature_object), only_transforms=True)
+    for datablock in (armature_object, armature_object.data):
+        add_drivers(graph, datablock)
+    sources = {}
     for bone in armature_object.pose.bones:
-        read = sources[bone.name] = set()
-        handles = (bone.bone.bbone_custom_handle_start, bone.bone.bbone_custom_handle_end)
-        read |= {other.name for other in (bone.parent, *handles) if other is not None}
-        for constraint in (c for c in bone.constraints if not c.mute):
-            read |= {name for target, name in constraint_targets(constraint) if target == armature_object and name}
-    for owner, chain in _ik_chains(armature_object):
-        for name in chain:
-            sources[name].add(owner)
-    animation = armature_object.animation_data
-    for curve in animation.drivers if animation else ():
-        bone_name, _ = split_bone_path(armature_object, curve.data_path)
-        for variable in curve.driver.variables if bone_name in sources else ():
-            for target in (target for target in variable.targets if target.id == armature_object):
-                is_number = variable.type == "SINGLE_PROP"
-                read_name = split_bone_path(target.id, target.data_path)[0] if is_number else target.bone_target
-                sources[bone_name].add(read_name)
+        # A driver may read a property that another driver sets.
+        needed, pending = set(), [Node(armature_object, bone.name)]
+        while pending:
+            new_nodes = graph.needs.get(pending.pop(), set()) - needed
+            needed |= new_nodes
+            pending += [node for node in new_nodes if node.driven_path]
+        sources[bone.name] = {node.bone for node in needed if node.datablock == armature_object} - {"", bone.name}
     return sources
-
-
-def _ik_chains(armature_object: bpy.types.Object) -> Iterator[tuple[str, list[str]]]:
-    """Yield each bone that has an inverse kinematics constraint, and the bones that the constraint moves."""
-    for bone in armature_object.pose.bones:
-        for constraint in bone.constraints:
-            if constraint.type in _IK_TYPES and not constraint.mute:
-                chain = [bone, *bone.parent_recursive][not getattr(constraint, "use_tail", True) :]
-                yield bone.name, [member.name for member in chain[: constraint.chain_count or len(chain)]]
 
 
 def _with_sources(sources: dict[str, set[str]], names: Iterable[str]) -> set[str]:

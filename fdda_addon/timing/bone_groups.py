@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.progress import Job, Progress
-from ..rig.bone_paths import split_bone_path
+from ..rig.references import split_bone_path
 from .armature_copy import RemovablePart, armature_copy
 from .durations import Duration, frame_ms
 

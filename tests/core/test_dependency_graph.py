@@ -3,9 +3,9 @@
 
 import pytest
 
-from fdda_addon.fast_rig.dependency_graph import DependencyGraph, Node, chain_members, datablock_key
+from fdda_addon.rig.dependency_graph import DependencyGraph, Node
 
-RIG = datablock_key("OBJECT", "rig")
+RIG = "rig"
 PARENTS = {"hips": "", "thigh": "hips", "shin": "thigh", "foot": "shin", "toe": "foot"}
 
 
@@ -33,8 +33,8 @@ def test_a_root_without_edges_is_kept():
 
 
 def test_bones_datablocks_and_driven_properties_of_one_name_are_different_nodes():
-    nodes = {Node(RIG), Node(RIG, bone="x"), Node(RIG, driven_path="x"), Node(datablock_key("OBJECT", "rig", "//a"))}
-    assert len(nodes) == 4
+    nodes = {Node(RIG), Node(RIG, bone="x"), Node(RIG, driven_path="x")}
+    assert len(nodes) == 3
 
 
 @pytest.mark.parametrize("member", ["foot", "shin", "thigh"])
@@ -44,24 +44,10 @@ def test_each_bone_of_a_chain_keeps_the_owner_and_its_target(member):
     for name, parent in PARENTS.items():
         graph.add(bone(name), *([bone(parent)] if parent else []))
     graph.add(bone("foot"), bone("ik_target"))
-    graph.add_chain(map(bone, chain_members(PARENTS, "foot", 3)))
+    graph.add_chain(map(bone, ("foot", "shin", "thigh")))
     kept = graph.kept([bone(member)])
     assert kept == {bone(name) for name in ("foot", "shin", "thigh", "hips", "ik_target")}
     assert bone("ik_target") not in graph.kept([bone("hips")])
-
-
-@pytest.mark.parametrize(
-    ("chain_count", "use_tail", "expected"),
-    [
-        (1, True, ["foot"]),
-        (2, True, ["foot", "shin"]),
-        (2, False, ["foot", "shin", "thigh"]),
-        (0, True, ["foot", "shin", "thigh", "hips"]),
-        (9, True, ["foot", "shin", "thigh", "hips"]),
-    ],
-)
-def test_members_of_a_chain(chain_count, use_tail, expected):
-    assert chain_members(PARENTS, "foot", chain_count, use_tail) == expected
 
 
 def test_a_chain_of_one_bone_needs_nothing_new():

@@ -11,11 +11,11 @@ from fdda_addon.core.errors import RigError
 from fdda_addon.core.progress import run_job
 from fdda_addon.fast_rig.compared_poses import ComparedPoses, differing_bones, evaluate_poses
 from fdda_addon.fast_rig.controls import control_bones
-from fdda_addon.fast_rig.dependency_graph import Node
 from fdda_addon.fast_rig.graph_reader import read_graph
 from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
 from fdda_addon.fast_rig.removal import remove_unneeded
-from fdda_addon.fast_rig.struct_reader import bone_node
+from fdda_addon.rig.dependencies import read_dependencies
+from fdda_addon.rig.dependency_graph import Node
 from fdda_addon.scene.node_groups import BONE_NODE
 from fdda_addon.scene.scene_rig import SceneRig
 
@@ -32,7 +32,7 @@ BENDY, HANDLE = "bendy", "handle"
 def kept_for_joints(scene_rig: SceneRig) -> tuple[set[Node], set[Node]]:
     """Return all nodes of the dependency graph, and those that `lower` needs."""
     graph = read_graph([scene_rig], REPLACED)
-    return graph.nodes, graph.kept([bone_node(scene_rig.armature_object, "lower")])
+    return graph.nodes, graph.kept([Node(scene_rig.armature_object, "lower")])
 
 
 def joint_matrices(scene_rig: SceneRig, *control_names: str) -> tuple[ComparedPoses, np.ndarray]:
@@ -54,19 +54,37 @@ def test_a_joint_keeps_the_bones_that_it_depends_on(name):
     assert differing_bones(poses, full, fast, 0.0) == {}
 
     # The same comparison finds the difference if the bone is missing.
-    missing = kept - {bone_node(armature_object, source)}
+    missing = kept - {Node(armature_object, source)}
     remove_drivers([scene_rig], nodes, missing, frozenset())
     assert remove_bones(armature_object, missing) == [source]
     _, broken = joint_matrices(scene_rig, "control")
     assert differing_bones(poses, full, broken, 1e-3).keys() == {"lower"}
 
 
+@pytest.mark.parametrize(
+    ("kind", "object_property", "bone_property"),
+    [
+        ("HOOK", "object", "subtarget"),
+        ("WARP", "object_from", "bone_from"),
+        ("WAVE", "start_position_object", ""),
+        ("DISPLACE", "texture_coords_object", "texture_coords_bone"),
+        ("UV_WARP", "object_to", "bone_to"),
+    ],
+)
+def test_a_mesh_depends_on_the_bones_that_its_modifiers_name(kind, object_property, bone_property, scene_rig):
+    modifier = scene_rig.mesh_object.modifiers.new("Modifier", kind)
+    setattr(modifier, object_property, scene_rig.armature_object)
+    if bone_property:
+        setattr(modifier, bone_property, UNUSED)
+    assert (UNUSED in read_dependencies(scene_rig).bones) == bool(bone_property)
+
+
 def test_a_bone_keeps_the_bone_at_which_its_custom_shape_is_drawn(scene_rig):
     armature_object = scene_rig.armature_object
     bone = armature_object.pose.bones["control"]
     bone.custom_shape, bone.custom_shape_transform = scene_rig.mesh_object, armature_object.pose.bones[UNUSED]
-    kept = read_graph([scene_rig], REPLACED).kept([bone_node(armature_object, "control")])
-    assert bone_node(armature_object, UNUSED) in kept
+    kept = read_graph([scene_rig], REPLACED).kept([Node(armature_object, "control")])
+    assert Node(armature_object, UNUSED) in kept
 
 
 def test_muted_constraints_count_only_if_animation_unmutes_them():
@@ -74,9 +92,9 @@ def test_muted_constraints_count_only_if_animation_unmutes_them():
     armature_object, source = scene_rig.armature_object, f"{SOURCE}.target"
     constraint = armature_object.pose.bones["lower"].constraints[source]
     constraint.mute = True
-    assert bone_node(armature_object, source) not in kept_for_joints(scene_rig)[1]
+    assert Node(armature_object, source) not in kept_for_joints(scene_rig)[1]
     constraint.driver_add("mute")
-    assert bone_node(armature_object, source) in kept_for_joints(scene_rig)[1]
+    assert Node(armature_object, source) in kept_for_joints(scene_rig)[1]
 
 
 def test_control_bones_are_visible_or_keyed_or_in_a_collection():
@@ -106,7 +124,7 @@ def test_a_driven_property_of_the_scene_is_followed():
         target = owner.driver.variables.new().targets[0]
         target.id_type = target_id.id_type
         target.id, target.data_path = target_id, path
-    assert bone_node(armature_object, UNUSED) in kept_for_joints(scene_rig)[1]
+    assert Node(armature_object, UNUSED) in kept_for_joints(scene_rig)[1]
 
 
 def drive(curve: bpy.types.FCurve, target_id: bpy.types.ID, path: str) -> None:
@@ -133,9 +151,9 @@ def test_an_expression_with_self_keeps_the_drivers_of_what_it_reads(expression, 
     owner = armature_object.pose.bones["lower"] if "id_data" in expression else armature_object
     curve = owner.driver_add("scale", 0)
     curve.driver.expression = expression
-    assert bone_node(armature_object, UNUSED) not in kept_for_joints(scene_rig)[1]
+    assert Node(armature_object, UNUSED) not in kept_for_joints(scene_rig)[1]
     curve.driver.use_self = True
-    assert bone_node(armature_object, UNUSED) in kept_for_joints(scene_rig)[1]
+    assert Node(armature_object, UNUSED) in kept_for_joints(scene_rig)[1]
 
 
 @pytest.fixture

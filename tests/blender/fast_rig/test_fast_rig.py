@@ -13,7 +13,7 @@ from fdda_addon.fast_rig import frame_times
 from fdda_addon.fast_rig import removal as fast_rig_removal
 from fdda_addon.fast_rig.compared_poses import ComparedPoses, differing_bones, infinite_bones
 from fdda_addon.fast_rig.graph_reader import read_graph
-from fdda_addon.fast_rig.struct_reader import bone_node
+from fdda_addon.rig.dependency_graph import Node
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rig
@@ -126,7 +126,7 @@ def drop_needs_of_bone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def read_incomplete_graph(*arguments):
         graph = read_graph(*arguments)
         for needed in graph.needs.values():
-            needed.discard(bone_node(arguments[0][0].armature_object, name))
+            needed.discard(Node(arguments[0][0].armature_object, name))
         return graph
 
     monkeypatch.setattr(fast_rig_removal, "read_graph", read_incomplete_graph)

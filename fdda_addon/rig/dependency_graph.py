@@ -1,28 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The graph of what needs what in a .blend file, as plain data, and what has to be kept for some of it."""
+"""The graph of what needs what in a .blend file."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 
 class Node(NamedTuple):
-    """A part of a .blend file that is kept or removed as a whole.
+    """A part of a .blend file.
 
     Attributes:
-        datablock: the datablock, as `datablock_key` writes it.
+        datablock: the datablock.
         bone: name of a bone of the armature object `datablock`; empty for the datablock itself.
         driven_path: RNA path of a driven property of `datablock`; empty otherwise.
     """
 
-    datablock: str
+    datablock: Hashable
     bone: str = ""
     driven_path: str = ""
-
-
-def datablock_key(id_type: str, name: str, library: str = "") -> str:
-    """Return the key of a datablock in `Node.datablock`; names are unique for each type and library."""
-    return f"{id_type}/{name}/{library}" if library else f"{id_type}/{name}"
 
 
 @dataclass
@@ -63,20 +58,3 @@ class DependencyGraph:
             kept |= new_nodes
             pending += new_nodes
         return kept
-
-
-def chain_members(parents: Mapping[str, str], owner: str, chain_count: int, use_tail: bool = True) -> list[str]:
-    """Return the bones that an IK or Spline IK constraint moves, from its owner up.
-
-    Args:
-        parents: name of the parent of each bone; empty for a root.
-        owner: name of the bone that has the constraint.
-        chain_count: number of bones in the chain; 0 for all up to the root.
-        use_tail: whether the chain includes the owner; if not, it begins at the owner's parent. The owner is returned
-            in any case, because the chain needs its constraint.
-    """
-    members, count = [owner], 1 if use_tail else 0
-    while (parent := parents[members[-1]]) and (not chain_count or count < chain_count):
-        members.append(parent)
-        count += 1
-    return members
