@@ -2,9 +2,7 @@
 """The setup scripts: which Python they choose, their messages without one, and when an environment is complete."""
 
 import importlib.util
-import os
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -35,13 +33,6 @@ environment = load_script("environment")
 package = load_script("package")
 retired_words = load_script("retired_words")
 posix_only = pytest.mark.skipif(WINDOWS, reason="setup/environment is a POSIX shell script.")
-
-
-def write_complete_environment(folder: Path, contents: str = "blender") -> None:
-    """Write the Python and the stamp of a complete environment that this Python has made."""
-    for path in (environment.program_path(folder, "python"), folder / environment.STAMP):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(environment.fingerprint(contents))
 
 
 def write_shell_script(path: Path, text: str) -> Path:
@@ -90,92 +81,12 @@ def test_a_python_on_path_that_does_not_start_is_skipped(tmp_path: Path):
     assert result.stdout == f"set up by the real one: setup/environment.py make {tmp_path}/venv blender\n"
 
 
-@posix_only
-def test_an_unsupported_python_in_the_variable_is_refused(tmp_path: Path):
-    unsupported_python = write_shell_script(tmp_path / "python", "exit 2")
-    command = [ROOT / "setup/environment", tmp_path / "venv", "everything"]
-    result = subprocess.run(
-        command, env=os.environ | {"PYTHON": unsupported_python}, capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 1
-    assert f"PYTHON={unsupported_python} is not a Python 3.13 or 3.11" in result.stderr
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="On other systems, wheels contain the libraries that they load.")
 def test_a_missing_system_library_is_reported_with_its_package(tmp_path: Path):
     listing = tmp_path / "libraries.txt"
     listing.write_text("# comment\nlibc.so.6 libc6\nlibfdda-missing.so.1 libfdda1\nlibfdda-gone.so.2 libfdda2\n")
     with pytest.raises(environment.SetupError, match="apt-get install libfdda1 libfdda2"):
         environment.check_system_libraries(listing)
-
-
-def test_an_environment_is_current_only_with_a_matching_stamp(tmp_path: Path):
-    python = os.path.realpath(sys.executable)
-    assert not environment.is_current(tmp_path, "blender", "")
-    write_complete_environment(tmp_path)
-    assert environment.is_current(tmp_path, "blender", "")
-    assert environment.is_current(tmp_path, "blender", python)
-    assert not environment.is_current(tmp_path, "blender", "/usr/bin/another-python")
-    assert not environment.is_current(tmp_path, "everything", "")
-
-
-def test_a_failed_setup_leaves_no_stamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    write_complete_environment(tmp_path)
-    monkeypatch.setenv("PYTHONHOME", str(tmp_path / "nowhere"))  # lets the started Python fail at once
-    monkeypatch.setattr(environment, "check_system_libraries", lambda: None)
-    with pytest.raises(environment.SetupError, match="could not be created"):
-        environment.make(tmp_path, "blender")
-    assert not (tmp_path / environment.STAMP).exists()
-
-
-def is_environment_made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Run environment.py and return whether it makes the environment, which it does unless a current one exists."""
-    calls: list[tuple[Path, str]] = []
-    monkeypatch.setattr(environment, "make", lambda *arguments: calls.append(arguments))
-    monkeypatch.setattr(sys, "argv", ["environment.py", "make", str(folder), "blender"])
-    assert environment.main() == 0
-    return calls == [(folder, "blender")]
-
-
-def test_only_an_environment_of_this_python_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    folder = tmp_path / "venv"
-    assert is_environment_made(folder, monkeypatch), "The folder has no environment."
-    write_complete_environment(folder)
-    assert not is_environment_made(folder, monkeypatch)
-    environment.program_path(folder, "python").unlink()
-    assert is_environment_made(folder, monkeypatch), "The environment has no Python."
-    write_complete_environment(folder)
-    monkeypatch.setattr(sys, "version", sys.version + " of another build")
-    assert is_environment_made(folder, monkeypatch), "The environment was made by another Python."
-
-
-def test_an_unsupported_python_version_is_refused(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sys, "version_info", (3, 12, 4))
-    monkeypatch.setattr(sys, "argv", ["environment.py", "make", "nowhere", "blender"])
-    assert environment.main() == 1
-    assert re.fullmatch(r"FDDA needs Python 3\.13 or 3\.11 and this is 3\.12; .*\n", capsys.readouterr().err)
-
-
-def test_a_second_setup_of_a_folder_waits_for_the_first(tmp_path: Path):
-    lock_code = (
-        "import importlib.util, sys\n"
-        "spec = importlib.util.spec_from_file_location('environment', sys.argv[1])\n"
-        "environment = importlib.util.module_from_spec(spec)\n"
-        "spec.loader.exec_module(environment)\n"
-        "with open(sys.argv[2], 'w') as file:\n"
-        "    print('waiting', flush=True)\n"
-        "    environment.lock(file)\n"
-        "    print('locked', flush=True)\n"
-    )
-    command = [sys.executable, "-c", lock_code, environment.__file__, tmp_path / "venv.lock"]
-    with open(tmp_path / "venv.lock", "w") as file:
-        environment.lock(file)
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as second_process:
-            assert second_process.stdout.readline() == "waiting\n"
-            with pytest.raises(subprocess.TimeoutExpired):
-                second_process.wait(0.3)
-            file.close()
-            assert second_process.communicate(timeout=60)[0] == "locked\n"
 
 
 @symbolic_links
@@ -210,51 +121,12 @@ def test_uv_gets_the_settings_of_pip(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("version", PINS)
-def test_requirement_files_contain_only_pins(version: str):
-    lines = [line for line in PINS[version].splitlines() if not line.startswith("#")]
-    assert len(lines) > 20
-    assert [line for line in lines if not re.fullmatch(r"[a-z0-9.-]+==[a-z0-9.]+", line)] == []
-
-
-@pytest.mark.parametrize("version", PINS)
 def test_requirements_of_the_project_are_pinned(version: str):
     requirements = [requirement for group in PROJECT["dependency-groups"].values() for requirement in group]
     for requirement in requirements:
         package, _, marker = requirement.partition("; ")
         if not marker or Marker(marker).evaluate({"python_version": version}):
             assert re.search(rf"^{re.escape(package)}(==|$)", PINS[version], re.MULTILINE), requirement
-
-
-def test_dependency_groups_of_environments_exist():
-    for groups, _ in environment.CONTENTS.values():
-        assert set(groups) <= set(PROJECT["dependency-groups"])
-
-
-def test_packages_of_the_farm_are_only_in_its_environment():
-    assert [name for name, (groups, _) in environment.CONTENTS.items() if "farm" in groups] == ["farm"]
-    farm_packages = {requirement.partition("==")[0] for requirement in PROJECT["dependency-groups"]["farm"]}
-    other_requirements = {
-        name
-        for group, group_requirements in PROJECT["dependency-groups"].items()
-        if group != "farm"
-        for name in group_requirements
-    }
-    assert farm_packages and not farm_packages & {requirement.partition("==")[0] for requirement in other_requirements}
-    assert "farm" not in (ROOT / "setup/package.py").read_text(), (
-        "The extension must not contain packages of the farm either."
-    )
-
-
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed.")
-def test_make_without_a_target_lists_all_targets():
-    # When make runs these tests, its flags must not reach the make that is started here.
-    environment_variables = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
-    output = subprocess.run(
-        ["make"], cwd=ROOT, env=environment_variables, capture_output=True, text=True, check=True
-    ).stdout
-    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    assert {"demo", "test", "test-all", "lint", "package"} <= set(targets)
-    assert [target for target in targets if f"  make {target} " not in output] == []
 
 
 def test_the_staged_extension_has_the_files_that_blender_expects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -279,27 +151,6 @@ def test_the_staged_extension_has_the_files_that_blender_expects(tmp_path: Path,
     }
 
 
-def test_platforms_of_a_package():
-    assert package.select_platforms([]) == [package.current_platform()]
-    all_platforms = ["linux-x64", "linux-arm64", "macos-arm64", "windows-x64", "windows-arm64"]
-    assert package.select_platforms(["all"]) == all_platforms
-    assert package.select_platforms(["windows-x64"]) == ["windows-x64"]
-
-
-def test_linux_has_a_second_zip_for_python_3_14():
-    """A zip with three wheels of 24 MB would exceed the size limit."""
-    assert (
-        package.python_versions_of_zips("linux-x64")
-        == package.python_versions_of_zips("linux-arm64")
-        == [("3.11", "3.13"), ("3.14",)]
-    )
-    assert (
-        package.python_versions_of_zips("windows-x64")
-        == package.python_versions_of_zips("macos-arm64")
-        == [("3.11", "3.13")]
-    )
-
-
 def test_a_platform_without_wheels_is_refused():
     command = [sys.executable, ROOT / "setup/package.py", "macos-x64"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -318,17 +169,3 @@ def test_a_package_that_is_too_large_is_refused(tmp_path: Path):
         file.truncate(61_000_000)
     with pytest.raises(package.PackageError, match=r"large\.zip has 61 MB, more than the limit of 60 MB; look for"):
         package.check_size(zip_path)
-
-
-def test_retired_words_are_found_in_prose_only():
-    # The words are composed, because the search for retired words reads this file too.
-    length, state = "met" + "res", "cancel" + "led"
-    text = f"100 {length}, {length}_per_unit, --{length}-per-unit\n{state}, '{state.upper()}', \"{state}\", is_{state}"
-    assert [match[:2] for match in retired_words.find_retired_words(text)] == [(1, length), (2, state)]
-
-
-def test_retired_words_are_searched_in_scripts_and_settings():
-    names = {path.relative_to(ROOT).as_posix() for path in retired_words.list_files()}
-    assert names >= {"Makefile", "pyproject.toml", ".ci/run", "setup/environment", "setup/windows/launcher.c"}
-    assert names >= {"examples/web/src/main.js", "farm/fdda_character.js", "README.md"}
-    assert not any("__pycache__" in name or "node_modules" in name for name in names)

@@ -76,17 +76,6 @@ def evaluated_positions(mesh_object: bpy.types.Object) -> np.ndarray:
     return vertex_positions
 
 
-def expected_positions(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
-    """Return the output of the bound model for the evaluated pose: (V, 3) float32, meters."""
-    network = extension_module("runtime.model_files").network_of(mesh_object)
-    depsgraph, info = bpy.context.evaluated_depsgraph_get(), network.info
-    scene_rig = extension_module("scene.scene_rig").SceneRig(mesh_object, armature_object)
-    reader = extension_module("rig.reading").PoseReader(scene_rig, info.joint_names, info.rest_matrices)
-    matrices = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))
-    inputs = extension_module("scene.control_reader").ControlReader(scene_rig, info.controls).read(scene_rig, depsgraph)
-    return network.positions(matrices[None], inputs[None])[0]
-
-
 def arm_positions(frame: int = BENT_FRAME) -> np.ndarray:
     """Return the evaluated vertex positions of the arm at a frame of its action: (V, 3) float32, meters."""
     bpy.context.scene.frame_set(frame)

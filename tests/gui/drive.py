@@ -19,15 +19,8 @@ import bpy
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 
-import cast_story
-import endure_story
-import fast_rig_story
-import film_story
-import flesh_story
-import leave_story
 import manual_story
 import path_story
-import ranges_story
 import session_story
 import shot_story
 import update_story
@@ -39,17 +32,9 @@ STEPS = {
     "path": path_story.STEPS,
     "work": work_story.STEPS,
     "shot": shot_story.STEPS,
-    "cast": cast_story.STEPS,
-    "ranges": ranges_story.STEPS,
-    "flesh": flesh_story.STEPS,
     "session": session_story.STEPS,
     "update": update_story.STEPS,
-    "film": film_story.STEPS,
-    "fast_rig": fast_rig_story.STEPS,
-    "endure": endure_story.STEPS,
     "manual": manual_story.STEPS,
-    "leave": leave_story.STEPS_BEFORE_CLOSING,
-    "back": leave_story.STEPS_AFTER_REOPENING,
 }[STORY_NAME]
 MAX_SECONDS = 590
 """Time limit of the whole story. A Blender that exceeds it is killed and prints where it was."""

@@ -26,9 +26,9 @@ WIDTH, HEIGHT = 1600, 1200
 INSTALL_MAX_SECONDS, STORY_MAX_SECONDS, TERMINATE_MAX_SECONDS = 60, 600, 5
 MISSING_REQUIREMENT_STATUS = 3
 MAX_BLANK_IMAGE_VALUES = 32
-STORIES = ("path", "film", "work", "shot", "cast", "ranges", "flesh", "fast_rig", "session", "leave", "back")
+STORIES = ("path", "work", "shot", "session")
 """Names of the stories, in order. Each runs in a new Blender, and most use the files of the story `path`."""
-LONG_STORIES = ("endure", "manual")
+LONG_STORIES = ("manual",)
 """Stories that run only by name, because they take minutes."""
 
 

@@ -10,7 +10,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.formats.model import METADATA_KEY
-from fdda_addon.core.formats.onnx_file import read_onnx
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
@@ -89,43 +88,9 @@ def test_a_missing_model_is_refused(refusal, verb, elbow_files, tmp_path):
     assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
 
 
-@pytest.mark.parametrize("content", [b"", b"text, not a model\n" * 50, bytes(5000)])
-def test_a_file_that_is_not_an_onnx_file_is_refused(refusal, verb, elbow_files, tmp_path, content):
-    path = tmp_path / "m.onnx"
-    path.write_bytes(content)
-    assert refusal(*verb(elbow_files.rig, path)) == (
-        f"The model '{path}' is refused: it is not an ONNX file; give one that train made."
-    )
-
-
-@pytest.mark.parametrize("kept_ratio", [0.1, 0.5, 0.999])
-def test_a_truncated_model_is_refused(refusal, verb, elbow_files, tmp_path, kept_ratio):
-    path, data = tmp_path / "m.onnx", elbow_files.model.read_bytes()
-    path.write_bytes(data[: int(len(data) * kept_ratio)])
-    assert f"The model '{path}' is refused: " in refusal(*verb(elbow_files.rig, path))
-
-
-def add_input(model) -> None:
-    model.graph.input.append(helper.make_tensor_value_info("controls", TensorProto.FLOAT, ["N", 3]))
-
-
 def add_custom_operator(model) -> None:
     model.graph.node.append(helper.make_node("Run", ["positions"], ["y"], domain="com.example"))
     model.opset_import.append(helper.make_opsetid("com.example", 1))
-
-
-def add_hidden_operator(model) -> None:
-    value = helper.make_tensor_value_info("inner", TensorProto.FLOAT, None)
-    branch = helper.make_graph([helper.make_node("Run", [], ["inner"], domain="com.example")], "b", [], [value])
-    model.graph.initializer.append(numpy_helper.from_array(np.array(True), "condition"))
-    model.graph.node.append(helper.make_node("If", ["condition"], ["y"], then_branch=branch, else_branch=branch))
-
-
-def keep_data_outside(model) -> None:
-    tensor = next(t for t in model.graph.initializer if t.raw_data)
-    tensor.ClearField("raw_data")
-    tensor.data_location = TensorProto.EXTERNAL
-    tensor.external_data.add(key="location", value="../../etc/passwd")
 
 
 def remove_metadata(model) -> None:
@@ -140,10 +105,7 @@ def set_version_2(model) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (add_input, "it takes the inputs {"),
         (add_custom_operator, "it has the operator set com.example, which train does not write; give one"),
-        (add_hidden_operator, "it has graphs inside of nodes, which train does not write; give one"),
-        (keep_data_outside, "it has data in other files, which train does not write; give one that train made"),
         (remove_metadata, "is an ONNX file but not a model of this add-on; give one that train made"),
         (set_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
     ],
@@ -154,38 +116,14 @@ def test_onnx_files_that_are_not_models_of_the_add_on_are_refused(refusal, verb,
     assert str(path) in text and words in text
 
 
-def use_unknown_operator(model) -> None:
-    model.graph.node[0].op_type = "NoSuchOperator"
-
-
-def create_loop(model) -> None:
-    model.graph.node[0].input[0] = model.graph.node[-1].output[0]
-
-
 def use_double_input(model) -> None:
     model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
-
-
-@pytest.mark.parametrize("change", [use_unknown_operator, create_loop])
-def test_invalid_graphs_are_refused_before_onnx_runtime_loads_them(refusal, verb, elbow_files, tmp_path, change):
-    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
-    text = refusal(*verb(elbow_files.rig, path))
-    assert text.startswith(f"The model '{path}' is refused: ") and text.endswith("; give one that train made.")
 
 
 def test_a_graph_with_double_inputs_is_refused(refusal, verb, elbow_files, tmp_path):
     path = write_edited(elbow_files.model, tmp_path / "m.onnx", use_double_input)
     text = refusal(*verb(elbow_files.rig, path))
     assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
-
-
-def test_weights_that_do_not_match_the_checksum_are_refused(refusal, verb, elbow_files, tmp_path):
-    data = bytearray(elbow_files.model.read_bytes())
-    weights = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
-    data[bytes(data).index(bytes(weights)) + len(weights) // 2] ^= 0x40
-    path = tmp_path / "m.onnx"
-    path.write_bytes(data)
-    assert "is damaged: its checksum is not that of its weights" in refusal(*verb(elbow_files.rig, path))
 
 
 def output_nan(model) -> None:
@@ -237,21 +175,6 @@ def test_playing_a_model_that_returns_nan_shows_an_error(bound_elbow, elbow_file
     else:
         assert sorted(set(is_error_shown)) == [False, True]
     assert bound_elbow.fdda.mode == "FDDA"
-
-
-def output_fewer_vertices(model) -> None:
-    last = next(node for node in model.graph.node if "positions" in node.output)
-    last.output[list(last.output).index("positions")] = "all"
-    for name, value in (("from", [0]), ("to", [7]), ("axis", [1])):
-        model.graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), name))
-    model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
-
-
-def test_a_model_whose_output_has_another_shape_is_refused(refusal, verb, elbow_files, tmp_path):
-    path = write_edited(elbow_files.model, tmp_path / "m.onnx", output_fewer_vertices)
-    assert "is refused: its output 'positions' comes out as (1, 7, 3), not as (1, 300, 3)" in refusal(
-        *verb(elbow_files.rig, path)
-    )
 
 
 def test_a_refused_model_does_not_change_a_bound_object(bound_elbow, elbow_files, tmp_path):

@@ -8,13 +8,10 @@ import shutil
 import subprocess
 import sys
 import textwrap
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.formats.messages import MessageType
-from fdda_addon.core.recording.arrays import array_shapes
 from fdda_addon.training.process import trainer_python
 
 from ..conftest import run
@@ -110,55 +107,3 @@ def dotted_keys(value: dict, prefix: str = "") -> set[str]:
     for key, inner in value.items():
         keys |= dotted_keys(inner, f"{prefix}{key}.") if isinstance(inner, dict) else {prefix + key}
     return keys
-
-
-def is_key_documented(text: str, key: str) -> bool:
-    """Return whether inline code of a page contains a key: its dotted name, or its first parts and the last part."""
-    parts = key.split(".")
-    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
-    words = set(re.findall(r"[a-z_0-9]+(?:\.[a-z_0-9]+)*", " ".join(re.findall(r"`([^`]+)`", text))))
-    return key in words or (
-        parts[-1] in words and any(".".join(parts[:count]) in words for count in range(1, len(parts)))
-    )
-
-
-def test_recording_chapter_names_every_key_and_array(folder):
-    text = chapter("Recording")
-    index = json.loads((folder / "recording" / "recording.json").read_text())
-    # Their keys are names of bones.
-    index["bones"] |= {"sources": [], "settings": []}
-    keys = dotted_keys(index) | set(index["joints"][0])
-    keys |= {key for name in ("limits", "sources") for key in index["sampling"][name][0]}
-    assert [key for key in sorted(keys) if not is_key_documented(text, key)] == []
-    assert [name for name in array_shapes(1, 1, 1, 1, 1, 3) if f"`{name}.npy`" not in text] == []
-
-
-def test_model_chapter_names_every_key(folder):
-    from fdda_addon.core.formats.model import read_model_info
-
-    value = json.loads(read_model_info(folder / "model.onnx").to_json())
-    keys = set(value) | {key for name in ("joints", "partitions") for key in value[name][0]}
-    keys |= set(value["fingerprint"]) | set(value["held_out_mm"]) | set(value["training_ranges"])
-    assert [key for key in sorted(keys) if not is_key_documented(chapter("Model"), key)] == []
-
-
-def test_metadata_table_names_every_key_of_a_partition():
-    from fdda_addon.core.formats.model_info import ModelPartition
-
-    section = chapter("Model").partition("#### Partitions of a model\n")[2].partition("\n#")[0]
-    keys = [field.name for field in fields(ModelPartition)]
-    assert [key for key in keys if not is_key_documented(section, key)] == []
-
-
-@pytest.mark.parametrize("name", ["evaluation", "benchmark"])
-def test_evaluation_chapter_names_every_key(folder, name):
-    value = json.loads((folder / f"{name}.json").read_text())
-    keys = set(value) | {key for inner in value.values() if isinstance(inner, dict) for key in inner}
-    assert [key for key in sorted(keys) if not is_key_documented(chapter(name.capitalize()), key)] == []
-
-
-def test_messages_chapter_names_every_type_and_its_keys():
-    text = chapter("Trainer messages")
-    rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", text, re.MULTILINE))
-    assert rows.pop("type")
-    assert list(rows) == [kind.value for kind in MessageType]

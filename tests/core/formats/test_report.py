@@ -144,25 +144,3 @@ def test_a_report_that_is_too_large_is_refused(tmp_path, monkeypatch):
     (tmp_path / "report.json").write_bytes(b" " * ((1 << 20) + 1))
     with pytest.raises(TrainingError, match=r"it is larger than 1 MB.*; train again"):
         read_report(tmp_path / "report.json")
-
-
-def test_the_formats_page_names_every_key():
-    text = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
-    section = text.partition("\n## Training report\n")[2].partition("\n## ")[0]
-
-    def key_names(kind: object) -> set[str]:
-        if isinstance(kind, report_format._Nullable):
-            return key_names(kind.value_type)
-        if isinstance(kind, list):
-            return key_names(kind[0])
-        if not isinstance(kind, dict):
-            return set()
-        return {key.removesuffix("?") for key in kind} | {name for inner in kind.values() for name in key_names(inner)}
-
-    documented_elsewhere = {"inside", "beside", "across"} | set(
-        REPORT["training"]
-    )  # chapter Evaluation, and the settings
-    assert (
-        sorted(name for name in key_names(report_format._REPORT_KEYS) - documented_elsewhere if name not in section)
-        == []
-    )
