@@ -17,7 +17,7 @@ from fdda_addon import register, unregister
 from fdda_addon.arm.joints import ACTION_NAME
 from fdda_addon.cli.files import open_file
 from fdda_addon.cli.progress import ProgressPrinter
-from fdda_addon.core.defaults import FILM_TIMED_FRAMES
+from fdda_addon.core.settings import FILM_TIMED_FRAMES
 from fdda_addon.evaluation.film import FDDA, FDDA_ERROR, LINEAR, LINEAR_ERROR, RIG, FilmSettings, film
 from fdda_addon.evaluation.results import PoseErrors
 from fdda_addon.evaluation.run import evaluate_action

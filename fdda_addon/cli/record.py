@@ -78,6 +78,7 @@ def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
 
 
 def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":
+    from ..core.settings import POSES, settings_of, values_from
     from ..recording.plan import RecordingSettings
     from ..recording.refinement import RefinementSettings, refine
     from ..recording.run import record_meshes
@@ -89,17 +90,13 @@ def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) 
         settings = RefinementSettings(seed=options.seed, resume=options.resume, **pose_options)
         return refine(rigs[0][0], options.recording, options.refine, settings)
     settings = RecordingSettings(
-        seed=options.seed,
-        spread=options.spread,
-        margin=options.margin,
         actions=tuple(options.action),
         resume=options.resume,
         overwrite=options.overwrite,
         sample=tuple(options.sample),
         controls=tuple(options.control),
         strips=tuple(options.strip),
-        mirror=options.mirror,
         target=target_settings(options),
-        **pose_options,
+        **(values_from(options, settings_of(RecordingSettings)) | {"poses": POSES.default} | pose_options),
     )
     return record_meshes(rigs, settings)

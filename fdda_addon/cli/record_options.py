@@ -4,11 +4,10 @@
 import argparse
 from pathlib import Path
 
-from ..core.defaults import MARGIN, POSES, REFINEMENT_POSES, SPREAD
 from ..core.errors import WrongUsageError
-from ..core.mathematics.poses import MAX_MARGIN
+from ..core.settings import MARGIN, MIRROR, POSES, REFINEMENT_POSES, REPEATABILITY_POSES, SEED, SPREAD
 from .files import add_rig_argument
-from .target import add_repeatability_option, add_target_options, target_settings
+from .target import add_target_options, target_settings
 
 
 def add_record_options(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +18,7 @@ def add_record_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
     add_target_options(parser)
-    add_repeatability_option(parser)
+    REPEATABILITY_POSES.add_option(parser)
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses at the worst errors of this model to the recording"
     )
@@ -42,24 +41,10 @@ def _add_mesh_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_pose_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--poses", type=int, help=f"number of random poses (default {POSES}, with --refine {REFINEMENT_POSES})"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="random seed of the poses (default 0)")
-    parser.add_argument(
-        "--spread",
-        type=float,
-        default=SPREAD,
-        help=f"how far random poses spread over the limits, from their middle (default {SPREAD})",
-    )
-    parser.add_argument(
-        "--margin",
-        type=float,
-        default=MARGIN,
-        metavar="F",
-        help="take a quarter of the random poses from limits wider by this factor, and rotate locked axes too, "
-        f"so that the model stays accurate beyond the limits; 1 to stay within the limits (default {MARGIN:g})",
-    )
+    default_text = f"(default {POSES.default}, with --refine {REFINEMENT_POSES})"
+    POSES.add_option(parser, default=None, help=f"number of random poses {default_text}")
+    for setting in (SEED, SPREAD, MARGIN, MIRROR):
+        setting.add_option(parser)
     parser.add_argument(
         "--action",
         action="append",
@@ -73,11 +58,6 @@ def _add_pose_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME",
         help="also record all frames of this NLA strip; repeatable",
-    )
-    parser.add_argument(
-        "--mirror",
-        action="store_true",
-        help="record the frames of actions and strips a second time, with left and right swapped",
     )
     parser.add_argument(
         "--sample",
@@ -103,15 +83,8 @@ def check_options(options: argparse.Namespace) -> None:
     """Check the options, as far as they need no rig.
 
     Raises:
-        WrongUsageError: a value is out of its range, or two options contradict each other.
+        WrongUsageError: two options contradict each other.
     """
-    if (options.poses or 0) < 0 or options.seed < 0:
-        raise WrongUsageError("--poses and --seed must be 0 or more.")
-    # At 10 the distribution is uniform. Above, most values would lie outside of the range and be drawn again.
-    if not 0 < options.spread <= 10:
-        raise WrongUsageError("--spread must be more than 0 and at most 10.")
-    if not 1 <= options.margin <= MAX_MARGIN:
-        raise WrongUsageError(f"--margin must be 1, for none, to {MAX_MARGIN:g} times the range of motion.")
     target_settings(options)
     new_recording_options = (
         options.action,

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.defaults import MIN_PARTITION_VERTICES
 from ..core.errors import ModelError
 from ..core.mathematics.metrics import viewport_colors
 from ..core.mathematics.partition import make_merged_partitions, partition_colors
 from ..core.sentences.counts import format_count
+from ..core.settings import MIN_PARTITION_VERTICES
 from ..rig.reading import read_rig
 from ..runtime.model_files import network_of
 from ..runtime.opened_model import open_model
@@ -53,7 +53,7 @@ def paint_errors(mesh_object: bpy.types.Object) -> None:
     _paint(mesh_object, Paint(ERRORS))
 
 
-def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PARTITION_VERTICES) -> None:
+def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PARTITION_VERTICES.default) -> None:
     """Show the partitions of the bound model as colors, or the partitions of the rig if no model can be read.
 
     Args:

@@ -4,7 +4,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
+from ..core.settings import EVALUATION_POSES, EVALUATION_SEED
 from ..poses.clip import Clip
 from ..rig.pose_setter import NO_TARGET, TargetSettings
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import bpy
 
-from ..core.defaults import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..core.errors import ModelError, RigError
 from ..core.formats.report import REPORT_HTML, page_path
 from ..core.progress import Job
+from ..core.settings import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..evaluation import heat_map, last_evaluation, side_by_side
 from ..evaluation.results import Evaluation
 from ..evaluation.run import evaluate, evaluate_action

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import bpy
 
-from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import FDDAError
 from ..core.recording.folder import remove_recording
 from ..core.recording.index import read_index
 from ..core.sentences.counts import format_count
+from ..core.settings import REFINEMENT_POSES
 from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder

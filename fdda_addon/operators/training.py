@@ -12,6 +12,7 @@ from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.progress import Job, Progress
 from ..core.recording.index import read_index
+from ..core.settings import EPOCHS, GOAL_MM, MIN_PARTITION_VERTICES, TOLERANCE_MM, TRAINING_SEED, values_from
 from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, training_steps
 from ..models.former_model import add_former_model, keep_former_model
@@ -99,14 +100,12 @@ class TrainingOperator(JobOperator):
             ) from error
         keep_former_model(model)
         settings = mesh_object.fdda.settings
-        arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
-        arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
-        arguments += ["--min-partition-vertices", str(settings.min_partition_vertices)]
+        arguments = [str(recording), str(model), TRAINING_SEED.option, str(settings.training_seed)]
+        values = values_from(settings, [TOLERANCE_MM, EPOCHS, MIN_PARTITION_VERTICES, *[GOAL_MM] * settings.use_goal])
+        arguments += [text for name, value in values.items() for text in (f"--{name.replace('_', '-')}", str(value))]
         if settings.fit_linear != "RIG":
             arguments += ["--fit-linear", settings.fit_linear.lower()]
         arguments += ["--joints", str(settings.joint_count) if settings.joints == "NUMBER" else settings.joints.lower()]
-        if settings.use_goal:
-            arguments += ["--goal-mm", f"{settings.goal_mm:.6g}"]
         if warm_start:
             arguments += ["--warm-start"]
         return Training(arguments) if bpy.app.background else DetachedTraining(arguments, model)

@@ -17,12 +17,40 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.defaults import EPOCHS, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, TOLERANCE_MM
 from ..core.errors import OutputError
+from ..core.settings import (
+    EPOCHS,
+    GOAL_MM,
+    MARGIN,
+    MAX_SETTLE_FRAMES,
+    MIN_PARTITION_VERTICES,
+    MIRROR,
+    POSES,
+    PRE_ROLL,
+    SEED,
+    SPREAD,
+    TARGET,
+    TOLERANCE_MM,
+    TRAINING_SEED,
+    Setting,
+)
 from ..scene.control_names import control_at, suggested_controls
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
 from .not_animatable import not_animatable
+
+MAX_INT = (1 << 31) - 1
+"""Largest value of an integer property."""
+
+
+def make_property(setting: Setting) -> object:
+    """Make Blender's property of a setting."""
+    kinds = {bool: BoolProperty, int: IntProperty, float: FloatProperty, str: StringProperty}
+    limits = {"min": setting.low} if setting.kind in (int, float) else {}
+    if setting.high < MAX_INT:
+        limits["max"] = setting.high
+    values = {"default": setting.default, **limits, **setting.ui}
+    return kinds[setting.kind](name=setting.label, description=setting.description, **values)
 
 
 @not_animatable
@@ -70,29 +98,10 @@ class FDDA_PG_control(bpy.types.PropertyGroup):
 class FDDA_PG_character(bpy.types.PropertyGroup):
     """Settings of the poses, the recording and the training of a character."""
 
-    poses: IntProperty(
-        name="Poses", description="Number of random poses to record", default=POSES, min=0, soft_max=10000
-    )
-    seed: IntProperty(name="Seed", description="Random seed of the poses", min=0)
-    spread: FloatProperty(
-        name="Spread",
-        description="How far random poses spread over the limits: small values stay near the middle, large values fill "
-        "the range evenly. An elbow with limits from 0° to 140° mostly bends between 35° and 105° at 0.5; at 10 all "
-        "angles are equally frequent",
-        default=SPREAD,
-        min=0.05,
-        max=10.0,
-        step=10,
-    )
-    margin: FloatProperty(
-        name="Overshoot",
-        description="Take a quarter of the random poses from limits that are wider by this factor, and rotate locked "
-        "axes too, so that the model stays accurate beyond the limits. 1 to stay within the limits",
-        default=MARGIN,
-        min=1.0,
-        max=4.0,
-        step=10,
-    )
+    poses: make_property(POSES)
+    seed: make_property(SEED)
+    spread: make_property(SPREAD)
+    margin: make_property(MARGIN)
     sample: EnumProperty(
         name="Bones to Pose",
         description="Bones that random poses move",
@@ -140,77 +149,28 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     joint_count: IntProperty(
         name="Number of Bones", description="How many bones the model reads", default=50, min=1, soft_max=500
     )
-    target: StringProperty(
-        name="Learn from Object",
-        description="Learn the shape of another mesh object with the same vertices, for example a simulated or cached "
-        "copy. Empty to learn from the rig itself",
-    )
-    pre_roll: IntProperty(
-        name="Pre-Roll",
-        description="Frames before an action in which a simulation moves from the rest pose to the first frame",
-        min=0,
-        soft_max=100,
-    )
-    max_settle_frames: IntProperty(
-        name="Settle",
-        description="Maximum number of frames to hold each random pose until the simulation comes to rest. 0 to record "
-        "no random poses",
-        min=0,
-        soft_max=200,
-    )
-    mirror: BoolProperty(
-        name="Also Record Mirrored",
-        description="Record each frame of the actions a second time with left and right swapped. The armature must be "
-        "symmetric",
-    )
+    target: make_property(TARGET)
+    pre_roll: make_property(PRE_ROLL)
+    max_settle_frames: make_property(MAX_SETTLE_FRAMES)
+    mirror: make_property(MIRROR)
     recording: StringProperty(
         name="Folder",
         description="Folder of the recording. Empty for a folder next to the .blend file",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    min_partition_vertices: IntProperty(
-        name="Min Vertices per Part",
-        description="Merge body parts with fewer vertices into a neighbor: a tongue of 5 vertices becomes part of the "
-        "jaw. 0 to merge none",
-        default=MIN_PARTITION_VERTICES,
-        min=0,
-        soft_max=100,
-    )
+    min_partition_vertices: make_property(MIN_PARTITION_VERTICES)
     model: StringProperty(
         name="Model",
         description="File to write the trained model to. Empty for a file in a folder next to the .blend file",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    tolerance_mm: FloatProperty(
-        name="Detail (mm)",
-        description="Smallest deformation worth learning; smaller is more accurate and slower. 0.05 is invisible in a "
-        "close-up of a face, 0.5 in a full figure",
-        default=TOLERANCE_MM,
-        min=0.001,
-        soft_max=1.0,
-        precision=3,
-        step=1,
-    )
+    tolerance_mm: make_property(TOLERANCE_MM)
     use_goal: BoolProperty(name="Goal (mm)", description="Report after the training whether the goal is met")
-    goal_mm: FloatProperty(
-        name="Goal (mm)",
-        description="Error that 99.9 % of the vertices in unseen poses shall stay below",
-        default=0.5,
-        min=0.001,
-        soft_max=10.0,
-        precision=2,
-        step=10,
-    )
-    epochs: IntProperty(
-        name="Training Passes",
-        description="How often to train on every recorded pose; more is more accurate and takes longer",
-        default=EPOCHS,
-        min=1,
-        soft_max=1000,
-    )
-    training_seed: IntProperty(name="Seed", description="Random seed of the training", min=0)
+    goal_mm: make_property(GOAL_MM)
+    epochs: make_property(EPOCHS)
+    training_seed: make_property(TRAINING_SEED)
 
 
 @not_animatable

@@ -4,6 +4,7 @@
 import bpy
 
 from ..core.errors import RigError
+from ..core.settings import settings_of, values_from
 from ..poses.action_range import action_frames
 from ..recording.plan import RecordingSettings
 from ..rig.pose_setter import TargetSettings
@@ -23,17 +24,12 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
     settings = scene_rig.mesh_object.fdda.settings
     actions = recorded_actions(scene_rig)
     return RecordingSettings(
-        poses=settings.poses,
-        seed=settings.seed,
-        spread=settings.spread,
-        # Round the float32 property to the number that the user typed.
-        margin=round(settings.margin, 6),
         actions=actions,
         resume=resume,
         sample=_sample_options(settings, actions),
         controls=_control_options(settings),
-        mirror=settings.mirror and bool(actions),
         target=target_settings(settings),
+        **(values_from(settings, settings_of(RecordingSettings)) | {"mirror": settings.mirror and bool(actions)}),
     )
 
 
@@ -54,15 +50,7 @@ def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
 
 def copy_sampling_settings(settings: FDDA_PG_character, source: FDDA_PG_character) -> None:
     """Copy the settings of poses and recording from another mesh, but not its paths and training settings."""
-    for name in (
-        "poses",
-        "seed",
-        "spread",
-        "margin",
-        "sample",
-        "bone_collection",
-        "mirror",
-    ):
+    for name in (*(setting.name for setting in settings_of(RecordingSettings)), "sample", "bone_collection"):
         setattr(settings, name, getattr(source, name))
     for name, attributes in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
         collection = getattr(settings, name)

@@ -6,8 +6,8 @@ from contextlib import suppress
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from ..core.defaults import EVALUATION_SEED, MARKERS, SIDEBAR_EVALUATION_POSES
 from ..core.errors import RigError
+from ..core.settings import EVALUATION_SEED, MARKERS, SIDEBAR_EVALUATION_POSES
 from ..evaluation.timeline import graph
 from ..scene import undo
 from ..scene.action_slots import active_action, dependencies, slots_of_action

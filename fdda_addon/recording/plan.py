@@ -8,12 +8,12 @@ from pathlib import Path
 import bpy
 
 from ..core.controls import Control
-from ..core.defaults import MARGIN, POSES, SPREAD
 from ..core.mathematics.poses import CONTROL, Channel, Margin, make_margin
 from ..core.mathematics.remix import PoseSampler
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
 from ..core.rig import Rig
+from ..core.settings import MARGIN, MIRROR, POSES, SEED, SPREAD
 from ..poses.clip import find_clips
 from ..poses.control_bones import split_control_bones
 from ..poses.remix import read_remix
@@ -60,17 +60,17 @@ class RecordingSettings:
         target: settings of the target whose surface is recorded.
     """
 
-    poses: int = POSES
-    seed: int = 0
-    spread: float = SPREAD
-    margin: float = MARGIN
+    poses: int = POSES.field()
+    seed: int = SEED.field()
+    spread: float = SPREAD.field()
+    margin: float = MARGIN.field()
     actions: tuple[str, ...] = ()
     influence_poses: int = INFLUENCE_POSES
     resume: bool = False
     sample: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     strips: tuple[str, ...] = ()
-    mirror: bool = False
+    mirror: bool = MIRROR.field()
     target: TargetSettings = NO_TARGET
     overwrite: bool = False
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.defaults import REFINEMENT_POSES, SPREAD
 from ..core.errors import RecordingError
 from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.features import joint_features
@@ -20,6 +19,7 @@ from ..core.recording.extension import RecordingExtension
 from ..core.recording.index import ALONE, REFINED
 from ..core.recording.reader import Recording, read_recording
 from ..core.rig import Rig, rig_differences
+from ..core.settings import REFINEMENT_POSES, SPREAD
 from ..poses.sampling import model_channels, rig_allows_ranges
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator, read_rig
@@ -154,7 +154,7 @@ def _evaluate_probes(
 
 
 def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
-    return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else SPREAD)
+    return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else SPREAD.default)
 
 
 def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[Channel, ...]) -> None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.defaults import REPEATABILITY_POSES, REST_THRESHOLD_MM
 from ..core.mathematics.poses import Channel
 from ..core.recording.target import RecordedTarget
+from ..core.settings import MAX_SETTLE_FRAMES, PRE_ROLL, REPEATABILITY_POSES, REST_THRESHOLD_MM, TARGET
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from .target import Target
@@ -32,11 +32,11 @@ class TargetSettings:
             direction.
     """
 
-    name: str = ""
-    pre_roll: int = 0
-    max_settle_frames: int = 0
-    rest_threshold_mm: float = REST_THRESHOLD_MM
-    repeatability_poses: int = REPEATABILITY_POSES
+    name: str = TARGET.default
+    pre_roll: int = PRE_ROLL.field()
+    max_settle_frames: int = MAX_SETTLE_FRAMES.field()
+    rest_threshold_mm: float = REST_THRESHOLD_MM.field()
+    repeatability_poses: int = REPEATABILITY_POSES.field()
 
 
 NO_TARGET = TargetSettings()

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import bpy
 import numpy as np
 
-from ..core.defaults import REST_THRESHOLD_MM
 from ..core.recording.target import RecordedTarget
+from ..core.settings import REST_THRESHOLD_MM
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..scene.arrays import POSE_CHANNELS, write
@@ -57,7 +57,7 @@ class Settler:
         last_rest_state: the rest state of the last pose; None before the first pose.
     """
 
-    def __init__(self, target: Target, max_frames: int, rest_threshold_mm: float = REST_THRESHOLD_MM):
+    def __init__(self, target: Target, max_frames: int, rest_threshold_mm: float = REST_THRESHOLD_MM.default):
         """Prepare to settle a target.
 
         Args:

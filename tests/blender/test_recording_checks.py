@@ -11,10 +11,10 @@ import pytest
 
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.checks.recording import check_recording
-from fdda_addon.core.defaults import MIN_PARTITION_VERTICES
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import skin_recording
+from fdda_addon.core.settings import MIN_PARTITION_VERTICES
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW, ELBOW_RIG, run, train

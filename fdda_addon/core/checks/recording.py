@@ -4,11 +4,11 @@
 import numpy as np
 
 from ..controls import SHAPE_KEY_PATH
-from ..defaults import MIN_PARTITION_VERTICES
 from ..mathematics.features import float32_rounding, joint_features_in_metres
 from ..recording.skinned import SkinnedRecording
 from ..rig import Rig
 from ..sentences.counts import format_count
+from ..settings import MIN_PARTITION_VERTICES
 from .flips import check_flips
 from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
@@ -258,7 +258,7 @@ def _check_still_vertices(
 
 def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarning]:
     small_partitions = [
-        partition for partition in recording.partitions if len(partition.vertices) < MIN_PARTITION_VERTICES
+        partition for partition in recording.partitions if len(partition.vertices) < MIN_PARTITION_VERTICES.default
     ]
     if not small_partitions or len(recording.partitions) == 1:
         return []
@@ -266,7 +266,7 @@ def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarnin
     min_vertex_count = min(len(partition.vertices) for partition in small_partitions)
     text = (
         f"{format_with_noun(names, 'partition')} {'has' if len(small_partitions) == 1 else 'have'} fewer than "
-        f"{MIN_PARTITION_VERTICES} vertices (the smallest {min_vertex_count}), and a network each: train with "
-        f"--min-partition-vertices {MIN_PARTITION_VERTICES} to merge them into others."
+        f"{MIN_PARTITION_VERTICES.default} vertices (the smallest {min_vertex_count}), and a network each: train with "
+        f"--min-partition-vertices {MIN_PARTITION_VERTICES.default} to merge them into others."
     )
     return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ..defaults import SPREAD
+from ..settings import SPREAD
 
 ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL = "rotation", "rotation_vector", "location", "scale", "control"
 CHANNEL_KINDS = (ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL)
@@ -81,7 +81,7 @@ class Channel:
         return channel
 
 
-def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: float = SPREAD) -> np.ndarray:
+def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: float = SPREAD.default) -> np.ndarray:
     """Draw one pose from normal distributions around the centers of the ranges, truncated to the ranges.
 
     The pose depends on seed and index alone, so a resumed recording continues with the same poses.

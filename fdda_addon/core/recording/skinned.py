@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..defaults import MIN_PARTITION_VERTICES
 from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import (
     INFLUENCE_TOLERANCE,
@@ -19,6 +18,7 @@ from ..mathematics.partition import (
 from ..mathematics.skin_fit import SkinFit
 from ..mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
 from ..rig import Fingerprint, Rig
+from ..settings import MIN_PARTITION_VERTICES
 from .index import ALONE, RecordingInfo
 from .influences import add_influences, detect_influences
 from .reader import Recording
@@ -109,7 +109,7 @@ def skin_recording(
     rig: Rig | None = None,
     joints: np.ndarray | None = None,
     follow: Callable[[Partition, np.ndarray], np.ndarray] = lambda partition, influences: influences,
-    min_partition_vertices: int = MIN_PARTITION_VERTICES,
+    min_partition_vertices: int = MIN_PARTITION_VERTICES.default,
     influence_tolerance: float = INFLUENCE_TOLERANCE,
     note: Callable[[str], None] = lambda text: None,
 ) -> SkinnedRecording:

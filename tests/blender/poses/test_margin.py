@@ -143,7 +143,7 @@ def test_record_accepts_margins_from_1_to_4(rig, tmp_path, capfd):
     assert (margin.factor, margin.poses) == (1.5, 5)
     for value in ("0.5", "4.5", "nan"):
         assert run("record", rig, tmp_path / "s", "--margin", value) == 2
-        assert "--margin must be 1, for none, to 4 times the range of motion." in capfd.readouterr().err
+        assert f"--margin: must be a number, 1 or more and at most 4, not '{value}'" in capfd.readouterr().err
     assert not (tmp_path / "s").exists()
 
 
