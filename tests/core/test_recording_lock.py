@@ -11,14 +11,12 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.errors import BusyError, OutputError, RecordingError
-from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.index import read_index
-from fdda_addon.core.recording.lock import LOCK_NAME, RecordingLock
-from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .. import systems
-from .limb import make_rig, record_limb, recording_info
+from .limb import make_rig, recording_info
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD_LOCK = """
@@ -131,16 +129,6 @@ def test_a_held_lock_with_an_unreadable_file_refuses_others(lock_process, tmp_pa
         make_writer(tmp_path)
 
 
-def test_a_lock_on_a_full_disk_refuses_others(small_disk):
-    (small_disk / "ballast").write_bytes(b"x" * os.statvfs(small_disk).f_bavail * 4096)
-    lock = RecordingLock(small_disk)
-    lock.acquire()
-    with pytest.raises(RecordingError, match="This Blender is recording into"):
-        RecordingLock(small_disk).acquire()
-    lock.release()
-    assert not (small_disk / LOCK_NAME).exists()
-
-
 @systems.forks
 def test_the_lock_file_is_the_lock_on_a_drive_that_cannot_lock_files(tmp_path, monkeypatch):
     systems.refuse_locks(monkeypatch)
@@ -171,23 +159,6 @@ def test_one_process_cannot_open_two_writers_of_a_recording(tmp_path):
             make_writer(tmp_path / "r", resume=True)
         assert sorted(path.name for path in (tmp_path / "r").iterdir()) == names_before
     assert read_index(tmp_path / "r")["complete"] == 0
-
-
-def test_an_extension_holds_the_lock(tmp_path):
-    record_limb(tmp_path / "r", 4)
-    with (
-        RecordingExtension(read_recording(tmp_path / "r"), "m.onnx"),
-        pytest.raises(RecordingError, match="This Blender is recording into"),
-    ):
-        make_writer(tmp_path / "r", resume=True)
-    assert not (tmp_path / "r" / LOCK_NAME).exists()
-
-
-def test_a_lock_that_is_not_held_is_not_released(tmp_path):
-    (tmp_path / LOCK_NAME).write_text("somebody's")
-    lock = RecordingLock(tmp_path)
-    lock.release()
-    assert not lock.is_held and (tmp_path / LOCK_NAME).exists()
 
 
 @systems.symbolic_links

@@ -3,7 +3,6 @@
 
 import errno
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,45 +14,12 @@ from fdda_addon.core.files import open_files
 from fdda_addon.core.files.output import atomic_write_all, write_text
 from fdda_addon.core.recording.folder import remove_recording
 from fdda_addon.core.recording.folder_check import check_recordable
-from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
-from ..limb import make_rig, random_poses, random_positions, record_limb, recording_info
+from ..limb import make_rig, record_limb, recording_info
 
 windows_only = pytest.mark.skipif(sys.platform != "win32", reason="Only on Windows, an open file cannot be replaced.")
-READ_REPEATEDLY = """
-import sys, time
-from pathlib import Path
-files = [Path(name) for name in sys.argv[2:]]
-print("reading", flush=True)
-while True:
-    for path in files:
-        try:
-            with open(path, "rb") as file:
-                file.read()
-                time.sleep(float(sys.argv[1]))
-        except OSError:
-            pass
-    time.sleep(0.05)
-"""
-
-
-@pytest.fixture
-def start_reader():
-    """Yield a function that starts a process, which opens files repeatedly and holds each for some seconds."""
-    processes = []
-
-    def start(seconds: float, *paths: Path) -> subprocess.Popen:
-        command = [sys.executable, "-c", READ_REPEATEDLY, str(seconds), *map(str, paths)]
-        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-        assert processes[-1].stdout.readline() == "reading\n"
-        return processes[-1]
-
-    yield start
-    for process in processes:
-        process.kill()
-        process.communicate()
 
 
 @pytest.fixture
@@ -104,45 +70,6 @@ def test_a_file_that_stays_open_is_not_replaced_and_new_files_are_kept(tmp_path,
     )
     assert exit_status(error.value) == TRY_AGAIN
     assert file_texts(tmp_path) == {"a": "old", "b": "old", "new-a": "new", "new-b": "new", "new-c": "new"}
-
-
-def test_a_recording_whose_index_stays_open_can_be_resumed(tmp_path, refuse_renames):
-    rig, matrices, residuals = make_rig(), random_poses(12), random_positions(12)
-    with (
-        pytest.raises(OutputError, match=r"another program has it open; 4 of 12 poses are complete, continue with"),
-        RecordingWriter(tmp_path / "r", rig, recording_info(12)) as writer,
-    ):
-        writer.append(matrices[:4], residuals[:4])
-        refuse_renames({"recording.json": 10**9})
-        writer.append(matrices[4:8], residuals[4:8])
-    refuse_renames({"recording.json": 0})
-    assert read_index(tmp_path / "r")["complete"] == 4
-    assert [path.name for path in (tmp_path / "r").glob("*.json")] == ["recording.json"]
-    record_limb(tmp_path / "r", 12, resume=True)
-    assert np.array_equal(read_recording(tmp_path / "r").positions, residuals)
-
-
-@windows_only
-def test_a_file_is_replaced_while_another_process_reads_it_repeatedly(tmp_path, start_reader):
-    path = tmp_path / "a.json"
-    write_text(path, "0")
-    start_reader(0.03, path)
-    for repetition in range(20):
-        write_text(path, str(repetition))
-        assert path.read_text() == str(repetition)
-    assert file_texts(tmp_path) == {"a.json": "19"}
-
-
-@windows_only
-def test_a_recording_is_written_while_another_process_reads_it_repeatedly(tmp_path, start_reader):
-    rig, poses = make_rig(), 60
-    matrices, residuals = random_poses(poses), random_positions(poses)
-    with RecordingWriter(tmp_path / "r", rig, recording_info(poses)) as writer:
-        start_reader(0.02, *(tmp_path / "r" / name for name in ("recording.json", "positions.npy")))
-        for pose_index in range(poses):
-            writer.append(matrices[pose_index : pose_index + 1], residuals[pose_index : pose_index + 1])
-            assert read_index(tmp_path / "r")["complete"] == pose_index + 1
-    assert np.array_equal(read_recording(tmp_path / "r").positions, residuals)
 
 
 @windows_only

@@ -151,12 +151,6 @@ def test_a_file_is_synced_before_it_is_renamed(tmp_path, monkeypatch):
     assert calls == ["fsync", "replace"]
 
 
-def test_a_new_file_has_the_usual_permissions(tmp_path):
-    write_text(tmp_path / "a", "")
-    (tmp_path / "b").touch()
-    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
-
-
 def test_writing_below_what_is_no_folder_is_refused(tmp_path):
     (tmp_path / "file").touch()
     for name, reason in (("gone", systems.NOT_FOUND), ("file", systems.BELOW_A_FILE)):
