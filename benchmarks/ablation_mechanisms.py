@@ -29,11 +29,7 @@ class Mechanism:
 
     @contextmanager
     def switched_off(self) -> Iterator[None]:
-        """Replace what the mechanism consists of, as long as the context lasts.
-
-        Raises:
-            AttributeError: the trainer has no such name.
-        """
+        """Replace what the mechanism consists of, as long as the context lasts."""
         originals = []
         try:
             for dotted_name, value in self.replacements.items():

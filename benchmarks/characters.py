@@ -50,11 +50,7 @@ def compare(rows: tuple[Row, ...], folder: Path) -> list[dict]:
 
 
 def write_tables(folder: Path) -> None:
-    """Write the results of all Blender versions in a folder to the tables of the page.
-
-    Raises:
-        SystemExit: the page has no place for them.
-    """
+    """Write the results of all Blender versions in a folder to the tables of the page."""
     files = [folder / f"{version}.json" for version in BLENDER_VERSIONS]
     runs = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()}
     TABLE.write(format_tables(runs))

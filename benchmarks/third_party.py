@@ -78,9 +78,6 @@ def prepare(source: Path, folder: Path, merge: bool = False) -> Character | None
 
     Returns:
         The character; None if there is nothing to merge.
-
-    Raises:
-        FDDAError: it has no rig.
     """
     with silenced_stdout():
         if source.suffix == ".blend":
@@ -148,11 +145,7 @@ def run_verb(*arguments: object) -> str:
 
 
 def measure(character: Character, folder: Path, poses: int, epochs: int) -> dict:
-    """Record, train, bind and evaluate a character; return the JSON of the evaluation and of the benchmark.
-
-    Raises:
-        VerbError: a verb has failed.
-    """
+    """Record, train, bind and evaluate a character; return the JSON of the evaluation and of the benchmark."""
     rig, recording, model = character.file, folder / "recording", folder / "model.onnx"
     object_options = ("--object", character.object_name)
     actions = [option for name in character.recorded for option in ("--action", name)]

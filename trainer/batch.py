@@ -61,9 +61,6 @@ def train_models(
         recordings: folders of complete recordings, which `check_batch` has checked.
         folder: folder of the models; the model of recording NAME is FOLDER/NAME/NAME.onnx.
         config, sink, stoppable, warm_start, strict: as in `train_model`.
-
-    Raises:
-        FDDAError: as in `train_model`.
     """
     from .train import train_model
 

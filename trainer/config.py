@@ -106,10 +106,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainingConfig:
-    """Create settings from the options that `add_options` added.
-
-    Raises:
-        TrainingError: a value is impossible.
-    """
+    """Create settings from the options that `add_options` added."""
     values = {setting.name: getattr(arguments, setting.name) for setting in settings_of(TrainingConfig)}
     return TrainingConfig(**{**values, "hidden": tuple(values["hidden"])})

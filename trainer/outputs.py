@@ -19,8 +19,5 @@ def check_training_outputs(model: Path, overwrite: bool) -> None:
     Args:
         model: path of the model file.
         overwrite: as in `core.files.output.check_outputs`.
-
-    Raises:
-        OutputError: a file cannot be written.
     """
     check_outputs(zip(training_outputs(model), (MODEL, CHECKPOINT, REPORT, PAGE), strict=True), overwrite=overwrite)

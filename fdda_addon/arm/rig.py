@@ -23,9 +23,6 @@ def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
 
     The arm has three deformers: an Armature modifier with hard skinning, a biceps shape key with a driver, and
     Corrective Smooth. The action `arm_drive` is assigned, and the scene gets its frame range.
-
-    Raises:
-        ValueError: the density is not 1, 2 or 3.
     """
     surface = sculpt_arm(density)
     armature_object = _create_armature_object()

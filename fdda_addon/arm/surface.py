@@ -203,11 +203,7 @@ def _build_grid(density: int) -> Grid:
 
 
 def sculpt_arm(density: int) -> Surface:
-    """Build the arm at density 1, 2 or 3 (about 1,450, 10,000 and 50,000 vertices).
-
-    Raises:
-        ValueError: the density is not 1, 2 or 3.
-    """
+    """Build the arm at density 1, 2 or 3 (about 1,450, 10,000 and 50,000 vertices)."""
     grid = _build_grid(density)
     field = arm_field()
     guide = _build_grid(1)

@@ -23,11 +23,7 @@ def add_rig_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def open_rig(options: argparse.Namespace) -> SceneRig:
-    """Open the .blend file of the options, and return its rig.
-
-    Raises:
-        FDDAError: the file cannot be opened, or has no rig.
-    """
+    """Open the .blend file of the options, and return its rig."""
     open_file(options.rig)
     return find_rig(options.object)
 

@@ -130,11 +130,6 @@ def render_frames(
 
     Yields:
         The path of each file, and its width and height in pixels.
-
-    Raises:
-        ModelError: as for `film`.
-        OSError: a picture cannot be written.
-        OutputError: the machine lacks a library that Workbench needs.
     """
     check_can_render()
     source = _FrameSource(scene_rig, model, errors, settings.columns)

@@ -58,9 +58,6 @@ def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PART
 
     Args:
         min_partition_vertices: smallest number of vertices in a partition of the rig.
-
-    Raises:
-        RigError: the rig cannot be read.
     """
     rig = read_rig(scene_rig)
     partitions = make_merged_partitions(rig, min_partition_vertices)

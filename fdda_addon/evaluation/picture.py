@@ -94,9 +94,6 @@ def draw(
         view: the view direction.
         has_heat_scale: whether to add the color scale of the heat map at the bottom.
         is_sculpted: whether to light the meshes so that their shape shows best, instead of their colors.
-
-    Raises:
-        OutputError: the file cannot be written, or the machine lacks a library that Workbench needs.
     """
     check_can_render()
     picture = Picture(view, mesh_object)

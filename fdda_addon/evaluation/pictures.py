@@ -61,11 +61,7 @@ def representative_poses(errors: PoseErrors) -> list[PicturedPose]:
 
 
 def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> None:  # noqa: B008 - frozen
-    """Draw the rest pose with one color for each partition.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Draw the rest pose with one color for each partition."""
     rig = read_rig(scene_rig)
     partitions = make_merged_partitions(rig)
     colors = partition_colors(partitions, rig.vertex_count)
@@ -92,10 +88,6 @@ def draw_comparison(
         title: title of the picture; empty for a default.
         view: the view direction.
         reference_label: label of the positions of the poses.
-
-    Raises:
-        ModelError: the model cannot be read, or was trained for another rig.
-        OutputError: the file cannot be written.
     """
     opened = open_model(scene_rig, model)
     network, skinning = opened.network, LinearSkinning(opened.linear_rig)

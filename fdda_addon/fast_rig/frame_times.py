@@ -72,9 +72,6 @@ def measure_frames(
         frames: number of frames to time with each rig.
         size: size of the full rig, armature units.
         rounds: number of rounds; each opens both files.
-
-    Raises:
-        FDDAError: a file cannot be opened.
     """
     times: dict[Path, list[float]] = {full: [], fast: []}
     frames_per_round = max(1, -(-frames // rounds))

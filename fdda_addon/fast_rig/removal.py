@@ -89,9 +89,6 @@ def remove_unneeded(
         joint_names: names of the joints that the models read.
         controls: names of the control bones to keep.
         nodes: further nodes to keep.
-
-    Raises:
-        RigError: as `deforming_modifiers` and `check_armature`, or something kept reads if a replaced modifier is on.
     """
     armature_object = scene_rigs[0].armature_object
     check_armature(armature_object)
@@ -143,11 +140,7 @@ def _write_names(owner: bpy.types.FCurve | bpy.types.DriverTarget, datablock: bp
 
 
 def _read_modifiers(mesh_object: bpy.types.Object, kept: set[Node]) -> set[str]:
-    """Return the names of the modifiers of an object whose settings kept drivers read.
-
-    Raises:
-        RigError: a driver reads if a modifier is on.
-    """
+    """Return the names of the modifiers of an object whose settings kept drivers read."""
     paths = [node.driven_path for node in kept if node.datablock == mesh_object]
     read = set()
     for modifier in mesh_object.modifiers:

@@ -129,11 +129,7 @@ class JobRunner:
                 return False
 
     def close(self) -> None:
-        """Close the generator, which restores the scene.
-
-        Raises:
-            FDDAError: restoring failed.
-        """
+        """Close the generator, which restores the scene."""
         self.steps.close()
 
     def end(self, outcome: str, level: str) -> None:

@@ -89,9 +89,6 @@ class FDDA_OT_fast_rig(FileJobOperator, bpy.types.Operator):
         """Check that there is a saved file of a full rig.
 
         Unsaved changes are allowed, because Blender 4.5 counts what playback restores after a save as a change.
-
-        Raises:
-            RigError: the file has no path, or the rig is a fast rig or linked.
         """
         mesh_object = scene_rig.mesh_object
         if mesh_object.fdda.is_fast_rig:

@@ -40,11 +40,7 @@ class FDDA_OT_help(bpy.types.Operator):
 
 
 def manual_file() -> Path:
-    """Write the manual as an HTML page and return its path. The pictures stay in the add-on.
-
-    Raises:
-        OSError, OutputError: it cannot be read or written.
-    """
+    """Write the manual as an HTML page and return its path. The pictures stay in the add-on."""
     text = MANUAL.read_text(encoding="utf-8")
     folder = Path(bpy.app.tempdir or tempfile.gettempdir())
     path = folder / "fdda_manual.html"

@@ -71,19 +71,11 @@ class RigOperator:
         return ""
 
     def rig(self, context: bpy.types.Context) -> SceneRig:
-        """Return the rig to apply the operator to.
-
-        Raises:
-            RigError: there is no rig.
-        """
+        """Return the rig to apply the operator to."""
         return active_rig(context, self.object)
 
     def rigs(self, context: bpy.types.Context) -> list[SceneRig]:
-        """Return the rigs to apply the operator to: with `all_meshes` all rigs of the active armature, else one rig.
-
-        Raises:
-            RigError: there is no rig.
-        """
+        """Return the rigs to apply the operator to: with `all_meshes` all rigs of the active armature, else one rig."""
         together = rigs_of_active_armature(context) if self.all_meshes and not self.object else []
         return together or [self.rig(context)]
 
@@ -99,11 +91,7 @@ class RigOperator:
         return scene_rig
 
     def bound_rigs(self, context: bpy.types.Context) -> list[SceneRig]:
-        """Return the rigs with a bound model to apply the operator to.
-
-        Raises:
-            FDDAError: there is no rig, or no model is bound to any of the rigs.
-        """
+        """Return the rigs with a bound model to apply the operator to."""
         bound = [rig for rig in self.rigs(context) if rig.mesh_object.fdda.is_bound]
         return bound or [self.bound_rig(context)]
 

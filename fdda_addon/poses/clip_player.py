@@ -62,9 +62,6 @@ class ClipPlayer:
 
         Args:
             clips: the clips that will be shown.
-
-        Raises:
-            RigError: a clip is mirrored, and the rig is not symmetric.
         """
         armature_object, self._clip = rigs[0][0].armature_object, None
         mesh_objects = [scene_rig.mesh_object for scene_rig, _ in rigs]
@@ -175,9 +172,6 @@ def clip_player(rigs: ControlledRigs, clips: tuple[Clip, ...]) -> Iterator[ClipP
     """Yield a player of clips, with the armatures that it animates in the rest pose and without animation.
 
     Afterwards restore poses, animation, the numbers that the clips animate, and the frame.
-
-    Raises:
-        RigError: as `ClipPlayer`.
     """
     player = ClipPlayer(rigs, clips)
     states = [(datablock, animation_state(datablock)) for datablock in player.other_datablocks]

@@ -28,9 +28,6 @@ def split_control_bones(scene_rig: SceneRig, texts: Iterable[str]) -> tuple[froz
 
     Args:
         texts: `collection:NAME` for the bones of a collection and its children, `bone:NAME`, or any other text.
-
-    Raises:
-        RigError: there is no such collection or bone.
     """
     names: set[str] = set()
     other_texts = []

@@ -43,9 +43,6 @@ class Mirror:
         Args:
             animated_numbers: datablocks and RNA paths of numbers to exchange with the other side, in addition to
                 custom properties of bones.
-
-        Raises:
-            RigError: the rest pose is not symmetric, or two bones have different rotation modes.
         """
         self._armature_object = armature_object
         bones = armature_object.pose.bones
@@ -93,11 +90,7 @@ class Mirror:
 
 
 def _check_symmetric(armature_object: bpy.types.Object, partner_indices: np.ndarray) -> None:
-    """Check that each bone is the mirror image of its partner, given by (B,) int indices.
-
-    Raises:
-        RigError: a bone is not symmetric; the message names it.
-    """
+    """Check that each bone is the mirror image of its partner, given by (B,) int indices."""
     bones = armature_object.data.bones
     matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
     tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)

@@ -65,11 +65,7 @@ def parse_sample_selection(
 
 
 def controls_of_bones(scene_rig: SceneRig, selection: SampleSelection) -> tuple[Control, ...]:
-    """Return the controls of the control bones of a selection.
-
-    Raises:
-        RigError: as `bone_controls`.
-    """
+    """Return the controls of the control bones of a selection."""
     channels = _bone_channels(scene_rig.armature_object, selection, set())
     return bone_controls(scene_rig, selection.control_bones, channels)
 

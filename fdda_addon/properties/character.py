@@ -208,20 +208,12 @@ def default_model(mesh_object: bpy.types.Object) -> str:
 
 
 def recording_folder(mesh_object: bpy.types.Object) -> Path:
-    """Return the folder of the recording: the chosen one, else FILE_NAME_recording next to the .blend file.
-
-    Raises:
-        OutputError: the path is relative to a .blend file that has not been saved.
-    """
+    """Return the folder of the recording: the chosen one, else FILE_NAME_recording next to the .blend file."""
     return _resolve_path(mesh_object.fdda.settings.recording, default_recording(mesh_object), "recording", "Folder")
 
 
 def model_file(mesh_object: bpy.types.Object) -> Path:
-    """Return the file of the model: the chosen one, else FILE_NAME_model/FILE_NAME.onnx next to the .blend file.
-
-    Raises:
-        OutputError: the path is relative to a .blend file that has not been saved.
-    """
+    """Return the file of the model: the chosen one, else FILE_NAME_model/FILE_NAME.onnx next to the .blend file."""
     return _resolve_path(mesh_object.fdda.settings.model, default_model(mesh_object), "model", "Model file")
 
 

@@ -16,11 +16,7 @@ from .character import FDDA_PG_character
 
 
 def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
-    """Return the settings of a recording of a character.
-
-    Raises:
-        RigError: the bones to pose have not been chosen.
-    """
+    """Return the settings of a recording of a character."""
     settings = scene_rig.mesh_object.fdda.settings
     actions = recorded_actions(scene_rig)
     return RecordingSettings(

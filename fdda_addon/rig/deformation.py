@@ -36,11 +36,7 @@ _SIGNIFICANT_DIGITS = 6
 
 
 def read_deformation(scene_rig: SceneRig) -> dict:
-    """Read the modifiers, shape keys, B-Bones and drivers that deform the mesh of a rig, as JSON values.
-
-    Raises:
-        RigError: as `recorded_modifiers`.
-    """
+    """Read the modifiers, shape keys, B-Bones and drivers that deform the mesh of a rig, as JSON values."""
     mesh_object = scene_rig.mesh_object
     deformation = {
         **read_modifiers_and_drivers(scene_rig),
@@ -57,11 +53,7 @@ def read_deformation(scene_rig: SceneRig) -> dict:
 
 
 def read_modifiers_and_drivers(scene_rig: SceneRig) -> dict:
-    """Read the modifiers that deform the mesh of a rig, and digests of the drivers, as JSON values.
-
-    Raises:
-        RigError: as `recorded_modifiers`.
-    """
+    """Read the modifiers that deform the mesh of a rig, and digests of the drivers, as JSON values."""
     modifiers = [_read_modifier(scene_rig, modifier) for modifier in recorded_modifiers(scene_rig.mesh_object)]
     return {"modifiers": modifiers, "drivers": read_drivers(scene_rig)}
 

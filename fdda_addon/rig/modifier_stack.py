@@ -75,9 +75,6 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     """Sort the modifiers of a mesh object while no model plays.
 
     Geometry Nodes with an unknown effect are evaluated, to find out whether they keep the topology of the mesh.
-
-    Raises:
-        RigError: Geometry Nodes have to be evaluated, and the object is hidden.
     """
     modifiers = [m for m in mesh_object.modifiers if not is_fdda_modifier(m)]
     effects = [effect_of(m) for m in modifiers]
@@ -122,9 +119,6 @@ def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifie
     """Return the modifiers that a model replaces, in their order, on or off.
 
     For a bound object these are the modifiers before the FDDA modifier, and nothing is evaluated.
-
-    Raises:
-        RigError: as `read_stack`.
     """
     fdda_index = _fdda_modifier_index(mesh_object)
     if fdda_index is not None:
@@ -133,11 +127,7 @@ def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifie
 
 
 def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """Return the modifiers whose effect a model includes, in their order: all that are on while the rig is shown.
-
-    Raises:
-        RigError: as `read_stack`.
-    """
+    """Return the modifiers whose effect a model includes, in their order: all that are on while the rig is shown."""
     index = _fdda_modifier_index(mesh_object)
     if index is None:
         index = read_stack(mesh_object).insert_index
@@ -282,11 +272,7 @@ def check_posable(scene_rig: SceneRig) -> None:
 
 
 def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
-    """Sort the modifiers of a rig, and check that its evaluated mesh can be compared with a model.
-
-    Raises:
-        RigError: as `check_posable`, the object is hidden, or a model cannot replace a modifier.
-    """
+    """Sort the modifiers of a rig, and check that its evaluated mesh can be compared with a model."""
     check_posable(scene_rig)
     mesh_object = scene_rig.mesh_object
     _evaluated_object(mesh_object)
@@ -298,11 +284,7 @@ def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
 
 @contextmanager
 def downstream_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Switch the downstream modifiers off, so that the evaluated mesh has the vertices of the original one.
-
-    Raises:
-        RigError: the evaluated mesh still has another number of vertices.
-    """
+    """Switch the downstream modifiers off, so that the evaluated mesh has the vertices of the original one."""
     stack = read_stack(mesh_object)
     with _modifiers_disabled(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
         _check_vertex_count(mesh_object, stack)

@@ -117,9 +117,6 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
 
     A fast rig lacks modifiers and bones of the rig that the model was trained for, so skin weights and deformation
     count as those of the model. If the model reads key joints, the rig has these alone.
-
-    Raises:
-        RigError: as `read_rig`.
     """
     rig = read_rig(scene_rig, info.joint_names)
     if info.fingerprint.has_key_joints:
@@ -158,9 +155,6 @@ class PoseReader:
         Args:
             names: names of J joints.
             rest_matrices: (J, 4, 4), rest matrices of the joints, mesh-object space.
-
-        Raises:
-            KeyError: the armature lacks a joint.
         """
         self._matrix_reader = armature_io.PoseMatrixReader(scene_rig.armature_object, names)
         self._rest_matrices = rest_matrices.astype(np.float64)
@@ -216,9 +210,6 @@ class PoseEvaluator:
 
         Args:
             target: the target whose positions replace those of the rig.
-
-        Raises:
-            RigError: the rig lacks one of its controls.
         """
         self._scene_rig, self._target = scene_rig, target
         self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)

@@ -42,11 +42,7 @@ class Cache:
 def read_caches(
     scene_rig: SceneRig, target_object: bpy.types.Object, controls: Iterable[Control] = ()
 ) -> tuple[Cache, ...]:
-    """Find the simulations and caches of a target and of everything that it depends on, except the rig and controls.
-
-    Raises:
-        RigError: a file is missing or damaged.
-    """
+    """Find the simulations and caches of a target and of everything that it depends on, except the rig and controls."""
     sources = Sources(scene_rig, target_object, [modifier.name for modifier in target_object.modifiers])
     inputs = time_inputs(sources, control_keys(scene_rig, controls))
     caches = [cache for scene_object in sources.objects for cache in _object_caches(scene_object)]

@@ -42,9 +42,6 @@ def temporary_rig_states(
 
     Yields:
         The player of the clips.
-
-    Raises:
-        RigError: a clip is mirrored, and a rig is not symmetric.
     """
     controlled_rigs = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *other_rigs)]
     with ExitStack() as stack:

@@ -58,9 +58,6 @@ def slots_of_action(action: bpy.types.Action, datablocks: Sequence[bpy.types.ID]
 
     Args:
         datablocks: the datablocks of the rig (`dependencies`).
-
-    Raises:
-        RigError: several datablocks or slots fit equally.
     """
     slots: ActionSlots = {}
     curves = {slot: unmuted_curves(action, slot) for slot in action.slots}
@@ -117,11 +114,7 @@ def unmuted_curves(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> li
 
 
 def curves_of_actions(actions: Iterable[bpy.types.Action], *roots: bpy.types.ID) -> list[CurvesByDatablock]:
-    """Return the F-curves with which each action animates datablocks and all that they depend on.
-
-    Raises:
-        RigError: as `slots_of_action`.
-    """
+    """Return the F-curves with which each action animates datablocks and all that they depend on."""
     actions = list(actions)
     datablocks = dependencies(*roots) if actions else []
     return [

@@ -30,11 +30,7 @@ def animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) ->
 
 
 def read_value(owner: bpy.types.ID, path: str) -> object:
-    """Return the number at an RNA path, or a copy of an array.
-
-    Raises:
-        ValueError: the path does not exist.
-    """
+    """Return the number at an RNA path, or a copy of an array."""
     value = owner.path_resolve(path)
     return value[:] if hasattr(value, "__len__") else value
 

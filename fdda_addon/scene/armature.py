@@ -37,9 +37,6 @@ class PoseMatrixReader:
 
         Args:
             names: names of J bones.
-
-        Raises:
-            KeyError: the armature lacks a bone.
         """
         bone_indices = {bone.name: bone_index for bone_index, bone in enumerate(armature_object.pose.bones)}
         self._bone_count = len(bone_indices)

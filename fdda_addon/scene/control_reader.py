@@ -37,9 +37,6 @@ class ControlReader:
 
         Args:
             controls: C controls.
-
-        Raises:
-            RigError: the rig lacks a control.
         """
         self._controls, self._mesh_name, self.warning = controls, scene_rig.mesh_object.name, ""
         channel_bones = set(_read_channel_bones())
@@ -96,9 +93,6 @@ class ControlReader:
 
         Returns:
             (C,) float32, each in the unit of its property.
-
-        Raises:
-            RigError: a control was removed or renamed.
         """
         owners = [owner_of(scene_rig, source.owner) for source in self.sources]
         return self.values([owner and owner.evaluated_get(depsgraph) for owner in owners])

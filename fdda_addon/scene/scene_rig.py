@@ -59,11 +59,7 @@ def find_rig(name: str = "") -> SceneRig:
 
 
 def find_rigs() -> list[SceneRig]:
-    """Find all rigs of the current scene: the meshes with an Armature modifier, in the order of the scene.
-
-    Raises:
-        RigError: there is no rig.
-    """
+    """Find all rigs of the current scene: the meshes with an Armature modifier, in the order of the scene."""
     meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
     rigged_objects = [o for o in meshes if armature_modifier(o) is not None]
     return [SceneRig(o, armature_of(o)) for o in rigged_objects] or [find_rig()]

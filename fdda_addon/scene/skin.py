@@ -48,9 +48,6 @@ class Skin:
 
         Returns:
             skin_joints (V, I) int32 and skin_weights (V, I) float32, rows of weights sum to 1; I is 4 or more.
-
-        Raises:
-            KeyError: a bone that has weights is no joint.
         """
         influence_counts = np.bincount(self.vertices, minlength=self.vertex_count)
         shape = (self.vertex_count, max(MIN_INFLUENCES, int(influence_counts.max(initial=0))))

@@ -134,11 +134,7 @@ class _ProcessFiles:
         self._errors = self._path.with_suffix(".errors")
 
     def new_messages(self) -> BinaryIO:
-        """Create the file for messages. The trainer inherits its lock and holds it while it runs.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Create the file for messages. The trainer inherits its lock and holds it while it runs."""
         file = self._new(self.messages)
         if sys.platform != "win32":
             with contextlib.suppress(OSError):
@@ -146,11 +142,7 @@ class _ProcessFiles:
         return file
 
     def new_errors(self) -> TextIO:
-        """Create the file for stderr.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Create the file for stderr."""
         return io.TextIOWrapper(self._new(self._errors), encoding="utf-8", errors="replace")
 
     def errors(self) -> TextIO:
@@ -168,11 +160,7 @@ class _ProcessFiles:
             raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; make room there.") from error
 
     def write_process_id(self, process_id: int) -> None:
-        """Write the process id.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write the process id."""
         write_json(self._path, {"process": process_id, "host": socket.gethostname()})
 
     @property

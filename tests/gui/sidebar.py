@@ -98,9 +98,6 @@ def find_button(identifier: str, across: float = 0.5) -> Iterator[float]:
     Args:
         identifier: part of the text that `describe_button_below_mouse` returns for the button.
         across: horizontal position of the search in the sidebar, 0 at the left and 1 at the right.
-
-    Raises:
-        StepError: there is no such button.
     """
     sidebar, scale = view_region("UI"), bpy.context.preferences.system.ui_scale
     # The tabs are at the right of the content.
@@ -145,9 +142,6 @@ def open_subpanel(above: str, content: str, across: float = 0.5, across_above: f
         above: identifier of a button above the header, as for `find_button`.
         content: identifier of a button of the sub-panel.
         across, across_above: horizontal position of the button of the sub-panel, and of the button above.
-
-    Raises:
-        StepError: no such sub-panel opens.
     """
     sidebar, scale = view_region("UI"), bpy.context.preferences.system.ui_scale
     _, top = yield from find_button(above, across_above)

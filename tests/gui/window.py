@@ -38,11 +38,7 @@ def require(condition: object, message: str) -> None:
 
 
 def wait_until(condition: Callable[[], object], seconds: float, message: str) -> Iterator[float]:
-    """Wait until a condition is true.
-
-    Raises:
-        StepError: the condition is still false after `seconds`.
-    """
+    """Wait until a condition is true."""
     deadline = time.monotonic() + seconds
     while not condition():
         require(time.monotonic() < deadline, f"{message} ({seconds:.0f} s)")

@@ -37,10 +37,6 @@ def render_html(report: dict, pictures: Sequence[Path] = (), evaluation: dict | 
 
     Returns:
         The HTML.
-
-    Raises:
-        OSError: a picture cannot be read.
-        ArithmeticError, IndexError, ValueError or TemplateError: figures of the report contradict each other.
     """
     return _template().render(
         report=report,

@@ -23,11 +23,7 @@ class FileKind:
     signature: bytes
 
     def matches(self, path: Path) -> bool:
-        """Return whether a file is of this kind; an empty file is of every kind.
-
-        Raises:
-            OSError: the file cannot be read.
-        """
+        """Return whether a file is of this kind; an empty file is of every kind."""
         with open_input(path) as file:
             first_bytes = file.read(SIGNATURE_BYTES)
         return not first_bytes or re.match(self.signature, first_bytes, re.DOTALL) is not None

@@ -68,10 +68,6 @@ def has_ended(process_id: int, host: str) -> bool:
 
 
 def wait_for_lock(descriptor: int) -> None:
-    """Wait until `try_lock` locks an open file.
-
-    Raises:
-        NoLocksError: the file system has no locks.
-    """
+    """Wait until `try_lock` locks an open file."""
     while not try_lock(descriptor):
         time.sleep(POLL_SECONDS)

@@ -42,11 +42,7 @@ def remove_file(path: Path) -> None:
 
 
 def open_with_retry(open_file: Callable[[], Result]) -> Result:
-    """Call a function that opens a file, and retry while Windows refuses it.
-
-    Raises:
-        OSError: `open_file` raised it.
-    """
+    """Call a function that opens a file, and retry while Windows refuses it."""
     # The exception of `open` lacks the error number of Windows.
     return _retry(open_file, OPEN_RETRY_SECONDS, lambda _: os.name == "nt")
 

@@ -89,9 +89,6 @@ def needed_cpp_library_version(data: bytes | mmap.mmap) -> tuple[int, int]:
 
     Microsoft promises only that a library as new as the linker will do. But all versions have the same functions, and
     those up to `NEWEST_KNOWN_TOOLSET` differ only in their mutexes.
-
-    Raises:
-        ValueError: as for `read_imports`.
     """
     linker_version, imports = read_imports(data)
     if CPP_LIBRARY not in imports:

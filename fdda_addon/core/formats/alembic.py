@@ -30,9 +30,6 @@ def read_time_range(path: Path) -> tuple[float, float] | None:
     Returns:
         First and last time in seconds. None where the file has another container format (HDF5), is no Alembic file,
         is damaged, or has no animation.
-
-    Raises:
-        OSError: the file cannot be opened.
     """
     with open_input(path) as file:
         try:

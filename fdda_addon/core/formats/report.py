@@ -111,12 +111,7 @@ def checkpoint_path(model_path: Path) -> Path:
 
 
 def write_report(path: Path, report: dict) -> None:
-    """Write a report with `format` and `version`.
-
-    Raises:
-        ValueError: a required key is missing or a value has the wrong type, which is a bug.
-        OutputError: the file cannot be written.
-    """
+    """Write a report with `format` and `version`."""
     write_text(path, report_text(report))
 
 
