@@ -47,12 +47,7 @@ def record(name: str, folder: Path, poses: int) -> None:
 
 
 def format_table(name: str, results: dict[str, list[dict]]) -> str:
-    """Format the results of a character as a Markdown table.
-
-    Args:
-        name: name of the character.
-        results: for each mechanism that is left out, the results of all seeds.
-    """
+    """Format the results of a character as a Markdown table."""
     kinds = [kind for kind in (ACTION, WITHIN, BEYOND) if kind in results[ALL][0]["errors"]]
     headings = ["without", *kinds, "MB", "time of a pose", "training, s"]
     lines = ["| " + " | ".join(headings) + " |", "|---" * len(headings) + "|"]

@@ -50,10 +50,6 @@ class Character:
     def result(self, without: str, seed: int) -> dict:
         """Return the figures of a model.
 
-        Args:
-            without: name in `MECHANISMS`.
-            seed: seed of the training.
-
         Returns:
             `seconds` of processor time of the training, 0 if only the graph was built again; `bytes` of the file;
             `frame_ratio`, time of a pose as a multiple of that of the model with all mechanisms; `errors`, for each

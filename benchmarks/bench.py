@@ -51,14 +51,7 @@ def measure(*arguments: object) -> dict:
 
 
 def bench(name: str, rig: Path, folder: Path, poses: int) -> dict:
-    """Record, train and bind one rig, and return all its figures.
-
-    Args:
-        name: name of the rig.
-        rig: .blend file of the rig.
-        folder: folder for the recording and the model.
-        poses: number of poses to record.
-    """
+    """Record, train and bind one rig, and return all its figures."""
     recording, model, bound = folder / f"{name}_recording", folder / f"{name}.onnx", folder / f"{name}_bound.blend"
     shutil.rmtree(recording, ignore_errors=True)
     print(f"{name}: record", file=sys.stderr)

@@ -101,10 +101,6 @@ def copy_checkout(folder: Path) -> None:
 def first_failure(folder: Path, tests: Sequence[str]) -> str:
     """Run test files until a test fails.
 
-    Args:
-        folder: the copy of the checkout.
-        tests: paths in it.
-
     Returns:
         The first test that failed, or `CRASHED` or `HUNG`; empty where all passed.
 
@@ -163,13 +159,7 @@ def run_command(
 
 
 def seed_and_test(fault: Fault, folder: Path, run_tiers: bool) -> Outcome:
-    """Seed one fault, run its tests and restore the file.
-
-    Args:
-        fault: the fault.
-        folder: the copy of the checkout.
-        run_tiers: run the whole tiers of the named files where these do not catch the fault.
-    """
+    """Seed one fault, run its tests and restore the file."""
     file, started = folder / fault.file, time.perf_counter()
     text = file.read_text(encoding="utf-8")
     file.write_text(fault.applied(text), encoding="utf-8")

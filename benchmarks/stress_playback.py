@@ -70,15 +70,7 @@ class PlaybackStress:
     """Apply random operations to the characters of the open file."""
 
     def __init__(self, first_object: bpy.types.Object, model: Path, characters: int, folder: Path, seed: int):
-        """Duplicate the first character and set up the scene.
-
-        Args:
-            first_object: a bound object; the other characters are copies of it.
-            model: model file of the first character.
-            characters: number of characters at the start.
-            folder: folder for renders and saves.
-            seed: seed of the random operations.
-        """
+        """Duplicate the first character and set up the scene."""
         self._random_generator = np.random.default_rng(seed)
         self._folder, self._max_characters = folder, characters + 2
         self._first_name = first_object.name

@@ -71,11 +71,6 @@ class Character:
 def prepare(source: Path, folder: Path, merge: bool = False) -> Character | None:
     """Import a character, and save it as a rig in `folder`.
 
-    Args:
-        source: the file.
-        folder: where the rig is saved.
-        merge: whether vertices that lie on each other are merged.
-
     Returns:
         The character; None if there is nothing to merge.
     """

@@ -30,10 +30,6 @@ def make_soft_body(flesh: bpy.types.Object, soft_bones: Collection[str]) -> None
 
     Without springs across the faces, faces shear and edges buckle at random. The result then does not look like flesh,
     and it is not a function of the pose.
-
-    Args:
-        flesh: a mesh with an Armature modifier.
-        soft_bones: the bones whose vertices sag and bulge; the vertices of other bones keep to the skinned surface.
     """
     soft_group_indices = {flesh.vertex_groups[name].index for name in soft_bones}
     goal_group = flesh.vertex_groups.new(name="held")

@@ -53,10 +53,6 @@ class Result:
 def record_row(row: Row, folder: Path) -> Iterator[tuple[Path, Path]]:
     """Build a character, save it as `rig.blend` and record each of its meshes.
 
-    Args:
-        row: the character.
-        folder: an empty folder for the character.
-
     Yields:
         For each mesh, the folder of the recording and the path for the model.
     """

@@ -40,13 +40,7 @@ class Trainings:
         """Arguments of each training that has not ended, and the size of `_errors` when it was added."""
 
     def add(self, recording: Path, model: Path, *options: object) -> None:
-        """Add a training that starts when those before it have ended, and return at once.
-
-        Args:
-            recording: folder of the recording.
-            model: file to write the model to.
-            options: options of `python -m trainer`.
-        """
+        """Add a training that starts when those before it have ended, and return at once."""
         arguments = [str(argument) for argument in (recording, model, *options)]
         self._pending.append((arguments, os.fstat(self._errors.fileno()).st_size))
         self._process.stdin.write(json.dumps(arguments) + "\n")

@@ -158,16 +158,7 @@ def _grow_digit(
     guide_shape: tuple[int, int],
     ring_count: int,
 ):
-    """Add a digit: rings of quads, and a patch that closes the tip.
-
-    Args:
-        quads: receives the vertices and faces.
-        name: name of the digit.
-        loop: vertices of the root, in the order of `_box_outline`.
-        shape: number of columns and sides of the outline.
-        guide_shape: the same at density 1.
-        ring_count: number of rings.
-    """
+    """Add a digit: rings of quads, and a patch that closes the tip."""
     digit = 0 if name == "thumb" else FINGERS.index(name) + 1
     guide_ring_count = len(_THUMB_RING_POSITIONS if digit == 0 else _FINGER_RING_POSITIONS) - 1
     ring_indices = np.arange(1, ring_count + 1) * guide_ring_count / ring_count

@@ -123,12 +123,7 @@ class Overlay:
         return OverlayMesh(positions, normals, colors, triangles, evaluated.matrix_world.copy())
 
     def _triangles_of(self, mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.types.GPUIndexBuf:
-        """Return the triangles of an evaluated mesh, stored because computing them takes longer than drawing them.
-
-        Args:
-            mesh_object: the original object. Triangles are computed if its mesh or the number of elements has changed.
-            mesh: the evaluated mesh.
-        """
+        """Return the triangles of an evaluated mesh, stored because computing them takes longer than drawing them."""
         mesh_key = (mesh_object.data.session_uid, len(mesh.vertices), len(mesh.loops))
         stored = self._triangles.get(mesh_object.session_uid)
         if stored is None or stored[0] != mesh_key:

@@ -78,12 +78,7 @@ class ErrorGraph:
         rectangle: tuple[float, float, float, float],
         shader: gpu.types.GPUShader,
     ) -> tuple[gpu.types.GPUBatch, ...]:
-        """Return the GPU batches of the area below the graph and of its line, stored until an argument changes.
-
-        Args:
-            rectangle: left end, right end, bottom and height of the graph, pixels.
-            shader: the shader that draws the batches.
-        """
+        """Return the GPU batches of the area below the graph and of its line, stored until an argument changes."""
         last = self._last_batches
         if last is None or last[0]() is not evaluation or last[1] != rectangle:
             left, right, bottom, height = rectangle

@@ -75,13 +75,7 @@ def evaluate_curves(curves: dict[int, bpy.types.FCurve], channel: str, frames: r
 
 
 def _continuous_angles(channel: str, rotation_mode: str, values: np.ndarray) -> np.ndarray:
-    """Convert rotations to Euler angles, (F, 3) radians, that do not jump by 360 degrees between frames.
-
-    Args:
-        channel: the channel of the rotations, "rotation_euler" or another one, which holds quaternions.
-        rotation_mode: rotation mode of the bone.
-        values: (F, 3 or 4) values.
-    """
+    """Convert rotations to Euler angles, (F, 3) radians, that do not jump by 360 degrees between frames."""
     angles, euler = np.empty((len(values), 3)), Euler((0.0, 0.0, 0.0), "XYZ")
     for index, value in enumerate(values):
         if channel == "rotation_euler":

@@ -67,14 +67,7 @@ def _parents(joint_bones: list[bpy.types.Bone]) -> dict[str, str]:
 
 
 def _parent(bone: bpy.types.Bone, names: set[str], joint_bones: list[bpy.types.Bone], bone_ends: np.ndarray) -> str:
-    """Find the parent joint of a joint.
-
-    Args:
-        bone: the bone of the joint.
-        names: names of all joints.
-        joint_bones: bones of the joints that an ancestor may coincide with.
-        bone_ends: (n, 6) float64, head and tail of these bones, armature space.
-    """
+    """Find the parent joint of a joint."""
     for ancestor in bone.parent_recursive:
         if ancestor.name in names:
             return ancestor.name

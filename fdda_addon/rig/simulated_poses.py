@@ -203,12 +203,7 @@ class SimulatedPoseSetter(PoseSetter):
 
     @contextmanager
     def _started_simulations(self, player: ClipPlayer, clip: Clip, extra_frames: int = 0) -> Iterator[None]:
-        """Play simulations up to the frame before a clip; inside, they can continue past the end of the clip.
-
-        Args:
-            player, clip: as in `show_frames`.
-            extra_frames: number of frames after the end of the clip.
-        """
+        """Play simulations up to the frame before a clip; inside, they can continue past the end of the clip."""
         first_frame = clip.frames[0] - self._pre_roll if self._pre_roll else None
         last_frame = clip.frames[-1] + extra_frames
         needs_range = self._pre_roll or extra_frames

@@ -92,12 +92,7 @@ def test_a_shape_key_that_never_moves_is_reported_with_what_drives_it(clean_reco
 def with_additional_joint(
     recording: SkinnedRecording, joint: Joint, local_transforms: np.ndarray, is_sampled: bool = True
 ) -> SkinnedRecording:
-    """Return the recording with one additional joint that has no weights.
-
-    Args:
-        local_transforms: (N, 4, 4) transforms of the joint relative to its rest pose.
-        is_sampled: whether the joint has a channel of random poses.
-    """
+    """Return the recording with one additional joint that has no weights."""
     rig = recording.rig
     rest_matrices = np.concatenate([rig.rest_matrices, rig.rest_matrices[-1:]])
     changed_rig = replace(rig, joints=(*rig.joints, joint), rest_matrices=rest_matrices)

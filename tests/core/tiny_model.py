@@ -47,11 +47,7 @@ def with_external_data(tensor: TensorProto, location: str = "weights.bin") -> Te
 
 
 def tiny_model(metadata: str | None = "", nodes=(), initializers=(), inputs=(), sparse=()) -> onnx.ModelProto:
-    """Return a model that `read_model` accepts, with additional nodes, initializers and inputs.
-
-    Args:
-        metadata: text of the metadata property; that of `tiny_info` when empty, no property when None.
-    """
+    """Return a model that `read_model` accepts, with additional nodes, initializers and inputs."""
     # Each coordinate is the sum of all pose matrices, so the output depends on the input.
     graph = helper.make_graph(
         [

@@ -76,12 +76,7 @@ def controlled_chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
 
 
 def blender_pose(info: dict, rotations: Rotations) -> np.ndarray:
-    """Compute pose matrices with Blender's mathutils: (1, J, 4, 4) float32.
-
-    Args:
-        info: metadata of a model.
-        rotations: rotations of the joints that are not in their rest pose.
-    """
+    """Compute pose matrices with Blender's mathutils: (1, J, 4, 4) float32."""
     rest = [Matrix([row[start : start + 4] for start in (0, 4, 8, 12)]) for row in info["rest_matrices"]]
     pose: list[Matrix] = []
     for index, joint in enumerate(info["joints"]):

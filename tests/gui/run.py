@@ -73,14 +73,7 @@ def end_process_group(process: subprocess.Popen) -> None:
 
 
 def run_command(command: list[str], environment: dict[str, str], seconds: float, output: Path) -> int | None:
-    """Run a command, and end its child processes with it; return its exit status, None after the time limit.
-
-    Args:
-        command: the command line.
-        environment: environment variables.
-        seconds: time limit.
-        output: file for stdout and stderr.
-    """
+    """Run a command, and end its child processes with it; return its exit status, None after the time limit."""
     with output.open("wb") as file:
         process = subprocess.Popen(
             command, cwd=ROOT, env=environment, start_new_session=True, stdout=file, stderr=subprocess.STDOUT

@@ -20,14 +20,7 @@ def pinned_version(package: str) -> str:
 
 
 def write_wheel(folder: Path, package: str, text: str = '__version__ = "{version}"\n', requires: str = "") -> Path:
-    """Write the wheel of a package.
-
-    Args:
-        folder: to write the wheel into.
-        package: its name.
-        text: content of `__init__.py`; `{version}` is replaced.
-        requires: another package that the wheel requires.
-    """
+    """Write the wheel of a package."""
     version = pinned_version(package)
     information = f"{package}-{version}.dist-info"
     path = folder / f"{package}-{version}-py3-none-any.whl"

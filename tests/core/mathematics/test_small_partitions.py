@@ -11,11 +11,7 @@ from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, Rig
 def make_weighted_rig(
     parents: list[int], vertices: list[tuple[dict[int, float], int]], names: list[str] | None = None
 ) -> Rig:
-    """Return a rig of joints with these parents.
-
-    Args:
-        vertices: weights by joint, and the number of vertices that have them.
-    """
+    """Return a rig of joints with these parents."""
     vertex_weights = [weights for weights, count in vertices for _ in range(count)]
     skin_joints, skin_weights = (
         np.zeros((len(vertex_weights), 4), np.int32),
