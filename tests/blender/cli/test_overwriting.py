@@ -106,15 +106,6 @@ def test_report_and_checkpoint_are_checked_too(place, capfd, monkeypatch):
         (place / name).unlink()
 
 
-def test_two_outputs_with_one_name_are_refused(place, capfd, monkeypatch):
-    monkeypatch.chdir(place)
-    refusal = Refusal(place, capfd)
-    text = refusal("evaluate", "rig.blend", "m.onnx", "--json", "e", "--heatmap", "e")
-    assert text == "Cannot write 'e': it would be the JSON of an evaluation and a PNG picture; give two names."
-    text = refusal("train", "recording", "report.json")
-    assert text == "Cannot write 'report.json': it would be a model and a training report; give two names."
-
-
 def test_a_bound_file_does_not_take_the_name_of_the_copied_model(place, capfd, monkeypatch):
     monkeypatch.chdir(place)
     (place / "there").mkdir()

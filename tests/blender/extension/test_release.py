@@ -15,7 +15,6 @@ import tomllib
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
@@ -91,15 +90,6 @@ def test_the_list_has_every_zip_with_its_hash(repository: Path, zips: list[Path]
         assert entry["website"] == WEBSITE and entry["copyright"]
 
 
-def test_the_page_has_a_link_to_drag_for_every_zip(repository: Path, zips: list[Path]):
-    page = (repository / "index.html").read_text()
-    links = [urlsplit(part.partition('"')[0]) for part in page.split('<a href="')[1:]]
-    queries = {link.path.removeprefix("./"): parse_qs(link.query) for link in links if link.query}
-    assert set(queries) == {path.name for path in zips}
-    assert {query["repository"][0] for query in queries.values()} == {"./index.json"}
-    assert "${" not in page and 'href="index.json"' in page
-
-
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="The repository of this test has zips for Linux.")
 @pytest.mark.skipif(package.current_platform() != "linux-x64", reason="The repository of this test has zips for x64.")
 def test_blender_installs_the_zip_of_its_python(address: str, tmp_path: Path):
@@ -131,44 +121,3 @@ def test_a_zip_that_blender_cannot_read_is_not_released(repository: Path, zips: 
         release.make_repository([damaged, *zips[1:]], repository)
     assert sorted((path.name, path.read_bytes()) for path in repository.iterdir()) == before
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
-
-
-def test_zips_of_two_versions_are_refused(zips: list[Path], tmp_path: Path):
-    older = tmp_path / "older.zip"
-    with zipfile.ZipFile(zips[0]) as source, zipfile.ZipFile(older, "w") as archive:
-        for name in source.namelist():
-            content = source.read(name)
-            if name == "blender_manifest.toml":
-                content = content.replace(f'version = "{package.read_version()}"'.encode(), b'version = "0.0.1"')
-            archive.writestr(name, content)
-    with pytest.raises(release.ReleaseError, match=r"The zips have the versions 0\.0\.1 and "):
-        release.make_repository([older, *zips[1:]], tmp_path / "repository")
-    assert not (tmp_path / "repository").exists()
-
-
-def test_another_folder_is_not_replaced(zips: list[Path], tmp_path: Path):
-    (tmp_path / "kept.txt").write_text("kept")
-    with pytest.raises(release.ReleaseError, match="is no repository and would be replaced; move it away"):
-        release.make_repository(zips, tmp_path)
-    assert (tmp_path / "kept.txt").read_text() == "kept"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["9.9.9"], "blender_manifest.toml has the version "),
-        ([package.read_version(), "--website", "fdda"], "'fdda' is no address of a web page; set WEBSITE to https://…"),
-    ],
-)
-def test_wrong_options_are_refused_before_anything_is_built(arguments: list[str], sentence: str):
-    command = [sys.executable, ROOT / "setup/release.py", *arguments]
-    result = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
-    assert result.returncode == 1 and result.stdout == "" and result.stderr.startswith(sentence)
-
-
-def test_a_version_without_a_chapter_in_the_changelog_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    release.check_version(package.read_version())
-    (tmp_path / "CHANGELOG.md").write_text("## 0.0.1\n")
-    monkeypatch.setattr(release, "ROOT", tmp_path)
-    with pytest.raises(release.ReleaseError, match=r"CHANGELOG\.md has no chapter '## "):
-        release.check_version(package.read_version())

@@ -140,10 +140,6 @@ def test_preferences_and_variable_come_before_the_own_environment(
     assert choice.select_python() == (str(folder.interpreter_path(own)), Origin.PREFERENCES)
 
 
-def test_the_running_python_is_used_by_default():
-    assert choice.select_python() == (sys.executable, Origin.THIS)
-
-
 @pytest.mark.slow
 def test_creation_warns_if_another_python_is_used_instead(user: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(choice.PYTHON_VARIABLE, sys.executable)
@@ -165,33 +161,12 @@ def test_a_missing_wheel_is_named_and_the_environment_kept(own: Path, wheels: Pa
 
 
 @pytest.mark.slow
-def test_a_missing_wheel_of_a_dependency_is_named(user: Path, wheels: Path, tmp_path: Path):
-    shutil.copytree(wheels, tmp_path / "fewer")
-    write_wheel(tmp_path / "fewer", "onnx", requires="fdda-nowhere")
-    text = refused(create, wheels=str(tmp_path / "fewer"))
-    assert text == (
-        f"The packages of '{tmp_path}/fewer' could not be installed (No matching distribution found for fdda-nowhere); "
-        f"add what is missing; the log is '{folder.log_path()}'."
-    )
-    assert session.environment_state() is FolderState.MISSING
-    assert "No matching distribution" in folder.log_path().read_text()
-
-
-@pytest.mark.slow
 def test_an_environment_with_broken_packages_is_removed(user: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "broken")
     write_wheel(tmp_path / "broken", "torch", "raise OSError('libcudart.so.13 is missing')\n")
     text = refused(create, wheels=str(tmp_path / "broken"))
     assert "installed but do not work: torch of" in text and "libcudart.so.13 is missing" in text
     assert session.environment_state() is FolderState.MISSING
-
-
-@pytest.mark.one_blender_version
-def test_a_folder_without_wheels_keeps_the_environment(own: Path, tmp_path: Path):
-    assert refused(create, wheels=str(tmp_path)).startswith(f"The folder '{tmp_path}' lacks the packages ")
-    missing = tmp_path / "none"
-    assert refused(create, wheels=str(missing)).startswith(f"'{missing}' is no folder; ")
-    assert session.environment_state() is FolderState.READY
 
 
 def test_without_online_access_wheels_are_required(user: Path, preferences, tmp_path: Path):
@@ -321,13 +296,6 @@ def test_an_environment_without_its_python_is_broken(
         f"Error: The trainer's Python '{python}' cannot be started (No such file or directory); reinstall the "
         "training environment in the add-on's preferences."
     )
-
-
-def test_an_environment_without_torch_is_reported(own: Path):
-    shutil.rmtree(own / "torch")
-    text = refused(bpy.ops.fdda.check_trainer)
-    assert text.endswith("lacks torch; reinstall the training environment in the add-on's preferences.")
-    assert session.check_result.level == "ERROR" and "torch is missing" in session.check_result.details
 
 
 @pytest.mark.one_blender_version

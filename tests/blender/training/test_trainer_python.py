@@ -119,11 +119,6 @@ def test_an_old_python_is_refused(tmp_path: Path):
     assert asked(python).message == f"'{python}' is Python 3.9.18, and the trainer needs 3.11 or later; do this."
 
 
-def test_a_missing_python_is_refused():
-    sentence = r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); do this\."
-    assert re.fullmatch(sentence, asked("/none/python").message)
-
-
 @pytest.mark.parametrize("said", ["", "hello", "5", "{}", '{"version": 3}'])
 def test_a_program_that_is_no_python_is_refused(tmp_path: Path, said: str):
     python = write_program(tmp_path / "program", f"print({said!r})")
@@ -167,11 +162,6 @@ def test_candidates_are_run_to_find_the_usable_python(tmp_path: Path):
 def test_a_base_python_says_what_it_lacks(tmp_path: Path, answer: list, lacks: str):
     base = query_interpreter([write_program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
     assert base.problem == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
-
-
-def test_blenders_python_is_the_first_candidate(monkeypatch: pytest.MonkeyPatch):
-    assert next(interpreters.default_candidates()) == [sys.executable]
-    assert next(find_interpreters()).path == sys.executable
 
 
 def test_a_training_without_blenders_program_finds_the_environment_that_blender_made(tmp_path: Path):
@@ -259,22 +249,6 @@ def test_pythons_are_searched_in_the_folders_of_windows(windows_folders: Path):
         ("path/py.exe", "-3.12"),
         ("path/python.exe",),
     ]
-
-
-@pytest.mark.skipif(os.name != "nt", reason="the registry is Windows'")
-def test_a_python_of_the_registry_is_found(tmp_path: Path):
-    import winreg
-
-    key = r"Software\Python\FDDATest"
-    with winreg.CreateKey(winreg.HKEY_CURRENT_USER, rf"{key}\3.13-64\InstallPath") as opened:
-        winreg.SetValue(opened, "", winreg.REG_SZ, str(tmp_path))
-    try:
-        assert tmp_path / "python.exe" in interpreters._registry_interpreters("3.13") and not [
-            *interpreters._registry_interpreters("3.1")
-        ]
-    finally:
-        for name in (rf"{key}\3.13-64\InstallPath", rf"{key}\3.13-64", key):
-            winreg.DeleteKey(winreg.HKEY_CURRENT_USER, name)
 
 
 @pytest.mark.one_blender_version
