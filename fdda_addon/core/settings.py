@@ -9,7 +9,6 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from types import MappingProxyType
 from typing import Any
 
 ABOVE_ZERO = sys.float_info.min
@@ -39,7 +38,7 @@ class Setting:
     high: float = sys.float_info.max
     choices: tuple[str, ...] = ()
     metavar: str = ""
-    ui: Mapping[str, Any] = MappingProxyType({})
+    ui: Mapping[str, Any] = field(default_factory=dict)
 
     def field(self) -> Any:
         """Return a field for the class of a dataclass."""

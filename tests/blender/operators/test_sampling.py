@@ -90,7 +90,7 @@ class TestBones:
         assert (turn.kind, turn.axis) == (ROTATION, 0)
         recording = recorded(arm)
         assert sampled_bones(recording) == {"fk_lower"}
-        assert [source.name for source in recording.info.sampling.sources] == ["", action.name]
+        assert [source.name for source in recording.info.sampling.sources if source.name] == [action.name]
         (ik,) = (channel for channel in recording.info.sampling.channels if channel.kind == CONTROL)
         assert (ik.low, ik.high) == pytest.approx((0.0, 0.5))
 
