@@ -14,7 +14,7 @@ def add_record_options(parser: argparse.ArgumentParser) -> None:
     """Add the options to a parser."""
     add_rig_argument(parser)
     _add_mesh_options(parser)
-    _add_pose_options(parser)
+    add_pose_options(parser)
     parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
     add_target_options(parser)
@@ -40,7 +40,8 @@ def _add_mesh_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
 
 
-def _add_pose_options(parser: argparse.ArgumentParser) -> None:
+def add_pose_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose poses."""
     default_text = f"(default {POSES.default}, with --refine {REFINEMENT_POSES})"
     POSES.add_option(parser, default=None, help=f"number of random poses {default_text}")
     for setting in (SEED, SPREAD, MARGIN, MIRROR):

@@ -13,7 +13,13 @@ from .rig_operator import RigOperator
 MENU_OPERATORS = (
     ("fdda.add_sample_arm", "fdda.build_model"),
     ("fdda.measure", "fdda.profile_frame"),
-    ("fdda.preview_pose", "fdda.rest_pose", "fdda.use_selected_bones", "fdda.limits_from_actions"),
+    (
+        "fdda.preview_pose",
+        "fdda.rest_pose",
+        "fdda.poses_to_action",
+        "fdda.use_selected_bones",
+        "fdda.limits_from_actions",
+    ),
     ("fdda.human_limits", "fdda.copy_limits", "fdda.mirror_limits", "fdda.set_limits", "fdda.clear_limits"),
     ("fdda.add_control", "fdda.add_control_bones", "fdda.remove_control"),
     ("fdda.record", "fdda.delete_recording"),

@@ -7,12 +7,16 @@ from contextlib import suppress
 import bpy
 
 from ..core.errors import FDDAError, RigError
+from ..core.progress import Job
 from ..core.sentences.counts import format_count
 from ..poses.measured_limits import set_limits_from_actions
 from ..poses.motion_range import clear_rotation_range, set_rotation_range
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
+from ..recording.posed_action import make_posed_action
 from ..recording.preview import show_random_pose, show_rest_pose, shows_random_pose
+from ..runtime.binding import model_disabled
 from ..scene.compatibility import select_bone
+from .job import JobOperator
 from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator
 
 
@@ -51,6 +55,28 @@ class FDDA_OT_rest_pose(RigOperator, bpy.types.Operator):
         show_rest_pose(rig, complete_settings(rig))
         context.window_manager.fdda.pose_index = -1
         return f"'{rig.armature_object.name}' is in its rest pose."
+
+
+class FDDA_OT_poses_to_action(JobOperator, bpy.types.Operator):
+    bl_idname = "fdda.poses_to_action"
+    bl_label = "Poses to Action"
+    bl_description = (
+        "Make an action with one training pose per frame, after the rest pose in frame 0, to export it for training in "
+        "other programs. The scene gets its frames"
+    )
+    bl_options = {"REGISTER"}
+    verb, title = "poses", "Poses to Action"
+    changes_file = True
+
+    def steps(self, context: bpy.types.Context) -> Job[tuple[bpy.types.Action, list[str]]]:
+        rig = self.rig(context)
+        with model_disabled(rig.mesh_object):
+            return (yield from make_posed_action(rig, recording_settings(rig)))
+
+    def finish(self, context: bpy.types.Context, result: tuple[bpy.types.Action, list[str]]) -> str:
+        action, driven = result
+        note = f" Keyed, with their drivers muted: {', '.join(driven)}." if driven else ""
+        return f"The action '{action.name}' has {format_count(context.scene.frame_end, 'pose')}.{note}"
 
 
 class LimitsOperator(RigOperator):
@@ -196,6 +222,7 @@ class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
 CLASSES = (
     FDDA_OT_preview_pose,
     FDDA_OT_rest_pose,
+    FDDA_OT_poses_to_action,
     FDDA_OT_set_limit,
     FDDA_OT_clear_limit,
     FDDA_OT_limits_from_actions,

@@ -54,6 +54,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         row = layout.row(align=True)
         row.prop(context.window_manager.fdda, "preview_pose")
         row.operator("fdda.rest_pose", text="Rest Pose", icon="LOOP_BACK")
+        layout.operator("fdda.poses_to_action", icon="ACTION")
         # Draw the sentences that come and go, below the buttons, so that these do not move under the mouse.
         if not _has_poses(rig):
             draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")

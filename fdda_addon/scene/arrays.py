@@ -57,11 +57,14 @@ POSE_CHANNELS = (
     ElementProperty("scale", np.float32, (3,)),
 )
 """All properties of a pose bone that define its pose; angles in radians."""
+KEY_POSITION_ELEMENT = ElementProperty("co", np.float32, (2,))
+"""Frame and value of a keyframe."""
+KEY_INTERPOLATION_ELEMENT = ElementProperty("interpolation", np.int32)
 KEYFRAME_ELEMENTS = (
-    ElementProperty("co", np.float32, (2,)),
+    KEY_POSITION_ELEMENT,
     ElementProperty("handle_left", np.float32, (2,)),
     ElementProperty("handle_right", np.float32, (2,)),
-    ElementProperty("interpolation", np.int32),
+    KEY_INTERPOLATION_ELEMENT,
     ElementProperty("easing", np.int32),
     ElementProperty("amplitude", np.float32),
     ElementProperty("back", np.float32),

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`poses RIG.blend OUT.blend`: saves a copy of a file with an action of recorded or random poses, one per frame."""
+
+import argparse
+from pathlib import Path
+
+from ..core.errors import WrongUsageError
+from ..core.files.file_kind import BLEND
+from ..core.files.output import check_outputs
+from ..core.recording.index import read_index, read_info
+from ..core.sentences.counts import format_count
+from ..recording.plan import RecordingSettings
+from ..recording.posed_action import make_posed_action, recorded_settings
+from ..runtime.binding import model_disabled
+from ..scene.blend_file import save_copy
+from ..scene.scene_rig import find_rig
+from .files import add_rig_options, open_file
+from .outputs import add_overwrite_option
+from .progress import ProgressPrinter
+from .record_options import add_pose_options
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    add_rig_options(parser)
+    parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, with the action")
+    parser.add_argument("--recording", metavar="RECORDING", type=Path, help="use the poses of this recording")
+    add_pose_options(parser)
+    add_overwrite_option(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    info = None
+    settings = RecordingSettings(
+        **({} if options.poses is None else {"poses": options.poses}),
+        seed=options.seed,
+        spread=options.spread,
+        margin=options.margin,
+        actions=tuple(options.action),
+        sample=tuple(options.sample),
+        controls=tuple(options.control),
+        strips=tuple(options.strip),
+        mirror=options.mirror,
+    )
+    if options.recording:
+        if settings != RecordingSettings():
+            raise WrongUsageError("--recording has its own poses; leave the other options of poses out.")
+        info = read_info(read_index(options.recording))
+        settings = recorded_settings(info)
+    check_outputs({options.out: BLEND}, (options.rig,), options.overwrite)
+    open_file(options.rig)
+    scene_rig = find_rig(options.object or (info.object_name if info else ""))
+    with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
+        action, driven = progress.run(make_posed_action(scene_rig, settings, info))
+    save_copy(options.out)
+    if driven:
+        print(f"Keyed, with their drivers muted: {', '.join(driven)}.")
+    count = int(action.frame_range[1])
+    print(f"{options.out}: {format_count(count, 'pose')} in the action '{action.name}', after the rest pose in frame 0")
