@@ -6,7 +6,6 @@ from typing import Self
 
 import numpy as np
 
-from ..core.recording.extension import RecordingExtension
 from ..core.recording.writer import RecordingWriter
 from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter
 from ..rig.reading import PoseEvaluator
@@ -27,7 +26,7 @@ class PoseAppender:
     def __init__(
         self,
         evaluator: PoseEvaluator,
-        writer: RecordingWriter | RecordingExtension,
+        writer: RecordingWriter,
         vertex_count: int,
         pose_setter: PoseSetter = DIRECT_POSE_SETTER,
     ) -> None:

@@ -16,7 +16,7 @@ from ..core.mathematics.poses import Channel, sample_pose
 from ..core.mathematics.refinement import Probes, choose_poses, nearest_recorded_distances
 from ..core.progress import Progress
 from ..core.recording.extension import RecordingExtension
-from ..core.recording.index import ALONE, REFINED
+from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
 from ..core.rig import Rig, rig_differences
 from ..core.settings import REFINEMENT_POSES, SPREAD
@@ -110,7 +110,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         )
         recorded_evaluator = PoseEvaluator(scene_rig, recording.rig)
         with (
-            RecordingExtension(recording, model.name, added_count) as extension,
+            RecordingExtension(recording, settings.poses - added_count, model.name, added_count) as extension,
             PoseAppender(recorded_evaluator, extension, rig.vertex_count) as appender,
         ):
             for pose in chosen_poses[added_count:]:
@@ -185,7 +185,7 @@ def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> in
     Raises:
         RecordingError: the poses were not chosen for this model.
     """
-    added_count = int((~_find_alone_poses(recording)).sum()) - info.trained_poses
+    added_count = recording.info.poses - len(recording.info.alone_poses) - info.trained_poses
     last_source = recording.info.sampling.sources[-1]
     if added_count == 0 or (
         last_source.kind == REFINED and (last_source.name, last_source.poses) == (model.name, added_count)
@@ -195,11 +195,6 @@ def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> in
         f"Cannot resume: '{model}' was trained on {info.trained_poses} poses, and the other "
         f"{added_count} of '{recording.path}' were not chosen for it; refine without --resume, or with the last model."
     )
-
-
-def _find_alone_poses(recording: Recording) -> np.ndarray:
-    """Return (N,) bool, the poses in which one input moves alone, which no model is trained on."""
-    return np.concatenate([np.full(s.poses, s.kind == ALONE) for s in recording.info.sampling.sources])
 
 
 def _distances_to_recording(
@@ -222,7 +217,7 @@ def _distances_to_recording(
         (M, P) distances.
     """
     columns = [recording.rig.joint_names.index(name) for name in rig.joint_names]
-    poses = np.flatnonzero(~_find_alone_poses(recording)[:recorded_count])
+    poses = np.delete(np.arange(recorded_count), recording.info.alone_poses)
     recorded_matrices = np.array(recording.pose_matrices[poses][:, columns])
     probe_features, recorded_features = (
         joint_features(matrices, rig.rest_matrices, rig.references) for matrices in (pose_matrices, recorded_matrices)

@@ -81,7 +81,7 @@ def test_a_recording_without_controls_has_an_empty_array(recording):
 
 
 def test_an_extension_appends_controls(controlled_recording):
-    with RecordingExtension(read_recording(controlled_recording), "model.onnx") as extension:
+    with RecordingExtension(read_recording(controlled_recording), 2, "model.onnx") as extension:
         extension.append(random_poses(2), random_positions(2), control_values(2))
     assert np.array_equal(
         read_recording(controlled_recording).controls, np.concatenate([control_values(POSE_COUNT), control_values(2)])

@@ -104,7 +104,7 @@ def test_an_extension_does_not_write_through_links(recording, tmp_path):
     bytes_before = (tmp_path / "victim.npy").read_bytes()
     (recording / "positions.npy").symlink_to(victim)
     with pytest.raises(FDDAError, match="it is a link to another place"):
-        RecordingExtension(opened_recording, "m.onnx")
+        RecordingExtension(opened_recording, 2, "m.onnx")
     assert (tmp_path / "victim.npy").read_bytes() == bytes_before
 
 

@@ -19,7 +19,7 @@ POSE_COUNT, ADDED_COUNT = 12, 5
 
 def append_poses(path, count: int = ADDED_COUNT, seed: int = 7) -> None:
     """Append random poses to the recording as those of a refinement."""
-    with RecordingExtension(read_recording(path), "limb.onnx") as extension:
+    with RecordingExtension(read_recording(path), count, "limb.onnx") as extension:
         extension.append(random_poses(count, seed), random_positions(count, seed))
 
 
@@ -36,7 +36,7 @@ def test_poses_are_appended_and_counted(recording):
     append_poses(recording)
     assert_poses(recording, (ADDED_COUNT, 7))
     assert read_recording(recording).info.sampling.sources[2:] == (Source(REFINED, ADDED_COUNT, "limb.onnx"),)
-    with RecordingExtension(read_recording(recording), "again.onnx") as extension:
+    with RecordingExtension(read_recording(recording), 4, "again.onnx") as extension:
         for seed in (8, 9):
             extension.append(random_poses(2, seed), random_positions(2, seed))
             assert extension.complete == POSE_COUNT + ADDED_COUNT + 2 * (seed - 7)
@@ -94,7 +94,7 @@ def test_non_finite_values_append_nothing(recording):
     positions[3, 0, 0] = np.nan
     with (
         pytest.raises(RecordingError, match=rf"Pose {POSE_COUNT + 3} of the rig .* not numbers \(positions\)"),
-        RecordingExtension(read_recording(recording), "limb.onnx") as extension,
+        RecordingExtension(read_recording(recording), ADDED_COUNT, "limb.onnx") as extension,
     ):
         extension.append(random_poses(ADDED_COUNT), positions)
     assert_poses(recording)
@@ -102,10 +102,10 @@ def test_non_finite_values_append_nothing(recording):
 
 def test_a_second_extension_at_the_same_time_is_refused(recording):
     with (
-        RecordingExtension(read_recording(recording), "limb.onnx"),
+        RecordingExtension(read_recording(recording), ADDED_COUNT, "limb.onnx"),
         pytest.raises(RecordingError, match="This Blender is recording into"),
     ):
-        RecordingExtension(read_recording(recording), "limb.onnx")
+        RecordingExtension(read_recording(recording), ADDED_COUNT, "limb.onnx")
     append_poses(recording)
     assert_poses(recording, (ADDED_COUNT, 7))
 
@@ -116,7 +116,7 @@ def test_poses_that_another_process_appended_are_not_overwritten(recording):
     with pytest.raises(
         RecordingError, match=f"had {POSE_COUNT} poses when it was read and has {POSE_COUNT + ADDED_COUNT} now"
     ):
-        RecordingExtension(recording_before, "limb.onnx")
+        RecordingExtension(recording_before, ADDED_COUNT, "limb.onnx")
     assert_poses(recording, (ADDED_COUNT, 7))
     append_poses(recording, 2, seed=8)
     assert_poses(recording, (ADDED_COUNT, 7), (2, 8))

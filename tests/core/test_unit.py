@@ -65,7 +65,8 @@ def test_a_resumed_recording_keeps_its_unit(tmp_path, first_unit, resumed_unit):
 
 
 def test_an_extension_keeps_the_unit(tmp_path):
-    with RecordingExtension(read_recording(record_in_unit(tmp_path / "recording", 0.01)), "model.onnx") as extension:
+    recording = read_recording(record_in_unit(tmp_path / "recording", 0.01))
+    with RecordingExtension(recording, 2, "model.onnx") as extension:
         extension.append(random_poses(2), random_positions(2))
     assert read_index(tmp_path / "recording")["metres_per_unit"] == 0.01
 

@@ -37,7 +37,7 @@ def grown_recording(recording, tmp_path):
     source = read_recording(folder)
     angles = chain_angles(ADDED_POSES, 3, seed=5)
     angles[:, 2, 1] = 0
-    with RecordingExtension(source, "model.onnx") as extension:
+    with RecordingExtension(source, ADDED_POSES, "model.onnx") as extension:
         matrices = pose_chain(source.rig, angles)
         skinning = LinearSkinning(source.rig)
         extension.append(matrices, skinning.complex_positions(matrices, chain_residuals(source.rig, angles)))

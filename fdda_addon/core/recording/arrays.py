@@ -70,13 +70,12 @@ def streamed_arrays(
     return {POSE_MATRICES: pose_matrices, POSITIONS: positions, **control_arrays}
 
 
-def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -> np.ndarray:
+def open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:
     """Memory-map an array after its header and size are checked against the index.
 
     Args:
         path: the file.
         shape, dtype: expected shape and dtype; arrays in `STREAMED_ARRAY_NAMES` may have more rows.
-        rows: number of rows that must exist and are mapped, at least one; by default all rows of `shape`.
 
     Raises:
         RecordingError: the file is missing, not a regular file, or truncated, or has another shape or dtype.
@@ -84,21 +83,19 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
     try:
         with open_input(path, follow_links=False) as file:
             file_shape, file_dtype = read_array_header(file)
-            # After an interrupted extension, arrays may have more poses than the index counts.
+            # The arrays of an interrupted recording or extension have more poses than the index counts as complete.
             may_be_longer = (
                 path.stem in STREAMED_ARRAY_NAMES and file_shape[:1] > shape[:1] and file_shape[1:] == shape[1:]
             )
             if not (file_shape == shape or may_be_longer) or file_dtype != np.dtype(dtype):
                 raise ValueError(f"it holds {file_shape} {file_dtype}, not {shape} {np.dtype(dtype)}")
-            data_start, mapped_shape = file.tell(), shape if rows is None else (rows, *shape[1:])
+            data_start = file.tell()
             # Not numpy.prod: the counts are untrusted, and integers of numpy overflow.
-            expected_bytes = (
-                data_start + math.prod(file_shape if rows is None else mapped_shape) * np.dtype(dtype).itemsize
-            )
+            expected_bytes = data_start + math.prod(file_shape) * np.dtype(dtype).itemsize
             file_bytes = file.seek(0, os.SEEK_END)
             if file_bytes < expected_bytes:
                 raise ValueError(f"it is truncated: {file_bytes} of {expected_bytes} bytes")
-            return np.memmap(file, dtype, "r", data_start, mapped_shape)
+            return np.memmap(file, dtype, "r", data_start, shape)
     except OSError as error:
         raise RecordingError(f"'{path}' cannot be used: {os_error_text(error)}; record again.") from error
     except ValueError as error:

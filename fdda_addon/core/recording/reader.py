@@ -122,7 +122,8 @@ def check_resumable(path: Path) -> None:
     alone_poses = read_info(index).alone_poses
     for name, (shape, dtype) in _index_array_shapes(index).items():
         if name in STREAMED_ARRAY_NAMES:
-            check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype, index["complete"]), alone_poses)
+            shape = (index["complete"], *shape[1:])
+            check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype), alone_poses)
         else:
             open_array(path / f"{name}.npy", shape, dtype)
 

@@ -29,7 +29,7 @@ from .arrays import (
 from .folder_check import check_folder, remove_recording_files, remove_temporary_files
 from .index import FORMAT, INDEX_NAME, VERSION, RecordingInfo, find_different_keys, read_index, write_index
 from .lock import RecordingLock
-from .reader import check_poses
+from .reader import check_resumable
 from .target import Repeatability
 
 MUTABLE_KEYS = ("complete", "unsettled", "repeatability")
@@ -85,7 +85,7 @@ class RecordingWriter:
             self._is_new = not os.path.exists(path / INDEX_NAME)
             remove_temporary_files(path)
             if not self._is_new:
-                self.complete = self._check_resumable()
+                self._read_previous(read_index(path))
             # The index is written first: a folder with arrays but no index can neither be resumed nor used again.
             self._write_index()
             self._open_arrays()
@@ -102,9 +102,11 @@ class RecordingWriter:
         """Return a sentence for the user about the drive; may be empty."""
         return self._lock.note
 
-    def _check_resumable(self) -> int:
-        """Check that the recording at `path` can be continued, and return its number of complete poses."""
-        previous = read_index(self.path)
+    def _read_previous(self, previous: dict) -> None:
+        """Read the state of the recording at `path` from its index, and check that it can be continued."""
+        self.complete, self.unsettled = previous["complete"], list(previous.get("unsettled", ()))
+        if "repeatability" in previous:
+            self.repeatability = Repeatability.from_json(previous["repeatability"], self.complete)
         # The scale of an object may be animated; no array depends on it.
         self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
         current = self._index()
@@ -115,10 +117,7 @@ class RecordingWriter:
                 f"Cannot resume '{self.path}': it was recorded differently ({', '.join(different_keys)}); "
                 "record with the same rig and options, or into another folder."
             )
-        self.unsettled = list(previous.get("unsettled", ()))
-        if "repeatability" in previous:
-            self.repeatability = Repeatability.from_json(previous["repeatability"], previous["complete"])
-        return previous["complete"]
+        check_resumable(self.path)
 
     def _open_arrays(self) -> None:
         rig = self.rig
@@ -143,34 +142,23 @@ class RecordingWriter:
                 continue
             header = array_header(shape, dtype)
             row_bytes = math.prod(shape[1:]) * np.dtype(dtype).itemsize
-            end_offset = len(header) + self.complete * row_bytes
-            if self.complete:
-                self._check_array(path, header, end_offset)
-                check_poses(self.path, name, open_array(path, shape, dtype, self.complete), self.info.alone_poses)
+            end_offset = len(header) + shape[0] * row_bytes
+            if self.complete and open_array(path, (self.complete, *shape[1:]), dtype).offset != len(header):
+                raise RecordingError(f"'{path}' has no room for {shape[0]} poses; record again.")
             self._files[name] = file = open_input(path, "r+b" if self.complete else "x+b", follow_links=False)
+            # The file is never shorter than its header says.
+            file.truncate(max(end_offset, file.seek(0, os.SEEK_END)))
+            file.seek(0)
             file.write(header)
             file.truncate(end_offset)
-            file.seek(0, os.SEEK_END)
+            file.seek(len(header) + self.complete * row_bytes)
             # Allocate the space of all poses now, so that a full disk is found before any pose is evaluated.
             if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, len(header) + self.info.poses * row_bytes)
+                os.posix_fallocate(file.fileno(), 0, end_offset)
 
     def _matches_rig(self, name: str, recorded: np.ndarray, array: np.ndarray) -> bool:
         """Return whether a recorded array without a row per pose equals the array of the rig."""
         return rest_matrices_match(recorded, self.rig) if name == "rest_matrices" else np.array_equal(recorded, array)
-
-    def _check_array(self, path: Path, header: bytes, end_offset: int) -> None:
-        """Raise RecordingError where an array has fewer poses than the index counts as complete."""
-        try:
-            with open_input(path, follow_links=False) as file:
-                is_complete = file.read(len(header)) == header and file.seek(0, os.SEEK_END) >= end_offset
-        except OSError:
-            is_complete = False
-        if not is_complete:
-            raise RecordingError(
-                f"Cannot resume '{self.path}': '{path.name}' does not hold the {self.complete} poses that are said to "
-                "be complete; remove the recording and record again."
-            )
 
     def _index(self) -> dict:
         info = self.info
