@@ -60,7 +60,6 @@ REQUIRED_KEYS = (
     "rig",
     "joints",
     "controls",
-    "bones",
     "sampling",
     "blender",
 )
@@ -91,19 +90,12 @@ def test_a_value_of_a_wrong_type_is_refused(recording, key, value):
         ({"joints": []}, "no joints"),
         ({"joints": [{"name": "a", "parent": 0}]}, "the parent of joint 'a' is 0"),
         ({"joints": [{"name": "a", "parent": -1}, {"name": "a", "parent": 0}]}, "two of one name"),
-        ({"bones": BONES | {"dependencies": [4]}}, "'dependencies' are none of its 4 joints"),
         ({"alone": ALONE | {"bases": 0}}, "inputs move from 0 base poses"),
-        (
-            {"alone": {"bases": 1, "inputs": [["joint", 4]], "keys": [], "undetectable": []}},
-            "a moved input has joint 4 of 4",
-        ),
+        ({"alone": ALONE | {"inputs": [["joint", 4]]}}, "a moved input has joint 4 of 4"),
         ({"alone": ALONE | {"inputs": [["bone", 0]]}}, "a moved input is 'bone'"),
         ({"alone": ALONE | {"undetectable": [0]}}, "a moved input has control 0 of 0"),
         ({"alone": ALONE | {"keys": [1]}}, "a moved input has control 1 of 0"),
-        (
-            {"alone": {"bases": 1, "inputs": [], "keys": [], "undetectable": []}},
-            "poses in which one input moves alone, not [1]",
-        ),
+        ({"alone": ALONE}, "poses in which one input moves alone, not [1]"),
         ({"controls": [{"name": "fist"}]}, "lacks 'owner'"),
         ({"controls": {}}, "its controls are not a list"),
         ({"controls": [FIST_CONTROL, FIST_CONTROL]}, "two of its controls have one name"),
@@ -115,6 +107,21 @@ def test_a_value_of_a_wrong_type_is_refused(recording, key, value):
 def test_inconsistent_values_are_refused(recording, changes, words):
     edit_index(recording, **changes)
     assert_refused(recording, "recording.json' is damaged: ", words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "is not a recording: it has no bones.json"),
+        ("{", "bones.json' cannot be read"),
+        ("[]", "bones.json' is damaged"),
+        ("{}", "bones.json' is damaged: it lacks 'dependencies'"),
+        (json.dumps(BONES | {"dependencies": [4]}), "bones.json' is damaged: 'dependencies' are none of its 4 joints"),
+    ],
+)
+def test_invalid_bones_are_refused(recording, text, words):
+    (recording / "bones.json").write_text(text) if text else (recording / "bones.json").unlink()
+    assert_refused(recording, words)
 
 
 @pytest.mark.parametrize("seed", [float("inf"), float("nan"), "one", None])

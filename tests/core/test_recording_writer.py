@@ -52,6 +52,7 @@ def test_arrays_are_plain_npy_files(recording):
     positions = np.load(recording / "positions.npy", mmap_mode="r", allow_pickle=False)
     assert positions.shape == (POSE_COUNT, 40, 3) and positions.dtype == np.float32
     assert sorted(file_bytes(recording)) == [
+        "bones.json",
         "face_starts.npy",
         "face_vertices.npy",
         "pose_matrices.npy",
@@ -243,9 +244,9 @@ def set_nested_value(index, *keys, value):
 )
 def test_resuming_another_recording_names_the_differences(tmp_path, keys, value, difference):
     record_limb(tmp_path / "r", POSE_COUNT, 5)
-    index_path = tmp_path / "r" / "recording.json"
+    index_path = tmp_path / "r" / ("bones.json" if keys[0] == "bones" else "recording.json")
     content = json.loads(index_path.read_text())
-    set_nested_value(content, *keys, value=value)
+    set_nested_value(content, *keys[keys[0] == "bones" :], value=value)
     index_path.write_text(json.dumps(content))
     bytes_before = file_bytes(tmp_path / "r")
     with pytest.raises(

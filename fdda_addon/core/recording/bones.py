@@ -26,7 +26,7 @@ class RecordedBones:
     settings: dict[str, dict] = field(default_factory=dict)
 
     def to_json(self) -> dict:
-        """Return the JSON for `recording.json`."""
+        """Return the JSON for `bones.json`."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
     @staticmethod

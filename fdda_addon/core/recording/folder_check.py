@@ -9,14 +9,15 @@ from ..files.file_kind import RECORDING
 from ..files.open_files import remove_file
 from ..files.output import check_folder_writable, is_temporary_name
 from .arrays import ARRAY_NAMES, STREAMED_ARRAY_NAMES
-from .index import INDEX_NAME
+from .index import BONES_NAME, INDEX_NAME
 from .lock import LOCK_NAME, RecordingLock
 from .reader import check_resumable
 
-RECORDING_FILES = tuple(
-    f"{name}.npy" for name in sorted(ARRAY_NAMES, key=STREAMED_ARRAY_NAMES.__contains__, reverse=True)
+RECORDING_FILES = (
+    *(f"{name}.npy" for name in sorted(ARRAY_NAMES, key=STREAMED_ARRAY_NAMES.__contains__, reverse=True)),
+    BONES_NAME,
 )
-"""File names of the arrays. Arrays that a training keeps open come first, because Windows refuses to remove them."""
+"""Names of the files but the index. Arrays that a training keeps open come first: Windows refuses to remove them."""
 
 
 def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
@@ -67,10 +68,12 @@ def check_folder(path: Path, resume: bool, overwrite: bool = False) -> None:
 
 
 def is_available(path: Path) -> bool:
-    """Return whether a folder is missing, empty, or has only temporary files of an interrupted recording."""
+    """Return whether a folder is missing, empty, or has only what a recording writes before its index."""
     if not os.path.exists(path):
         return True
-    return os.path.isdir(path) and all(name == LOCK_NAME or is_temporary_name(name) for name in os.listdir(path))
+    return os.path.isdir(path) and all(
+        name in (LOCK_NAME, BONES_NAME) or is_temporary_name(name) for name in os.listdir(path)
+    )
 
 
 def is_recording(path: Path) -> bool:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The index of a recording, `recording.json`."""
+"""The index of a recording, `recording.json`, and `bones.json`, which does not change while poses are appended."""
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -20,9 +20,9 @@ from .target import RecordedTarget, Repeatability
 
 FORMAT = "fdda-recording"
 VERSION = 2
-INDEX_NAME = "recording.json"
+INDEX_NAME, BONES_NAME = "recording.json", "bones.json"
 MAX_INDEX_BYTES = 16 << 20
-"""Largest size of an index."""
+"""Largest size of either file."""
 MAX_INFLUENCES = 1000
 """Largest number of skin weights of a vertex."""
 RANDOM, ACTION, STRIP, MIRRORED = "random", "action", "strip", "mirrored"
@@ -179,39 +179,57 @@ def alone_poses(sources: Sequence[Source]) -> range:
 
 
 def read_index(path: Path) -> dict:
-    """Read `recording.json` of a recording, complete or not, and check the types of its values.
+    """Read `recording.json` of a recording, complete or not, with `bones.json` as its `bones`; check their values.
 
     Raises:
-        RecordingError: the file is missing, damaged, or of another version.
+        RecordingError: a file is missing, damaged, or of another version.
     """
-    index_path = path / INDEX_NAME
+
+    def check_format(index: dict) -> None:
+        if not isinstance(index, dict) or index.get("format") != FORMAT:
+            raise RecordingError(
+                f"'{path / INDEX_NAME}' is not the index of a recording; give a folder that record made."
+            )
+        if index.get("version") != VERSION:
+            raise RecordingError(
+                f"'{path}' is a recording of version {index.get('version')!r} and this add-on reads version {VERSION}; "
+                "record again."
+            )
+        _check_index(index)
+
+    index = _read_json(path / INDEX_NAME, check_format)
+    joint_count = len(index["joints"])
+    return index | {"bones": _read_json(path / BONES_NAME, lambda bones: RecordedBones.from_json(bones, joint_count))}
+
+
+def _read_json(path: Path, check: Callable[[dict], object]) -> dict:
+    """Read a JSON file and check its value; `check` may raise the errors of damaged JSON.
+
+    Raises:
+        RecordingError: the file is missing or damaged.
+    """
     try:
         # Python accepts NaN and infinity, which JSON does not permit.
         invalid_constants: list[str] = []
-        data = read_input(index_path, MAX_INDEX_BYTES, follow_links=False)
-        index = json.loads(data, parse_constant=lambda name: invalid_constants.append(name) or float(name.lower()))
+        data = read_input(path, MAX_INDEX_BYTES, follow_links=False)
+        value = json.loads(data, parse_constant=lambda name: invalid_constants.append(name) or float(name.lower()))
     except FileNotFoundError as error:
-        raise RecordingError(f"'{path}' is not a recording: it has no {INDEX_NAME}; make one with record.") from error
-    except OSError as error:
-        raise RecordingError(f"'{index_path}' cannot be read ({os_error_text(error)}); record again.") from error
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"'{index_path}' cannot be read ({error}); record again with --overwrite.") from error
-    if not isinstance(index, dict) or index.get("format") != FORMAT:
-        raise RecordingError(f"'{index_path}' is not the index of a recording; give a folder that record made.")
-    if index.get("version") != VERSION:
         raise RecordingError(
-            f"'{path}' is a recording of version {index.get('version')!r} and this add-on reads version {VERSION}; "
-            "record again."
-        )
+            f"'{path.parent}' is not a recording: it has no {path.name}; make one with record."
+        ) from error
+    except OSError as error:
+        raise RecordingError(f"'{path}' cannot be read ({os_error_text(error)}); record again.") from error
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"'{path}' cannot be read ({error}); record again with --overwrite.") from error
     try:
-        _check_index(index)
+        check(value)
         if invalid_constants:
             raise ValueError(f"it holds {invalid_constants[0]}, which is no number")
     except KeyError as error:
-        raise RecordingError(f"'{index_path}' is damaged: it lacks {error}; record again.") from error
+        raise RecordingError(f"'{path}' is damaged: it lacks {error}; record again.") from error
     except (TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise RecordingError(f"'{index_path}' is damaged: {error}; record again.") from error
-    return index
+        raise RecordingError(f"'{path}' is damaged: {error}; record again.") from error
+    return value
 
 
 def _check_index(index: dict) -> None:
@@ -234,7 +252,6 @@ def _check_index(index: dict) -> None:
     joint_count = len(read_joints(index["joints"]))
     Fingerprint.from_json(index["rig"]["fingerprint"])
     read_unit(index)
-    RecordedBones.from_json(index["bones"], joint_count)
     if "target" in index:
         RecordedTarget.from_json(index["target"])
     if "repeatability" in index:
@@ -312,9 +329,18 @@ def write_index(path: Path, index: dict) -> None:
     Raises:
         OSError: it cannot be written.
     """
+    write_json(path / INDEX_NAME, {key: value for key, value in index.items() if key != "bones"})
+
+
+def write_json(path: Path, value: dict) -> None:
+    """Replace a file of a recording.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     try:
-        with atomic_write(path / INDEX_NAME, keep_on_failure=False) as temporary:
-            temporary.write_text(to_json_text(index), encoding="utf-8")
+        with atomic_write(path, keep_on_failure=False) as temporary:
+            temporary.write_text(to_json_text(value), encoding="utf-8")
     except OutputError as error:
         raise error.__cause__ from None
 

@@ -18,7 +18,6 @@ from ..files.open_files import remove_file
 from ..rig import Rig, rest_matrices_match
 from ..unit import read_unit, unit_to_json
 from .arrays import (
-    ARRAY_NAMES,
     STREAMED_ARRAY_NAMES,
     array_header,
     array_shapes,
@@ -26,8 +25,18 @@ from .arrays import (
     open_array,
     streamed_arrays,
 )
-from .folder_check import check_folder, remove_recording_files, remove_temporary_files
-from .index import FORMAT, INDEX_NAME, VERSION, RecordingInfo, find_different_keys, read_index, write_index
+from .folder_check import RECORDING_FILES, check_folder, remove_recording_files, remove_temporary_files
+from .index import (
+    BONES_NAME,
+    FORMAT,
+    INDEX_NAME,
+    VERSION,
+    RecordingInfo,
+    find_different_keys,
+    read_index,
+    write_index,
+    write_json,
+)
 from .lock import RecordingLock
 from .reader import check_resumable
 from .target import Repeatability
@@ -86,6 +95,8 @@ class RecordingWriter:
             remove_temporary_files(path)
             if not self._is_new:
                 self._read_previous(read_index(path))
+            if self._is_new:
+                write_json(path / BONES_NAME, self._index()["bones"])
             # The index is written first: a folder with arrays but no index can neither be resumed nor used again.
             self._write_index()
             self._open_arrays()
@@ -269,9 +280,9 @@ class RecordingWriter:
         """Remove a new recording without poses, and the folders that were created for it."""
         if not self._is_new or self.complete or not self._lock.is_held:
             return
-        for path in (self.path / INDEX_NAME, *(self.path / f"{name}.npy" for name in ARRAY_NAMES)):
+        for name in (INDEX_NAME, *RECORDING_FILES):
             with contextlib.suppress(OSError):
-                remove_file(path)
+                remove_file(self.path / name)
         self._lock.release()
         for folder in self._new_folders:
             with contextlib.suppress(OSError):
