@@ -46,10 +46,8 @@ class JobPlan:
 
     @property
     def heading(self) -> str:
-        """Return the text "Step 2 of 5: recording", or "Recording" if that is the only step."""
-        if len(self.steps) == 1:
-            return self.current.label.capitalize()
-        return f"Step {self.index + 1} of {len(self.steps)}: {self.current.label}"
+        """Return the text "Step 2 of 5"; empty if there is only one step."""
+        return f"Step {self.index + 1} of {len(self.steps)}" if len(self.steps) > 1 else ""
 
     def enter(self, stage: str) -> None:
         """Go on to the next step that has a stage; stay if there is none."""

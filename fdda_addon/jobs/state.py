@@ -113,20 +113,26 @@ class JobState:
         return None if later_seconds is None else stage_seconds + later_seconds
 
     @property
-    def sentence(self) -> str:
-        """Return the progress as text: "212 of 1,000 poses", or "Step 2 of 5: recording (212 of 1,000)"."""
+    def heading(self) -> str:
+        """Return a short text for the progress bar: "Step 2 of 5, body", "body" or "Recording"."""
+        parts = [self.plan.heading if self.plan is not None else "", self.current_object]
+        return ", ".join(filter(None, parts)) or self.title
+
+    @property
+    def detail(self) -> str:
+        """Return the progress of the stage: "Training: 50 of 200", "Poses compared: 3 of 10", "Starting…"."""
         stage, separator, mesh_part = self.stage.partition(" of '")
-        unit = STAGE_UNITS.get(stage, stage) + separator + mesh_part
-        if self.plan is not None:
-            count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
-            text = f"{self.plan.heading}{separator}{mesh_part}" + (f" ({count})" if self.stage else "")
-        elif not self.stage:
-            text = "Starting…"
-        elif not self.total:
-            text = f"{unit[:1].upper()}{unit[1:]}: {self.done} s"
-        else:
-            text = f"{self.done:,} of {self.total:,} {unit}"
-        return f"{self.current_object}: {text}" if self.current_object else text
+        label = self.plan.current.label if self.plan is not None else STAGE_UNITS.get(stage, stage)
+        if not self.stage:
+            return f"{label[:1].upper()}{label[1:]}…" if label else "Starting…"
+        count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
+        return f"{label[:1].upper()}{label[1:]}{separator}{mesh_part}: {count}"
+
+    @property
+    def sentence(self) -> str:
+        """Return heading and detail in one line: "Step 2 of 5, body: training: 50 of 200"."""
+        heading = "" if self.heading == self.title else f"{self.heading}: "
+        return heading + (self.detail[:1].lower() + self.detail[1:] if heading else self.detail)
 
     @property
     def remaining_text(self) -> str:

@@ -9,6 +9,7 @@ import bpy
 from ..core.errors import FDDAError
 from ..core.files.temporary import temporary_folder
 from ..core.progress import Job
+from ..jobs.plan import JobPlan, JobStep
 from ..jobs.verb_process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements
@@ -16,6 +17,16 @@ from ..timing.fast_rig_saving import FastRigSaving
 from ..timing.frame_profile import FrameProfile
 from ..timing.profiling import profile_frame
 from .job import JobOperator
+
+STEPS = (
+    ("timing objects", ("objects",)),
+    ("timing modifiers", ("modifiers",)),
+    ("timing bones", ("bones",)),
+    *([] if bpy.app.background else [("timing drawing", ("drawing",))]),
+    ("timing models", ("benchmark",)),
+    ("timing a fast rig", ("frames",)),
+)
+"""Labels of the steps of a profile, and the stages of their progress."""
 
 
 class FDDA_OT_profile_frame(JobOperator, bpy.types.Operator):
@@ -30,6 +41,7 @@ class FDDA_OT_profile_frame(JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Job[FrameProfile]:
         scene_rig = self.rig(context)
+        self.state.plan = JobPlan([JobStep(label, stages) for label, stages in STEPS])
         profile = yield from profile_frame(scene_rig.armature_object)
         return (yield from _with_fast_rig(profile, scene_rig.mesh_object.name))
 

@@ -11,6 +11,7 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..core.progress import Job
+from ..core.sentences.window import for_window
 from ..jobs.job import JobRunner, current, redraw, request_cancel, stop, unregister
 from ..jobs.state import JobState
 from .rig_operator import RigOperator
@@ -108,6 +109,8 @@ class JobOperator(RigOperator):
             return {"CANCELLED"}
         if event.type == "ESC" and self.changes_scene:
             request_cancel()
+        if event.type == "S" and event.value == "PRESS" and (event.ctrl or event.oskey) and self.changes_scene:
+            self.report({"WARNING"}, f"Not saved. {self.state.busy_text}")
         if event.type == "TIMER" or self._run.state.cancel_requested:
             result = self._tick(context)
             if result is not None:
@@ -182,7 +185,7 @@ class JobOperator(RigOperator):
             self.on_failure()
         if self.changes_file:
             bpy.ops.ed.undo_push(message=self.title)
-        self.report({state.outcome_level}, state.outcome)
+        self.report({state.outcome_level}, for_window(state.outcome))
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
     def _set_status_text(self, context: bpy.types.Context, text: str | None) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, ModelError, RigError
+from ..core.sentences.window import for_window
 from ..jobs.job import current
 from ..scene.active_rig import active_rig, any_mesh_object, cached_active_rig, rigs_of_active_armature
 from ..scene.scene_rig import SceneRig, armature_of
@@ -98,9 +99,9 @@ class RigOperator:
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             if message := self.apply(context):
-                self.report({"INFO"}, message)
+                self.report({"INFO"}, for_window(message))
         except FDDAError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, for_window(str(error)))
             return {"CANCELLED"}
         return {"FINISHED"}
 

@@ -42,6 +42,10 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         layout = self.enabled_layout()
         rig, message = panel_rig(context)
         if rig is None:
+            active_object = context.view_layer.objects.active
+            if active_object is not None and active_object.type == "MESH" and active_object.fdda.status:
+                # Without an armature, the section Model is not shown.
+                draw_wrapped(layout, context, active_object.fdda.status, "ERROR")
             draw_wrapped(layout, context, message, "INFO")
             layout.operator("fdda.add_sample_arm", text="Add Sample Arm", icon="ADD")
             return

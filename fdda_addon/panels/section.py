@@ -5,6 +5,7 @@ import blf
 import bpy
 
 from ..core.errors import RigError
+from ..core.sentences.window import for_window
 from ..jobs import job
 from ..scene.active_rig import active_rig, cached_active_rig, cached_rigs_of_active_armature
 from ..scene.draw_cache import draw_cached
@@ -85,7 +86,7 @@ def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: s
     width = context.region.width - (TEXT_MARGIN + (ICON_WIDTH if icon != "NONE" else 0)) * scale
     lines = _wrap(text, max(width, MIN_TEXT_WIDTH * scale), points)
     if len(lines) == 1:
-        layout.label(text=text, icon=icon)
+        layout.label(text=lines[0], icon=icon)
         return
     column = layout.column(align=True)
     column.scale_y = 0.8
@@ -105,7 +106,7 @@ def _wrap(text: str, width: float, points: float) -> tuple[str, ...]:
     """Wrap text to a width in pixels, in the font of the interface, without breaking long words."""
     blf.size(0, points)
     lines: list[str] = []
-    for word in text.split():
+    for word in for_window(text).split():
         if lines and blf.dimensions(0, f"{lines[-1]} {word}")[0] <= width:
             lines[-1] += f" {word}"
         else:
@@ -158,7 +159,9 @@ def draw_job(
         return False
     column = layout.column(align=True)
     if state.total or state.plan is not None:
-        column.progress(factor=state.fraction, text=state.sentence)
+        # The text of a progress bar is cut off at the default width, so the bar has the short one.
+        column.progress(factor=state.fraction, text=state.heading)
+        draw_wrapped(column, context, state.detail)
     else:
         # A progress bar that stays at 0 would look as if the job did nothing.
         draw_wrapped(column, context, state.sentence, "SORTTIME")

@@ -79,7 +79,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             if not rig.mesh_object.fdda.is_bound:
                 row = layout.row()
                 row.scale_y = 1.3
-                bind = row.operator("fdda.bind", text=f"Bind '{trained.path.name}'", icon="LINKED")
+                bind = row.operator("fdda.bind", text=f"Bind {trained.path.stem}", icon="LINKED")
                 bind.object, bind.filepath = rig.mesh_object.name, str(trained.path)
             improve = layout.column(align=True)
             improve.enabled = can_train

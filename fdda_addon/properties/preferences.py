@@ -69,11 +69,17 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
         state = session.environment_state()
         name_part, value_part = _split_row(layout)
         name_part.label(text="Training Environment")
-        value_part.label(
-            text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.INCOMPLETE, FolderState.BROKEN) else "NONE"
-        )
-        if not self.trainer_python and (named := os.environ.get(choice.PYTHON_VARIABLE)):
-            draw_lines(layout, f"{choice.PYTHON_VARIABLE} is set: {named}", "INFO")
+        result = session.check_result or session.notice
+        chosen_python = self.trainer_python or os.environ.get(choice.PYTHON_VARIABLE)
+        if current(ENVIRONMENT) is not None:
+            value_part.label(text="…")
+        elif result is not None:
+            draw_check_result(value_part.column(), result)
+        elif chosen_python:
+            draw_lines(value_part.column(), f"Not checked: {chosen_python}")
+        else:
+            icon = "ERROR" if state in (FolderState.INCOMPLETE, FolderState.BROKEN) else "NONE"
+            value_part.label(text=STATE_LABELS[state], icon=icon)
         if (job := current(ENVIRONMENT)) is not None:
             draw_job(layout, job)
         else:
@@ -90,11 +96,8 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
             row.operator("fdda.open_trainer_log", text="", icon="TEXT")
             if reason:
                 draw_lines(layout, f"{reason}.", "INFO")
-            draw_check_result(layout, session.notice)
         _, right = _split_row(layout)
         right.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
-        if current(ENVIRONMENT) is None:
-            draw_check_result(layout, session.check_result)
         layout.separator()
         # Draw the settings of packing, and the folders from which models are loaded.
         column = layout.column()

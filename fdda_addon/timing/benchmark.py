@@ -305,8 +305,8 @@ def benchmark(
                     round_times = time_frames(scene, animation_frames, index * frames_per_round, frames_per_round)
                 times[variant] += round_times
                 rounds[variant].append(float(np.median(round_times)))
-                done, total = index * len(show) + number, max(ROUNDS, index + 1) * len(show)
-                yield Progress("benchmark", done, total)
+                # More rounds than the smallest number are rare, and a total that grows would look like a fault.
+                yield Progress("benchmark", min(index * len(show) + number, ROUNDS * len(show) - 1), ROUNDS * len(show))
             index += 1
         times[INFERENCE] = list(np.sum([_inference_times(network, frames) for network in networks], axis=0))
     described = [

@@ -71,7 +71,10 @@ def train(folder: Path) -> Iterator[float]:
         longest_wait = max(longest_wait, time.monotonic() - start)
     require(longest_wait < 2, f"Blender did not answer for {longest_wait:.1f} s while the trainer worked")
     if state.is_running:
-        require(state.sentence.startswith("Step 3 of 3: training"), f"the progress is '{state.sentence}'")
+        require(
+            state.heading == "Step 3 of 3" and state.detail.startswith("Training"),
+            f"the progress is '{state.sentence}'",
+        )
         require(state.remaining_seconds is not None, "the remaining time is unknown in the middle of the training")
         header = bpy.types.STATUSBAR_HT_header
         require(header.draw != header._draw_orig, "the status bar does not show the training")

@@ -194,14 +194,14 @@ def test_a_job_with_a_plan_has_one_number_of_steps_and_one_remaining_time(monkey
     state = JobState("build_model", "Record, Train & Bind", started=100.0)
     # The training takes 6, 6 and 24 s.
     state.plan = JobPlan([*recording_steps(1000), *training_steps(22, 20_000, 1000, 200)])
-    assert state.sentence == "Step 1 of 4: recording" and state.remaining_text == "…"
+    assert (state.heading, state.detail) == ("Step 1 of 4", "Recording…") and state.remaining_text == "…"
     state.show(Progress("poses", 0, 1000))
     now[0] += 10
     state.show(Progress("poses", 100, 1000))
     fractions = [state.fraction]
     now[0] += 40
     state.show(Progress("poses", 500, 1000))
-    assert state.sentence == "Step 1 of 4: recording (500 of 1,000)"
+    assert state.sentence == "Step 1 of 4: recording: 500 of 1,000"
     assert state.remaining_seconds == pytest.approx(50 + 36)
     fractions.append(state.fraction)
     now[0] += 50
@@ -211,13 +211,15 @@ def test_a_job_with_a_plan_has_one_number_of_steps_and_one_remaining_time(monkey
     state.show(Progress("starting", 0, 0))
     now[0] += 2
     state.show(Progress("starting", 2, 0))
-    assert state.sentence == "Step 2 of 4: reading the recording (2 s)"
+    assert state.detail == "Reading the recording: 2 s"
     assert state.remaining_seconds == pytest.approx(4 + 6 + 24)
     fractions.append(state.fraction)
     state.show(Progress("epochs", 0, 200))
     now[0] += 10
     state.show(Progress("epochs", 50, 200))
-    assert state.sentence == "Step 4 of 4: training (50 of 200)" and state.remaining_text == "About 30 s left"
+    state.current_object = "body"
+    assert state.heading == "Step 4 of 4, body" and state.remaining_text == "About 30 s left"
+    assert state.sentence == "Step 4 of 4, body: training: 50 of 200"
     fractions.append(state.fraction)
     assert fractions == sorted(fractions) and fractions[0] > 0 and fractions[-1] < 1
     state.show(Progress("epochs", 200, 200))
@@ -259,4 +261,4 @@ def test_a_job_is_not_finishing_when_a_preparing_stage_is_complete(stage):
 def test_the_check_of_a_target_is_counted_in_poses():
     state = JobState("record", "Recording")
     state.show(Progress("target", 2, 5))
-    assert state.sentence == "2 of 5 poses of the target checked"
+    assert state.sentence == "Poses of the target checked: 2 of 5" and state.heading == "Recording"

@@ -85,6 +85,12 @@ def test_a_section_of_a_bound_model_draws(active: bpy.types.Object, name: str, t
     assert text in texts_of(draw_section(name))
 
 
+def test_the_reason_stays_in_view_without_an_armature(active: bpy.types.Object):
+    bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
+    bpy.context.view_layer.update()
+    assert active.fdda.status and " ".join(active.fdda.status.split()) in " ".join(texts_of(draw_section("rig")))
+
+
 def test_a_fast_rig_offers_no_comparison_with_the_rig(active: bpy.types.Object):
     sections = ("rig", "playback", "evaluation")
     compared = {"Record, Train & Bind", "Measure Speed", "Frame Profile", "Rig", "Evaluate", "Beside"}

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The window names its own fields in place of options of the command line."""
+
+import pytest
+
+from fdda_addon.core.sentences.window import for_window
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint weights.",
+            "have one fitted (Base Skinning in the sidebar), or paint weights.",
+        ),
+        ("keep more bones with --controls collection:NAME.", "keep more bones with Bone Collection."),
+        (
+            "0 poses and no action; give --poses or --action.",
+            "0 poses and no action; set Random Poses, or check an action.",
+        ),
+        (
+            "continue it with --resume, or replace it with --overwrite.",
+            "continue it with Resume, or replace it with Overwrite.",
+        ),
+        ("more frames (--max-settle-frames) let them rest", "more frames (Settle Frames) let them rest"),
+        ("The file 'a--b.blend' -- or none - stays.", "The file 'a--b.blend' -- or none - stays."),
+    ],
+)
+def test_options_become_labels(text, expected):
+    assert for_window(text) == expected
