@@ -166,7 +166,7 @@ class _Part:
     """
 
     def __init__(self, rig: Rig, index: int, partition: Partition, part_count: int, keys: list[int]):
-        self._skin = SkinBlock(rig, partition)
+        self._skin = SkinBlock(rig, partition.joint, partition.vertices)
         fit_count = min(FIT_JOINTS, len(rig.joints))
         fit_joints = (partition.joint + np.arange(fit_count)) % len(rig.joints)
         others = np.full(COMPONENTS + len(keys), partition.joint)
