@@ -26,6 +26,7 @@ from ..scene.time_stretching import frames_covering, time_ratio
 from .run import ALEMBIC_SUFFIX, KINDS, BakeSettings
 
 COLLECTION_NAME = "FDDA Bake"
+HIDING_PATHS = ("hide_viewport", "hide_render")
 MODIFIER_NAME = "FDDA Bake"
 """Name of the Mesh Sequence Cache modifier of a baked mesh."""
 
@@ -148,7 +149,7 @@ def _export_state(names: dict[bpy.types.Object, str], is_copy_saved: bool) -> It
         stack.callback(bpy.data.collections.remove, collection)
         for mesh_object in names:
             collection.objects.link(mesh_object)
-            stack.enter_context(temporary_visibility([mesh_object, armature_of(mesh_object)]))
+            stack.enter_context(temporary_visibility([mesh_object, armature_of(mesh_object)], HIDING_PATHS))
             attributes = {"name": names[mesh_object], "hide_viewport": False, "hide_render": False}
             stack.enter_context(temporary_attributes(mesh_object, **attributes))
             index = max(i for i, modifier in enumerate(mesh_object.modifiers) if is_fdda_modifier(modifier)) + 1

@@ -88,7 +88,9 @@ def deformation_disabled(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.
 
 
 @contextmanager
-def temporary_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
+def temporary_visibility(
+    objects: Iterable[bpy.types.Object], paths: Iterable[str] = ("hide_viewport",)
+) -> Iterator[None]:
     """Show objects that animation hides in some frames: Blender does not evaluate the pose of a hidden object.
 
     Objects that are hidden in all frames stay hidden; Blender evaluates them if a visible object needs them.
@@ -97,7 +99,7 @@ def temporary_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
         for scene_object in (o for o in objects if o.animation_data is not None):
             animation = scene_object.animation_data
             curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
-            for path in ("hide_viewport", "hide_render"):
+            for path in paths:
                 hiding_curves = [curve for curve in (*curves, *animation.drivers) if curve.data_path == path]
                 for curve in hiding_curves:
                     stack.enter_context(temporary_attributes(curve, mute=True))
