@@ -67,7 +67,7 @@ class TrainedModel:
             for part, p in zip(self.parts, self.prepared, strict=True)
         ]
         return Checkpoint(
-            self.rig.fingerprint,
+            self.rig.meshes,
             tuple(control.name for control in self.rig.controls),
             deformation,
             holdout,

@@ -53,7 +53,7 @@ def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:
         )
     models: dict[str, Path] = {}
     for path in paths:
-        name = read_model_info(path).object_name
+        name = read_model_info(path).meshes[0].name
         if not name:
             raise ModelError(f"'{path}' has no object name; give this file instead of the folder, with --object NAME.")
         if name in models:

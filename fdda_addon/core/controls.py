@@ -2,7 +2,8 @@
 """Controls: inputs of a model beside the joints, such as values of shape keys."""
 
 import re
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -14,6 +15,8 @@ EVALUATION_TIME = "eval_time"
 """Path of the evaluation time of absolute shape keys."""
 OTHER_OBJECT = "object:"
 """Prefix of the owner of a control on another object; the name of the object follows."""
+MESH_OWNER = re.compile(rf"(?P<owner>{MESH_OBJECT}|{SHAPE_KEYS}):(?P<mesh>.+)", re.DOTALL)
+"""Owner of a control on another mesh of the rig than the first: `shape_keys:shirt`."""
 MAX_TEXT_LENGTH = 1000
 """Largest number of characters of an owner or a path in a file."""
 
@@ -24,7 +27,8 @@ class Control:
 
     Attributes:
         owner: the data-block that has the property. It is identified by its role in the rig, one of `OWNERS`, so that a
-            linked or renamed character keeps its controls; or by `OTHER_OBJECT` and the name of an object.
+            linked or renamed character keeps its controls; by `MESH_OWNER`; or by `OTHER_OBJECT` and the name of an
+            object.
         path: RNA path inside the owner, `key_blocks["Smile"].value`, `pose.bones["hand"]["fist"]`; one element of an
             array is `location[0]`.
         low, high: range of the control, in the unit of the property.
@@ -37,8 +41,8 @@ class Control:
 
     @property
     def is_shape_key(self) -> bool:
-        """Whether the control is the value of a shape key of the mesh."""
-        return self.owner == SHAPE_KEYS and bool(SHAPE_KEY_PATH.fullmatch(self.path))
+        """Whether the control is the value of a shape key of a mesh of the rig."""
+        return self.owner.partition(":")[0] == SHAPE_KEYS and bool(SHAPE_KEY_PATH.fullmatch(self.path))
 
     @property
     def name(self) -> str:
@@ -62,11 +66,33 @@ class Control:
         for limit in (value["low"], value["high"]):
             if type(limit) not in (int, float):
                 raise TypeError(f"the range of the control {control.name!r} ends at {limit!r}")
-        if control.owner not in OWNERS and not control.owner.startswith(OTHER_OBJECT):
+        is_other = control.owner.startswith(OTHER_OBJECT) or MESH_OWNER.fullmatch(control.owner)
+        if control.owner not in OWNERS and not is_other:
             raise ValueError(f"a control belongs to {control.owner!r}")
         if not (np.isfinite([control.low, control.high]).all() and control.low <= control.high):
             raise ValueError(f"the control {control.name!r} has the range {control.low} to {control.high}")
         return control
+
+
+def owner_of_mesh(owner: str, mesh: str) -> str:
+    """Return the owner that a control of one mesh has in a rig of several; `mesh` is empty for the first mesh."""
+    return f"{owner}:{mesh}" if mesh and owner in (MESH_OBJECT, SHAPE_KEYS) else owner
+
+
+def controls_of_mesh(controls: Iterable[Control], mesh: str) -> tuple[Control, ...]:
+    """Return the controls of a rig as they are in a rig of one of its meshes, without those of the other meshes.
+
+    Args:
+        controls: controls of the rig.
+        mesh: name of the mesh; empty for the first mesh.
+    """
+    own = []
+    for control in controls:
+        match = MESH_OWNER.fullmatch(control.owner)
+        owner, owner_mesh = (match["owner"], match["mesh"]) if match else (control.owner, "")
+        if owner not in (MESH_OBJECT, SHAPE_KEYS) or owner_mesh == mesh:
+            own.append(replace(control, owner=owner))
+    return tuple(own)
 
 
 def read_controls(values: list) -> tuple[Control, ...]:

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The rig as arrays: joints, rest pose and skin weights of one mesh."""
+"""The rig as arrays: joints, rest pose and skin weights of the meshes of a character."""
 
 import hashlib
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from .controls import Control
+from .controls import Control, controls_of_mesh
 from .deformation import check_deformation, deformation_differences
 
 STATIC_JOINT = ""
@@ -142,9 +143,76 @@ class Fingerprint:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+IDENTITY = tuple(np.eye(4).ravel().tolist())
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """One of the meshes of a rig, whose vertices follow those of the meshes before it.
+
+    Attributes:
+        name: name of the mesh object.
+        vertices: number of vertices.
+        fingerprint: fingerprint of the mesh alone.
+        transform: (16,) 4x4 matrix, row by row, from the space of this mesh object to that of the first.
+    """
+
+    name: str = field(compare=False)
+    vertices: int
+    fingerprint: Fingerprint
+    transform: tuple[float, ...] = IDENTITY
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(4, 4) float64, from the space of this mesh object to that of the first."""
+        return np.array(self.transform).reshape(4, 4)
+
+    def to_json(self) -> dict:
+        """Return the JSON for recordings and models."""
+        value = {"name": self.name, "vertices": self.vertices, "fingerprint": asdict(self.fingerprint)}
+        return value if self.transform == IDENTITY else value | {"transform": list(self.transform)}
+
+
+def read_meshes(values: list) -> tuple[MeshPart, ...]:
+    """Read the meshes of a recording or model.
+
+    Raises:
+        KeyError, TypeError, ValueError: the meshes are damaged, or two have the same name.
+    """
+    if not isinstance(values, list):
+        raise TypeError("its meshes are not a list")
+    meshes = tuple(
+        MeshPart(
+            read_name(value["name"]),
+            value["vertices"],
+            Fingerprint.from_json(value["fingerprint"]),
+            tuple(map(float, value.get("transform", IDENTITY))),
+        )
+        for value in values
+    )
+    if not meshes or len({mesh.name for mesh in meshes}) != len(meshes):
+        raise ValueError("it has no meshes, or two of one name")
+    for mesh in meshes:
+        if type(mesh.vertices) is not int or mesh.vertices < 1:
+            raise ValueError(f"the mesh {mesh.name!r} has {mesh.vertices!r} vertices")
+        if len(mesh.transform) != 16 or not np.isfinite(mesh.transform).all() or not np.linalg.det(mesh.matrix[:3, :3]):
+            raise ValueError(f"the transform of the mesh {mesh.name!r} is {mesh.transform}")
+    if meshes[0].transform != IDENTITY:
+        raise ValueError("its first mesh has a transform")
+    return meshes
+
+
+def mesh_slices(meshes: Sequence[MeshPart]) -> list[slice]:
+    """Return the vertices of each mesh."""
+    ends = np.cumsum([mesh.vertices for mesh in meshes]).tolist()
+    return [slice(end - mesh.vertices, end) for end, mesh in zip(ends, meshes, strict=True)]
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """One mesh, its joints and its linear skinning.
+    """The meshes of a character, their joints and their linear skinning.
+
+    Mesh-object space and mesh units are those of the first mesh.
 
     Attributes:
         joints: J joints, every parent before its children.
@@ -152,7 +220,7 @@ class Rig:
         rest_matrices: (J, 4, 4) float32, rest pose of the joints in mesh-object space, column vectors.
         skin_joints: (V, I) int32, indices of the joints with a weight on each vertex; unused entries are 0.
         skin_weights: (V, I) float32, weights of these joints; each row sums to 1, unused entries are 0.
-        fingerprint: hashes of topology, rest positions and skin weights.
+        meshes: the meshes, in the order of their vertices.
         face_starts: (F,) int32, first corner of each face in `face_vertices`; empty where faces are unknown.
         face_vertices: (C,) int32, vertex indices of the corners, face by face.
         controls: the inputs beside the joints.
@@ -164,7 +232,7 @@ class Rig:
     rest_matrices: np.ndarray
     skin_joints: np.ndarray
     skin_weights: np.ndarray
-    fingerprint: Fingerprint
+    meshes: tuple[MeshPart, ...]
     face_starts: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     face_vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     controls: tuple[Control, ...] = ()
@@ -189,6 +257,11 @@ class Rig:
         return len(self.rest_positions)
 
     @property
+    def mesh_slices(self) -> list[slice]:
+        """Vertices of each mesh."""
+        return mesh_slices(self.meshes)
+
+    @property
     def has_weights(self) -> bool:
         """Whether vertices follow other joints than the static joint."""
         return any(
@@ -209,20 +282,25 @@ def rest_matrices_match(rest_matrices: np.ndarray, rig: Rig) -> bool:
 
 
 def rig_differences(
-    joints: tuple[Joint, ...], rest_matrices: np.ndarray, vertex_count: int, fingerprint: Fingerprint, rig: Rig
+    joints: tuple[Joint, ...], rest_matrices: np.ndarray, meshes: Sequence[MeshPart], rig: Rig
 ) -> list[str]:
     """List the differences between a rig and the rig of a recording or model.
 
     Args:
-        joints, rest_matrices, vertex_count, fingerprint: of the recording or model, as in `Rig`.
+        joints, rest_matrices, meshes: of the recording or model, as in `Rig`.
         rig: the rig to compare.
 
     Returns:
         One clause per difference ("it has 1443 vertices, the mesh 1450"); empty when the rigs are the same.
     """
     clauses = []
-    if vertex_count != rig.vertex_count:
-        clauses.append(f"it has {vertex_count} vertices, the mesh has {rig.vertex_count}")
+    if len(meshes) != len(rig.meshes):
+        names, rig_names = (", ".join(f"'{mesh.name}'" for mesh in each) for each in (meshes, rig.meshes))
+        return [f"it has the meshes {names}, the rig has {rig_names}"]
+    for mesh, rig_mesh in zip(meshes, rig.meshes, strict=True):
+        if mesh.vertices != rig_mesh.vertices:
+            noun = "the mesh" if len(meshes) == 1 else f"the mesh '{rig_mesh.name}'"
+            clauses.append(f"it has {mesh.vertices} vertices, {noun} has {rig_mesh.vertices}")
     file_joints, rig_joints = {j.name for j in joints}, set(rig.joint_names)
     if file_joints != rig_joints:
         if missing := sorted(file_joints - rig_joints):
@@ -236,15 +314,26 @@ def rig_differences(
     elif rest_matrices.shape != rig.rest_matrices.shape or (not rest_matrices_match(rest_matrices, rig)):
         clauses.append("the rest pose of the armature differs")
     if not clauses:
-        for attribute, label in (
-            ("topology", "the topology of the mesh"),
-            ("rest_positions", "the rest pose of the mesh"),
-            ("skin_weights", "the skin weights"),
-        ):
-            if getattr(fingerprint, attribute) != getattr(rig.fingerprint, attribute):
-                clauses.append(f"{label} differ" + ("s" if attribute != "skin_weights" else ""))
-        clauses += deformation_differences(fingerprint.deformation, rig.fingerprint.deformation, rig.controls)
+        for index, (mesh, rig_mesh) in enumerate(zip(meshes, rig.meshes, strict=True)):
+            controls = controls_of_mesh(rig.controls, mesh.name if index else "")
+            mesh_clauses = _mesh_differences(mesh, rig_mesh, controls)
+            clauses += [f"{clause} ('{rig_mesh.name}')" for clause in mesh_clauses] if len(meshes) > 1 else mesh_clauses
     return clauses
+
+
+def _mesh_differences(mesh: MeshPart, rig_mesh: MeshPart, controls: Iterable[Control]) -> list[str]:
+    """List the differences between a mesh of a recording or model and the mesh of a rig with the given controls."""
+    clauses, (fingerprint, rig_fingerprint) = [], (mesh.fingerprint, rig_mesh.fingerprint)
+    for attribute, label in (
+        ("topology", "the topology of the mesh"),
+        ("rest_positions", "the rest pose of the mesh"),
+        ("skin_weights", "the skin weights"),
+    ):
+        if getattr(fingerprint, attribute) != getattr(rig_fingerprint, attribute):
+            clauses.append(f"{label} differ" + ("s" if attribute != "skin_weights" else ""))
+    if not np.allclose(mesh.matrix, rig_mesh.matrix, atol=REST_MATRIX_TOLERANCE):
+        clauses.append("the mesh has moved against the others")
+    return clauses + deformation_differences(fingerprint.deformation, rig_fingerprint.deformation, controls)
 
 
 def _format_joints(names: list[str], max_names: int = 3) -> str:

@@ -65,7 +65,7 @@ def compare_with_model(name: str, info: ModelInfo, rig: Rig, channels: tuple[Cha
         channels: the current channels of the rig. Ranges of control bones and of actions are chosen by the user and
             not compared.
     """
-    blocking_changes = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    blocking_changes = rig_differences(info.joints, info.rest_matrices, info.meshes, rig)
     has_joint_ranges = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
     changed_bones = bones_with_changed_range(info.limits, channels) if info.limits and has_joint_ranges else ()
     return RigChanges(name, tuple(blocking_changes), tuple(changed_bones))

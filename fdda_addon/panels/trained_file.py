@@ -53,7 +53,7 @@ def _read_trained_file(scene_rig: SceneRig, rig: object, path: Path) -> TrainedF
     try:
         info = read_model_info(path)
         current_rig = rig_of_model(scene_rig, rig, info)
-        model_rig = (info.joints, info.rest_matrices, info.vertex_count, info.fingerprint)
+        model_rig = (info.joints, info.rest_matrices, info.meshes)
         return TrainedFile(path, "; ".join(rig_differences(*model_rig, current_rig)), info.skin_sentence)
     except FDDAError as error:
         return TrainedFile(path, str(error))

@@ -160,9 +160,7 @@ def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np
 def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[Channel, ...]) -> None:
     recorded_rig = recording.rig
     rig = replace(read_rig(scene_rig, recorded_rig.joint_names), controls=recorded_rig.controls)
-    differences = rig_differences(
-        recorded_rig.joints, recorded_rig.rest_matrices, recorded_rig.vertex_count, recorded_rig.fingerprint, rig
-    )
+    differences = rig_differences(recorded_rig.joints, recorded_rig.rest_matrices, recorded_rig.meshes, rig)
     if differences:
         raise RecordingError(
             f"'{recording.path}' is a recording of another rig: {'; '.join(differences)}. Record this rig."

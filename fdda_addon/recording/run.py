@@ -221,7 +221,6 @@ def _make_info(
         sum(source.poses for source in sampling.sources),
         0,
         Path(bpy.data.filepath).name,
-        mesh.name,
         bpy.app.version_string,
         sampling,
         describe_bones(mesh.scene_rig, mesh.rig, dependencies, find_fixed_joints(mesh.scene_rig)),

@@ -15,7 +15,10 @@ COINCIDENCE_TOLERANCE = 1e-5
 
 
 def choose_joints(
-    scene_rig: SceneRig, weighted_bones: Iterable[str], extra_joints: Iterable[str] | None = None
+    scene_rig: SceneRig,
+    weighted_bones: Iterable[str],
+    extra_joints: Iterable[str] | None = None,
+    are_joints_complete: bool = False,
 ) -> tuple[Joint, ...]:
     """Choose the joints of a rig; every parent comes before its children.
 
@@ -24,16 +27,19 @@ def choose_joints(
 
     Args:
         scene_rig: the rig.
-        weighted_bones: names of the bones that have weights, `STATIC_JOINT` among them; if empty, all deforming bones.
+        weighted_bones: names of the bones that have weights, `STATIC_JOINT` among them; if there are no bones, all
+            deforming bones.
         extra_joints: names of further joints; names that the armature lacks are ignored. If they include all joints,
             they define the order. By default: the bones on which the mesh depends in other ways, and all ancestors
             of joints.
+        are_joints_complete: a mesh without weights gets no deforming bones besides `extra_joints`, which are the joints
+            of a recording or a model.
     """
     armature_object = scene_rig.armature_object
     bones = armature_object.data.bones
     names = set(weighted_bones)
     extra_joints = None if extra_joints is None else list(extra_joints)
-    if not names - {STATIC_JOINT}:
+    if not names - {STATIC_JOINT} and not are_joints_complete:
         names |= {bone.name for bone in bones if bone.use_deform}
     if extra_joints is not None:
         names |= {name for name in extra_joints if name in bones or name == STATIC_JOINT}

@@ -12,7 +12,7 @@ from ..core.errors import RigError
 from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
 from ..core.mathematics.key_joints import select_joints
-from ..core.rig import STATIC_JOINT, Fingerprint, Rig
+from ..core.rig import STATIC_JOINT, Fingerprint, MeshPart, Rig
 from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
 from ..scene.control_reader import ControlReader
@@ -33,13 +33,19 @@ IDENTITY_TOLERANCE = 1e-6
 """A matrix counts as the identity if no element differs from the identity by more than this."""
 
 
-def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, include_static_joint: bool = False) -> Rig:
-    """Read a rig into arrays.
+def read_rig(
+    scene_rig: SceneRig,
+    extra_joints: Iterable[str] | None = None,
+    include_static_joint: bool = False,
+    are_joints_complete: bool = False,
+) -> Rig:
+    """Read a rig of one mesh into arrays.
 
     Args:
         extra_joints: names of joints besides the bones with weights, such as those of a model or a recording; None as
             for `choose_joints`.
         include_static_joint: add the joint that never moves, which tells the networks the direction of gravity.
+        are_joints_complete: as for `choose_joints`.
 
     Raises:
         RigError: there is no vertex, all vertices are at one point, an object or a bone has a scale of zero, or a rest
@@ -58,7 +64,8 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
     rest_positions = mesh_io.rest_positions(mesh_object.data)
     _check_rest_positions(mesh_object, rest_positions)
     skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
-    joints = choose_joints(scene_rig, (*skin.bones, STATIC_JOINT) if include_static_joint else skin.bones, extra_joints)
+    weighted_bones = (*skin.bones, STATIC_JOINT) if include_static_joint else skin.bones
+    joints = choose_joints(scene_rig, weighted_bones, extra_joints, are_joints_complete)
     names = tuple(joint.name for joint in joints)
     skin_joints, skin_weights = skin.arrays({name: index for index, name in enumerate(names)})
     rest_matrices = armature_io.rest_matrices(scene_rig.armature_object.data, names)
@@ -86,7 +93,7 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
         rest_matrices.astype(np.float32),
         skin_joints,
         skin_weights,
-        fingerprint,
+        (MeshPart(mesh_object.name, len(rest_positions), fingerprint),),
         *faces,
         metres_per_unit=metres_per_unit(mesh_object),
     )
@@ -118,17 +125,20 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
     A fast rig lacks modifiers and bones of the rig that the model was trained for, so skin weights and deformation
     count as those of the model. If the model reads key joints, the rig has these alone.
     """
-    rig = read_rig(scene_rig, info.joint_names)
-    if info.fingerprint.has_key_joints:
+    rig = read_rig(scene_rig, info.joint_names, are_joints_complete=True)
+    if info.has_key_joints:
         names = [name for name in info.joint_names if name in rig.joint_names]
         is_complete = len(names) == len(info.joints)
         selected = select_joints(rig, info.joints if is_complete else choose_joints(scene_rig, names, names))
-        unread_bones = info.fingerprint.deformation.get("unread_bones", {})
-        deformation = rig.fingerprint.deformation | {"unread_bones": read_unread_bones(scene_rig, unread_bones)}
-        rig = replace(selected, fingerprint=replace(selected.fingerprint, deformation=deformation))
+        unread_bones = info.meshes[0].fingerprint.deformation.get("unread_bones", {})
+        (mesh,) = selected.meshes
+        deformation = mesh.fingerprint.deformation | {"unread_bones": read_unread_bones(scene_rig, unread_bones)}
+        mesh = replace(mesh, fingerprint=replace(mesh.fingerprint, deformation=deformation))
+        rig = replace(selected, meshes=(mesh,))
     if scene_rig.mesh_object.fdda.is_fast_rig:
-        skin_weights, deformation = info.fingerprint.skin_weights, info.fingerprint.deformation
-        rig = replace(rig, fingerprint=replace(rig.fingerprint, skin_weights=skin_weights, deformation=deformation))
+        (mesh,), recorded = rig.meshes, info.meshes[0].fingerprint
+        fingerprint = replace(mesh.fingerprint, skin_weights=recorded.skin_weights, deformation=recorded.deformation)
+        rig = replace(rig, meshes=(replace(mesh, fingerprint=fingerprint),))
     return replace(rig, controls=info.controls, metres_per_unit=info.metres_per_unit)
 
 

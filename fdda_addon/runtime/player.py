@@ -145,7 +145,7 @@ class Player:
         return True
 
     def _read_signature(self, scene_rig: SceneRig, parts: Iterable[str]) -> dict[str, tuple]:
-        unread_bones = self.network.info.fingerprint.deformation.get("unread_bones", {})
+        unread_bones = self.network.info.meshes[0].fingerprint.deformation.get("unread_bones", {})
         return rig_signature.read_signature(scene_rig, unread_bones, parts)
 
     def update_mask(self, mesh_object: bpy.types.Object, weights_changed: bool) -> bool:

@@ -122,13 +122,13 @@ def check(scene_rig: SceneRig, network: Network, signature: dict[str, tuple]) ->
     passed_check = (
         mesh_object.data.session_uid,
         signature,
-        (info.joints, info.rest_matrices.tobytes(), info.fingerprint),
+        (info.joints, info.rest_matrices.tobytes(), info.meshes),
     )
     if session.passed_checks.get(mesh_object.session_uid) == passed_check:
         return
     rig = read_model_rig(scene_rig, info)
     rig = replace(rig, rest_matrices=_align_rest_matrices(rig, info.joint_names, info.rest_matrices))
-    differences = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    differences = rig_differences(info.joints, info.rest_matrices, info.meshes, rig)
     if differences:
         raise ModelError(
             f"The rig of '{mesh_object.name}' is not the one that its model '{network.path.name}' was trained for: "

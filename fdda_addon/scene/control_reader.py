@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import bpy
 import numpy as np
 
-from ..core.controls import SHAPE_KEY_PATH, SHAPE_KEYS, Control
+from ..core.controls import SHAPE_KEY_PATH, Control
 from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT
 from .armature import PoseMatrixReader, rest_matrices
@@ -48,11 +48,11 @@ class ControlReader:
 
         bone_elements: dict[tuple[str, str], list[tuple[int, BoneTransform]]] = {}
         self._single_controls: list[int] = []
-        key_blocks: list[tuple[int, str]] = []
+        keys_by_owner: dict[str, list[tuple[int, str]]] = {}
         for index, control in enumerate(controls):
             if control.is_shape_key:
                 name = SHAPE_KEY_PATH.fullmatch(control.path)["name"]
-                key_blocks.append((index, bpy.utils.unescape_identifier(name)))
+                keys_by_owner.setdefault(control.owner, []).append((index, bpy.utils.unescape_identifier(name)))
                 continue
             transform = bone_transform(control.path)
             is_scale = transform is not None and transform.scale_axis is not None
@@ -81,11 +81,9 @@ class ControlReader:
         self._scale_controls, self._scale_elements = np.array(scales, np.intp).reshape(-1, 2).T
         first_controls = [elements[0][0] for elements in groups] + self._single_controls
         self.sources: tuple[Control, ...] = tuple(controls[index] for index in first_controls)
-        self._key_controls, self._key_names = [index for index, _ in key_blocks], [name for _, name in key_blocks]
-        self._key_order: list[str] | None = None
-        if key_blocks:
-            # This property depends on the drivers of all keys; the value of a key only depends on its own driver.
-            self.sources += (Control(SHAPE_KEYS, "use_relative", 0.0, 1.0),)
+        self._key_readers = [([i for i, _ in keys], KeyReader([n for _, n in keys])) for keys in keys_by_owner.values()]
+        # This property depends on the drivers of all keys; the value of a key only depends on its own driver.
+        self.sources += tuple(Control(owner, "use_relative", 0.0, 1.0) for owner in keys_by_owner)
         self.values([owner_of(scene_rig, source.owner) for source in self.sources])
 
     def read(self, scene_rig: SceneRig, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
@@ -100,10 +98,9 @@ class ControlReader:
     def values(self, owners: Sequence[bpy.types.ID | None]) -> np.ndarray:
         """Read the values as `read` does, given the owner of each of `sources`, which may be an evaluated datablock."""
         values, self.warning = np.zeros(len(self._controls), np.float32), ""
-        if self._key_controls:
-            *owners, shape_keys = owners
-            values[self._key_controls] = self._read_keys(shape_keys)
-        bone_count = len(self._bone_names)
+        bone_count, source_count = len(self._bone_names), len(owners) - len(self._key_readers)
+        for (key_controls, reader), shape_keys in zip(self._key_readers, owners[source_count:], strict=True):
+            values[key_controls] = reader.read(shape_keys)
         remaining = set(range(bone_count))
         for bone_indices, bones in self._constrained_bones:
             owner = owners[bone_indices[0]]
@@ -125,7 +122,7 @@ class ControlReader:
         if len(self._scale_controls):
             lengths = np.linalg.norm(self._matrices[:, :3, :3], axis=1)
             values[self._scale_controls] = lengths.reshape(-1)[self._scale_elements]
-        for index, owner in zip(self._single_controls, owners[bone_count:], strict=True):
+        for index, owner in zip(self._single_controls, owners[bone_count:source_count], strict=True):
             control = self._controls[index]
             value = None if owner is None else number_at(owner, control.path)
             values[index] = np.nan if value is None else value
@@ -136,19 +133,28 @@ class ControlReader:
             )
         return values
 
-    def _read_keys(self, shape_keys: bpy.types.Key | None) -> np.ndarray:
-        """Read the values of the shape keys that are controls, (K,) float32; NaN for those that the mesh lacks."""
+
+class KeyReader:
+    """Reads the values of shape keys of one mesh."""
+
+    def __init__(self, names: Sequence[str]):
+        """Prepare to read the K shape keys with these names."""
+        self._names = names
+        self._order: list[str] | None = None
+
+    def read(self, shape_keys: bpy.types.Key | None) -> np.ndarray:
+        """Read the values, (K,) float32; NaN for those that the mesh lacks."""
         order = [] if shape_keys is None else shape_keys.key_blocks.keys()
-        if order != self._key_order:
+        if order != self._order:
             indices = {name: index for index, name in enumerate(order)}
             # The last element is NaN.
-            self._key_indices = np.array([indices.get(name, len(order)) for name in self._key_names])
-            self._key_values = np.full(len(order) + 1, np.nan, np.float32)
-            self._key_reader = PropertyReader(KEY_VALUE_ELEMENT, self._key_values[: len(order)])
-            self._key_order = order
+            self._indices = np.array([indices.get(name, len(order)) for name in self._names])
+            self._values = np.full(len(order) + 1, np.nan, np.float32)
+            self._reader = PropertyReader(KEY_VALUE_ELEMENT, self._values[: len(order)])
+            self._order = order
         if order:
-            self._key_reader.read(shape_keys.key_blocks)
-        return self._key_values[self._key_indices]
+            self._reader.read(shape_keys.key_blocks)
+        return self._values[self._indices]
 
 
 class ConstrainedBones:

@@ -14,6 +14,7 @@ from ..core.controls import (
     ARMATURE_OBJECT,
     EVALUATION_TIME,
     MESH_OBJECT,
+    MESH_OWNER,
     OTHER_OBJECT,
     OWNERS,
     SHAPE_KEYS,
@@ -39,6 +40,10 @@ def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
     mesh_object = scene_rig.mesh_object
     if owner.startswith(OTHER_OBJECT):
         return bpy.data.objects.get(owner.removeprefix(OTHER_OBJECT))
+    if match := MESH_OWNER.fullmatch(owner):
+        mesh_object, owner = dict(scene_rig.other_meshes).get(match["mesh"]), match["owner"]
+        if mesh_object is None:
+            return None
     return {
         ARMATURE_OBJECT: scene_rig.armature_object,
         ARMATURE: scene_rig.armature_object.data,
@@ -49,7 +54,8 @@ def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
 
 def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID) -> str:
     """Return the name of a datablock as `Control.owner`; empty for a datablock that cannot have controls."""
-    for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
+    mesh_owners = (f"{owner}:{name}" for name, _ in scene_rig.other_meshes for owner in (MESH_OBJECT, SHAPE_KEYS))
+    for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS, *mesh_owners):
         if owner_of(scene_rig, owner) == datablock:
             return owner
     return f"{OTHER_OBJECT}{datablock.name}" if isinstance(datablock, bpy.types.Object) else ""

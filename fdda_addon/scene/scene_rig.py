@@ -20,10 +20,28 @@ MIN_VOLUME = 1e-15
 
 @dataclass(frozen=True)
 class SceneRig:
-    """A mesh object and the armature object that deforms it. Holds RNA references, so do not store it."""
+    """Mesh objects and the armature object that deforms them. Holds RNA references, so do not store it.
+
+    Attributes:
+        mesh_object: the first or only mesh object.
+        armature_object: the armature object.
+        other_meshes: the further mesh objects, each after its name in the recording or model.
+    """
 
     mesh_object: bpy.types.Object
     armature_object: bpy.types.Object
+    other_meshes: tuple[tuple[str, bpy.types.Object], ...] = ()
+
+    @property
+    def mesh_objects(self) -> list[bpy.types.Object]:
+        """Return all mesh objects."""
+        return [self.mesh_object, *(mesh_object for _, mesh_object in self.other_meshes)]
+
+    @property
+    def parts(self) -> "list[tuple[str, SceneRig]]":
+        """Return a rig for each mesh, after the mesh's name in owners of controls: empty for the first mesh."""
+        meshes = (("", self.mesh_object), *self.other_meshes)
+        return [(name, SceneRig(mesh_object, self.armature_object)) for name, mesh_object in meshes]
 
 
 def find_rig(name: str = "") -> SceneRig:

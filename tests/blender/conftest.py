@@ -121,7 +121,7 @@ def with_deformation(model: Path, deformation: dict) -> Path:
     loaded, path = onnx.load(model), model.with_name(f"other_{os.getpid()}_{model.name}")
     (prop,) = (prop for prop in loaded.metadata_props if prop.key == METADATA_KEY)
     info = json.loads(prop.value)
-    info["fingerprint"]["deformation"] = deformation
+    info["meshes"][0]["fingerprint"]["deformation"] = deformation
     prop.value = json.dumps(info)
     onnx.save(loaded, path)
     return path

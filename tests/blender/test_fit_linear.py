@@ -112,7 +112,7 @@ def test_fitted_weights_reduce_errors_and_are_in_the_model(kind, build, make_fit
     rig = files.open()
     rig_data = read_rig(rig)
     # The fingerprint describes the rig, and does not include fitted weights.
-    assert recording.rig.fingerprint == rig_data.fingerprint == info.fingerprint
+    assert recording.rig.meshes[0].fingerprint == rig_data.meshes[0].fingerprint == info.meshes[0].fingerprint
     assert [rig_data.joint_names[p.joint] for p in info.partitions] == ["upper", "lower"]
     linear_rig = Network(files.model).linear_rig(rig_data)
     assert (linear_rig.skin_weights > 0).sum(axis=1).max() == (1 if kind == "hard" else 2)

@@ -196,7 +196,7 @@ def test_an_action_that_moves_the_object_restores_its_transform(fresh, tmp_path)
 
 def test_the_index_describes_the_rig_and_its_sampling(fresh, elbow_files):
     index = json.loads((elbow_files.recording / "recording.json").read_text())
-    assert index["rig"]["file"] == "elbow.blend" and index["rig"]["object"] == "elbow"
+    assert index["rig"]["file"] == "elbow.blend" and index["meshes"][0]["name"] == "elbow"
     assert index["blender"] == bpy.app.version_string
     assert index["units"] == {"length": "m", "angle": "rad"}
     assert [(c["bone"], c["axis"]) for c in index["sampling"]["limits"]] == [

@@ -12,7 +12,7 @@ from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
-from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig
 
 from ..recordings import ResidualRecording, make_recording
 
@@ -39,9 +39,8 @@ def good_rig() -> Rig:
     rest_matrices = np.stack([np.eye(4, dtype=np.float32)] * len(JOINTS))
     rest_matrices[:, 2, 3] = np.arange(len(JOINTS)) * BONE_LENGTH
     skin_weights = np.stack([1 - upper_weights, upper_weights], axis=1)
-    return Rig(
-        JOINTS, positions, rest_matrices, skin_joints, skin_weights, Fingerprint("a", "b", "c"), controls=CONTROLS
-    )
+    meshes = (MeshPart("tube", len(positions), Fingerprint("a", "b", "c")),)
+    return Rig(JOINTS, positions, rest_matrices, skin_joints, skin_weights, meshes, controls=CONTROLS)
 
 
 def axis_rotations(angles: np.ndarray, axis: int = 0) -> np.ndarray:
@@ -88,7 +87,7 @@ def good_recording(poses: int = 200, angles: np.ndarray | None = None, seed: int
     partitions = make_partitions(rig, influencing, dict.fromkeys(range(len(JOINTS)), (0,)))
     channels = tuple(Channel(joint.name, "rotation", 0, -ROTATION_LIMIT, ROTATION_LIMIT) for joint in JOINTS)
     sampling = Sampling(seed, 1.0, channels, (Source("random", len(angles)),))
-    info = RecordingInfo(len(angles), len(angles), "tube.blend", "tube", "5.2.0", sampling)
+    info = RecordingInfo(len(angles), len(angles), "tube.blend", "5.2.0", sampling)
     matrices = pose_rig(rig, axis_rotations(angles))
     return make_recording(Path("tube"), info, rig, partitions, matrices, residuals, controls)
 

@@ -9,7 +9,7 @@ from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig
 
 JOINTS = (Joint("root", -1), Joint("upper", 0), Joint("lower", 1), Joint("thumb", 1))
 VERTEX_COUNT = 40
@@ -48,7 +48,15 @@ def make_rig(seed: int = 0) -> Rig:
     positions = rng.uniform(-0.5, 0.5, (VERTEX_COUNT, 3)).astype(np.float32)
     fingerprint = Fingerprint("limb", Fingerprint.digest(positions), Fingerprint.digest(skin_joints, skin_weights))
     rest_matrices = random_transforms(rng, len(JOINTS)).astype(np.float32)
-    return Rig(JOINTS, positions, rest_matrices, skin_joints, skin_weights, fingerprint, *make_faces())
+    return Rig(
+        JOINTS,
+        positions,
+        rest_matrices,
+        skin_joints,
+        skin_weights,
+        (MeshPart("limb", len(positions), fingerprint),),
+        *make_faces(),
+    )
 
 
 def make_faces() -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +86,7 @@ def partitions_of(rig: Rig) -> tuple[Partition, ...]:
 def recording_info(poses: int, seed: int = 0) -> RecordingInfo:
     """Return the header of a recording without poses yet: random poses, and two frames of an action."""
     sampling = Sampling(seed, 1.0, CHANNELS, (Source("random", poses - 2), Source("action", 2, "wave", (1, 1))))
-    return RecordingInfo(poses, 0, "limb.blend", "limb", "5.2.0", sampling)
+    return RecordingInfo(poses, 0, "limb.blend", "5.2.0", sampling)
 
 
 def record_limb(

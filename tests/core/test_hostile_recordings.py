@@ -223,7 +223,7 @@ def test_an_invalid_joint_name_is_refused(recording, name):
 )
 def test_an_invalid_fingerprint_is_refused(recording, fingerprint):
     index = json.loads((recording / "recording.json").read_text())
-    edit_index(recording, rig={**index["rig"], "fingerprint": fingerprint})
+    edit_index(recording, meshes=[{**index["meshes"][0], "fingerprint": fingerprint}])
     assert_refused(recording, "recording.json' is damaged: ")
 
 

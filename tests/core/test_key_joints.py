@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.joint_option import parse_joints
 from fdda_addon.core.mathematics.key_joints import KeyJointReport, select_joints
 from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, weights_match
-from fdda_addon.core.rig import Fingerprint, Joint, Rig, rig_differences
+from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig, rig_differences
 
 REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
 ERRORS = FitReport({"rig": 2.0, "fitted": 1.0}, {"rig": 20.0, "fitted": 10.0})
@@ -25,7 +25,7 @@ def chain_rig(*names: str, weighted: tuple[str, ...] = ("a", "b", "c", "d")) -> 
     skin_joints[:, 1] = [names.index(name) for name in (*weighted[1:], weighted[0])]
     weights = np.tile(np.array([0.75, 0.25, 0, 0], np.float32), (4, 1))
     positions = np.arange(12, dtype=np.float32).reshape(4, 3)
-    return Rig(joints, positions, matrices, skin_joints, weights, Fingerprint("t", "r", "s"))
+    return Rig(joints, positions, matrices, skin_joints, weights, (MeshPart("mesh", 4, Fingerprint("t", "r", "s")),))
 
 
 @pytest.mark.parametrize("text", ["all", "auto", "1", "50", "0050"])
@@ -45,14 +45,14 @@ def test_weights_of_other_joints_count_for_the_nearest_ancestor():
     assert selected.joint_names == ("a", "c")
     assert selected.skin_joints[:, :2].tolist() == [[0, 0], [0, 1], [1, 1], [1, 0]]
     np.testing.assert_array_equal(selected.rest_matrices, rig.rest_matrices[[0, 2]])
-    assert selected.fingerprint.has_key_joints and not rig.fingerprint.has_key_joints
+    assert selected.meshes[0].fingerprint.has_key_joints and not rig.meshes[0].fingerprint.has_key_joints
 
 
 def test_the_fingerprint_depends_on_all_weights_but_not_on_joints_without_weights():
     joints = (Joint("a", -1), Joint("c", 0))
 
     def fingerprint(rig: Rig) -> str:
-        return select_joints(rig, joints).fingerprint.skin_weights
+        return select_joints(rig, joints).meshes[0].fingerprint.skin_weights
 
     rig = chain_rig("a", "b", "c", "d")
     assert fingerprint(chain_rig("root", "a", "b", "x", "c", "d")) == fingerprint(rig)
@@ -69,7 +69,7 @@ def test_the_fingerprint_depends_on_all_weights_but_not_on_joints_without_weight
     assert len({fingerprint(rig), *map(fingerprint, others)}) == 4
     selected = select_joints(others[0], joints)
     recorded = select_joints(rig, joints)
-    assert rig_differences(recorded.joints, recorded.rest_matrices, 4, recorded.fingerprint, selected) == [
+    assert rig_differences(recorded.joints, recorded.rest_matrices, recorded.meshes, selected) == [
         "the skin weights differ"
     ]
 

@@ -43,7 +43,7 @@ def test_content_is_read_back_unchanged(recording):
     for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights", "face_starts", "face_vertices"):
         assert np.array_equal(getattr(read_back.rig, name), getattr(rig, name))
         assert getattr(read_back.rig, name).dtype == getattr(rig, name).dtype
-    assert read_back.rig.joints == JOINTS and read_back.rig.fingerprint == rig.fingerprint
+    assert read_back.rig.joints == JOINTS and read_back.rig.meshes[0].fingerprint == rig.meshes[0].fingerprint
     assert (read_back.info.poses, read_back.info.complete) == (POSE_COUNT, POSE_COUNT)
     assert read_back.info.sampling == recording_info(POSE_COUNT).sampling
 
@@ -232,7 +232,7 @@ def set_nested_value(index, *keys, value):
         (("sampling", "limits", 0, "high"), 0.1, "sampling.limits"),
         (("sampling", "sources", 1, "name"), "fist", "sampling.sources"),
         (("rig", "file"), "other.blend", "rig.file"),
-        (("rig", "fingerprint", "skin_weights"), "0", "rig.fingerprint.skin_weights"),
+        (("meshes", 0, "fingerprint", "skin_weights"), "0", "meshes"),
         (("joints", 1, "name"), "arm", "joints"),
         (("bones", "dependencies"), [2], "bones.dependencies"),
         (("poses",), 13, "poses"),

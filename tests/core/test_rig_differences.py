@@ -8,14 +8,20 @@ import pytest
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.deformation import MAX_ENTRIES
-from fdda_addon.core.rig import REST_MATRIX_TOLERANCE, Fingerprint, Joint, Rig, rig_differences
+from fdda_addon.core.rig import REST_MATRIX_TOLERANCE, Fingerprint, Joint, MeshPart, Rig, rig_differences
 
 from .limb import JOINTS, make_rig
 
 
 def differences(rig: Rig, **changes) -> list[str]:
     """Return the differences between a rig, as stored in a model, and the same rig with changed fields."""
-    return rig_differences(rig.joints, rig.rest_matrices, rig.vertex_count, rig.fingerprint, replace(rig, **changes))
+    return rig_differences(rig.joints, rig.rest_matrices, rig.meshes, replace(rig, **changes))
+
+
+def with_fingerprint(rig: Rig, **changes) -> tuple[MeshPart, ...]:
+    """Return the mesh of a rig with changes of its fingerprint."""
+    (mesh,) = rig.meshes
+    return (replace(mesh, fingerprint=replace(mesh.fingerprint, **changes)),)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +35,7 @@ def test_the_same_rig_has_no_differences(rig):
 
 
 def test_another_vertex_count_is_named(rig):
-    assert differences(rig, rest_positions=rig.rest_positions[:-3]) == ["it has 40 vertices, the mesh has 37"]
+    assert differences(rig, meshes=(replace(rig.meshes[0], vertices=37),)) == ["it has 40 vertices, the mesh has 37"]
 
 
 def joints_with_names(*names: str) -> tuple[Joint, ...]:
@@ -87,7 +93,7 @@ def test_rest_poses_are_compared_in_meters(rig):
     ],
 )
 def test_other_fingerprints_are_named(rig, part, sentence):
-    assert differences(rig, fingerprint=replace(rig.fingerprint, **{part: "0"})) == [sentence]
+    assert differences(rig, meshes=with_fingerprint(rig, **{part: "0"})) == [sentence]
 
 
 def test_digest_depends_on_values_shapes_and_types():
@@ -183,11 +189,10 @@ CHANGED_DEFORMATIONS = {
 @pytest.mark.parametrize("change", CHANGED_DEFORMATIONS)
 def test_other_deformations_are_named(rig, change):
     deformation, sentences = CHANGED_DEFORMATIONS[change]
-    recorded_rig = replace(rig, fingerprint=replace(rig.fingerprint, deformation=DEFORMATION))
+    recorded_rig = replace(rig, meshes=with_fingerprint(rig, deformation=DEFORMATION))
     controls = (Control("mesh_object", 'modifiers["Mush"].iterations', 0.0, 1.0),)
     assert (
-        differences(recorded_rig, fingerprint=replace(rig.fingerprint, deformation=deformation), controls=controls)
-        == sentences
+        differences(recorded_rig, meshes=with_fingerprint(rig, deformation=deformation), controls=controls) == sentences
     )
 
 
@@ -197,14 +202,14 @@ def test_an_input_of_nodes_that_is_a_control_may_differ(rig, path, index):
     def with_input(identifier):
         settings = {"Socket_2": 0.0, "Socket_3": 0.0} | {identifier: 0.5}
         deformation = {"modifiers": [{"name": "GN", "type": "NODES", "settings": settings}]}
-        return replace(rig.fingerprint, deformation=deformation)
+        return with_fingerprint(rig, deformation=deformation)
 
     recorded_rig, controls = (
-        replace(rig, fingerprint=with_input("none")),
+        replace(rig, meshes=with_input("none")),
         (Control("mesh_object", f'modifiers["GN"]{path}{index}', 0.0, 1.0),),
     )
-    assert not differences(recorded_rig, fingerprint=with_input("Socket_2"), controls=controls)
-    clauses = differences(recorded_rig, fingerprint=with_input("Socket_3"), controls=controls)
+    assert not differences(recorded_rig, meshes=with_input("Socket_2"), controls=controls)
+    clauses = differences(recorded_rig, meshes=with_input("Socket_3"), controls=controls)
     assert clauses == ["'Socket_3' of the modifier 'GN' was 0.0 and is 0.5"]
 
 

@@ -10,7 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.formats.model import CHECKSUM_KEY, METADATA_KEY
 from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
-from fdda_addon.core.rig import Fingerprint, Joint
+from fdda_addon.core.rig import Fingerprint, Joint, MeshPart
 
 JOINT_COUNT, VERTEX_COUNT = 3, 4
 
@@ -21,8 +21,7 @@ def tiny_info(**changes) -> ModelInfo:
     info = ModelInfo(
         joints=(Joint("root", -1), Joint("upper.L", 0), Joint("löwer", 1)),
         rest_matrices=rng.normal(size=(JOINT_COUNT, 4, 4)).astype(np.float32),
-        vertex_count=VERTEX_COUNT,
-        fingerprint=Fingerprint("a1", "b2", "c3"),
+        meshes=(MeshPart("mesh", VERTEX_COUNT, Fingerprint("a1", "b2", "c3")),),
         partitions=(ModelPartition(0, (), 1, 0), ModelPartition(2, (1, 2), 3, 17)),
         feature_low=rng.normal(size=(JOINT_COUNT, 12)).astype(np.float32),
         feature_high=rng.normal(size=(JOINT_COUNT, 12)).astype(np.float32),

@@ -69,7 +69,7 @@ def controlled_chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
     poses = np.concatenate([poses, np.broadcast_to(np.eye(4, dtype=np.float32), (POSES, 1, 4, 4))], axis=1)
     moving_joints = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for joint in range(JOINTS)}
     partitions = make_partitions(rig, moving_joints, {joint: (0,) for joint in range(JOINTS)})
-    info = RecordingInfo(POSES, 0, "chain.blend", "chain", "5.2.0", Sampling(1, 1.0, (), (Source("random", POSES),)))
+    info = RecordingInfo(POSES, 0, "chain.blend", "5.2.0", Sampling(1, 1.0, (), (Source("random", POSES),)))
     with RecordingWriter(recording, rig, partitions, info) as writer:
         writer.append(poses, residuals, values)
     return train_character(recording)

@@ -8,7 +8,7 @@ import numpy as np
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
-from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig
 
 from ..recordings import write_recording
 
@@ -40,8 +40,9 @@ def chain_rig(joint_count: int = 3, vertex_count: int = 90, seed: int = 0) -> Ri
     skin_weights = np.stack([1 - upper_weights, upper_weights], axis=1).astype(np.float32)
     joints = tuple(Joint(f"bone_{index}", index - 1) for index in range(joint_count))
     fingerprint = Fingerprint("chain", Fingerprint.digest(positions), Fingerprint.digest(skin_weights))
+    meshes = (MeshPart("chain", len(positions), fingerprint),)
     faces = chain_faces(height)
-    return Rig(joints, positions, rest_matrices.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
+    return Rig(joints, positions, rest_matrices.astype(np.float32), skin_joints, skin_weights, meshes, *faces)
 
 
 def chain_faces(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,4 +114,4 @@ def chain_info(pose_count: int, seed: int = 0) -> RecordingInfo:
     """Create the index of a recording of random poses."""
     limits = (Channel("bone_1", "rotation", 0, -MAX_ANGLE, MAX_ANGLE),)
     sampling = Sampling(seed, 1.0, limits, (Source("random", pose_count),))
-    return RecordingInfo(pose_count, 0, "chain.blend", "chain", "5.2.0", sampling)
+    return RecordingInfo(pose_count, 0, "chain.blend", "5.2.0", sampling)

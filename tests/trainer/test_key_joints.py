@@ -18,7 +18,7 @@ from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, Rig
+from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, MeshPart, Rig
 from trainer.config import TrainingConfig
 from trainer.skin.choice import choose_key_joints
 from trainer.skin.fit_poses import FitPoses
@@ -96,7 +96,8 @@ def _skinned_rig(joints: tuple[Joint, ...], rest_matrices: np.ndarray, rng: np.r
     skin_joints[:, 1] = np.maximum([joint.parent for joint in joints], 0)[main]
     weights[:, 0] = np.where(main == 0, 1, rng.uniform(0.6, 1, len(main)))
     weights[:, 1] = 1 - weights[:, 0]
-    return Rig(joints, positions.astype(np.float32), rest_matrices, skin_joints, weights, Fingerprint("", "", ""))
+    meshes = (MeshPart("mesh", len(positions), Fingerprint("", "", "")),)
+    return Rig(joints, positions.astype(np.float32), rest_matrices, skin_joints, weights, meshes)
 
 
 def choose(poses: FitPoses, requested: str = "auto"):
@@ -279,7 +280,7 @@ def split(folder: Path, poses: FitPoses, random_count: int, **settings: object) 
     sampling = Sampling(0, 1.0, channels, tuple(source for source in sources if source.poses))
     controls = (Control("shape_keys", 'key_blocks["Slide"].value', -1.0, 1.0),)
     rig = replace(poses.rig, controls=controls)
-    info = RecordingInfo(len(poses.positions), 0, "chain.blend", "chain", "5.2.0", sampling)
+    info = RecordingInfo(len(poses.positions), 0, "chain.blend", "5.2.0", sampling)
     with RecordingWriter(folder, rig, with_influences(info, rig)) as writer:
         writer.append(poses.pose_matrices, poses.positions, poses.controls)
         writer.append(*alone_arrays(rig, make_partitions(rig, {0: (len(names) - 1,)})))
@@ -291,7 +292,7 @@ def test_weights_are_fitted_to_key_joints(tmp_path):
     skinned, messages = split(tmp_path / "r", poses, 120, joints="auto")
     names, rig = poses.rig.joint_names, skinned.rig
     assert skinned.fit.key_joints.joints == len(rig.joints) == skinned.pose_matrices.shape[1] < len(names)
-    assert rig.fingerprint.has_key_joints and set(rig.joint_names) < set(names)
+    assert rig.meshes[0].fingerprint.has_key_joints and set(rig.joint_names) < set(names)
     assert len(skinned.rows) == len(poses.positions) == skinned.info.poses
     residuals = skinned.compute_residuals(np.arange(len(poses.positions)))
     assert np.linalg.norm(residuals, axis=2).mean() < 0.02 * rig.size

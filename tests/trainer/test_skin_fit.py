@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig
 from trainer.skin.fit_poses import FitPoses, choose_fit_poses
 from trainer.skin.solver import fit_skin, simplex_weights
 from trainer.skin.split_deformation import measure_skin
@@ -42,7 +42,8 @@ def random_rig(influences: int, seed: int = 0, origin_distance: float = 0.0) -> 
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
     positions = (rng.uniform(-1, 1, (VERTICES, 3)) + origin_distance).astype(np.float32)
     joints = tuple(Joint(str(index), index - 1) for index in range(JOINTS))
-    return Rig(joints, positions, rest_matrices.astype(np.float32), skin_joints, weights, Fingerprint("", "", ""))
+    meshes = (MeshPart("mesh", len(positions), Fingerprint("", "", "")),)
+    return Rig(joints, positions, rest_matrices.astype(np.float32), skin_joints, weights, meshes)
 
 
 def with_one_joint(rig: Rig, joints: np.ndarray) -> Rig:

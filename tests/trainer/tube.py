@@ -6,7 +6,7 @@ import numpy as np
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.skinned import SkinnedRecording
-from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig
 
 from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, pose_chain, rotation
@@ -39,7 +39,7 @@ def tube(units_per_metre: float = 1.0, origin_distance: float = 0.0) -> Rig:
         rest_matrices.astype(np.float32),
         skin_joints,
         np.ones(skin_joints.shape, np.float32),
-        Fingerprint("tube", Fingerprint.digest(positions), "one"),
+        (MeshPart("tube", len(positions), Fingerprint("tube", Fingerprint.digest(positions), "one")),),
         np.arange(0, faces.size, 4, dtype=np.int32),
         faces.astype(np.int32).ravel(),
         metres_per_unit=1 / units_per_metre,

@@ -24,7 +24,6 @@ from fdda_addon.core.formats.model_info import (
     FIT_KEY,
     KEY_JOINTS_KEY,
     LIMITS_KEY,
-    OBJECT_KEY,
     ModelInfo,
     ModelPartition,
 )
@@ -208,8 +207,7 @@ def _model_info(
     return ModelInfo(
         rig.joints,
         rig.rest_matrices,
-        rig.vertex_count,
-        rig.fingerprint,
+        rig.meshes,
         tuple(
             ModelPartition(
                 p.joint,
@@ -227,7 +225,6 @@ def _model_info(
         1000 * held_out.difference,
         {
             **training_info,
-            OBJECT_KEY: recording.info.object_name,
             LIMITS_KEY: recording.info.sampling.to_json()["limits"],
             **({FIT_KEY: recording.fit.to_json()} if recording.fit else {}),
             **({KEY_JOINTS_KEY: recording.key_joints.to_json()} if recording.key_joints else {}),

@@ -14,7 +14,7 @@ import numpy as np
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.files.input_file import open_input
 from fdda_addon.core.recording.arrays import MAX_VALUE, NPY_HEADER_ERRORS
-from fdda_addon.core.rig import Fingerprint
+from fdda_addon.core.rig import MeshPart, read_meshes
 
 from ..inputs.block import State
 from .networks import Network
@@ -59,7 +59,7 @@ class Checkpoint:
     """The state from which a training can be continued.
 
     Attributes:
-        fingerprint: fingerprint of the rig.
+        meshes: meshes of the rig.
         controls: names of the rig's controls.
         deformation: digest of joints, partitions and influences (`data.skinned_recording.SkinnedRecording.digest`).
         holdout: fingerprint of the held-out and validation poses (`data.split.holdout_fingerprint`).
@@ -70,7 +70,7 @@ class Checkpoint:
         input_states: state of each block of the inputs, by its name (`inputs.block`).
     """
 
-    fingerprint: Fingerprint
+    meshes: tuple[MeshPart, ...]
     controls: tuple[str, ...]
     deformation: str
     holdout: str
@@ -87,7 +87,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    metadata = {"version": VERSION, **vars(checkpoint), "fingerprint": vars(checkpoint.fingerprint)}
+    metadata = {"version": VERSION, **vars(checkpoint), "meshes": [m.to_json() for m in checkpoint.meshes]}
     metadata["partitions"] = len(checkpoint.partitions)
     del metadata["input_states"]
     arrays = {"about": np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
@@ -143,7 +143,7 @@ def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
         _check_partition(partition, hidden)
         partitions.append(partition)
     return Checkpoint(
-        Fingerprint.from_json(metadata["fingerprint"]),
+        read_meshes(metadata["meshes"]),
         tuple(str(name) for name in metadata["controls"]),
         str(metadata["deformation"]),
         str(metadata["holdout"]),

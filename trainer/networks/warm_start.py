@@ -35,7 +35,7 @@ def read_initial_checkpoint(
     """
     path = checkpoint_path(model_path)
     checkpoint = read_checkpoint(path)
-    if checkpoint.fingerprint != recording.rig.fingerprint:
+    if checkpoint.meshes != recording.rig.meshes:
         raise TrainingError(f"The checkpoint '{path}' is of another rig; train without --warm-start.")
     if checkpoint.controls != tuple(control.name for control in recording.rig.controls):
         raise TrainingError(f"The checkpoint '{path}' is of other controls; train without --warm-start.")

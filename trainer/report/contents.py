@@ -47,7 +47,7 @@ def make_report(
         "model": model_name,
         "model_bytes": len(exported.content),
         "recording": recording.path.name,
-        "object": recording.info.object_name,
+        "object": recording.rig.meshes[0].name,
         "vertices": recording.rig.vertex_count,
         "joints": len(recording.rig.joints),
         **({"controls": controls} if controls else {}),

@@ -110,8 +110,14 @@ def keep_key_joints(recording: Recording, fitted_rig: Rig, choice: KeyJoints) ->
         key_rig,
         skin_joints=indices[fitted_rig.skin_joints],
         skin_weights=fitted_rig.skin_weights,
-        fingerprint=replace(
-            key_rig.fingerprint, deformation=key_rig.fingerprint.deformation | {"unread_bones": unread}
+        meshes=tuple(
+            replace(
+                mesh,
+                fingerprint=replace(
+                    mesh.fingerprint, deformation=mesh.fingerprint.deformation | {"unread_bones": unread}
+                ),
+            )
+            for mesh in key_rig.meshes
         ),
     )
 
@@ -132,7 +138,7 @@ def check_has_weights(recording: Recording) -> None:
     """
     if not recording.rig.has_weights:
         raise TrainingError(
-            f"The vertices of '{recording.info.object_name}' follow no bone by skin weights, so there is no linear "
+            f"The vertices of '{recording.rig.meshes[0].name}' follow no bone by skin weights, so there is no linear "
             "skinning to learn from; have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint "
             "weights and record again."
         )

@@ -122,7 +122,7 @@ def check_rig(path: Path, info: ModelInfo, rig: Rig) -> None:
     Raises:
         ModelError: the rigs differ.
     """
-    differences = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    differences = rig_differences(info.joints, info.rest_matrices, info.meshes, rig)
     if differences:
         raise ModelError(
             f"The model '{path}' was trained for another rig: {'; '.join(differences)}. Record and train this rig."

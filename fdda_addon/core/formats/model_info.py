@@ -11,7 +11,7 @@ from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import Partition, make_partitions
 from ..mathematics.poses import Channel
 from ..mathematics.skin_fit import SkinFit
-from ..rig import Fingerprint, Joint, Rig, read_joints
+from ..rig import Joint, MeshPart, Rig, read_joints, read_meshes
 from ..unit import read_unit, unit_to_json
 
 VERSION = 1
@@ -22,8 +22,6 @@ LIMITS_KEY = "limits"
 FIT_KEY, KEY_JOINTS_KEY = "fit", "key_joints"
 """Keys in `ModelInfo.training` for the fit of the skin weights (`SkinFit`) and the choice of key joints
 (`KeyJointReport`), where there was one."""
-OBJECT_KEY = "object"
-"""Key in `ModelInfo.training` for the name of the recorded mesh object."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +53,7 @@ class ModelInfo:
     Attributes:
         joints: joints of the input `pose_matrices`, every parent before its children.
         rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
-        vertex_count: number of vertices of the mesh.
-        fingerprint: fingerprint of the recorded rig.
+        meshes: the recorded meshes, in the order of their vertices in the output `positions`.
         partitions: partitions in ascending order of their main joints; the output `confidence` has the same order.
         feature_low, feature_high: (J, 12) float32, range of the joint features (core.mathematics.features) in training.
         controls: controls with their ranges in training.
@@ -69,8 +66,7 @@ class ModelInfo:
 
     joints: tuple[Joint, ...]
     rest_matrices: np.ndarray
-    vertex_count: int
-    fingerprint: Fingerprint
+    meshes: tuple[MeshPart, ...]
     partitions: tuple[ModelPartition, ...]
     feature_low: np.ndarray
     feature_high: np.ndarray
@@ -115,10 +111,14 @@ class ModelInfo:
         return ""
 
     @property
-    def object_name(self) -> str:
-        """Name of the recorded mesh object; empty where unknown."""
-        name = self.training.get(OBJECT_KEY, "")
-        return name if isinstance(name, str) else ""
+    def vertex_count(self) -> int:
+        """Number of vertices of all meshes."""
+        return sum(mesh.vertices for mesh in self.meshes)
+
+    @property
+    def has_key_joints(self) -> bool:
+        """Whether the model reads fewer joints than those with skin weights."""
+        return any(mesh.fingerprint.has_key_joints for mesh in self.meshes)
 
     def to_json(self) -> str:
         """Return the text of the metadata property."""
@@ -126,8 +126,7 @@ class ModelInfo:
             "version": VERSION,
             "joints": [joint.to_json() for joint in self.joints],
             "rest_matrices": self.rest_matrices.reshape(-1, 16).tolist(),
-            "vertices": self.vertex_count,
-            "fingerprint": asdict(self.fingerprint),
+            "meshes": [mesh.to_json() for mesh in self.meshes],
             "partitions": [partition.to_json() for partition in self.partitions],
             **({"controls": [control.to_json() for control in self.controls]} if self.controls else {}),
             "training_ranges": {"low": self.feature_low.tolist(), "high": self.feature_high.tolist()},
@@ -177,7 +176,8 @@ def _read_info(value: dict) -> ModelInfo:
         raise ValueError("a partition names a control that is none of its controls")
     if not partitions or not all(p.vertices > 0 and p.basis >= 0 for p in partitions):
         raise ValueError("it has no partitions, or one without vertices")
-    if sum(p.vertices for p in partitions) != int(value["vertices"]):
+    meshes = read_meshes(value["meshes"])
+    if sum(p.vertices for p in partitions) != sum(mesh.vertices for mesh in meshes):
         raise ValueError("the partitions do not add up to the vertices")
     rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(joint_count, 4, 4)
     if not np.isfinite(rest_matrices).all():
@@ -185,8 +185,7 @@ def _read_info(value: dict) -> ModelInfo:
     info = ModelInfo(
         joints,
         rest_matrices,
-        int(value["vertices"]),
-        Fingerprint.from_json(value["fingerprint"]),
+        meshes,
         partitions,
         np.array(value["training_ranges"]["low"], np.float32).reshape(joint_count, 12),
         np.array(value["training_ranges"]["high"], np.float32).reshape(joint_count, 12),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Key joints: a rig whose model reads fewer joints than those with skin weights."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -91,8 +91,8 @@ def _first_names(names: tuple[str, ...]) -> str:
 def select_joints(rig: Rig, joints: tuple[Joint, ...]) -> Rig:
     """Return a rig with some of its joints.
 
-    Weights of other joints count for the nearest ancestor that is selected, else for the first joint. The fingerprint
-    identifies the skin weights of all joints by their names.
+    Weights of other joints count for the nearest ancestor that is selected, else for the first joint. The
+    fingerprints identify the skin weights of all joints by their names.
 
     Args:
         rig: the rig with its own skin weights.
@@ -105,13 +105,23 @@ def select_joints(rig: Rig, joints: tuple[Joint, ...]) -> Rig:
         heirs[index] = heirs[joint.parent] if joint.parent >= 0 else 0
         if index in selected:
             heirs[index] = selected.index(index)
-    skin_weights = _digest_weights(rig)
+    meshes = tuple(
+        replace(
+            mesh,
+            fingerprint=replace(
+                mesh.fingerprint,
+                skin_weights=KEY_JOINTS_PREFIX
+                + _digest_weights(rig.joint_names, rig.skin_joints[vertices], rig.skin_weights[vertices]),
+            ),
+        )
+        for mesh, vertices in zip(rig.meshes, rig.mesh_slices, strict=True)
+    )
     return replace(
         rig,
         joints=joints,
         rest_matrices=rig.rest_matrices[selected],
         skin_joints=heirs[rig.skin_joints].astype(np.int32),
-        fingerprint=replace(rig.fingerprint, skin_weights=f"{KEY_JOINTS_PREFIX}{skin_weights}"),
+        meshes=meshes,
     )
 
 
@@ -164,13 +174,13 @@ def find_unread_bones(
     return sorted(followers | (with_sources(followers) - visible))
 
 
-def _digest_weights(rig: Rig) -> str:
-    """Hash the skin weights of a rig, so that the hash does not depend on joints without weights and on their order."""
-    vertices, slots = np.nonzero(rig.skin_weights > 0)
-    joints, weights = rig.skin_joints[vertices, slots], rig.skin_weights[vertices, slots]
-    names = sorted({rig.joint_names[joint] for joint in np.unique(joints)})
+def _digest_weights(joint_names: Sequence[str], skin_joints: np.ndarray, skin_weights: np.ndarray) -> str:
+    """Hash the skin weights of a mesh; the hash does not depend on joints without weights and on their order."""
+    vertices, slots = np.nonzero(skin_weights > 0)
+    joints, weights = skin_joints[vertices, slots], skin_weights[vertices, slots]
+    names = sorted({joint_names[joint] for joint in np.unique(joints)})
     ranks = {name: rank for rank, name in enumerate(names)}
-    ranks_of_joints = np.array([ranks.get(name, 0) for name in rig.joint_names], np.int32)[joints]
+    ranks_of_joints = np.array([ranks.get(name, 0) for name in joint_names], np.int32)[joints]
     order = np.lexsort((ranks_of_joints, vertices))
     names_digest = Fingerprint.digest_text("\0".join(names))
     digest = Fingerprint.digest(vertices[order].astype(np.int32), ranks_of_joints[order], weights[order])

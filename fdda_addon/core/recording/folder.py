@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import OutputError, RecordingError, os_error_text
-from ..rig import Fingerprint, Rig, read_joints, rig_differences
+from ..rig import Rig, read_joints, read_meshes, rig_differences
 from .folder_check import is_available, is_recording, remove_recording_files
 from .index import ALONE, INDEX_NAME, REFINED, find_different_keys, read_index, read_info
 from .lock import RecordingLock
@@ -112,10 +112,8 @@ def _planned_sampling(sampling: dict) -> dict:
 
 
 def _rig_differences(index: dict, rig: Rig) -> list[str]:
-    joints = read_joints(index["joints"])
-    fingerprint = Fingerprint.from_json(index["rig"]["fingerprint"])
     # The rest matrices are in an array; they are compared when the recording is used.
-    return rig_differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
+    return rig_differences(read_joints(index["joints"]), rig.rest_matrices, read_meshes(index["meshes"]), rig)
 
 
 def remove_recording(path: Path) -> None:

@@ -13,7 +13,7 @@ from ..files.input_file import read_input
 from ..files.output import atomic_write, to_json_text
 from ..mathematics.poses import CONTROL, Channel, Margin
 from ..mathematics.surface import MIN_CORNERS
-from ..rig import Fingerprint, read_joints, read_name
+from ..rig import read_joints, read_meshes, read_name
 from ..unit import read_unit
 from .bones import RecordedBones
 from .target import RecordedTarget, Repeatability
@@ -140,7 +140,7 @@ class RecordingInfo:
 
     Attributes:
         poses, complete: number of all poses, and of complete poses.
-        rig_file, object_name: names of the .blend file and of the mesh object.
+        rig_file: name of the .blend file.
         blender: version of Blender.
         sampling: sampling of the poses.
         bones: the bones of the rig.
@@ -153,7 +153,6 @@ class RecordingInfo:
     poses: int
     complete: int
     rig_file: str
-    object_name: str
     blender: str
     sampling: Sampling
     bones: RecordedBones = field(default_factory=RecordedBones)
@@ -233,10 +232,10 @@ def _read_json(path: Path, check: Callable[[dict], object]) -> dict:
 
 
 def _check_index(index: dict) -> None:
-    for key in ("poses", "complete", "vertices", "influences"):
+    for key in ("poses", "complete", "influences"):
         if type(index[key]) is not int or index[key] < 0:
             raise ValueError(f"'{key}' is {index[key]!r}")
-    if index["complete"] > index["poses"] or not index["vertices"] or not index["influences"]:
+    if index["complete"] > index["poses"] or not index["influences"]:
         raise ValueError("its counts contradict each other")
     if index["influences"] > MAX_INFLUENCES:
         raise ValueError(f"its vertices have {index['influences']} skin weights each, and {MAX_INFLUENCES} is the most")
@@ -246,11 +245,11 @@ def _check_index(index: dict) -> None:
     if index.get("corners", 0) < MIN_CORNERS * index.get("faces", 0):
         raise ValueError(f"{index['faces']} faces cannot have {index.get('corners', 0)} corners")
     controls = read_controls(index["controls"])
-    for text in (index["blender"], index["rig"]["file"], index["rig"]["object"]):
+    for text in (index["blender"], index["rig"]["file"]):
         if not isinstance(text, str):
             raise TypeError(f"{text!r} is not a string")
     joint_count = len(read_joints(index["joints"]))
-    Fingerprint.from_json(index["rig"]["fingerprint"])
+    read_meshes(index["meshes"])
     read_unit(index)
     if "target" in index:
         RecordedTarget.from_json(index["target"])
@@ -310,7 +309,6 @@ def read_info(index: dict) -> RecordingInfo:
         index["poses"],
         index["complete"],
         index["rig"]["file"],
-        index["rig"]["object"],
         index["blender"],
         _read_sampling(index["sampling"]),
         RecordedBones.from_json(index["bones"], len(index["joints"])),

@@ -76,7 +76,7 @@ def detect_influences(
     base_text = f"random pose {base_index}" if base_index else "the rest pose"
     name = recording.rig.joint_names[indices[0]] if kind == JOINT else rig.controls[indices[0]].name
     return influences, (
-        f"Some positions of '{recording.info.object_name}' are not finite in {len(infinite_tests)} tests of its "
+        f"Some positions of '{rig.meshes[0].name}' are not finite in {len(infinite_tests)} tests of its "
         f"influences, as when '{name or STATIC_JOINT_LABEL}' moves from {base_text}; "
         "that counts as an influence. Look for a constraint, driver or modifier that fails in extreme poses."
     )

@@ -14,7 +14,7 @@ from ..errors import RecordingError
 from ..mathematics.skin_fit import are_skin_weights
 from ..mathematics.skinning import are_invertible
 from ..mathematics.surface import are_faces
-from ..rig import Fingerprint, Rig, read_joints
+from ..rig import Rig, read_joints, read_meshes
 from ..unit import read_unit
 from .arrays import MAX_VALUE, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array
 from .index import RecordingInfo, read_index, read_info
@@ -82,7 +82,7 @@ def open_recording(path: Path) -> Recording:
     rig = Rig(
         joints,
         *(np.array(arrays[name]) for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
-        Fingerprint.from_json(index["rig"]["fingerprint"]),
+        read_meshes(index["meshes"]),
         *(np.array(arrays.get(name, np.zeros(0, np.int32))) for name in ("face_starts", "face_vertices")),
         read_controls(index["controls"]),
         read_unit(index),
@@ -130,7 +130,7 @@ def check_resumable(path: Path) -> None:
 
 def _index_array_shapes(index: dict) -> dict[str, tuple[tuple, type]]:
     return array_shapes(
-        *(index["poses"], len(index["joints"]), index["vertices"], index["influences"]),
+        *(index["poses"], len(index["joints"]), sum(mesh["vertices"] for mesh in index["meshes"]), index["influences"]),
         *(index.get(key, 0) for key in ("faces", "corners")),
         len(index["controls"]),
     )

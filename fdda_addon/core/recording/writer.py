@@ -7,7 +7,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -178,17 +178,13 @@ class RecordingWriter:
             "version": VERSION,
             "poses": info.poses,
             "complete": self.complete,
-            "vertices": self.rig.vertex_count,
             "influences": int(self.rig.skin_joints.shape[1]),
             **self._face_counts(),
             "units": {"length": "m", "angle": "rad"},
             **unit_to_json(self.rig.metres_per_unit),
             "blender": info.blender,
-            "rig": {
-                "file": info.rig_file,
-                "object": info.object_name,
-                "fingerprint": asdict(self.rig.fingerprint),
-            },
+            "rig": {"file": info.rig_file},
+            "meshes": [mesh.to_json() for mesh in self.rig.meshes],
             "joints": [joint.to_json() for joint in self.rig.joints],
             "controls": [control.to_json() for control in self.rig.controls],
             "bones": json.loads(json.dumps(info.bones.to_json())),

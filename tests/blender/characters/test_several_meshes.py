@@ -71,7 +71,7 @@ def test_the_meshes_share_their_poses(two):
     assert body.rig.joint_names == sleeve.rig.joint_names
     assert len(body.pose_matrices) == POSES + 30 + ALONE and (body.pose_matrices == sleeve.pose_matrices).all()
     assert body.info.sampling == sleeve.info.sampling
-    assert [recording.info.object_name for recording in (body, sleeve)] == [BODY, SLEEVE]
+    assert [recording.rig.meshes[0].name for recording in (body, sleeve)] == [BODY, SLEEVE]
 
 
 def test_each_mesh_is_recorded_as_by_itself(two, tmp_path):
@@ -156,7 +156,7 @@ def test_an_interrupted_recording_goes_on_where_each_mesh_stopped(two, tmp_path)
 
 def test_each_mesh_has_a_model_and_a_report_of_its_own(two):
     for name in (BODY, SLEEVE):
-        assert read_model_info(two.models / name / f"{name}.onnx").object_name == name
+        assert read_model_info(two.models / name / f"{name}.onnx").meshes[0].name == name
         assert {path.name for path in (two.models / name).iterdir()} == {
             *(f"{name}.onnx", f"{name}.checkpoint.npz", "report.json", "report.html")
         }

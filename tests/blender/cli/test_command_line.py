@@ -161,7 +161,7 @@ def test_the_option_object_selects_a_mesh(elbow_files, tmp_path, capfd):
 
     path = save_elbow(tmp_path / "rig.blend", add_second)
     assert run("record", path, tmp_path / "r", "--object", "sleeve", "--poses", 3) == 0
-    assert read_recording(tmp_path / "r").info.object_name == "sleeve"
+    assert read_recording(tmp_path / "r").rig.meshes[0].name == "sleeve"
     assert run("record", path, tmp_path / "other", "--object", "elbow", "--poses", 3) == 1
     assert "'elbow' is hidden" in capfd.readouterr().err
 

@@ -55,4 +55,4 @@ def test_arguments_without_utf_8_mode(unicode_rig, tmp_path):
     arguments = ("record", unicode_rig, recording, "--poses", 12, "--object", "Ärmel")
     result = run_verb(*arguments, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
     assert result.returncode == 0 and b"Traceback" not in result.stderr, result.stderr
-    assert json.loads((recording / "recording.json").read_text(encoding="utf-8"))["rig"]["object"] == "Ärmel"
+    assert json.loads((recording / "recording.json").read_text(encoding="utf-8"))["meshes"][0]["name"] == "Ärmel"

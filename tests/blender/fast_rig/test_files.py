@@ -8,7 +8,6 @@ import bpy
 
 from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.core.formats.model import METADATA_KEY
-from fdda_addon.core.formats.model_info import OBJECT_KEY
 from fdda_addon.scene.blend_file import save_copy
 
 from ..command_output import output_of
@@ -24,7 +23,7 @@ def rename_object(name: str):
     def edit(proto):
         (prop,) = (prop for prop in proto.metadata_props if prop.key == METADATA_KEY)
         info = json.loads(prop.value)
-        info["training"][OBJECT_KEY] = name
+        info["meshes"][0]["name"] = name
         prop.value = json.dumps(info)
 
     return edit

@@ -66,7 +66,7 @@ class TestChecks:
         bpy.context.view_layer.update()
         moved = checks.check_now(fresh)
         assert moved.rig is not first.rig
-        assert moved.rig.fingerprint.rest_positions != first.rig.fingerprint.rest_positions
+        assert moved.rig.meshes[0].fingerprint.rest_positions != first.rig.meshes[0].fingerprint.rest_positions
 
     def test_a_change_of_the_rest_pose_reads_it_again(self, fresh):
         first = checks.check_now(fresh)

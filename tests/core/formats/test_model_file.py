@@ -53,8 +53,7 @@ def test_metadata_has_the_documented_keys():
         "version",
         "joints",
         "rest_matrices",
-        "vertices",
-        "fingerprint",
+        "meshes",
         "partitions",
         "training_ranges",
         "held_out_mm",
@@ -206,10 +205,14 @@ def test_other_names_of_input_and_output_are_refused(tmp_path):
 
 def test_a_model_of_another_rig_is_refused(tmp_path):
     rig = make_rig()
-    info = tiny_info(joints=rig.joints, rest_matrices=rig.rest_matrices, vertex_count=40, fingerprint=rig.fingerprint)
+    info = tiny_info(joints=rig.joints, rest_matrices=rig.rest_matrices, meshes=rig.meshes)
     check_rig(tmp_path / "m.onnx", info, rig)
     with pytest.raises(ModelError) as error:
-        check_rig(tmp_path / "m.onnx", replace(info, vertex_count=41), replace(rig, joints=rig.joints[:3]))
+        check_rig(
+            tmp_path / "m.onnx",
+            replace(info, meshes=(replace(rig.meshes[0], vertices=41),)),
+            replace(rig, joints=rig.joints[:3]),
+        )
     assert str(error.value) == (
         f"The model '{tmp_path / 'm.onnx'}' was trained for another rig: it has 41 vertices, the mesh has 40; "
         "the armature lacks the joint 'thumb'. Record and train this rig."

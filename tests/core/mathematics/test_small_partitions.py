@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.mathematics.partition import main_joints, make_partitions, small_partition_merges
-from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, Rig
+from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, MeshPart, Rig
 
 
 def make_weighted_rig(
@@ -25,7 +25,8 @@ def make_weighted_rig(
     joints = tuple(Joint(names[j] if names else f"joint_{j}", parent) for j, parent in enumerate(parents))
     rest_matrices = np.tile(np.eye(4, dtype=np.float32), (len(parents), 1, 1))
     positions = np.random.default_rng(0).normal(size=(len(vertex_weights), 3)).astype(np.float32)
-    return Rig(joints, positions, rest_matrices, skin_joints, skin_weights, Fingerprint("a", "b", "c"))
+    meshes = (MeshPart("mesh", len(positions), Fingerprint("a", "b", "c")),)
+    return Rig(joints, positions, rest_matrices, skin_joints, skin_weights, meshes)
 
 
 def vertex_counts_after_merging(rig: Rig, min_vertices: int) -> dict[int, int]:
