@@ -270,6 +270,10 @@ def _send_final_messages(
             basis=partition["basis"],
             held_out_mm=partition["held_out"]["mean"],
         )
+    for mesh in report["meshes"] if len(report["meshes"]) > 1 else ():
+        mean, linear = mesh["held_out"]["mean"], mesh["linear"]["mean"]
+        ratio = f", {100 * mean / linear:.1f} % of linear skinning's" if linear else ""
+        sink.send(MessageType.LOG, text=f"'{mesh['name']}': held-out error {mean:.4f} mm{ratio}")
     if goal_text:
         sink.send(MessageType.LOG, text=goal_text)
     values = {

@@ -26,6 +26,30 @@ def body_and_sleeve() -> None:
     modifier.target, modifier.offset = mesh_object, 0.004
 
 
+def dressed_limb() -> None:
+    """Build a body, a sleeve with weights, and the object `cuff`, which is elsewhere and follows the body's surface.
+
+    The cuff has no weights: a Surface Deform modifier binds it. Body and sleeve have shape keys of one name.
+    """
+    body_and_sleeve()
+    body, sleeve = bpy.data.objects["elbow"], bpy.data.objects["sleeve"]
+    for mesh_object, size in ((body, 1.1), (sleeve, 1.05)):
+        mesh_object.shape_key_add(name="Basis", from_mix=False)
+        for point in mesh_object.shape_key_add(name="puff", from_mix=False).data:
+            point.co.yz *= size
+    cuff = cage("cuff", 1.3)
+    cuff.parent = bpy.data.objects["elbow_rig"]
+    cuff.location, cuff.rotation_euler = (0.03, -0.02, 0.01), (0.4, 0.0, 0.2)
+    bpy.context.view_layer.update()
+    cuff.data.transform(cuff.matrix_world.inverted())
+    modifier = cuff.modifiers.new("SurfaceDeform", "SURFACE_DEFORM")
+    modifier.target = body
+    with bpy.context.temp_override(object=cuff, active_object=cuff):
+        bpy.ops.object.surfacedeform_bind(modifier=modifier.name)
+    if not modifier.is_bound:
+        raise RuntimeError("the cuff is not bound")
+
+
 def through_a_lattice() -> None:
     """Build a tube without weights inside a lattice whose points follow the bones."""
     mesh_object, armature_object = tube()

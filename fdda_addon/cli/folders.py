@@ -1,36 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Handles folders that contain a recording or a model for each of several meshes."""
+"""Handles folders that contain a model for each of several meshes."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import FDDAError, ModelError, OutputError
+from ..core.errors import FDDAError, ModelError
 from ..core.formats.model import read_model_info
 from ..scene.scene_rig import SceneRig, find_rig
 from .files import open_file
-
-
-def mesh_folders(rigs: Sequence[SceneRig], folder: Path) -> list[tuple[SceneRig, Path]]:
-    """Return the rigs, each with a subfolder that is named after its mesh object.
-
-    Raises:
-        OutputError: two subfolders would have the same name.
-    """
-    names_by_folder: dict[str, str] = {}
-    rigs_and_folders = []
-    for scene_rig in rigs:
-        name = scene_rig.mesh_object.name
-        folder_name = bpy.path.clean_name(name)
-        # Some file systems ignore case.
-        if (other_name := names_by_folder.setdefault(folder_name.lower(), name)) != name:
-            raise OutputError(
-                f"'{other_name}' and '{name}' would both be recorded into '{folder / folder_name}'; rename one of them."
-            )
-        rigs_and_folders.append((scene_rig, folder / folder_name))
-    return rigs_and_folders
 
 
 def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """`record RIG.blend RECORDING`: records how a rig deforms its mesh, or adds poses at the worst errors of a model.
 
-With `--all`, or with several `--object`, all meshes are recorded in the same poses, each into a subfolder of RECORDING.
+With `--all`, or with several `--object`, one recording has several meshes of an armature.
 """
 
 import argparse
 import time
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.sentences.counts import format_count
@@ -36,15 +35,15 @@ def run(options: argparse.Namespace) -> None:
 
     check_options(options)
     open_file(options.rig)
-    rigs = _find_rigs(options)
+    scene_rig = _find_rig(options)
     if not options.refine:
-        print_control_bones(rigs[0][0], options)
-        print_remix_hint(rigs[0][0], options)
+        print_control_bones(scene_rig, options)
+        print_remix_hint(scene_rig, options)
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:
-        for scene_rig, _ in rigs:
-            stack.enter_context(model_disabled(scene_rig.mesh_object))
-        for step in _make_job(rigs, options):
+        for mesh_object in scene_rig.mesh_objects:
+            stack.enter_context(model_disabled(mesh_object))
+        for step in _make_job(scene_rig, options):
             if step.note:
                 progress.end_line()
                 print(step.note, flush=True)
@@ -53,42 +52,41 @@ def run(options: argparse.Namespace) -> None:
     if options.refine:
         print(f"{options.recording}: {format_count(step.total, 'pose')} added in {seconds:.1f} s")
         return
-    for _, recording in rigs:
-        index = read_index(recording)
-        repeatability = read_info(index).repeatability
-        for sentence in filter(None, (unsettled_sentence(index), repeatability and repeatability.sentence())):
-            print(sentence)
-        print(f"{recording}: {format_count(index['poses'], 'pose')} in {seconds:.1f} s")
+    index = read_index(options.recording)
+    repeatability = read_info(index).repeatability
+    for sentence in filter(None, (unsettled_sentence(index), repeatability and repeatability.sentence())):
+        print(sentence)
+    meshes = f" of {len(index['meshes'])} meshes" if len(index["meshes"]) > 1 else ""
+    print(f"{options.recording}: {format_count(index['poses'], 'pose')}{meshes} in {seconds:.1f} s")
 
 
-def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
-    """Return the rigs to record, each with the folder of its recording."""
-    from ..scene.scene_rig import describe_left_out_meshes, find_rig, find_rigs
-    from .folders import mesh_folders
+def _find_rig(options: argparse.Namespace) -> "SceneRig":
+    """Return the rig of the meshes to record, or of those of the recording that `--refine` extends."""
+    from ..recording.recorded_character import find_recorded_character
+    from ..scene.scene_rig import find_character, find_whole_character
 
-    names = list(dict.fromkeys(options.object))
-    if options.all:
-        rigs = find_rigs()
-        if note := describe_left_out_meshes(rigs):
-            print(note)
-        return mesh_folders(rigs, options.recording)
-    if len(names) > 1:
-        return mesh_folders([find_rig(name) for name in names], options.recording)
-    return [(find_rig(*names), options.recording)]
+    if options.refine:
+        return find_recorded_character(options.recording, *options.object[:1])
+    if not options.all:
+        return find_character(options.object or [""])
+    scene_rig, note = find_whole_character()
+    if note:
+        print(note)
+    return scene_rig
 
 
-def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":
+def _make_job(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Progress]":
     from ..core.settings import POSES, settings_of, values_from
     from ..recording.plan import RecordingSettings
     from ..recording.refinement import RefinementSettings, refine
-    from ..recording.run import record_meshes
+    from ..recording.run import record
     from .target import requested_poses, target_settings
 
-    poses = requested_poses(rigs[0][0], options)
+    poses = requested_poses(scene_rig, options)
     pose_options = {} if poses is None else {"poses": poses}
     if options.refine:
         settings = RefinementSettings(seed=options.seed, resume=options.resume, **pose_options)
-        return refine(rigs[0][0], options.recording, options.refine, settings)
+        return refine(scene_rig, options.recording, options.refine, settings)
     settings = RecordingSettings(
         actions=tuple(options.action),
         resume=options.resume,
@@ -99,4 +97,4 @@ def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) 
         target=target_settings(options),
         **(values_from(options, settings_of(RecordingSettings)) | {"poses": POSES.default} | pose_options),
     )
-    return record_meshes(rigs, settings)
+    return record(scene_rig, options.recording, settings)

@@ -30,12 +30,12 @@ def _add_mesh_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="mesh object to record, if several have a rig; repeatable, each with a subfolder of RECORDING",
+        help="mesh object to record, if several have a rig; repeatable, for one recording of several meshes",
     )
     parser.add_argument(
         "--all",
         action="store_true",
-        help="record all meshes that an armature deforms, each into a subfolder of RECORDING",
+        help="record all meshes that follow the armature by their modifiers",
     )
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
 
@@ -100,8 +100,6 @@ def check_options(options: argparse.Namespace) -> None:
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
             "--control and --target out."
         )
-    if options.refine and (options.all or len(options.object) > 1):
-        raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")
     if options.all and options.object:
         raise WrongUsageError("--all records all meshes, and --object those that it names; give one of them.")
     if options.overwrite and (options.resume or options.refine):

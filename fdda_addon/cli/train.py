@@ -7,6 +7,7 @@ poses at the worst errors and continues the training, until the goal is met or m
 
 import argparse
 import subprocess
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,7 +54,9 @@ def _refinement_parser() -> argparse.ArgumentParser:
         type=Path,
         help="add poses of this rig at the worst errors, and continue the training",
     )
-    group.add_argument("--object", default="", metavar="NAME", help="mesh object to use, if several have a rig")
+    group.add_argument(
+        "--object", default="", metavar="NAME", help="mesh object of the recording, if it has another name now"
+    )
     group.add_argument(
         "--poses", type=int, metavar="N", help=f"number of poses to add in each round (default {REFINEMENT_POSES})"
     )
@@ -102,15 +105,14 @@ def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
     recording, model = map(Path, arguments[:2])
     if recordings_in(recording):
         raise WrongUsageError(
-            f"--refine takes one mesh, and '{recording}' holds recordings of several; give one of them, its model and "
-            "--object NAME."
+            f"--refine takes one recording, and '{recording}' holds several; give one of them and its model."
         )
     # Imported here, because a training without refinement needs no Blender.
     from .registered import registered
 
     with registered():
         # Open the rig now, so that a wrong path or object raises an error before the training.
-        _open_rig(options)
+        _open_rig(recording, options)
         for round_index in range(MAX_ROUNDS):
             if round_index:
                 _refine(recording, model, options, round_index)
@@ -122,21 +124,23 @@ def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
     return 0
 
 
-def _open_rig(options: argparse.Namespace) -> "SceneRig":
-    from ..scene.scene_rig import find_rig
+def _open_rig(recording: Path, options: argparse.Namespace) -> "SceneRig":
+    from ..recording.recorded_character import find_recorded_character
     from .files import open_file
 
     open_file(options.refine)
-    return find_rig(options.object)
+    return find_recorded_character(recording, options.object)
 
 
 def _refine(recording: Path, model: Path, options: argparse.Namespace, round_index: int) -> None:
     from ..recording.refinement import RefinementSettings, refine
     from ..runtime.binding import model_disabled
 
-    scene_rig = _open_rig(options)
+    scene_rig = _open_rig(recording, options)
     pose_options = {} if options.poses is None else {"poses": options.poses}
-    with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
+    with ProgressPrinter() as progress, ExitStack() as stack:
+        for mesh_object in scene_rig.mesh_objects:
+            stack.enter_context(model_disabled(mesh_object))
         for step in refine(scene_rig, recording, model, RefinementSettings(seed=round_index, **pose_options)):
             progress.show(step.stage, step.done, step.total)
     print(f"{recording}: added {format_count(step.total, 'pose')} at the worst errors of the model")

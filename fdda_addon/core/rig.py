@@ -208,6 +208,39 @@ def mesh_slices(meshes: Sequence[MeshPart]) -> list[slice]:
     return [slice(end - mesh.vertices, end) for end, mesh in zip(ends, meshes, strict=True)]
 
 
+def join_positions(positions: Sequence[np.ndarray], meshes: Sequence[MeshPart]) -> np.ndarray:
+    """Join the (V, 3) float32 positions of meshes, each in the space of its object, in the space of the first."""
+    if len(meshes) == 1:
+        return positions[0]
+    return np.concatenate(
+        [
+            array
+            if mesh.transform == IDENTITY
+            else (array @ mesh.matrix[:3, :3].T + mesh.matrix[:3, 3]).astype(np.float32)
+            for array, mesh in zip(positions, meshes, strict=True)
+        ]
+    )
+
+
+def join_weights(weights: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Join the skin joints and skin weights of meshes, which have the same joints."""
+    columns = max(joints.shape[1] for joints, _ in weights)
+    return tuple(
+        np.concatenate([np.pad(array, ((0, 0), (0, columns - array.shape[1]))) for array in arrays])
+        for arrays in zip(*weights, strict=True)
+    )
+
+
+def join_faces(
+    faces: Sequence[tuple[np.ndarray, np.ndarray]], meshes: Sequence[MeshPart]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Join the starts and vertices of the faces of meshes."""
+    corners = np.cumsum([0, *(len(vertices) for _, vertices in faces)])
+    starts = [starts + corner for (starts, _), corner in zip(faces, corners.tolist(), strict=False)]
+    vertices = [vertices + part.start for (_, vertices), part in zip(faces, mesh_slices(meshes), strict=True)]
+    return np.concatenate(starts).astype(np.int32), np.concatenate(vertices).astype(np.int32)
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """The meshes of a character, their joints and their linear skinning.
@@ -264,9 +297,21 @@ class Rig:
     @property
     def has_weights(self) -> bool:
         """Whether vertices follow other joints than the static joint."""
-        return any(
-            self.joint_names[joint] != STATIC_JOINT for joint in np.unique(self.skin_joints[self.skin_weights > 0])
-        )
+        return bool(self._follows_bones.any())
+
+    @property
+    def unweighted_vertices(self) -> np.ndarray:
+        """(n,) int64, vertices of the meshes without skin weights, which are fitted; none if no mesh has weights."""
+        parts = [part for part in self.mesh_slices if not self._follows_bones[part].any()]
+        if len(parts) in (0, len(self.meshes)):
+            return np.zeros(0, np.int64)
+        return np.concatenate([np.arange(part.start, part.stop) for part in parts])
+
+    @property
+    def _follows_bones(self) -> np.ndarray:
+        """(V,) bool, whether vertices follow other joints than the static joint."""
+        is_bone = np.array([name != STATIC_JOINT for name in self.joint_names])
+        return (is_bone[self.skin_joints] & (self.skin_weights > 0)).any(axis=1)
 
     @property
     def size(self) -> float:

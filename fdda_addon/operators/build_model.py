@@ -5,13 +5,14 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.progress import Job
+from ..core.recording.index import INDEX_NAME
 from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import planned_pose_count
 from ..recording.rig_check import check_has_weights
 from ..scene.scene_rig import SceneRig, armature_of
 from .playback import bind_model
-from .recording import is_recorded, record_rigs, recording_plan
+from .recording import is_recorded, record_character, recording_plan
 from .training import TrainingOperator
 
 
@@ -27,34 +28,30 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
     ends_itself = True
 
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
-        rigs = self.rigs(context)
-        for rig in rigs:
-            if rig.mesh_object.library is not None:
-                raise RigError(f"'{rig.mesh_object.name}' is linked; make its model in the file that it comes from.")
-            settings = rig.mesh_object.fdda.settings
-            if settings.fit_linear == "RIG" and settings.joints == "ALL":
-                check_has_weights(rig)
-        files = [(rig, recording_folder(rig.mesh_object), model_file(rig.mesh_object)) for rig in rigs]
-        pose_count = planned_pose_count(self.rig(context))
-        trainings = [step for rig in rigs for step in self.training_plan(rig.mesh_object, pose_count)]
-        missing = [(rig, recording) for rig, recording, _ in files if not is_recorded(recording)]
-        self.state.plan = JobPlan([*(recording_plan(self.rig(context)) if missing else ()), *trainings])
-        if missing:
+        character = self.character(context)
+        mesh_object = character.mesh_object
+        if mesh_object.library is not None:
+            raise RigError(f"'{mesh_object.name}' is linked; make its model in the file that it comes from.")
+        if mesh_object.fdda.settings.fit_linear == "RIG" and mesh_object.fdda.settings.joints == "ALL":
+            check_has_weights(character)
+        recording, model = recording_folder(mesh_object), model_file(mesh_object)
+        is_missing = not is_recorded(recording)
+        trainings = self.training_plan(character.mesh_objects, planned_pose_count(character))
+        self.state.plan = JobPlan([*(recording_plan(character) if is_missing else ()), *trainings])
+        if is_missing:
             # An interrupted recording is resumed.
-            resume = any((recording / "recording.json").exists() for _, recording in missing)
-            for step in record_rigs(self.rig(context), missing, resume):
+            for step in record_character(character, recording, (recording / INDEX_NAME).exists()):
                 yield step
                 if self.state.cancel_requested:
                     return None
         self.changes_scene = self.state.changes_scene = False
-        return (yield from self.train_all([(rig.mesh_object, recording, model) for rig, recording, model in files]))
+        return (yield from self.train_all([(character.mesh_objects, recording, model)]))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         self.add_trained_models_to_list()
         sentences = []
-        for uid, model in self.trained_models:
-            mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
-            if mesh_object is not None and (armature_object := armature_of(mesh_object)) is not None:
+        for mesh_object, model in self.meshes_of_trained_models():
+            if (armature_object := armature_of(mesh_object)) is not None:
                 sentences.append(bind_model(SceneRig(mesh_object, armature_object), model))
         return f"Trained in {result:.0f} s. {' '.join(sentences)}"
 

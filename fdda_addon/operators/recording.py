@@ -15,28 +15,29 @@ from ..core.settings import REFINEMENT_POSES
 from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder
-from ..properties.recording_options import copy_sampling_settings, planned_pose_count, recording_settings
+from ..properties.recording_options import copy_settings, planned_pose_count, recording_settings
+from ..recording.recorded_character import find_recorded_character
 from ..recording.refinement import RefinementSettings, refine
-from ..recording.run import record_meshes
+from ..recording.run import record
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
 from .rig_operator import RigOperator
 
 
-def record_rigs(shown_rig: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool = False) -> Iterator[object]:
-    """Record the meshes of an armature together, with the settings of the mesh that the sidebar shows.
+def record_character(character: SceneRig, path: Path, resume: bool = False) -> Iterator[object]:
+    """Record the meshes of a character with the settings of the first mesh, which the others get, too.
 
     Raises:
-        FDDAError: the errors of `recording.run.record_meshes`.
+        FDDAError: the errors of `recording.run.record`.
     """
+    first, *others = character.mesh_objects
     with ExitStack() as stack:
-        for rig, _ in rigs:
-            stack.enter_context(model_disabled(rig.mesh_object))
-            if rig.mesh_object != shown_rig.mesh_object:
-                copy_sampling_settings(rig.mesh_object.fdda.settings, shown_rig.mesh_object.fdda.settings)
-        # The settings of the shown mesh are used even if this mesh is recorded already.
-        yield from record_meshes(rigs, recording_settings(shown_rig, resume))
+        for mesh_object in character.mesh_objects:
+            stack.enter_context(model_disabled(mesh_object))
+        for mesh_object in others:
+            copy_settings(mesh_object, first)
+        yield from record(character, path, recording_settings(character, resume))
 
 
 def recording_plan(rig: SceneRig) -> list[JobStep]:
@@ -79,19 +80,16 @@ class FDDA_OT_record(JobOperator, bpy.types.Operator):
         return cls.bl_description
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        rigs = self.rigs(context)
-        self.state.plan = JobPlan(recording_plan(self.rig(context)))
+        character = self.character(context)
+        self.state.plan = JobPlan(recording_plan(character))
         # The other meshes get the settings of the shown one.
-        self.changes_file = len(rigs) > 1
-        if self.folder:
-            self._paths = [Path(bpy.path.abspath(self.folder))]
-        else:
-            self._paths = [recording_folder(rig.mesh_object) for rig in rigs]
-        yield from record_rigs(self.rig(context), list(zip(rigs, self._paths, strict=True)), self.resume)
+        self.changes_file = len(character.mesh_objects) > 1
+        folder = self.folder and Path(bpy.path.abspath(self.folder))
+        self._path = folder or recording_folder(character.mesh_object)
+        yield from record_character(character, self._path, self.resume)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
-        names = " and ".join(f"'{path.name}'" for path in self._paths)
-        return f"Recorded {format_count(self.state.total, 'pose')} into {names}."
+        return f"Recorded {format_count(self.state.total, 'pose')} into '{self._path.name}'."
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
         if self.state.stage != "poses" or not self.state.done:
@@ -116,8 +114,11 @@ class FDDA_OT_refine(JobOperator, bpy.types.Operator):
         rig = self.rig(context)
         self._path, model = recording_folder(rig.mesh_object), model_file(rig.mesh_object)
         settings = RefinementSettings(self.poses, rig.mesh_object.fdda.settings.seed)
-        with model_disabled(rig.mesh_object):
-            yield from refine(rig, self._path, model, settings)
+        character = find_recorded_character(self._path, rig.mesh_object.name)
+        with ExitStack() as stack:
+            for mesh_object in character.mesh_objects:
+                stack.enter_context(model_disabled(mesh_object))
+            yield from refine(character, self._path, model, settings)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
         return f"Added {format_count(self.state.total, 'pose')} to '{self._path.name}'; press Continue Training."

@@ -9,7 +9,7 @@ from ..core.errors import FDDAError, ModelError, RigError
 from ..core.sentences.window import for_window
 from ..jobs.job import current
 from ..scene.active_rig import active_rig, any_mesh_object, cached_active_rig, rigs_of_active_armature
-from ..scene.scene_rig import SceneRig, armature_of
+from ..scene.scene_rig import SceneRig, armature_of, join_rigs
 
 
 def _is_bound(mesh_object: bpy.types.Object) -> bool:
@@ -79,6 +79,15 @@ class RigOperator:
         """Return the rigs to apply the operator to: with `all_meshes` all rigs of the active armature, else one rig."""
         together = rigs_of_active_armature(context) if self.all_meshes and not self.object else []
         return together or [self.rig(context)]
+
+    def character(self, context: bpy.types.Context) -> SceneRig:
+        """Return the rig of all meshes to apply the operator to, of which the shown mesh is the first.
+
+        Raises:
+            RigError: there is no rig.
+        """
+        shown = self.rig(context)
+        return join_rigs([shown, *(rig for rig in self.rigs(context) if rig.mesh_object != shown.mesh_object)])
 
     def bound_rig(self, context: bpy.types.Context) -> SceneRig:
         """Return the rig to apply the operator to, which has a bound model.

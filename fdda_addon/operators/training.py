@@ -2,6 +2,7 @@
 """The operator that trains a model in another process and shows the progress."""
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -34,18 +35,21 @@ class TrainingOperator(JobOperator):
     """
 
     def train(
-        self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool = False
+        self, mesh_objects: Sequence[bpy.types.Object], recording: Path, model: Path, warm_start: bool = False
     ) -> Job[float | None]:
-        """Train a model, or follow its running training; return the seconds, or None if it was canceled.
+        """Train a model of meshes with the settings of the first, or follow its running training.
+
+        Returns:
+            The seconds; None if it was canceled.
 
         Raises:
             FDDAError: the recording is not complete, or the training fails.
         """
         # No data of Blender is used from here on, because the user may change it.
-        mesh_uid, start, seconds = mesh_object.session_uid, time.monotonic(), None
+        mesh_uids, start, seconds = [o.session_uid for o in mesh_objects], time.monotonic(), None
         state = self.state
         state.curves.update(training=[], validation=[])
-        with self._training(mesh_object, recording, model, warm_start) as training:
+        with self._training(mesh_objects[0], recording, model, warm_start) as training:
             try:
                 for message in training.messages(wait=False):
                     if state.cancel_requested:
@@ -53,7 +57,7 @@ class TrainingOperator(JobOperator):
                     if message is not None:
                         if message.type is MessageType.FINISHED:
                             # This message may come after a cancellation, if the trainer was writing the model.
-                            self.trained_models.append((mesh_uid, model))
+                            self.trained_models += [(uid, model) for uid in mesh_uids]
                             seconds = float(message.values["seconds"])
                         yield self._to_progress(message)
                         continue
@@ -69,23 +73,24 @@ class TrainingOperator(JobOperator):
         return seconds
 
     def train_all(
-        self, files: list[tuple[bpy.types.Object, Path, Path]], warm_start: bool = False
+        self, files: list[tuple[Sequence[bpy.types.Object], Path, Path]], warm_start: bool = False
     ) -> Job[float | None]:
-        """Train the models of meshes, each with its recording and model; return the seconds of the last training."""
+        """Train models, each given with its meshes and its recording; return the seconds of the last training."""
         seconds = None
-        for number, (mesh_object, recording, model) in enumerate(files):
-            self.state.begin_object(mesh_object.name if len(files) > 1 else "")
+        for number, (mesh_objects, recording, model) in enumerate(files):
+            self.state.begin_object(mesh_objects[0].name if len(files) > 1 else "")
             self.state.plan.begin_training(number)
-            seconds = (yield from self.train(mesh_object, recording, model, warm_start)) or seconds
+            seconds = (yield from self.train(mesh_objects, recording, model, warm_start)) or seconds
             if self.state.cancel_requested:
                 break
         return seconds
 
-    def training_plan(self, mesh_object: bpy.types.Object, pose_count: int) -> list[JobStep]:
-        """Return the steps of a training on a recording with this number of poses."""
-        mesh, settings = mesh_object.data, mesh_object.fdda.settings
+    def training_plan(self, mesh_objects: Sequence[bpy.types.Object], pose_count: int) -> list[JobStep]:
+        """Return the steps of a training on a recording of meshes with this number of poses."""
+        settings = mesh_objects[0].fdda.settings
         fits_weights = settings.fit_linear != "RIG" or settings.joints != "ALL"
-        counts = len(mesh_object.vertex_groups), len(mesh.vertices), pose_count
+        group_count = max(len(mesh_object.vertex_groups) for mesh_object in mesh_objects)
+        counts = group_count, sum(len(mesh_object.data.vertices) for mesh_object in mesh_objects), pose_count
         return training_steps(*counts, settings.epochs, fits_weights)
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
@@ -129,12 +134,15 @@ class TrainingOperator(JobOperator):
     def add_trained_models_to_list(self) -> None:
         """Add the trained models to the Model Library of their meshes."""
         self.changes_file = bool(self.trained_models)
-        for uid, model in self.trained_models:
-            mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
-            if mesh_object is not None:
-                add_former_model(mesh_object, model)
-                # The last one that is added is the active one.
-                add_model(mesh_object, model)
+        for mesh_object, model in self.meshes_of_trained_models():
+            add_former_model(mesh_object, model)
+            # The last one that is added is the active one.
+            add_model(mesh_object, model)
+
+    def meshes_of_trained_models(self) -> list[tuple[bpy.types.Object, Path]]:
+        """Return the meshes that still exist, each with its trained model."""
+        objects = {o.session_uid: o for o in bpy.data.objects}
+        return [(objects[uid], model) for uid, model in self.trained_models if uid in objects]
 
     def on_failure(self) -> None:
         # Models that were trained before the failure have new files, so packed copies of them are outdated.
@@ -212,14 +220,18 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
         return recording, Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
 
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
-        files = [(rig.mesh_object, *self._files(rig.mesh_object)) for rig in self.rigs(context)]
-        plans = (self.training_plan(mesh_object, _pose_count(recording)) for mesh_object, recording, _ in files)
+        # Meshes of one recording have one model.
+        meshes_of_files: dict[tuple[Path, Path], list[bpy.types.Object]] = {}
+        for mesh_object in self.character(context).mesh_objects:
+            meshes_of_files.setdefault(self._files(mesh_object), []).append(mesh_object)
+        files = [(mesh_objects, *paths) for paths, mesh_objects in meshes_of_files.items()]
+        plans = (self.training_plan(mesh_objects, _pose_count(recording)) for mesh_objects, recording, _ in files)
         self.state.plan = JobPlan([step for plan in plans for step in plan])
         return (yield from self.train_all(files, self.warm_start))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         self.add_trained_models_to_list()
-        names = " and ".join(f"'{model.name}'" for _, model in self.trained_models)
+        names = " and ".join(dict.fromkeys(f"'{model.name}'" for _, model in self.trained_models))
         return f"Trained {names} in {result:.0f} s."
 
     def cancel_message(self, _context: bpy.types.Context) -> str:

@@ -3,11 +3,13 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import FDDAError
+from ..core.errors import FDDAError, RecordingError, RigError
+from ..core.mathematics.poses import Channel
 from ..core.recording.folder import FolderContent, FolderState, read_folder
 from ..core.recording.index import INDEX_NAME
 from ..core.sentences.counts import format_count
@@ -15,8 +17,8 @@ from ..jobs import job
 from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder
 from ..properties.recording_options import recorded_actions, recording_settings
-from ..recording.plan import RecordingSettings, make_sampling
-from ..recording.rig_check import RigCheck
+from ..recording.plan import RecordingSettings, make_sampling, read_sampled_rig
+from ..recording.recorded_character import find_recorded_character
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
@@ -44,15 +46,24 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     def read() -> "FolderContent":
         if check is None or check.rig is None:
             return read_folder(path)
-        return read_folder(path, check.rig, _current_sampling(rig, settings, check))
+        try:
+            character = find_recorded_character(path, rig.mesh_object.name)
+            recorded_rig, channels = check.rig, check.channels
+            if character.other_meshes:
+                recorded_rig, channels = read_sampled_rig(character, settings)
+        except RecordingError:
+            character, recorded_rig, channels = rig, check.rig, check.channels
+        except RigError as error:
+            return replace(read_folder(path), state=FolderState.OTHER, sentence=str(error))
+        return read_folder(path, recorded_rig, _current_sampling(character, settings, channels))
 
     name = ("recording folder", rig.mesh_object.session_uid)
     return computed_once(name, (path, modified_ns, check, settings), read)
 
 
-def _current_sampling(rig: SceneRig, settings: "RecordingSettings", check: "RigCheck") -> dict:
+def _current_sampling(rig: SceneRig, settings: "RecordingSettings", channels: tuple[Channel, ...]) -> dict:
     """Return the sampling of the settings, converted to JSON and back, so that it equals the one of a recording."""
-    return json.loads(json.dumps(make_sampling(rig, settings, check.channels).to_json()))
+    return json.loads(json.dumps(make_sampling(rig, settings, channels).to_json()))
 
 
 class FDDA_PT_recording(Section, bpy.types.Panel):

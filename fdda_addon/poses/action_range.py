@@ -197,7 +197,7 @@ def keyed_numbers(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> l
         For each action, (F,) float64 values in its frames, by owner and path as in `Control`.
     """
     actions, numbers_by_action = list(actions), []
-    curves_by_action = curves_of_actions(actions, scene_rig.mesh_object, scene_rig.armature_object)
+    curves_by_action = curves_of_actions(actions, *scene_rig.mesh_objects, scene_rig.armature_object)
     for action, curves in zip(actions, curves_by_action, strict=True):
         frames, numbers = action_frames(action), {}
         for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):

@@ -56,7 +56,7 @@ def find_clips(
     Raises:
         RigError: there is no action or strip of a name, it animates nothing of the rigs, or a strip is muted.
     """
-    roots = [scene_rigs[0].armature_object, *(scene_rig.mesh_object for scene_rig in scene_rigs)]
+    roots = [scene_rigs[0].armature_object, *(o for scene_rig in scene_rigs for o in scene_rig.mesh_objects)]
     actions, strips = list(actions), list(strips)
     datablocks = dependencies(*roots) if actions or strips else []
     clips = []

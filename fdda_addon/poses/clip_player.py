@@ -64,7 +64,7 @@ class ClipPlayer:
             clips: the clips that will be shown.
         """
         armature_object, self._clip = rigs[0][0].armature_object, None
-        mesh_objects = [scene_rig.mesh_object for scene_rig, _ in rigs]
+        mesh_objects = [mesh_object for scene_rig, _ in rigs for mesh_object in scene_rig.mesh_objects]
         datablocks = dependencies(armature_object, *mesh_objects) if clips else []
         self._slots = {clip: _animated_datablocks(clip, datablocks) for clip in clips}
         animated_datablocks = dict.fromkeys(datablock for slots in self._slots.values() for datablock in slots)

@@ -31,7 +31,7 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
         RigError: the actions move no bone, or have one pose.
     """
     armature_object = scene_rig.armature_object
-    curves_by_action = curves_of_actions(actions, scene_rig.mesh_object, armature_object)
+    curves_by_action = curves_of_actions(actions, *scene_rig.mesh_objects, armature_object)
     clips = [
         (action_frames(action), curves_by_bone(armature_object, curves))
         for action, curves in zip(actions, curves_by_action, strict=True)

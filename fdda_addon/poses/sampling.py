@@ -93,11 +93,12 @@ def sampled_channels(
         # A control that is a number of a bone is set with the bone, in the range of the control.
         bounds = controls.pop(control_name(armature_object, channel), (channel.low, channel.high))
         channels.append(replace(channel, low=bounds[0], high=bounds[1]))
-    driven_keys = driven_numbers(scene_rig.mesh_object.data.shape_keys)
+    key_owners = {control.owner for control in selection.controls if control.is_shape_key}
+    driven_keys = {owner: driven_numbers(owner_of(scene_rig, owner)) for owner in key_owners}
     for control in selection.controls:
         # There may be hundreds of shape keys.
         is_set = (
-            (control.path, 0) in driven_keys
+            (control.path, 0) in driven_keys[control.owner]
             if control.is_shape_key
             else is_driven(owner_of(scene_rig, control.owner), control.path)
         )

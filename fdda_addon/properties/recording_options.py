@@ -12,7 +12,7 @@ from ..scene.action_slots import dependencies, may_animate
 from ..scene.active_rig import cached_active_rig
 from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
-from .character import FDDA_PG_character
+from .character import FDDA_PG_character, default_model, default_recording
 
 
 def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
@@ -44,8 +44,11 @@ def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
     return TargetSettings(settings.target, settings.pre_roll, settings.max_settle_frames)
 
 
-def copy_sampling_settings(settings: FDDA_PG_character, source: FDDA_PG_character) -> None:
-    """Copy the settings of poses and recording from another mesh, but not its paths and training settings."""
+def copy_settings(mesh_object: bpy.types.Object, source_object: bpy.types.Object) -> None:
+    """Copy the settings of poses, recording and paths from another mesh, so that they share recording and model."""
+    settings, source = mesh_object.fdda.settings, source_object.fdda.settings
+    settings.recording = source.recording or default_recording(source_object)
+    settings.model = source.model or default_model(source_object)
     for name in (*(setting.name for setting in settings_of(RecordingSettings)), "sample", "bone_collection"):
         setattr(settings, name, getattr(source, name))
     for name, attributes in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
@@ -109,5 +112,5 @@ def actions_of_active_rig(context: bpy.types.Context) -> list[str]:
 @draw_cached
 def actions_of_rig(scene_rig: SceneRig) -> tuple[bpy.types.Action, ...]:
     """Return the actions that may animate a rig or something on which it depends."""
-    datablocks = dependencies(scene_rig.armature_object, scene_rig.mesh_object)
+    datablocks = dependencies(scene_rig.armature_object, *scene_rig.mesh_objects)
     return tuple(action for action in bpy.data.actions if may_animate(action, datablocks))

@@ -7,7 +7,7 @@ rig, each joint is set to its transform in another pose, with all constraints mu
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
 import bpy
@@ -91,7 +91,10 @@ class AlonePosePlan:
         scene_rig, moves = self._scene_rig, self.description
         clear_pose(scene_rig.armature_object)
         # The effect of shape keys is that of their values, not of the joints that drive these.
-        with muted_key_drivers(scene_rig.mesh_object), self._prepared():
+        with ExitStack() as stack:
+            for mesh_object in scene_rig.mesh_objects:
+                stack.enter_context(muted_key_drivers(mesh_object))
+            stack.enter_context(self._prepared())
             for index in range(start, moves.first_key_pose):
                 base, moved = divmod(index, len(moves.inputs) + 1)
                 self._set_pose(base, moved - 1 if moved else None)
@@ -225,7 +228,7 @@ def plan_alone_poses(
     """Plan the poses of a rig that move one input at a time; clear the pose of the armature afterwards.
 
     Args:
-        scene_rig, rig: the rig, prepared by `temporary_rig_states`, with its reference joints.
+        scene_rig, rig: the rig, prepared by `temporary_rig_state`, with its reference joints.
         channels: channels of the random poses; may be empty.
         settings: settings of the recording.
         clips: the clips of the recording; without channels, the drawn poses are frames of these.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of a mesh before its first pose is recorded: cuts, controls, the target, and what changes with the frame."""
+"""Checks of a rig before its first pose is recorded: cuts, controls, the target, and what changes with the frame."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from ..core.recording.target import SIMULATION
 from ..poses.clip_player import ClipPlayer
 from ..scene.armature import clear_pose
 from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control
-from .plan import RecordedMesh
+from .plan import RecordedRig
 from .pose_plan import PosePlan
 
 MAX_TARGET_POSES, MAX_SEAM_POSES = 20, 10
@@ -37,7 +37,7 @@ MAX_CHANGE_RATIO = 1 / 8
 """A range saturates if the surface changes in at most this part of it."""
 
 
-def check_target_moves(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
+def check_target_moves(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
     """Check that a target moves in poses in which the rig moves.
 
     A simulation is checked in its first frames, other targets in poses that are far apart. Poses that are held settle,
@@ -49,10 +49,10 @@ def check_target_moves(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -
     Raises:
         RigError: the target does not move.
     """
-    if not mesh.rig.has_weights:
+    if not recorded.rig.has_weights:
         return
-    skinning, size, target = LinearSkinning(mesh.rig), mesh.rig.size, plan.pose_setter.target
-    is_simulation = target.follows == SIMULATION
+    rig, size, target = recorded.rig, recorded.rig.size, plan.pose_setter.target
+    skinning, is_simulation = LinearSkinning(rig), target.follows == SIMULATION
     spread_indices = sorted(
         {int(number * GOLDEN_RATIO * plan.total) % plan.total for number in range(MAX_TARGET_POSES)}
     )
@@ -62,7 +62,7 @@ def check_target_moves(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -
     first_positions, rig_motion, target_motion = None, 0.0, 0.0
     with closing(plan.show_poses(player, pose_indices)) as poses:
         for checked_count, _ in enumerate(poses, 1):
-            pose_matrices, positions, _ = mesh.evaluator.evaluate()
+            pose_matrices, positions, _ = recorded.evaluator.evaluate()
             skinned_positions = skinning.positions(pose_matrices[None])[0]
             if first_positions is None:
                 first_positions = skinned_positions, positions
@@ -76,28 +76,28 @@ def check_target_moves(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -
     player.stop()
     if rig_motion > MIN_RIG_MOTION_RATIO * size and target_motion <= MAX_STILL_TARGET_RATIO * size:
         raise RigError(
-            f"The target '{target.name}' does not move while '{mesh.name}' does, by "
-            f"{rig_motion * mesh.rig.metres_per_unit * 1000:.0f} mm; look whether its modifiers are on and its cache "
+            f"The target '{target.name}' does not move while '{recorded.scene_rig.mesh_object.name}' does, by "
+            f"{rig_motion * rig.metres_per_unit * 1000:.0f} mm; look whether its modifiers are on and its cache "
             "is that of this action, or choose another target."
         )
 
 
-def check_follows_pose(meshes: Sequence[RecordedMesh], plan: PosePlan, player: ClipPlayer) -> float:
-    """Check that the surfaces of meshes do not change between frames while pose and controls are the same.
+def check_follows_pose(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer) -> float:
+    """Check that the surface of a rig does not change between frames while pose and controls are the same.
 
     Two poses of the plan are held in the first, middle and last frame of the scene. Poses that change with the frame
     are skipped.
 
     Args:
-        meshes: the meshes that are evaluated together, prepared by `temporary_rig_states`.
+        recorded: the rig, prepared by `temporary_rig_state`.
         plan: plan of the poses.
         player: player of the clips of the plan.
 
     Returns:
-        The mean time of an evaluation of all meshes, seconds.
+        The mean time of an evaluation, seconds.
 
     Raises:
-        RigError: a surface differs between frames.
+        RigError: the surface differs between frames.
     """
     scene, start_time, evaluation_count = bpy.context.scene, time.perf_counter(), 0
     frame, subframe = scene.frame_current, scene.frame_subframe
@@ -106,14 +106,13 @@ def check_follows_pose(meshes: Sequence[RecordedMesh], plan: PosePlan, player: C
         for pose_index in {plan.total // 3, plan.total - 1}:
             with closing(plan.show_poses(player, {pose_index})) as poses:
                 next(poses)
-                clip_frame, first_evaluations = player.current_clip_frame, None
+                clip_frame, first_evaluation = player.current_clip_frame, None
                 for checked_frame in (frame, *sorted(other_frames)):
                     player.set_clip_frame(clip_frame, checked_frame)
-                    evaluations = [mesh.evaluator.evaluate() for mesh in meshes]
+                    evaluation = recorded.evaluator.evaluate()
                     evaluation_count += 1
-                    first_evaluations = first_evaluations or evaluations
-                    for mesh, *pair in zip(meshes, first_evaluations, evaluations, strict=True):
-                        _compare_surfaces(mesh, (frame, checked_frame), *pair)
+                    first_evaluation = first_evaluation or evaluation
+                    _compare_surfaces(recorded, (frame, checked_frame), first_evaluation, evaluation)
     finally:
         player.stop()
         player.reset_pose()
@@ -122,58 +121,59 @@ def check_follows_pose(meshes: Sequence[RecordedMesh], plan: PosePlan, player: C
 
 
 def _compare_surfaces(
-    mesh: RecordedMesh, frames: tuple[int, int], first: Sequence[np.ndarray], other: Sequence[np.ndarray]
+    recorded: RecordedRig, frames: tuple[int, int], first: Sequence[np.ndarray], other: Sequence[np.ndarray]
 ) -> None:
     """Raise a RigError if the positions of two evaluations differ, and pose matrices and controls do not."""
     if not all(np.allclose(first[index], other[index], rtol=POSE_TOLERANCE, atol=POSE_TOLERANCE) for index in (0, 2)):
         return
-    largest_difference = float(np.linalg.norm(first[1] - other[1], axis=1).max())
-    mesh_object = mesh.scene_rig.mesh_object
-    extent = max(float(np.abs(mesh.rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
-    if largest_difference > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
+    differences, rig = np.linalg.norm(first[1] - other[1], axis=1), recorded.rig
+    largest_difference = float(differences.max())
+    mesh_object = recorded.scene_rig.mesh_object
+    extent = max(float(np.abs(rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
+    if largest_difference > max(INFLUENCE_TOLERANCE * rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
         raise RigError(
-            f"The surface of '{mesh.name}' differs by {largest_difference * mesh.rig.metres_per_unit * 1000:.2g} mm "
-            f"between frames {frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; find "
-            "the keys, drivers, Geometry Nodes or constraint targets that depend on the frame, and make them controls "
-            "or switch them off."
+            f"The surface of '{recorded.name_of_vertex(int(differences.argmax()))}' differs by "
+            f"{largest_difference * rig.metres_per_unit * 1000:.2g} mm between frames {frames[0]} and {frames[1]} in "
+            "the same pose, so it does not follow from the pose; find the keys, drivers, Geometry Nodes or constraint "
+            "targets that depend on the frame, and make them controls or switch them off."
         )
 
 
-def check_seams(mesh: RecordedMesh, plan: PosePlan, player: ClipPlayer) -> str:
+def check_seams(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer) -> str:
     """Return a sentence if cuts of a mesh open in poses that are far apart; empty if not.
 
     Args:
-        mesh: the mesh, prepared by `temporary_rig_states`.
+        recorded: the rig, prepared by `temporary_rig_state`.
         plan: plan of the poses.
         player: player of the clips of the plan.
     """
-    skinning = LinearSkinning(mesh.rig)
+    skinning = LinearSkinning(recorded.rig)
     pose_indices = set(np.linspace(0, plan.total - 1, MAX_SEAM_POSES).round().astype(int).tolist())
 
     def evaluate_residuals() -> Iterator[np.ndarray]:
         with closing(plan.show_poses(player, pose_indices)) as poses:
             for _ in poses:
-                pose_matrices, positions, _ = mesh.evaluator.evaluate()
+                pose_matrices, positions, _ = recorded.evaluator.evaluate()
                 yield skinning.local_residuals(pose_matrices[None], positions[None])[0]
 
     with closing(evaluate_residuals()) as residuals:
-        warnings = find_open_seams(mesh.rig, residuals)
+        warnings = find_open_seams(recorded.rig, residuals)
     player.stop()
-    clear_pose(mesh.scene_rig.armature_object)
+    clear_pose(recorded.scene_rig.armature_object)
     player.restore_numbers()
-    return f"{mesh.name}: {warnings[0]}" if warnings else ""
+    return f"{recorded.scene_rig.mesh_object.name}: {warnings[0]}" if warnings else ""
 
 
-def check_saturation(mesh: RecordedMesh) -> str:
+def check_saturation(recorded: RecordedRig) -> str:
     """Return a sentence about the controls whose effect ends far inside their ranges; empty if there is none.
 
     Random poses would hardly ever show the values between the two ends of the effect.
 
     Args:
-        mesh: the mesh in its rest pose, prepared by `temporary_rig_states`.
+        recorded: the rig in its rest pose, prepared by `temporary_rig_state`.
     """
-    scene_rig, sentences = mesh.scene_rig, []
-    for control in mesh.rig.controls:
+    scene_rig, sentences = recorded.scene_rig, []
+    for control in recorded.rig.controls:
         owner, (low, high) = owner_of(scene_rig, control.owner), (control.low, control.high)
         if high - low < MIN_CHECKED_WIDTH or not can_be_set(control.name) or is_driven(owner, control.path):
             continue
@@ -184,9 +184,9 @@ def check_saturation(mesh: RecordedMesh) -> str:
             surfaces = []
             for value in compared.tolist():
                 set_control(scene_rig, control.name, value)
-                surfaces.append(mesh.evaluator.evaluate()[1])
+                surfaces.append(recorded.evaluator.evaluate()[1])
             moves = np.linalg.norm(np.diff(surfaces, axis=0), axis=2).max(axis=1)
-            changed = np.flatnonzero(moves > INFLUENCE_TOLERANCE * mesh.rig.size)
+            changed = np.flatnonzero(moves > INFLUENCE_TOLERANCE * recorded.rig.size)
             if len(changed):
                 low, high = float(compared[changed[0]]), float(compared[changed[-1] + 1])
             if not 0 < len(changed) <= MAX_CHANGE_RATIO * (VALUE_COUNT - 1) or high - low < 1:
@@ -194,8 +194,8 @@ def check_saturation(mesh: RecordedMesh) -> str:
         set_control(scene_rig, control.name, previous_value)
         if high - low < MAX_CHANGE_RATIO * (control.high - control.low):
             sentences.append(
-                f"The surface of '{mesh.name}' changes only between {low:.3g} and {high:.3g} in the range "
-                f"{control.low:g} to {control.high:g} of '{control.name}'. Give the range that is used: --control "
-                f"'{control.name}={low:.3g}:{high:.3g}', or Soft Min and Soft Max of the property."
+                f"The surface of '{scene_rig.mesh_object.name}' changes only between {low:.3g} and {high:.3g} in the "
+                f"range {control.low:g} to {control.high:g} of '{control.name}'. Give the range that is used: "
+                f"--control '{control.name}={low:.3g}:{high:.3g}', or Soft Min and Soft Max of the property."
             )
     return " ".join(sentences)

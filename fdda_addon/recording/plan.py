@@ -3,7 +3,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import bpy
 
@@ -32,7 +31,7 @@ from ..rig.pose_setter import NO_TARGET, TargetSettings
 from ..rig.reading import PoseEvaluator, read_rig
 from ..rig.shape_keys import find_unposed_keys, key_distances
 from ..rig.target import find_target
-from ..scene.controls import parse_controls
+from ..scene.controls import owner_name, parse_controls
 from ..scene.scene_rig import SceneRig
 
 INFLUENCE_POSES = 4
@@ -76,27 +75,23 @@ class RecordingSettings:
 
 
 @dataclass(eq=False)
-class RecordedMesh:
-    """A mesh that is recorded.
+class RecordedRig:
+    """A rig that is recorded.
 
     Attributes:
         scene_rig: the rig as scene objects.
         rig: the rig as arrays, with its own skin weights and all joints.
-        path: folder of the recording.
-        channels: channels of the random poses that belong to the mesh or its armature.
-        evaluator: evaluates the mesh, or its target.
+        evaluator: evaluates the meshes, or the target.
     """
 
     scene_rig: SceneRig
     rig: Rig
-    path: Path
-    channels: tuple[Channel, ...]
     evaluator: PoseEvaluator
 
-    @property
-    def name(self) -> str:
-        """Return the name of the mesh object."""
-        return self.scene_rig.mesh_object.name
+    def name_of_vertex(self, vertex: int) -> str:
+        """Return the name of the mesh object that has a vertex."""
+        slices = self.rig.mesh_slices
+        return next(o.name for o, part in zip(self.scene_rig.mesh_objects, slices, strict=True) if vertex < part.stop)
 
 
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
@@ -107,8 +102,13 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
     """
     selection, extra_joints = read_sample_selection(scene_rig, settings)
     # A shape key that moves no vertex is no input.
-    moving_keys = {path for path, distances in key_distances(scene_rig.mesh_object).items() if distances.any()}
-    controls = tuple(c for c in selection.controls if not c.is_shape_key or c.path in moving_keys)
+    moving_keys = {
+        f"{owner_name(scene_rig, mesh_object.data.shape_keys)}/{path}"
+        for mesh_object in scene_rig.mesh_objects
+        for path, distances in key_distances(mesh_object).items()
+        if distances.any()
+    }
+    controls = tuple(c for c in selection.controls if not c.is_shape_key or c.name in moving_keys)
     selection = replace(selection, controls=controls)
     rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings, selection.controls))
     return replace(rig, controls=controls), random_pose_channels(scene_rig, rig, selection) if settings.poses else ()
@@ -124,7 +124,7 @@ def random_pose_channels(scene_rig: SceneRig, rig: Rig, selection: SampleSelecti
     key_channels = (
         Channel(control.name, CONTROL, 0, control.low, control.high)
         for control in selection.controls
-        if control.is_shape_key and control.path in unposed_keys
+        if control.is_shape_key and control.name in unposed_keys
     )
     return (*channels, *key_channels)
 

@@ -29,7 +29,8 @@ def find_fixed_joints(scene_rig: SceneRig) -> set[str]:
     What a driver reads of a bone without a parent is relative to the armature.
     """
     armature_object, read_bones = scene_rig.armature_object, set()
-    for _, curve in Sources(scene_rig, scene_rig.mesh_object, follows_shape_keys=False).drivers.values():
+    sources = [Sources(scene_rig, mesh_object, follows_shape_keys=False) for mesh_object in scene_rig.mesh_objects]
+    for _, curve in (owned_curve for each in sources for owned_curve in each.drivers.values()):
         for variable in curve.driver.variables:
             for target in (target for target in variable.targets if target.id == armature_object):
                 is_number = variable.type == "SINGLE_PROP"
@@ -46,7 +47,7 @@ def find_references(
     """Return a rig with its reference joints (`core.mathematics.references`).
 
     Args:
-        scene_rig, rig: the rig, prepared by `temporary_rig_states`.
+        scene_rig, rig: the rig, prepared by `temporary_rig_state`.
         fixed_joints: result of `find_fixed_joints`.
         plan: plan of the poses.
         player: player of the clips of the plan.

@@ -76,12 +76,14 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         ModelError: the model cannot be read, or is of another rig.
         OutputError: the recording cannot be written.
     """
-    check_full_rig(scene_rig.mesh_object)
-    recording = _read_rig_recording(path)
-    stack = check_evaluable(scene_rig)
+    recording, stacks = _read_rig_recording(path), []
+    for _, part in scene_rig.parts:
+        check_full_rig(part.mesh_object)
+        stacks.append(check_evaluable(part))
     opened = open_model(scene_rig, model)
     network, rig = opened.network, replace(opened.rig, joints=opened.network.info.joints)
-    check_time_inputs(scene_rig, rig.controls, stack)
+    for mesh_object, stack in zip(scene_rig.mesh_objects, stacks, strict=True):
+        check_time_inputs(scene_rig, rig.controls, stack, (), mesh_object)
     channels = model_channels(scene_rig, rig, network.info)
     _check_recording(scene_rig, recording, channels)
     added_count = _count_added_poses(recording, model, network.info) if settings.resume else 0
@@ -159,7 +161,8 @@ def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np
 
 def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[Channel, ...]) -> None:
     recorded_rig = recording.rig
-    rig = replace(read_rig(scene_rig, recorded_rig.joint_names), controls=recorded_rig.controls)
+    rig = read_rig(scene_rig, recorded_rig.joint_names, are_joints_complete=True)
+    rig = replace(rig, controls=recorded_rig.controls)
     differences = rig_differences(recorded_rig.joints, recorded_rig.rest_matrices, recorded_rig.meshes, rig)
     if differences:
         raise RecordingError(

@@ -12,7 +12,7 @@ from ..core.errors import RigError
 from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
 from ..core.mathematics.key_joints import select_joints
-from ..core.rig import STATIC_JOINT, Fingerprint, MeshPart, Rig
+from ..core.rig import STATIC_JOINT, Fingerprint, MeshPart, Rig, join_faces, join_positions, join_weights
 from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
 from ..scene.control_reader import ControlReader
@@ -29,6 +29,8 @@ from .joints import choose_joints
 from .target import Target
 from .unread_bones import read_unread_bones
 
+MAX_MESH_MOTION_RATIO = 1e-4
+"""Largest motion of a mesh object against the first one, as a part of the rig's size."""
 IDENTITY_TOLERANCE = 1e-6
 """A matrix counts as the identity if no element differs from the identity by more than this."""
 
@@ -39,7 +41,7 @@ def read_rig(
     include_static_joint: bool = False,
     are_joints_complete: bool = False,
 ) -> Rig:
-    """Read a rig of one mesh into arrays.
+    """Read a rig into arrays.
 
     Args:
         extra_joints: names of joints besides the bones with weights, such as those of a model or a recording; None as
@@ -51,9 +53,9 @@ def read_rig(
         RigError: there is no vertex, all vertices are at one point, an object or a bone has a scale of zero, or a rest
             position or a transform is not finite.
     """
-    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    # Check the armature first, because the mesh may be its child.
-    for scene_object in (armature_object, mesh_object):
+    armature_object = scene_rig.armature_object
+    # Check the armature first, because the meshes may be its children.
+    for scene_object in (armature_object, *scene_rig.mesh_objects):
         if not np.isfinite(scene_object.matrix_world).all():
             raise RigError(
                 f"'{scene_object.name}' is at no finite place; clear the location, rotation and scale of it and of its "
@@ -61,18 +63,17 @@ def read_rig(
             )
         if is_flat(scene_object):
             raise RigError(f"'{scene_object.name}' has a scale of zero; give it another.")
-    rest_positions = mesh_io.rest_positions(mesh_object.data)
-    _check_rest_positions(mesh_object, rest_positions)
-    skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
-    weighted_bones = (*skin.bones, STATIC_JOINT) if include_static_joint else skin.bones
+    rest_positions = [mesh_io.rest_positions(mesh_object.data) for mesh_object in scene_rig.mesh_objects]
+    for mesh_object, positions in zip(scene_rig.mesh_objects, rest_positions, strict=True):
+        _check_rest_positions(mesh_object, positions)
+    skins = [read_skin(o, armature_object, armature_modifier(o)) for o in scene_rig.mesh_objects]
+    weighted_bones = {bone for skin in skins for bone in skin.bones}
+    weighted_bones |= {STATIC_JOINT} if include_static_joint else set()
     joints = choose_joints(scene_rig, weighted_bones, extra_joints, are_joints_complete)
     names = tuple(joint.name for joint in joints)
-    skin_joints, skin_weights = skin.arrays({name: index for index, name in enumerate(names)})
-    rest_matrices = armature_io.rest_matrices(scene_rig.armature_object.data, names)
+    rest_matrices = armature_io.rest_matrices(armature_object.data, names)
     is_bone = np.array([name != STATIC_JOINT for name in names], bool)
-    rest_matrices[is_bone] = (
-        armature_to_mesh_matrix(scene_rig.mesh_object, scene_rig.armature_object) @ rest_matrices[is_bone]
-    )
+    rest_matrices[is_bone] = armature_to_mesh_matrix(scene_rig.mesh_object, armature_object) @ rest_matrices[is_bone]
     # Raise a RigError if a rest matrix, (J, 4, 4), has no inverse.
     for name, matrix in zip(names, rest_matrices, strict=True):
         if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < MIN_VOLUME:
@@ -80,22 +81,33 @@ def read_rig(
                 f"The bone '{name}' has no length or no finite place in the rest pose; give its head and its tail "
                 "places in edit mode."
             )
-    faces = mesh_io.topology(mesh_object.data)
-    fingerprint = Fingerprint(
-        Fingerprint.digest(*faces),
-        Fingerprint.digest(rest_positions),
-        Fingerprint.digest(skin_joints, skin_weights),
-        read_deformation(scene_rig),
+    joint_indices = {name: index for index, name in enumerate(names)}
+    weights = [skin.arrays(joint_indices) for skin in skins]
+    faces = [mesh_io.topology(mesh_object.data) for mesh_object in scene_rig.mesh_objects]
+    meshes = tuple(
+        MeshPart(
+            name or part.mesh_object.name,
+            len(positions),
+            Fingerprint(
+                Fingerprint.digest(*mesh_faces),
+                Fingerprint.digest(positions),
+                Fingerprint.digest(*mesh_weights),
+                read_deformation(part),
+            ),
+            tuple(mesh_to_mesh_matrix(scene_rig.mesh_object, part.mesh_object).ravel().tolist()),
+        )
+        for (name, part), positions, mesh_weights, mesh_faces in zip(
+            scene_rig.parts, rest_positions, weights, faces, strict=True
+        )
     )
     return Rig(
         joints,
-        rest_positions,
+        join_positions(rest_positions, meshes),
         rest_matrices.astype(np.float32),
-        skin_joints,
-        skin_weights,
-        (MeshPart(mesh_object.name, len(rest_positions), fingerprint),),
-        *faces,
-        metres_per_unit=metres_per_unit(mesh_object),
+        *join_weights(weights),
+        meshes,
+        *join_faces(faces, meshes),
+        metres_per_unit=metres_per_unit(scene_rig.mesh_object),
     )
 
 
@@ -149,6 +161,13 @@ def armature_to_mesh_matrix(mesh_object: bpy.types.Object, armature_object: bpy.
 
 def _armature_to_mesh_transform(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:
     return mesh_object.matrix_world.inverted_safe() @ armature_object.matrix_world
+
+
+def mesh_to_mesh_matrix(first_mesh_object: bpy.types.Object, mesh_object: bpy.types.Object) -> np.ndarray:
+    """Return the matrix from the space of a mesh object to that of the first, (4, 4) float64."""
+    if mesh_object.matrix_world == first_mesh_object.matrix_world:
+        return np.eye(4)
+    return np.array(first_mesh_object.matrix_world.inverted_safe() @ mesh_object.matrix_world, np.float64)
 
 
 class PoseReader:
@@ -221,7 +240,7 @@ class PoseEvaluator:
         Args:
             target: the target whose positions replace those of the rig.
         """
-        self._scene_rig, self._target = scene_rig, target
+        self._scene_rig, self._rig, self._target = scene_rig, rig, target
         self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
         self._controls = ControlReader(scene_rig, rig.controls)
 
@@ -231,6 +250,9 @@ class PoseEvaluator:
         Returns:
             pose_matrices (J, 4, 4) and positions (V, 3), both float32, mesh-object space, mesh units, and the values of
             the controls, (C,) float32.
+
+        Raises:
+            RigError: an object has a scale of zero, or the mesh objects move against each other.
         """
         depsgraph = bpy.context.evaluated_depsgraph_get()
         mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)
@@ -238,6 +260,23 @@ class PoseEvaluator:
         if self._target is not None:
             positions = self._target.positions(depsgraph)
         else:
-            positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
+            mesh_objects = self._scene_rig.mesh_objects
+            positions = join_positions(
+                [mesh_io.evaluated_positions(each, depsgraph) for each in mesh_objects], self._rig.meshes
+            )
+            for part, other in zip(self._rig.meshes[1:], mesh_objects[1:], strict=True):
+                self._check_transform(part, mesh_object, other.evaluated_get(depsgraph))
         controls = self._controls.read(self._scene_rig, depsgraph)
         return self._reader.read(mesh_object, armature_object), positions, controls
+
+    def _check_transform(self, part: MeshPart, first: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
+        """Raise a RigError if an evaluated mesh object has moved against the first."""
+        if (mesh_to_mesh_matrix(first, mesh_object) == part.matrix).all():
+            return
+        corners = np.array([[*corner, 1.0] for corner in mesh_object.bound_box])
+        moves = (corners @ (mesh_to_mesh_matrix(first, mesh_object) - part.matrix).T)[:, :3]
+        if np.linalg.norm(moves, axis=1).max() > MAX_MESH_MOTION_RATIO * self._rig.size:
+            raise RigError(
+                f"The object '{mesh_object.name}' moves against '{first.name}', and meshes of one recording move "
+                f"together; record '{mesh_object.name}' by itself."
+            )

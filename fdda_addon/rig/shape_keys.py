@@ -2,13 +2,13 @@
 """Reads which vertices the shape keys of a mesh move and which poses drive them, and mutes their drivers."""
 
 from collections.abc import Container, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import product
 
 import bpy
 import numpy as np
 
-from ..core.controls import SHAPE_KEY_PATH, SHAPE_KEYS
+from ..core.controls import SHAPE_KEY_PATH
 from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..poses.bone_channels import is_moved_by_constraints
 from ..scene.arrays import COORDINATE_ELEMENT, KEY_VALUE_ELEMENT, read, write
@@ -54,9 +54,19 @@ def find_unposed_keys(scene_rig: SceneRig, channels: Iterable[Channel]) -> set[s
         channels: channels of random poses.
 
     Returns:
-        The paths of their values.
+        The names of the controls that are their values.
     """
-    shape_keys, armature_object = scene_rig.mesh_object.data.shape_keys, scene_rig.armature_object
+    unposed = set()
+    for mesh_object in scene_rig.mesh_objects:
+        if (shape_keys := mesh_object.data.shape_keys) is not None:
+            owner = owner_name(scene_rig, shape_keys)
+            unposed |= {f"{owner}/{path}" for path in _find_unposed_keys(scene_rig, shape_keys, channels)}
+    return unposed
+
+
+def _find_unposed_keys(scene_rig: SceneRig, shape_keys: bpy.types.Key, channels: Iterable[Channel]) -> set[str]:
+    """Return the paths of the values of the unposed shape keys of one mesh."""
+    armature_object = scene_rig.armature_object
     posed = {
         (channel.name, ROTATION if channel.kind == ROTATION_VECTOR else channel.kind, channel.axis)
         for channel in channels
@@ -95,7 +105,7 @@ def find_unposed_keys(scene_rig: SceneRig, channels: Iterable[Channel]) -> set[s
             return not posed.isdisjoint(product([bone_name], [kind], axes))
         return (f"{owner_name(scene_rig, target.id)}/{path}", CONTROL, 0) in posed
 
-    curves = shape_keys.animation_data.drivers if shape_keys is not None and shape_keys.animation_data else ()
+    curves = shape_keys.animation_data.drivers if shape_keys.animation_data else ()
     paths = [(canonical_path(shape_keys, curve.data_path), curve) for curve in curves if not curve.mute]
     curves_by_path = {path: curve for path, curve in paths if SHAPE_KEY_PATH.fullmatch(path)}
     posed_keys: set[str] = set()
@@ -149,7 +159,11 @@ def muted_key_drivers(mesh_object: bpy.types.Object, paths: Container[str] | Non
 @contextmanager
 def set_keys_undriven(scene_rig: SceneRig, channels: Iterable[Channel]) -> Iterator[None]:
     """Mute the drivers of the shape keys whose values are channels of random poses."""
-    prefix = f"{SHAPE_KEYS}/"
-    paths = {channel.name.removeprefix(prefix) for channel in channels if channel.name.startswith(prefix)}
-    with muted_key_drivers(scene_rig.mesh_object, paths):
+    names = {channel.name for channel in channels}
+    with ExitStack() as stack:
+        for mesh_object in scene_rig.mesh_objects:
+            owner = owner_name(scene_rig, mesh_object.data.shape_keys)
+            paths = {name.removeprefix(f"{owner}/") for name in names if name.startswith(f"{owner}/")}
+            if paths:
+                stack.enter_context(muted_key_drivers(mesh_object, paths))
         yield

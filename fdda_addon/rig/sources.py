@@ -58,10 +58,10 @@ class Sources:
         """Find everything on which the surface of an object depends.
 
         Args:
-            root: its mesh object, or a target.
+            root: one of its mesh objects, or a target.
             modifiers: names of the modifiers of `root` to follow. If they are given, only modifiers that are on and
                 drivers that can move the surface are followed. None to follow everything.
-            follows_shape_keys: follow the drivers of the shape keys of the rig's mesh. Their values are inputs of a
+            follows_shape_keys: follow the drivers of the shape keys of the rig's meshes. Their values are inputs of a
                 model.
         """
         self._rig, self._root = scene_rig, root
@@ -70,7 +70,7 @@ class Sources:
         carriers = [scene_rig.mesh_object, scene_rig.armature_object]
         for scene_object in carriers:
             carriers += [o for o in followed_objects(scene_object) if o not in carriers]
-        self.carriers = set(carriers) - {scene_rig.mesh_object}
+        self.carriers = set(carriers) - {*scene_rig.mesh_objects}
         self.objects: dict[bpy.types.Object, bool] = {}
         self.datablocks: dict[bpy.types.ID, str] = {}
         self.bones: dict[bpy.types.Object, set[str]] = {}
@@ -124,7 +124,8 @@ class Sources:
         return modifier.show_viewport and self.objects.get(scene_object, False)
 
     def _add_object(self, scene_object: bpy.types.Object | None, uses_geometry: bool) -> None:
-        is_rig_mesh = scene_object != self._root and scene_object == self._rig.mesh_object
+        # The other meshes of a rig are roots themselves.
+        is_rig_mesh = scene_object != self._root and scene_object in self._rig.mesh_objects
         if scene_object is None or scene_object in self.carriers or is_rig_mesh:
             return
         if scene_object not in self.objects or (uses_geometry and not self.objects[scene_object]):
@@ -176,15 +177,16 @@ class Sources:
         data = scene_object.data
         if isinstance(data, bpy.types.ID) and scene_object.type != "ARMATURE":
             self._add_datablock(data, f"{owner}/data.")
-            is_rig_mesh = scene_object == self._rig.mesh_object
-            key_prefix = "shape_keys/" if is_rig_mesh else f"{owner}/data.shape_keys."
-            self._add_datablock(getattr(data, "shape_keys", None), key_prefix)
+            shape_keys = getattr(data, "shape_keys", None)
+            is_rig_mesh = scene_object in self._rig.mesh_objects
+            key_prefix = f"{owner_name(self._rig, shape_keys)}/" if is_rig_mesh else f"{owner}/data.shape_keys."
+            self._add_datablock(shape_keys, key_prefix)
             for name in ("bevel_object", "taper_object"):
                 self._add_object(getattr(data, name, None), uses_geometry=True)
 
     def _follow_modifier(self, scene_object: bpy.types.Object, modifier: bpy.types.Modifier, path: str) -> None:
         reads_rig = getattr(modifier, "object", None) == self._rig.armature_object
-        is_rig_skinning = scene_object == self._rig.mesh_object and reads_rig
+        is_rig_skinning = scene_object in self._rig.mesh_objects and reads_rig
         for armature_object, bone, _ in references(modifier):
             if bone:
                 self._add_bones(armature_object, [bone])
@@ -248,7 +250,8 @@ class Sources:
 
     def _add_driver(self, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> None:
         driven_property = (datablock, curve.data_path, curve.array_index)
-        is_input = is_shape_key_value(self._rig.mesh_object, datablock, curve.data_path)
+        meshes = self._rig.mesh_objects
+        is_input = any(is_shape_key_value(mesh_object, datablock, curve.data_path) for mesh_object in meshes)
         if driven_property in self.drivers or (is_input and not self._follows_shape_keys):
             return
         self.drivers[driven_property] = datablock, curve

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Prepares one or several rigs of an armature for posing, and restores everything that posing changes."""
+"""Prepares a rig for posing, and restores everything that posing changes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 from ..core.mathematics.poses import CONTROL, Channel
@@ -14,44 +14,31 @@ from ..scene.scene_rig import SceneRig
 from ..scene.time_stretching import unstretched_time
 from .modifier_stack import downstream_disabled
 
-PosedRig = tuple[SceneRig, Rig, tuple[Channel, ...]]
-"""A rig as scene objects and as arrays, and the channels of the random poses that will be set."""
-
 
 @contextmanager
 def temporary_rig_state(
     scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...] = (), clips: tuple[Clip, ...] = ()
 ) -> Iterator[ClipPlayer]:
-    """Prepare one rig for posing, as `temporary_rig_states` does."""
-    with temporary_rig_states([(scene_rig, rig, channels)], clips) as player:
-        yield player
-
-
-@contextmanager
-def temporary_rig_states(
-    rigs: Sequence[PosedRig], clips: tuple[Clip, ...] = (), other_rigs: Sequence[PosedRig] = ()
-) -> Iterator[ClipPlayer]:
-    """Set rigs to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
+    """Set a rig to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
 
     In the block, time is not stretched, so frames of the scene are frames of the clips.
 
     Args:
-        rigs: rigs of one armature object.
+        scene_rig, rig: the rig.
+        channels: the channels of the random poses that will be set.
         clips: the clips that the yielded player will show.
-        other_rigs: further rigs that the poses move, whose modifiers do not change.
 
     Yields:
         The player of the clips.
     """
-    controlled_rigs = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *other_rigs)]
+    names = control_names(rig, channels)
     with ExitStack() as stack:
-        player = stack.enter_context(clip_player(controlled_rigs, clips))
+        player = stack.enter_context(clip_player([(scene_rig, names)], clips))
         stack.enter_context(hidden_comparison_objects())
-        for scene_rig, _, _ in rigs:
-            stack.enter_context(downstream_disabled(scene_rig.mesh_object))
+        for mesh_object in scene_rig.mesh_objects:
+            stack.enter_context(downstream_disabled(mesh_object))
         stack.enter_context(unstretched_time())
-        for scene_rig, names in controlled_rigs:
-            stack.enter_context(temporary_controls(scene_rig, names))
+        stack.enter_context(temporary_controls(scene_rig, names))
         yield player
 
 

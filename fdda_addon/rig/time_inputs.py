@@ -72,7 +72,7 @@ def describe_independent_objects(
         A sentence for the user; empty if there are no such objects.
     """
     moved_by_inputs = {owner for owner, path, _ in (*controls, *sources.drivers) if path.startswith(TRANSFORM_PREFIXES)}
-    followed = {scene_rig.mesh_object, *sources.carriers, *moved_by_inputs}
+    followed = {*scene_rig.mesh_objects, *sources.carriers, *moved_by_inputs}
     names = [o.name for o in list(sources.objects)[1:] if not _follows(o, followed)]
     if not names:
         return ""
@@ -121,13 +121,15 @@ def check_time_inputs(
     controls: Iterable[Control],
     stack: ModifierStack,
     actions: Iterable[bpy.types.Action] = (),
+    mesh_object: bpy.types.Object | None = None,
 ) -> str:
-    """Check that the surface of a mesh depends only on the pose of its armature and on controls.
+    """Check that the surface of one mesh of a rig depends only on the pose of its armature and on controls.
 
     Args:
         controls: the controls of the model or the recording.
         stack: the modifiers of the mesh object.
         actions: the actions whose frames are recorded.
+        mesh_object: the mesh; None for the first mesh of the rig.
 
     Returns:
         Sentences for the user about objects that do not move with the rig (`describe_independent_objects`), and about
@@ -136,7 +138,7 @@ def check_time_inputs(
     Raises:
         RigError: the surface depends on time, or on a bone of another armature; the message names the cause.
     """
-    mesh_object = scene_rig.mesh_object
+    mesh_object = mesh_object or scene_rig.mesh_object
     followed_modifiers = [modifier.name for modifier in mesh_object.modifiers if not is_fdda_modifier(modifier)][
         : stack.insert_index
     ]

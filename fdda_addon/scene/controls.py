@@ -52,8 +52,10 @@ def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
     }.get(owner)
 
 
-def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID) -> str:
-    """Return the name of a datablock as `Control.owner`; empty for a datablock that cannot have controls."""
+def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID | None) -> str:
+    """Return the name of a datablock as `Control.owner`; empty for none, and for one that cannot have controls."""
+    if datablock is None:
+        return ""
     mesh_owners = (f"{owner}:{name}" for name, _ in scene_rig.other_meshes for owner in (MESH_OBJECT, SHAPE_KEYS))
     for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS, *mesh_owners):
         if owner_of(scene_rig, owner) == datablock:
@@ -119,13 +121,17 @@ def parse_controls(
                 raise RigError(
                     f"'{text}' has an invalid range; write it as NAME=LOW:HIGH, with two numbers."
                 ) from error
-        shape_keys = scene_rig.mesh_object.data.shape_keys
-        if shape_keys and name in shape_keys.key_blocks and name != shape_keys.reference_key.name:
-            owner, path = SHAPE_KEYS, f'key_blocks["{bpy.utils.escape_identifier(name)}"].value'
-        else:
-            owner, _, path = name.partition("/")
-        control = make_control(scene_rig, owner, path, bounds, sampled_ranges)
-        controls[control.name] = control
+        all_keys = [keys for mesh_object in scene_rig.mesh_objects if (keys := mesh_object.data.shape_keys)]
+        key_path = f'key_blocks["{bpy.utils.escape_identifier(name)}"].value'
+        names = [
+            f"{owner_name(scene_rig, keys)}/{key_path}"
+            for keys in all_keys
+            if name in keys.key_blocks and name != keys.reference_key.name
+        ]
+        for owner_and_path in names or [name]:
+            owner, _, path = owner_and_path.partition("/")
+            control = make_control(scene_rig, owner, path, bounds, sampled_ranges)
+            controls[control.name] = control
     return tuple(controls.values())
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the rigs of a scene, without evaluating anything."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import bpy
@@ -89,19 +89,63 @@ def rigs_of_armature(armature_object: bpy.types.Object) -> list[SceneRig]:
     return [SceneRig(o, armature_object) for o in meshes if not is_comparison(o)]
 
 
-def describe_left_out_meshes(rigs: list[SceneRig]) -> str:
-    """Describe the other meshes that follow the armatures of rigs from `find_rigs`; empty if there are none."""
-    armature_objects = {rig.armature_object for rig in rigs}
-    mesh_objects = {rig.mesh_object for rig in rigs}
-    candidates = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
-    names = [o.name for o in candidates if o not in mesh_objects and armature_of(o) in armature_objects]
-    if not names:
-        return ""
-    return (
-        f"Left out: {format_with_noun(names, 'mesh', 'meshes')}, because no Armature modifier deforms "
-        f"{'it' if len(names) == 1 else 'them'}. Other modifiers follow the armature; record such a mesh by itself "
-        f"(--object '{names[0]}' --fit-linear smooth)."
-    )
+def find_character(names: Iterable[str]) -> SceneRig:
+    """Find the rig of several mesh objects by their names.
+
+    Raises:
+        RigError: as `find_rig`, or the meshes follow different armatures.
+    """
+    return join_rigs([find_rig(name) for name in dict.fromkeys(names)])
+
+
+def join_rigs(rigs: Sequence[SceneRig]) -> SceneRig:
+    """Join the rigs of several meshes of one armature, of which the first defines the space.
+
+    Raises:
+        RigError: the meshes follow different armatures.
+    """
+    first, *others = rigs
+    for other in others:
+        if other.armature_object != first.armature_object:
+            raise RigError(
+                f"'{first.mesh_object.name}' follows the armature '{first.armature_object.name}' and "
+                f"'{other.mesh_object.name}' follows '{other.armature_object.name}'; record the meshes of each "
+                "armature by themselves, with --object."
+            )
+    meshes = [(o.name, o) for rig in rigs for o in rig.mesh_objects]
+    return SceneRig(first.mesh_object, first.armature_object, tuple(meshes[1:]))
+
+
+def find_whole_character() -> tuple[SceneRig, str]:
+    """Find the rig of all meshes of the scene that follow its armature by modifiers.
+
+    Returns:
+        The rig, meshes with an Armature modifier first; and a sentence about the meshes that are left out, or an empty
+        text.
+
+    Raises:
+        RigError: there is no such mesh, or the meshes follow different armatures.
+    """
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
+    rigs = [SceneRig(o, armature) for o in meshes if (armature := armature_of(o)) is not None]
+    visible_rigs = [rig for rig in rigs if rig.mesh_object.visible_get()]
+    if not visible_rigs:
+        return find_rig(), ""
+    visible_rigs.sort(key=lambda rig: armature_modifier(rig.mesh_object) is None)
+    character = join_rigs(visible_rigs)
+    hidden = [rig.mesh_object.name for rig in rigs if rig not in visible_rigs]
+    carried = [
+        o.name
+        for o in meshes
+        if armature_of(o) is None and o.parent in {character.armature_object, *character.mesh_objects}
+    ]
+    reasons = ((hidden, "hidden"), (carried, "moved as a whole, which is nothing to learn"))
+    clauses = [
+        f"{format_with_noun(names, 'mesh', 'meshes')}, {'which is' if len(names) == 1 else 'which are'} {reason}"
+        for names, reason in reasons
+        if names
+    ]
+    return character, f"Left out: {'; '.join(clauses)}." if clauses else ""
 
 
 def check_full_rig(mesh_object: bpy.types.Object) -> None:

@@ -47,16 +47,9 @@ def make_rig(seed: int = 0) -> Rig:
     skin_weights = (skin_weights / skin_weights.sum(axis=1, keepdims=True)).astype(np.float32)
     positions = rng.uniform(-0.5, 0.5, (VERTEX_COUNT, 3)).astype(np.float32)
     fingerprint = Fingerprint("limb", Fingerprint.digest(positions), Fingerprint.digest(skin_joints, skin_weights))
+    meshes = (MeshPart("limb", len(positions), fingerprint),)
     rest_matrices = random_transforms(rng, len(JOINTS)).astype(np.float32)
-    return Rig(
-        JOINTS,
-        positions,
-        rest_matrices,
-        skin_joints,
-        skin_weights,
-        (MeshPart("limb", len(positions), fingerprint),),
-        *make_faces(),
-    )
+    return Rig(JOINTS, positions, rest_matrices, skin_joints, skin_weights, meshes, *make_faces())
 
 
 def make_faces() -> tuple[np.ndarray, np.ndarray]:

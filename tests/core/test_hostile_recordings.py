@@ -240,7 +240,8 @@ def test_messages_are_short_and_escape_control_characters(recording):
 def test_a_huge_sparse_recording_is_refused_without_reading_it(recording):
     """A sparse file of 100 GB takes no space on the disk: here skin weights, which would not fit into memory."""
     vertices = 1 << 31
-    edit_index(recording, vertices=vertices)
+    mesh = json.loads((recording / "recording.json").read_text())["meshes"][0]
+    edit_index(recording, meshes=[{**mesh, "vertices": vertices}])
     for name, shape, kind in (
         ("rest_positions", (vertices, 3), "<f4"),
         ("skin_joints", (vertices, 4), "<i4"),

@@ -55,7 +55,7 @@ ALONE = {"bases": 1, "inputs": [], "keys": [], "undetectable": []}
 REQUIRED_KEYS = (
     "poses",
     "complete",
-    "vertices",
+    "meshes",
     "influences",
     "rig",
     "joints",
@@ -63,6 +63,11 @@ REQUIRED_KEYS = (
     "sampling",
     "blender",
 )
+
+
+HASHES = dict.fromkeys(("topology", "rest_positions", "skin_weights"), "a")
+MESH_JSON = {"name": "tube", "vertices": 8, "fingerprint": HASHES}
+SCALE = np.diag([2.0, 2, 2, 1]).ravel().tolist()
 
 
 @pytest.mark.parametrize("key", REQUIRED_KEYS)
@@ -86,7 +91,14 @@ def test_a_value_of_a_wrong_type_is_refused(recording, key, value):
     ("changes", "words"),
     [
         ({"complete": 13}, "its counts contradict each other"),
-        ({"vertices": 0}, "its counts contradict each other"),
+        ({"meshes": []}, "it has no meshes"),
+        ({"meshes": [MESH_JSON, MESH_JSON]}, "two of one name"),
+        ({"meshes": [{**MESH_JSON, "vertices": 0}]}, "the mesh 'tube' has 0 vertices"),
+        ({"meshes": [{**MESH_JSON, "transform": [1.0] * 16}]}, "the transform of the mesh 'tube' is"),
+        (
+            {"meshes": [{**MESH_JSON, "transform": SCALE}]},
+            "first mesh has a transform",
+        ),
         ({"joints": []}, "no joints"),
         ({"joints": [{"name": "a", "parent": 0}]}, "the parent of joint 'a' is 0"),
         ({"joints": [{"name": "a", "parent": -1}, {"name": "a", "parent": 0}]}, "two of one name"),
@@ -134,7 +146,7 @@ def test_an_invalid_seed_is_refused(recording, seed):
 @pytest.mark.parametrize(
     "counts",
     [
-        *({"poses": 10**15}, {"poses": 1 << 62}, {"poses": 10**30}, {"vertices": 1 << 61}),
+        *({"poses": 10**15}, {"poses": 1 << 62}, {"poses": 10**30}, {"meshes": [{**MESH_JSON, "vertices": 1 << 61}]}),
         *({"corners": 1 << 62}, {"faces": 1 << 60, "corners": 1 << 62}),
     ],
 )

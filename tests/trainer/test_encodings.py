@@ -29,13 +29,12 @@ ASCII_ENVIRONMENT = {
 def recording(tmp_path):
     """A recording of a chain with names in several scripts."""
     rig = chain_rig(2)
-    rig = replace(rig, joints=(Joint("Wurzel ß", -1), Joint("前腕.L", 0)))
+    mesh = replace(rig.meshes[0], name="Ärmel")
+    rig = replace(rig, joints=(Joint("Wurzel ß", -1), Joint("前腕.L", 0)), meshes=(mesh,))
     angles = chain_angles(60, 2, 0)
     path = tmp_path / "Aufnahme äöü"
-    info = replace(chain_info(60), object_name="Ärmel")
-    write_recording(
-        path, rig, make_partitions(rig, {0: (1,), 1: (1,)}), info, pose_chain(rig, angles), chain_residuals(rig, angles)
-    )
+    arrays = pose_chain(rig, angles), chain_residuals(rig, angles)
+    write_recording(path, rig, make_partitions(rig, {0: (1,), 1: (1,)}), chain_info(60), *arrays)
     return path
 
 

@@ -47,7 +47,15 @@ def make_report(
         "model": model_name,
         "model_bytes": len(exported.content),
         "recording": recording.path.name,
-        "object": recording.rig.meshes[0].name,
+        "meshes": [
+            {
+                "name": mesh.name,
+                "vertices": mesh.vertices,
+                "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),
+                "linear": error_statistics(held_out.linear[:, vertices]).to_json(),
+            }
+            for mesh, vertices in zip(recording.rig.meshes, recording.rig.mesh_slices, strict=True)
+        ],
         "vertices": recording.rig.vertex_count,
         "joints": len(recording.rig.joints),
         **({"controls": controls} if controls else {}),

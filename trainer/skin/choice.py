@@ -2,7 +2,6 @@
 """Chooses the key joints of a recording, and finds what the motion of each vertex follows from."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -93,14 +92,7 @@ def _cut(rest_positions: np.ndarray, vertices: np.ndarray) -> list[np.ndarray]:
 
 def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit the weights of (n,) vertices to poses; returns (n, 4) joints and (n, 4) weights."""
-    rig = poses.rig
-    selected_rig = replace(
-        rig,
-        rest_positions=rig.rest_positions[vertices],
-        skin_joints=rig.skin_joints[vertices],
-        skin_weights=rig.skin_weights[vertices],
-    )
-    return fit_skin(replace(poses, rig=selected_rig, positions=poses.positions[:, vertices]), "smooth")
+    return fit_skin(poses.of_vertices(vertices), "smooth")
 
 
 def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndarray) -> np.ndarray:

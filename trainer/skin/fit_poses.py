@@ -48,6 +48,11 @@ class FitPoses:
         arrays = {name: getattr(self, name)[poses] for name in ("pose_matrices", "positions", "controls")}
         return replace(self, **arrays)
 
+    def of_vertices(self, vertices: np.ndarray) -> "FitPoses":
+        """Return the poses of the (v,) vertices."""
+        arrays = {name: getattr(self.rig, name)[vertices] for name in ("rest_positions", "skin_joints", "skin_weights")}
+        return replace(self, rig=replace(self.rig, **arrays), positions=self.positions[:, vertices])
+
     def with_joints(self, joints: np.ndarray) -> "FitPoses":
         """Return the poses of the joints with (K,) ascending indices; they have no parents, and their own weights."""
         indices = np.zeros(len(self.rig.joints), np.int32)
@@ -69,12 +74,13 @@ class FitPoses:
         )
 
 
-def read_fit_poses(recording: Recording, has_key_joints: bool) -> FitPoses:
+def read_fit_poses(recording: Recording, has_key_joints: bool, vertices: np.ndarray | None = None) -> FitPoses:
     """Read the poses of a fit. Refined poses are none of them, so a recording that grows has the same fit.
 
     Args:
         recording: the recording.
         has_key_joints: key joints are chosen, which takes random poses.
+        vertices: (v,) indices of the vertices that are read; None for all.
 
     Raises:
         RecordingError: there are too few poses.
@@ -88,13 +94,18 @@ def read_fit_poses(recording: Recording, has_key_joints: bool) -> FitPoses:
             f"Key joints are chosen by at least {MIN_RANDOM_POSES} random poses, and the recording has {random_count}; "
             "record more (--poses), or leave --joints out."
         )
-    poses = choose_fit_poses(pose_count, recording.rig.vertex_count, random_count)
+    vertex_count = recording.rig.vertex_count if vertices is None else len(vertices)
+    poses = choose_fit_poses(pose_count, vertex_count, random_count)
     rig, roles = recording.rig, np.zeros((2, len(recording.rig.joints)), bool)
     roles[0, list(recording.info.bones.dependencies)] = True
     sampled = {channel.name for channel in recording.info.sampling.channels if channel.kind != CONTROL}
     roles[1] = [name in sampled for name in rig.joint_names]
-    arrays = (np.array(array[poses]) for array in (recording.pose_matrices, recording.positions, recording.controls))
-    return FitPoses(rig, *arrays, *roles, int((poses < random_count).sum()))
+    matrices, controls = (np.array(array[poses]) for array in (recording.pose_matrices, recording.controls))
+    fit_poses = FitPoses(rig, matrices, recording.positions[:0], controls, *roles, int((poses < random_count).sum()))
+    if vertices is None:
+        return replace(fit_poses, positions=np.array(recording.positions[poses]))
+    positions = np.stack([recording.positions[pose][vertices] for pose in poses])
+    return replace(fit_poses.of_vertices(vertices), positions=positions)
 
 
 def choose_fit_poses(pose_count: int, vertex_count: int, random_count: int = 0) -> np.ndarray:

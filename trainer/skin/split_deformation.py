@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fdda_addon.core.checks.warning import format_with_noun
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.joint_option import ALL, KEY_JOINTS_STAGE
@@ -46,9 +47,10 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
     """
     rig, joint_count = recording.rig, len(recording.rig.joints)
     joints, choice, fit = np.arange(joint_count), None, None
-    has_key_joints = config.joints != ALL
-    if has_key_joints or config.fit_linear:
-        poses = read_fit_poses(recording, has_key_joints)
+    has_key_joints, unweighted = config.joints != ALL, rig.unweighted_vertices
+    if has_key_joints or config.fit_linear or len(unweighted):
+        vertices = None if has_key_joints or config.fit_linear else unweighted
+        poses = read_fit_poses(recording, has_key_joints, vertices)
         if has_key_joints:
             choice = choose_key_joints(
                 poses,
@@ -58,16 +60,31 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
         removes_joints = choice is not None and len(choice.joints) < joint_count
         if choice and not removes_joints:
             sink.send(MessageType.LOG, text=choice.report.sentence())
-        if removes_joints or config.fit_linear:
+        fits_all = removes_joints or bool(config.fit_linear)
+        if fits_all or len(unweighted):
+            if not fits_all:
+                meshes = zip(rig.meshes, rig.mesh_slices, strict=True)
+                names = [mesh.name for mesh, part in meshes if part.start in unweighted]
+                subject = format_with_noun(names, "mesh", "meshes")
+                sink.send(MessageType.LOG, text=f"Skin weights are fitted for the {subject}, which have none.")
+                poses = poses.of_vertices(unweighted) if vertices is None else poses
             kind, weighted = config.fit_linear or DEFAULT_KIND, choice.weighted_joints if removes_joints else joints
             training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
             fitted_joints, weights = fit_skin(
                 training.with_joints(weighted) if removes_joints else training,
                 kind,
-                lambda done: sink.send(MessageType.PREPARING, stage=FIT_STAGE, done=done, total=rig.vertex_count),
+                lambda done: sink.send(MessageType.PREPARING, stage=FIT_STAGE, done=done, total=poses.rig.vertex_count),
             )
-            rig = replace(rig, skin_joints=weighted[fitted_joints].astype(np.int32), skin_weights=weights)
-            reports = measure_skin(held_out, rig), measure_skin(training, rig)
+            fitted = weighted[fitted_joints].astype(np.int32), weights
+            fitted_rig = replace(poses.rig, skin_joints=fitted[0], skin_weights=fitted[1])
+            reports = measure_skin(held_out, fitted_rig), measure_skin(training, fitted_rig)
+            if not fits_all:
+                fitted = [np.pad(each, ((0, 0), (0, rig.skin_joints.shape[1] - each.shape[1]))) for each in fitted]
+                own = rig.skin_joints.copy(), rig.skin_weights.copy()
+                for array, rows in zip(own, fitted, strict=True):
+                    array[unweighted] = rows
+                fitted = own
+            rig = replace(rig, skin_joints=fitted[0], skin_weights=fitted[1])
             fit = SkinFit(kind, len(poses.positions), *reports, choice.report if removes_joints else None)
             sink.send(MessageType.LOG, text=fit.sentence())
             if removes_joints:

@@ -101,9 +101,15 @@ def _check_large_residuals(recording: SkinnedRecording, scan: ResidualScan) -> l
     """Warn about residuals that are larger than the bones; residuals should be small corrections of linear skinning."""
     rig, bone_lengths = recording.rig, compute_bone_lengths(recording.rig)
     large_residuals = []
+    # The skin weights of some meshes are fitted later.
+    largest = scan.largest.copy()
+    largest[rig.unweighted_vertices] = 0
     for partition in recording.partitions:
-        extent = float(np.linalg.norm(np.ptp(rig.rest_positions[partition.vertices], axis=0)))
-        rms = float(np.sqrt(np.mean(scan.rms[partition.vertices] ** 2)))
+        vertices = np.setdiff1d(partition.vertices, rig.unweighted_vertices)
+        if not len(vertices):
+            continue
+        extent = float(np.linalg.norm(np.ptp(rig.rest_positions[vertices], axis=0)))
+        rms = float(np.sqrt(np.mean(scan.rms[vertices] ** 2)))
         size = max(float(bone_lengths[partition.joint]), extent)
         if rms > size > 0:
             large_residuals.append((rms / size, rms, size, joint_name(rig, partition.joint)))
@@ -119,12 +125,12 @@ def _check_large_residuals(recording: SkinnedRecording, scan: ResidualScan) -> l
             f"{format_length(rig, size)} long: {advice}"
         )
         return [RecordingWarning("large-residuals", text)]
-    vertex = int(scan.largest.argmax())
+    vertex = int(largest.argmax())
     size = max(rig.size, float(np.linalg.norm(np.ptp(rig.rest_matrices[:, :3, 3], axis=0))))
-    if scan.largest[vertex] <= size:
+    if largest[vertex] <= size:
         return []
     text = (
-        f"The residual of vertex {vertex} is {format_length(rig, float(scan.largest[vertex]))} in pose "
+        f"The residual of vertex {vertex} is {format_length(rig, float(largest[vertex]))} in pose "
         f"{scan.largest_pose[vertex]}, and the character is {format_length(rig, size)} large: {advice}"
     )
     return [RecordingWarning("large-residuals", text)]

@@ -87,7 +87,7 @@ def _seam_pairs(rig: Rig) -> np.ndarray:
 
 
 def _coincident_groups(rig: Rig) -> np.ndarray:
-    """Group the vertices that lie on others which have the same skin weights.
+    """Group the vertices that lie on others of the same mesh which have the same skin weights.
 
     Returns:
         (V,) int64, index of the group of each vertex; -1 for a vertex that lies on no other.
@@ -100,7 +100,14 @@ def _coincident_groups(rig: Rig) -> np.ndarray:
         order = np.argsort(np.where(weights > 0, joints, -1), axis=1)
         joints, weights = (np.take_along_axis(values, order, axis=1) for values in (joints, weights))
         main = main_joints(rig.skin_joints[vertices], rig.skin_weights[vertices])
-        columns = (positions[vertices], np.where(weights > 0, joints, -1), weights.round(WEIGHT_DIGITS), main[:, None])
+        meshes = np.repeat(np.arange(len(rig.meshes)), [mesh.vertices for mesh in rig.meshes])[vertices]
+        columns = (
+            positions[vertices],
+            meshes[:, None],
+            np.where(weights > 0, joints, -1),
+            weights.round(WEIGHT_DIGITS),
+            main[:, None],
+        )
         indices, counts = _equal_rows(np.concatenate(columns, axis=1, dtype=np.float64))
         groups[vertices] = np.where(counts > 1, indices, -1)
     return groups

@@ -72,7 +72,7 @@ _REPORT_KEYS = {
     "model": str,
     "model_bytes": int,
     "recording": str,
-    "object": str,
+    "meshes": [{"name": str, "vertices": int, "held_out": _ERROR_STATISTICS, "linear": _ERROR_STATISTICS}],
     "vertices": int,
     "joints": int,
     "controls?": [str],

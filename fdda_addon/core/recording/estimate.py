@@ -4,7 +4,6 @@
 import math
 import os
 import shutil
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +26,7 @@ class Estimate:
     Attributes:
         poses: number of remaining poses.
         vertices: number of vertices of all meshes together.
-        size_bytes: size of the complete recordings.
+        size_bytes: size of the complete recording.
         seconds: time for the remaining poses; None where unknown.
     """
 
@@ -52,24 +51,22 @@ def recording_bytes(rig: Rig, poses: int) -> int:
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
 
 
-def check_disk_space(sizes: Iterable[tuple[Path, int]]) -> None:
-    """Check that the disk has enough free space for recordings.
+def check_disk_space(folder: Path, size: int) -> None:
+    """Check that the disk has enough free space for a recording.
 
     Args:
-        sizes: the folder of each recording and the size of the complete recording in bytes. A folder may already have a
-            part of the recording. All folders are on the same disk.
+        folder: the folder, which may already have a part of the recording.
+        size: size of the complete recording in bytes.
 
     Raises:
         DiskFullError: the disk has too little free space.
-        OutputError: a folder has no existing parent.
+        OutputError: the folder has no existing parent.
     """
-    sizes = list(sizes)
-    needed_bytes = sum(size - min(size, _used_bytes(folder)) for folder, size in sizes)
-    first_folder = sizes[0][0]
-    free_bytes = shutil.disk_usage(nearest_existing_folder(first_folder)).free
+    needed_bytes = size - min(size, _used_bytes(folder))
+    free_bytes = shutil.disk_usage(nearest_existing_folder(folder)).free
     if needed_bytes > free_bytes:
         raise DiskFullError(
-            f"Cannot write the recording '{first_folder}': it takes {format_size(needed_bytes)} and the disk has "
+            f"Cannot write the recording '{folder}': it takes {format_size(needed_bytes)} and the disk has "
             f"{format_size(free_bytes)} left; make room, record fewer poses, or choose another folder."
         )
 

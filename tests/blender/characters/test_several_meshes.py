@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Two meshes on one armature are recorded, trained, bound, evaluated and timed with one command each."""
+"""Two meshes on one armature with a recording each are trained, bound, evaluated and timed with one command each."""
 
 import json
 import shutil
@@ -7,21 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
-import numpy as np
 import pytest
 
 import fdda_addon
-from blend_fixtures.characters.base import cage, link, skin
 from blend_fixtures.characters.meshes import body_and_sleeve
-from fdda_addon.cli.pose_notes import REMIX_HINT
-from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.formats.model import read_model_info
-from fdda_addon.core.recording.index import read_index
-from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.run import record_meshes
 from fdda_addon.scene.blend_file import save_copy
-from fdda_addon.scene.scene_rig import find_rigs
 
 from ..command_output import CommandOutput, output_of
 from ..conftest import assert_plays, pose, run
@@ -45,7 +36,7 @@ class Files:
 
 @pytest.fixture(scope="module")
 def commands() -> dict[str, CommandOutput]:
-    """The output of `record` and `train`."""
+    """The output of `train`."""
     return {}
 
 
@@ -57,101 +48,13 @@ def two(tmp_path_factory: pytest.TempPathFactory, commands: dict[str, CommandOut
     bpy.ops.wm.read_factory_settings(use_empty=True)
     body_and_sleeve()
     save_copy(made.rig)
-    commands["record"] = output_of(
-        "record", made.rig, made.recordings, "--all", "--poses", POSES, "--action", "elbow_wave"
-    )
+    for name in (BODY, SLEEVE):
+        options = ("--object", name, "--poses", POSES, "--action", "elbow_wave")
+        assert run("record", made.rig, made.recordings / name, *options) == 0
     commands["train"] = output_of("train", made.recordings, made.models, "--epochs", 8, "--hidden", 16)
     assert run("bind", made.rig, made.models, made.bound) == 0
     fdda_addon.unregister()
     return made
-
-
-def test_the_meshes_share_their_poses(two):
-    body, sleeve = (read_recording(two.recordings / name) for name in (BODY, SLEEVE))
-    assert body.rig.joint_names == sleeve.rig.joint_names
-    assert len(body.pose_matrices) == POSES + 30 + ALONE and (body.pose_matrices == sleeve.pose_matrices).all()
-    assert body.info.sampling == sleeve.info.sampling
-    assert [recording.rig.meshes[0].name for recording in (body, sleeve)] == [BODY, SLEEVE]
-
-
-def test_each_mesh_is_recorded_as_by_itself(two, tmp_path):
-    for name in (BODY, SLEEVE):
-        options = ("--object", name, "--poses", POSES, "--action", "elbow_wave")
-        assert run("record", two.rig, tmp_path / name, *options) == 0
-    assert file_contents(tmp_path) == file_contents(two.recordings)
-
-
-def test_a_pose_is_evaluated_once(two, tmp_path):
-    bpy.ops.wm.open_mainfile(filepath=str(two.rig))
-    evaluations = []
-
-    def count(*_: object) -> None:
-        evaluations.append(1)
-
-    bpy.app.handlers.depsgraph_update_post.append(count)
-    seen = []
-    rigs = [(rig, tmp_path / rig.mesh_object.name) for rig in find_rigs()]
-    steps = record_meshes(rigs, RecordingSettings(poses=20, influence_poses=1))
-    for step in steps:
-        if step.stage == "poses":
-            seen.append(len(evaluations))
-    # One base pose for each mesh, and one pose for each of the two joints.
-    assert len(rigs) == 2 and np.diff(seen).tolist() == [1] * (20 + 2 * 3)
-
-
-def test_a_subdivided_body_is_recorded_after_the_sleeve_that_reads_it(two, tmp_path):
-    bpy.ops.wm.open_mainfile(filepath=str(two.rig))
-    bpy.data.objects[BODY].modifiers.new("Subdivision", "SUBSURF").levels = 1
-    save_copy(tmp_path / "rig.blend")
-    options = ("--poses", 8, "--object", SLEEVE)
-    assert run("record", tmp_path / "rig.blend", tmp_path / "both", *options, "--object", BODY) == 0
-    assert run("record", tmp_path / "rig.blend", tmp_path / "alone", *options) == 0
-    body, sleeve, alone = (read_recording(tmp_path / name) for name in ("both/elbow", "both/sleeve", "alone"))
-    assert (body.pose_matrices == sleeve.pose_matrices).all()
-    assert (sleeve.positions == alone.positions).all()
-
-
-def test_each_mesh_has_its_own_shape_keys_as_controls(two, tmp_path):
-    """`shape_keys/…` names a separate property of each mesh. A key of one mesh is no input of the other mesh."""
-
-    def add_keys() -> None:
-        for name, keys in ((BODY, ("Basis", "puff")), (SLEEVE, ("Basis", "puff", "fold"))):
-            for key in keys:
-                bpy.data.objects[name].shape_key_add(name=key, from_mix=False)
-                for point in bpy.data.objects[name].data.shape_keys.key_blocks[key].data:
-                    point.co *= 1.0 if key == "Basis" else 1.1
-
-    rig = changed(two, tmp_path / "rig.blend", add_keys)
-    options = ("--all", "--poses", 12, "--control", "fold=0:0.5")
-    assert run("record", rig, tmp_path / "r", *options) == 0
-    body, sleeve = (read_recording(tmp_path / "r" / name) for name in (BODY, SLEEVE))
-    assert (body.pose_matrices[:12] == sleeve.pose_matrices[:12]).all()
-    puff, fold = (f'shape_keys/key_blocks["{key}"].value' for key in ("puff", "fold"))
-    assert [control.name for control in body.rig.controls] == [puff]
-    assert [control.name for control in sleeve.rig.controls] == [puff, fold]
-    for recording in (body, sleeve):
-        sampled = [channel.name for channel in recording.info.sampling.channels if channel.kind == "control"]
-        assert sampled == [control.name for control in recording.rig.controls]
-        assert np.ptp(recording.controls, axis=0).min() > 0.1
-    assert np.abs(body.controls[:12, 0] - sleeve.controls[:12, 0]).max() > 0.1
-
-
-def test_an_interrupted_recording_goes_on_where_each_mesh_stopped(two, tmp_path):
-    bpy.ops.wm.open_mainfile(filepath=str(two.rig))
-    settings = RecordingSettings(poses=POSES, actions=("elbow_wave",))
-    rigs = [(rig, tmp_path / "r" / rig.mesh_object.name) for rig in find_rigs()]
-    steps = record_meshes(rigs, settings)
-    for step in steps:
-        if step.stage == "poses" and step.done == 7:
-            break
-    steps.close()
-    assert [read_index(path)["complete"] for _, path in rigs] == [7, 7]
-    # The recording of the body is complete, and the recording of the sleeve is not.
-    shutil.rmtree(tmp_path / "r" / BODY)
-    shutil.copytree(two.recordings / BODY, tmp_path / "r" / BODY)
-    options = ("--all", "--poses", POSES, "--action", "elbow_wave", "--resume")
-    assert run("record", two.rig, tmp_path / "r", *options) == 0
-    assert file_contents(tmp_path / "r") == file_contents(two.recordings)
 
 
 def test_each_mesh_has_a_model_and_a_report_of_its_own(two):
@@ -160,15 +63,6 @@ def test_each_mesh_has_a_model_and_a_report_of_its_own(two):
         assert {path.name for path in (two.models / name).iterdir()} == {
             *(f"{name}.onnx", f"{name}.checkpoint.npz", "report.json", "report.html")
         }
-
-
-def test_record_prints_its_requirements_and_results(two, commands):
-    out, err = commands["record"].out, commands["record"].err
-    poses = f"{POSES + 30 + ALONE} poses"
-    assert out[0] == REMIX_HINT
-    assert out[1].startswith(f"{POSES + 30 + 2 * ALONE} poses of 600 vertices: less than 1 MB on the disk, about ")
-    assert [line.partition(" in ")[0] for line in out[2:]] == [f"{two.recordings / n}: {poses}" for n in (BODY, SLEEVE)]
-    assert {line.partition(":")[0] for line in err} == {"poses"}
 
 
 def test_train_prints_its_requirements_and_results(two, commands):
@@ -272,26 +166,6 @@ def test_a_mesh_that_fails_loses_no_times_of_others(two, tmp_path, capfd):
     assert meshes[BODY]["has_model"] and "was trained for another rig" in meshes[SLEEVE]["reason"]
 
 
-def test_two_names_with_the_same_folder_are_refused(two, tmp_path, capfd):
-    def rename() -> None:
-        bpy.data.objects[BODY].name, bpy.data.objects[SLEEVE].name = "left arm", "Left_arm"
-
-    rig = changed(two, tmp_path / "rig.blend", rename)
-    sentence = Refusal(tmp_path, capfd)("record", rig, tmp_path / "r", "--all")
-    assert f"'left arm' and 'Left_arm' would both be recorded into '{tmp_path / 'r' / 'Left_arm'}'; rename" in sentence
-
-
-def test_meshes_of_two_armatures_are_refused(two, tmp_path, capfd):
-    def add_hat() -> None:
-        other = link(bpy.data.objects["elbow_rig"].copy())
-        other.name = "hat_rig"
-        skin(cage("hat", 1.3), other)
-
-    rig = changed(two, tmp_path / "rig.blend", add_hat)
-    sentence = Refusal(tmp_path, capfd)("record", rig, tmp_path / "r", "--all", "--poses", 3)
-    assert "'elbow' follows the armature 'elbow_rig' and 'hat' follows 'hat_rig'; record the meshes of each" in sentence
-
-
 def test_a_model_of_a_missing_object_is_refused(two, tmp_path, capfd):
     rig = changed(two, tmp_path / "rig.blend", lambda: bpy.data.objects.remove(bpy.data.objects[SLEEVE]))
     sentence = Refusal(tmp_path, capfd)("bind", rig, two.models, tmp_path / "bound.blend")
@@ -324,8 +198,7 @@ def test_an_incomplete_recording_of_several_is_refused_before_the_first_training
 @pytest.mark.parametrize(
     ("verb", "options", "text"),
     [
-        ("train", ("--goal-mm", 1, "--refine", "rig"), "--refine takes one mesh"),
-        ("record", ("--all", "--refine", "m.onnx"), "--refine takes one mesh"),
+        ("train", ("--goal-mm", 1, "--refine", "rig"), "--refine takes one recording"),
         ("record", ("--all", "--object", BODY), "give one of them"),
         ("evaluate", ("--json", "e.json", "--heatmap", "h.png"), "--heatmap draws one mesh"),
     ],
@@ -341,9 +214,3 @@ def test_options_for_one_mesh_are_refused_for_several(two, tmp_path, monkeypatch
     assert run(verb, *first[verb], *options) == 2
     assert text in capfd.readouterr().err
     assert file_contents(tmp_path) == {}
-
-
-def test_a_full_disk_is_refused_before_anything_is_recorded(two, tmp_path, capfd):
-    sentence = Refusal(tmp_path, capfd)("record", two.rig, tmp_path / "r", "--all", "--poses", 10**11, status=TRY_AGAIN)
-    assert f"Cannot write the recording '{tmp_path / 'r' / BODY}': it takes 745" in sentence
-    assert sentence.endswith(" GB left; make room, record fewer poses, or choose another folder.")

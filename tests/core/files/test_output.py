@@ -205,7 +205,7 @@ def test_a_missing_drive_is_refused():
     with pytest.raises(OutputError, match=words):
         check_folder_writable(path)
     with pytest.raises(OutputError, match=words):
-        check_disk_space([(path, 1000)])
+        check_disk_space(path, 1000)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Only Linux has /proc.")

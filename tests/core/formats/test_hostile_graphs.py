@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Graphs that would hang a process or fill its memory are refused in one sentence, before ONNX Runtime loads them."""
 
+from dataclasses import replace
+
 import numpy as np
 import onnx
 import onnxruntime
@@ -153,8 +155,9 @@ def test_constants_with_a_wrong_type_or_size_are_refused(tensor):
 def test_metadata_with_a_huge_vertex_count_is_refused():
     """The metadata of a file of a few kilobytes claims a billion vertices."""
     vertex_count = 10**9
+    meshes = (replace(tiny_info().meshes[0], vertices=vertex_count),)
     partitions = (ModelPartition(0, (), 1, 0), ModelPartition(2, (1, 2), vertex_count - 1, 17))
-    model = tiny_model(tiny_info(vertex_count=vertex_count, partitions=partitions).to_json())
+    model = tiny_model(tiny_info(meshes=meshes, partitions=partitions).to_json())
     assert_refused(model, "its output 'positions' comes out as (1, 4, 3), not as (1, 1000000000, 3)")
 
 

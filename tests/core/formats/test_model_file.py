@@ -155,6 +155,7 @@ def test_invalid_metadata_text_is_refused(tmp_path, text):
     assert_refused(save_model(tmp_path, tiny_model(text)), "cannot be used: its metadata ")
 
 
+MESH_JSON = tiny_info().meshes[0].to_json()
 PARTITION_JSON = {"joint": 0, "influencing": [], "vertices": 4, "basis": 1}
 
 
@@ -165,7 +166,7 @@ PARTITION_JSON = {"joint": 0, "influencing": [], "vertices": 4, "basis": 1}
         ({"joints": [{"name": "a", "parent": -2}]}, "a joint comes before its parent"),
         ({"partitions": [{**PARTITION_JSON, "joint": 3}]}, "none of its joints"),
         ({"partitions": [{**PARTITION_JSON, "influencing": [9]}]}, "none of its joints"),
-        ({"vertices": 5}, "the partitions do not add up to the vertices"),
+        ({"meshes": [{**MESH_JSON, "vertices": 5}]}, "the partitions do not add up to the vertices"),
         ({"partitions": [{**PARTITION_JSON, "merged": 1}]}, "its metadata cannot be read"),
         ({"rest_matrices": [[float("nan")] * 16] * 3}, "its rest pose holds values that are not numbers"),
         ({"rest_matrices": [[0.0] * 16] * 2}, "cannot reshape"),
@@ -176,7 +177,8 @@ def test_inconsistent_metadata_is_refused(tmp_path, changes, words):
 
 
 def test_a_graph_that_contradicts_the_metadata_is_refused(tmp_path):
-    info_of_five_vertices = replace(tiny_info(), partitions=(ModelPartition(0, (), 5, 0),), vertex_count=5)
+    info_of_five_vertices = replace(tiny_info(), partitions=(ModelPartition(0, (), 5, 0),))
+    info_of_five_vertices = replace(info_of_five_vertices, meshes=(replace(tiny_info().meshes[0], vertices=5),))
     assert_refused(
         save_model(tmp_path, tiny_model(info_of_five_vertices.to_json())),
         "its output 'positions'",

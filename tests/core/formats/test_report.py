@@ -16,7 +16,7 @@ REPORT = {
     "model": "elbow.onnx",
     "model_bytes": 1000,
     "recording": "recording",
-    "object": "Ellbogen ü",
+    "meshes": [{"name": "Ellbogen ü", "vertices": 300, "held_out": ERRORS, "linear": ERRORS}],
     "vertices": 300,
     "joints": 2,
     "poses": 150,
