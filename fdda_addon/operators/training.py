@@ -57,7 +57,7 @@ class TrainingOperator(JobOperator):
                     if message is not None:
                         if message.type is MessageType.FINISHED:
                             # This message may come after a cancellation, if the trainer was writing the model.
-                            self.trained_models += [(uid, model) for uid in mesh_uids]
+                            self.trained_models.extend((uid, model) for uid in mesh_uids)
                             seconds = float(message.values["seconds"])
                         yield self._to_progress(message)
                         continue

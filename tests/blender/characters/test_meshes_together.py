@@ -4,9 +4,11 @@
 import bpy
 import pytest
 
+from fdda_addon.core.recording.index import read_index
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.jobs import job
 from fdda_addon.panels import checks
+from fdda_addon.properties.character import recording_folder
 from fdda_addon.scene.active_rig import rigs_of_active_armature
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
@@ -37,8 +39,10 @@ def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
     assert [rig.mesh_object for rig in rigs_of_active_armature(bpy.context)] == list(two)
     assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
     assert two[1].fdda.settings.poses == 30, "the other takes over how the first is recorded"
+    paths = [recording_folder(mesh_object) for mesh_object in two]
+    assert paths[0] == paths[1] and [mesh["name"] for mesh in read_index(paths[0])["meshes"]] == [o.name for o in two]
     assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
-    assert job.state_of("train").outcome.startswith("Trained 'two_elbow.onnx' and 'two_elbow_001.onnx' in")
+    assert job.state_of("train").outcome.startswith("Trained 'two_elbow.onnx' in")
     assert bpy.ops.fdda.bind(all_meshes=True) == {"FINISHED"}
     for mode in ("RIG", "LINEAR", "FDDA"):
         bpy.ops.fdda.set_mode(mode=mode, all_meshes=True)
