@@ -11,13 +11,11 @@ import pytest
 
 import fdda_addon
 from fdda_addon.cli import build_arm
-from fdda_addon.cli.folders import mesh_folders
 from fdda_addon.cli.main import VERBS
 from fdda_addon.cli.progress import ProgressPrinter
 from fdda_addon.core.errors import TRY_AGAIN, OutputError
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.runtime.session import session
-from fdda_addon.scene.scene_rig import SceneRig
 
 from ..conftest import assert_plays, evaluated_positions, pose, run
 from ..refusals import file_contents, save_elbow
@@ -194,13 +192,6 @@ def test_a_bound_file_plays_when_it_is_opened(elbow_files, tmp_path, capfd):
     first = assert_plays(mesh_object, elbow_files.model)
     pose(angle=1.7)
     assert abs(assert_plays(mesh_object, elbow_files.model) - first).max() > 0.01
-
-
-def test_folders_that_differ_only_in_letter_case_are_refused(tmp_path):
-    rigs = [SceneRig(bpy.data.objects.new(name, bpy.data.meshes.new(name)), None) for name in ("Arm", "arm.", "ARM")]
-    assert [path.name for _, path in mesh_folders(rigs[:2], tmp_path)] == ["Arm", "arm_"]
-    with pytest.raises(OutputError, match="'Arm' and 'ARM' would both be recorded into"):
-        mesh_folders(rigs, tmp_path)
 
 
 def test_a_bound_file_that_cannot_be_saved_leaves_no_copy_of_the_model(elbow_files, tmp_path, monkeypatch):
