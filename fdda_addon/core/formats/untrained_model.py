@@ -50,8 +50,7 @@ def build_untrained_model(rig: Rig, key_distances: Mapping[str, np.ndarray]) -> 
     info = ModelInfo(
         joints=rig.joints,
         rest_matrices=rig.rest_matrices,
-        vertex_count=rig.vertex_count,
-        fingerprint=rig.fingerprint,
+        meshes=rig.meshes,
         partitions=tuple(
             ModelPartition(p.joint, (), len(p.vertices), COMPONENTS, controls, p.merged) for p in partitions
         ),
