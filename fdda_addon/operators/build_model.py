@@ -28,24 +28,25 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
     ends_itself = True
 
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
-        character = self.character(context)
-        mesh_object = character.mesh_object
+        shown, character = self.rig(context), self.character(context)
+        mesh_object = shown.mesh_object
+        mesh_objects = [mesh_object, *(o for o in character.mesh_objects if o != mesh_object)]
         if mesh_object.library is not None:
             raise RigError(f"'{mesh_object.name}' is linked; make its model in the file that it comes from.")
         if mesh_object.fdda.settings.fit_linear == "RIG" and mesh_object.fdda.settings.joints == "ALL":
             check_has_weights(character)
         recording, model = recording_folder(mesh_object), model_file(mesh_object)
         is_missing = not is_recorded(recording)
-        trainings = self.training_plan(character.mesh_objects, planned_pose_count(character))
-        self.state.plan = JobPlan([*(recording_plan(character) if is_missing else ()), *trainings])
+        trainings = self.training_plan(mesh_objects, planned_pose_count(shown))
+        self.state.plan = JobPlan([*(recording_plan(shown) if is_missing else ()), *trainings])
         if is_missing:
             # An interrupted recording is resumed.
-            for step in record_character(character, recording, (recording / INDEX_NAME).exists()):
+            for step in record_character(character, mesh_object, recording, (recording / INDEX_NAME).exists()):
                 yield step
                 if self.state.cancel_requested:
                     return None
         self.changes_scene = self.state.changes_scene = False
-        return (yield from self.train_all([(character.mesh_objects, recording, model)]))
+        return (yield from self.train_all([(mesh_objects, recording, model)]))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         self.add_trained_models_to_list()

@@ -25,18 +25,19 @@ from .job import JobOperator
 from .rig_operator import RigOperator
 
 
-def record_character(character: SceneRig, path: Path, resume: bool = False) -> Iterator[object]:
-    """Record the meshes of a character with the settings of the first mesh, which the others get, too.
+def record_character(
+    character: SceneRig, shown_object: bpy.types.Object, path: Path, resume: bool = False
+) -> Iterator[object]:
+    """Record the meshes of a character with the settings of the mesh that the sidebar shows, which the others get, too.
 
     Raises:
         FDDAError: the errors of `recording.run.record`.
     """
-    first, *others = character.mesh_objects
     with ExitStack() as stack:
         for mesh_object in character.mesh_objects:
             stack.enter_context(model_disabled(mesh_object))
-        for mesh_object in others:
-            copy_settings(mesh_object, first)
+            if mesh_object != shown_object:
+                copy_settings(mesh_object, shown_object)
         yield from record(character, path, recording_settings(character, resume))
 
 
@@ -80,13 +81,13 @@ class FDDA_OT_record(JobOperator, bpy.types.Operator):
         return cls.bl_description
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        character = self.character(context)
-        self.state.plan = JobPlan(recording_plan(character))
+        shown, character = self.rig(context), self.character(context)
+        self.state.plan = JobPlan(recording_plan(shown))
         # The other meshes get the settings of the shown one.
         self.changes_file = len(character.mesh_objects) > 1
         folder = self.folder and Path(bpy.path.abspath(self.folder))
-        self._path = folder or recording_folder(character.mesh_object)
-        yield from record_character(character, self._path, self.resume)
+        self._path = folder or recording_folder(shown.mesh_object)
+        yield from record_character(character, shown.mesh_object, self._path, self.resume)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
         return f"Recorded {format_count(self.state.total, 'pose')} into '{self._path.name}'."

@@ -81,13 +81,12 @@ class RigOperator:
         return together or [self.rig(context)]
 
     def character(self, context: bpy.types.Context) -> SceneRig:
-        """Return the rig of all meshes to apply the operator to, of which the shown mesh is the first.
+        """Return the rig of all meshes to apply the operator to.
 
         Raises:
             RigError: there is no rig.
         """
-        shown = self.rig(context)
-        return join_rigs([shown, *(rig for rig in self.rigs(context) if rig.mesh_object != shown.mesh_object)])
+        return join_rigs(self.rigs(context))
 
     def bound_rig(self, context: bpy.types.Context) -> SceneRig:
         """Return the rig to apply the operator to, which has a bound model.

@@ -222,7 +222,8 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
         # Meshes of one recording have one model.
         meshes_of_files: dict[tuple[Path, Path], list[bpy.types.Object]] = {}
-        for mesh_object in self.character(context).mesh_objects:
+        shown_object = self.rig(context).mesh_object
+        for mesh_object in sorted(self.character(context).mesh_objects, key=lambda o: o != shown_object):
             meshes_of_files.setdefault(self._files(mesh_object), []).append(mesh_object)
         files = [(mesh_objects, *paths) for paths, mesh_objects in meshes_of_files.items()]
         plans = (self.training_plan(mesh_objects, _pose_count(recording)) for mesh_objects, recording, _ in files)

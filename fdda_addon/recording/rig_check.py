@@ -57,14 +57,15 @@ def check_recordable_rig(scene_rig: SceneRig, settings: RecordingSettings = DEFA
 
 
 def check_has_weights(scene_rig: SceneRig) -> None:
-    """Check that vertices follow deforming bones, so that there is linear skinning to learn from.
+    """Check that vertices of some mesh follow deforming bones, so that there is linear skinning to learn from.
 
     Raises:
         RigError: there is no Armature modifier, or no vertex has a weight on a deforming bone.
     """
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    modifier = armature_modifier(mesh_object)
-    if modifier is None or set(read_skin(mesh_object, armature_object, modifier).bones) <= {STATIC_JOINT}:
+    modifiers = {each: armature_modifier(each) for each in scene_rig.mesh_objects}
+    skins = (read_skin(each, armature_object, modifier) for each, modifier in modifiers.items() if modifier)
+    if all(set(skin.bones) <= {STATIC_JOINT} for skin in skins):
         raise RigError(
             f"The vertices of '{mesh_object.name}' have no weights on deforming bones of '{armature_object.name}', so "
             "there is no linear skinning to learn from; set Base Skinning in Training to Fit, or paint weights."

@@ -99,12 +99,12 @@ def find_character(names: Iterable[str]) -> SceneRig:
 
 
 def join_rigs(rigs: Sequence[SceneRig]) -> SceneRig:
-    """Join the rigs of several meshes of one armature, of which the first defines the space.
+    """Join the rigs of several meshes of one armature, those with an Armature modifier first.
 
     Raises:
         RigError: the meshes follow different armatures.
     """
-    first, *others = rigs
+    first, *others = rigs = sorted(rigs, key=lambda rig: armature_modifier(rig.mesh_object) is None)
     for other in others:
         if other.armature_object != first.armature_object:
             raise RigError(
@@ -120,7 +120,7 @@ def find_whole_character() -> tuple[SceneRig, str]:
     """Find the rig of all meshes of the scene that follow its armature by modifiers.
 
     Returns:
-        The rig, meshes with an Armature modifier first; and a sentence about the meshes that are left out, or an empty
+        The rig, as of `join_rigs`; and a sentence about the meshes that are left out, or an empty
         text.
 
     Raises:
@@ -131,7 +131,6 @@ def find_whole_character() -> tuple[SceneRig, str]:
     visible_rigs = [rig for rig in rigs if rig.mesh_object.visible_get()]
     if not visible_rigs:
         return find_rig(), ""
-    visible_rigs.sort(key=lambda rig: armature_modifier(rig.mesh_object) is None)
     character = join_rigs(visible_rigs)
     hidden = [rig.mesh_object.name for rig in rigs if rig not in visible_rigs]
     carried = [
