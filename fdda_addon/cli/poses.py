@@ -2,6 +2,7 @@
 """`poses RIG.blend OUT.blend`: saves a copy of a file with an action of recorded or random poses, one per frame."""
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 
 from ..core.errors import WrongUsageError
@@ -13,7 +14,7 @@ from ..recording.plan import RecordingSettings
 from ..recording.posed_action import make_posed_action, recorded_settings
 from ..runtime.binding import model_disabled
 from ..scene.blend_file import save_copy
-from ..scene.scene_rig import find_rig
+from ..scene.scene_rig import find_character
 from .files import add_rig_options, open_file
 from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
@@ -29,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    info = None
+    info, index = None, {}
     settings = RecordingSettings(
         **({} if options.poses is None else {"poses": options.poses}),
         seed=options.seed,
@@ -44,12 +45,16 @@ def run(options: argparse.Namespace) -> None:
     if options.recording:
         if settings != RecordingSettings():
             raise WrongUsageError("--recording has its own poses; leave the other options of poses out.")
-        info = read_info(read_index(options.recording))
+        index = read_index(options.recording)
+        info = read_info(index)
         settings = recorded_settings(info)
     check_outputs({options.out: BLEND}, (options.rig,), options.overwrite)
     open_file(options.rig)
-    scene_rig = find_rig(options.object or (info.object_name if info else ""))
-    with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
+    names = [mesh["name"] for mesh in index.get("meshes", ())]
+    scene_rig = find_character([options.object] if options.object and len(names) < 2 else names or [""])
+    with ProgressPrinter() as progress, ExitStack() as stack:
+        for mesh_object in scene_rig.mesh_objects:
+            stack.enter_context(model_disabled(mesh_object))
         action, driven = progress.run(make_posed_action(scene_rig, settings, info))
     save_copy(options.out)
     if driven:

@@ -14,7 +14,7 @@ from ..core.recording.index import ACTION, MIRRORED, RANDOM, STRIP, RecordingInf
 from ..poses.clip import find_clips
 from ..poses.clip_player import ClipPlayer
 from ..poses.sample_selection import REMIX
-from ..rig.temporary_rig_state import temporary_rig_states
+from ..rig.temporary_rig_state import temporary_rig_state
 from ..scene.animated_values import read_value
 from ..scene.armature import clear_pose, pose_values
 from ..scene.arrays import KEY_INTERPOLATION_ELEMENT, KEY_POSITION_ELEMENT, POSE_CHANNELS, write
@@ -81,7 +81,7 @@ def make_posed_action(
                 "axes have changed; record again, or leave --recording out."
             )
     clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
-    plan = PosePlan([(scene_rig, channels)], settings, clips)
+    plan = PosePlan(scene_rig, channels, settings, clips)
     if plan.total < 1:
         raise RigError("There is no pose: 0 random poses and no action; give --poses or --action.")
     names = [channel.name for channel in channels if channel.kind == CONTROL and can_be_set(channel.name)]
@@ -97,7 +97,7 @@ def make_posed_action(
         for key, value in numbers.items():
             values.setdefault(key, []).append(np.atleast_1d(np.array(value, np.float64)))
 
-    with temporary_rig_states([(scene_rig, rig, channels)], clips) as player:
+    with temporary_rig_state(scene_rig, rig, channels, clips) as player:
         append_pose(player)
         with closing(plan.show_poses(player, range(plan.total))) as poses:
             for index in poses:
