@@ -49,6 +49,7 @@ class JobState:
         plan: the steps of a job that has several; None for others.
         stage, done, total: progress. If the number of steps is unknown, total is 0 and done counts seconds.
         started, ended: times of `time.monotonic`, seconds.
+        note: why something that the user has tried must wait; empty for nothing.
         outcome: message at the end of the job; empty while it runs.
         outcome_level: 'INFO', 'WARNING' (canceled) or 'ERROR'.
         warnings: messages about the recording.
@@ -70,6 +71,7 @@ class JobState:
     total: int = 0
     started: float = field(default_factory=time.monotonic)
     ended: float = 0.0
+    note: str = ""
     outcome: str = ""
     outcome_level: str = "INFO"
     warnings: list[str] = field(default_factory=list)

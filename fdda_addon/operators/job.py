@@ -110,7 +110,8 @@ class JobOperator(RigOperator):
         if event.type == "ESC" and self.changes_scene:
             request_cancel()
         if event.type == "S" and event.value == "PRESS" and (event.ctrl or event.oskey) and self.changes_scene:
-            self.report({"WARNING"}, f"Not saved. {self.state.busy_text}")
+            self.state.note = "Not saved: this job changes the scene. Save when it has ended, or press ESC."
+            redraw()
         if event.type == "TIMER" or self._run.state.cancel_requested:
             result = self._tick(context)
             if result is not None:
@@ -171,7 +172,7 @@ class JobOperator(RigOperator):
             if self.state.remaining_seconds is not None:
                 text += f", {self.state.remaining_text.lower()}"
             if self.changes_scene:
-                self._set_status_text(context, f"{text} (ESC: cancel)")
+                self._set_status_text(context, f"{text} (ESC: cancel). {self.state.note}".rstrip(". "))
             elif len(context.window.modal_operators) <= 1:
                 # Another modal operator, such as Move, shows its own keys.
                 self._set_status_text(context, text)

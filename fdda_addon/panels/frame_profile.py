@@ -28,7 +28,7 @@ def draw_times(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
             layout.label(text=f"{times.model_count} of {len(times.meshes)} Meshes with Models, ms per Frame")
         suffix = " (estimate)" if times.is_estimate else ""
         rows = [
-            ("Rig", times.median(RIG)),
+            ("Rig, per Frame", times.median(RIG)),
             *([("Armature Only", times.median(LINEAR))] if LINEAR in times.times else []),
             (("Model" if len(times.meshes) == 1 else "Models") + suffix, times.median(FDDA)),
             ("   Bones", times.median(BONES)),

@@ -43,10 +43,9 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         rig, message = panel_rig(context)
         if rig is None:
             active_object = context.view_layer.objects.active
-            if active_object is not None and active_object.type == "MESH" and active_object.fdda.status:
-                # Without an armature, the section Model is not shown.
-                draw_wrapped(layout, context, active_object.fdda.status, "ERROR")
-            draw_wrapped(layout, context, message, "INFO")
+            # Without an armature, the section Model is not shown.
+            status = active_object.fdda.status if active_object is not None and active_object.type == "MESH" else ""
+            draw_wrapped(layout, context, status or message, "ERROR" if status else "INFO")
             layout.operator("fdda.add_sample_arm", text="Add Sample Arm", icon="ADD")
             return
         is_fast_rig = rig.mesh_object.fdda.is_fast_rig

@@ -170,4 +170,6 @@ def draw_job(
     row.operator("fdda.cancel", text="Canceling…" if state.cancel_requested else "Cancel", icon="X")
     # This line is always drawn, so that the elements below it do not move.
     layout.label(text=state.remaining_text, icon="TIME")
+    if state.note:
+        draw_wrapped(layout, context, state.note, "ERROR")
     return True

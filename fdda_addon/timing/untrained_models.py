@@ -31,7 +31,7 @@ def untrained_models(
     models, reasons = {}, {}
     with temporary_folder() as folder:
         for scene_rig in rigs:
-            mesh_object, path = scene_rig.mesh_object, folder / f"{len(models)}.onnx"
+            mesh_object, path = scene_rig.mesh_object, folder / f"untrained_{len(models)}.onnx"
             try:
                 stack = check_evaluable(scene_rig)
                 distances, dependencies = key_distances(mesh_object), read_dependencies(scene_rig)
