@@ -92,12 +92,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=(0, 1, 2), help="seeds of the trainings")
     parser.add_argument("--without", nargs="+", choices=names, default=names, metavar="MECHANISM", help=str(names))
     parser.add_argument("--poses", type=int, default=POSES, help="random poses to train on")
-    parser.add_argument("--epochs", type=int, default=EPOCHS, help="epochs of each training")
+    parser.add_argument("--passes", type=int, default=EPOCHS, help="epochs of each training")
     options = parser.parse_args(arguments)
     try:
         check_folder_writable(options.out)
         torch.set_num_threads(1)
-        print(measure(options.out, *(vars(options)[k] for k in ("characters", "seeds", "without", "poses", "epochs"))))
+        print(measure(options.out, *(vars(options)[k] for k in ("characters", "seeds", "without", "poses", "passes"))))
     except FDDAError as error:
         print(error, file=sys.stderr)
         return error.exit_status

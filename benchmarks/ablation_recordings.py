@@ -91,10 +91,10 @@ def record(name: str, folder: Path, poses: int = POSES) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     rig = folder / "rig.blend"
     actions, held_out = build(name, rig)
-    sampled = [option for action in actions for option in ("--sample", f"action:{action}")]
+    sampled = [option for action in actions for option in ("--bones-to-pose", f"action:{action}")]
     recorded = [option for action in actions for option in ("--action", action)]
     _run("record", rig, folder / "recording", "--poses", poses, "--overwrite", *sampled, *recorded)
-    options = ["--seed", HELD_OUT_SEED, "--margin", HELD_OUT_MARGIN, *sampled]
+    options = ["--seed", HELD_OUT_SEED, "--overshoot", HELD_OUT_MARGIN, *sampled]
     options += ["--action", held_out] if held_out else []
     _run("record", rig, folder / "held_out", "--poses", HELD_OUT_POSES, "--overwrite", *options)
     write_json(folder / "character.json", {"name": name, "poses": poses, "actions": actions, "held_out": held_out})

@@ -84,7 +84,7 @@ class Character:
 
     def _train(self, without: str, seed: int, model: Path) -> None:
         mechanism = MECHANISMS[without]
-        config = TrainingConfig(epochs=self._epochs, seed=seed)
+        config = TrainingConfig(passes=self._epochs, seed=seed)
         build_model = train.build_model
 
         def keep_arguments(*arguments):

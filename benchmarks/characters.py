@@ -39,7 +39,7 @@ def compare(rows: tuple[Row, ...], folder: Path) -> list[dict]:
             print(f"{row.name}: record", file=sys.stderr)
             (folder / row.name).mkdir()
             for recording, model in record_row(row, folder / row.name):
-                trainings.add(recording, model, "--epochs", row.epochs, *row.training, *SMALL)
+                trainings.add(recording, model, "--passes", row.epochs, *row.training, *SMALL)
         print("train", file=sys.stderr)
     results = []
     for row in rows:

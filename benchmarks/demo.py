@@ -65,10 +65,10 @@ def main(folder: Path) -> int:
     refine = ["record", rig, recording, "--refine", model]
     for title, arguments in (
         ("1. The rig", ["build-arm", rig]),
-        ("2. Recording", ["record", rig, recording, "--poses", POSES, "--margin", MARGIN]),
-        ("3. Training", ["train", recording, model, "--epochs", EPOCHS]),
+        ("2. Recording", ["record", rig, recording, "--poses", POSES, "--overshoot", MARGIN]),
+        ("3. Training", ["train", recording, model, "--passes", EPOCHS]),
         ("Refinement: more poses where the error is largest", [*refine, "--poses", REFINED_POSES]),
-        ("", ["train", recording, model, "--epochs", EPOCHS, "--warm-start"]),
+        ("", ["train", recording, model, "--passes", EPOCHS, "--warm-start"]),
     ):
         if title:
             print(f"\n== {title}", flush=True)

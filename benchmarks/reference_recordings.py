@@ -167,7 +167,7 @@ def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bo
     else:
         measured, trained_on = np.arange(TRAINING_POSES, pose_count), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
-    prepared = [prepare_partition(partition.data, split, config.tolerance_mm, config.seed) for partition in partitions]
+    prepared = [prepare_partition(partition.data, split, config.detail_mm, config.seed) for partition in partitions]
     rows = []
     for partition, trained in zip(partitions, train(prepared, split, config, choose_device().device), strict=True):
         mean, largest, linear = measure(partition, trained, measured)

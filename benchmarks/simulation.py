@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=("soft-body", "whole-arm", "cloth"), default="soft-body")
     parser.add_argument("--poses", type=int, default=300)
     parser.add_argument("--held-out", type=int, default=50)
-    parser.add_argument("--max-settle-frames", type=int, default=60)
+    parser.add_argument("--settle-frames", type=int, default=60)
     options = parser.parse_args()
     out = options.out
     out.mkdir(parents=True, exist_ok=True)
@@ -79,7 +79,7 @@ def main() -> None:
     )
     fdda_addon.register()
     build(rig, options.kind)
-    target_options = ["--object", "arm", "--target", FLESH, "--max-settle-frames", options.max_settle_frames]
+    target_options = ["--object", "arm", "--learn-from", FLESH, "--settle-frames", options.settle_frames]
     seconds = {"record": time_verb("record", rig, recording, *target_options, "--poses", options.poses, "--resume")}
     model.parent.mkdir(exist_ok=True)
     seconds["train"] = time_verb("train", recording, model)

@@ -280,7 +280,7 @@ def bind_elbow(folder: Path) -> tuple[Path, Path]:
         save_copy(rig)
         for arguments in (
             ("record", rig, recording, "--poses", 150),
-            ("train", recording, model, "--epochs", 40),
+            ("train", recording, model, "--passes", 40),
             ("bind", rig, model, bound),
         ):
             if status := run_verb([str(argument) for argument in arguments], "fdda"):

@@ -24,7 +24,7 @@ CONFIGURATIONS = [((64, 64), "silu"), *itertools.product(
     ((128, 128), (128, 128, 128), (512, 512), (512, 512, 512)), ("silu", "tanh", "relu")
 )]  # fmt: skip
 """Units of the hidden layers, and activation; the first one is the trainer's default."""
-TOLERANCE_MM = 0.02
+DETAIL_MM = 0.02
 """The default would leave so many components out that networks could not differ."""
 
 
@@ -57,7 +57,7 @@ def main() -> None:
         if not model.exists():
             model.parent.mkdir(exist_ok=True)
             print(f"{model.parent.name} …", file=sys.stderr, flush=True)
-            settings = ("--hidden", *units, "--activation", activation, "--seed", seed, "--tolerance-mm", TOLERANCE_MM)
+            settings = ("--hidden", *units, "--activation", activation, "--seed", seed, "--detail-mm", DETAIL_MM)
             run("trainer", recording, model, *settings)
     costs = measure([Network(paths[0]) for paths in models.values()])
     print("| hidden layers | activation | mean, mm | 99.9 % | largest | training, s | one pose, ms | MB |")

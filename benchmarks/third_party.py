@@ -144,9 +144,9 @@ def measure(character: Character, folder: Path, poses: int, epochs: int) -> dict
     rig, recording, model = character.file, folder / "recording", folder / "model.onnx"
     object_options = ("--object", character.object_name)
     actions = [option for name in character.recorded for option in ("--action", name)]
-    actions += ["--sample", "remix"] if actions else []
+    actions += ["--bones-to-pose", "remix"] if actions else []
     run_verb("record", rig, recording, *object_options, "--poses", poses, *actions, "--overwrite")
-    run_verb("train", recording, model, "--epochs", epochs, "--overwrite")
+    run_verb("train", recording, model, "--passes", epochs, "--overwrite")
     run_verb("bind", rig, model, folder / "bound.blend", *object_options, "--overwrite")
     held_out = ("--poses", 0, "--action", character.held_out) if character.held_out else ("--poses", 50)
     results = {}
@@ -197,7 +197,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER)
     parser.add_argument("--poses", type=int, default=1000)
-    parser.add_argument("--epochs", type=int, default=200)
+    parser.add_argument("--passes", type=int, default=200)
     # The table of some characters must not replace that of all.
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--only", nargs="+", help="names of characters, without their extension")
@@ -215,14 +215,14 @@ def main() -> None:
     if options.write:
         TABLE.check()
     lines = [
-        f"{options.poses:,} random poses, {options.epochs} epochs, one seed, Blender {bpy.app.version_string}.",
+        f"{options.poses:,} random poses, {options.passes} passes, one seed, Blender {bpy.app.version_string}.",
         "",
         "| character | author, license | vertices | bones | mean (largest) error, part of linear skinning's "
         "| compared on | times as fast | model, MB |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for source in sources:
-        for line in rows(source, out, options.poses, options.epochs):
+        for line in rows(source, out, options.poses, options.passes):
             lines.append(line)
             print(line, flush=True)
     table = "\n".join(lines)

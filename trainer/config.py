@@ -10,10 +10,10 @@ from fdda_addon.core.mathematics.partition import INFLUENCE_TOLERANCE
 from fdda_addon.core.mathematics.skin_fit import FIT_KINDS
 from fdda_addon.core.settings import (
     ABOVE_ZERO,
-    EPOCHS,
+    DETAIL_MM,
     GOAL_MM,
-    MIN_PARTITION_VERTICES,
-    TOLERANCE_MM,
+    MIN_VERTICES_PER_PART,
+    PASSES,
     TRAINING_SEED,
     Setting,
     settings_of,
@@ -39,13 +39,13 @@ HELD_OUT_FRACTION = Setting(
     high=0.4,
 )
 INCLUDE_UNSETTLED = Setting("include_unsettled", False, "Also use poses in which the target did not come to rest")
-FIT_LINEAR = Setting(
-    "fit_linear",
+BASE_SKINNING = Setting(
+    "base_skinning",
     "",
     "Skin weights to fit: hard for one joint per vertex, smooth for at most four; the rig's own if left out",
     choices=FIT_KINDS,
 )
-JOINTS = Setting("joints", ALL, "Joints that the model reads: auto for the fewest, all, or their number")
+BONES_TO_READ = Setting("bones_to_read", ALL, "Joints that the model reads: auto for the fewest, all, or their number")
 INFLUENCE = Setting(
     "influence_tolerance",
     INFLUENCE_TOLERANCE,
@@ -62,10 +62,10 @@ class TrainingConfig:
     """
 
     seed: int = TRAINING_SEED.field()
-    tolerance_mm: float = TOLERANCE_MM.field()
+    detail_mm: float = DETAIL_MM.field()
     hidden: tuple[int, ...] = HIDDEN.field()
     activation: str = ACTIVATION.field()
-    epochs: int = EPOCHS.field()
+    passes: int = PASSES.field()
     batch_size: int = BATCH_SIZE.field()
     learning_rate: float = LEARNING_RATE.field()
     weight_decay: float = WEIGHT_DECAY.field()
@@ -73,15 +73,15 @@ class TrainingConfig:
     held_out_fraction: float = HELD_OUT_FRACTION.field()
     goal_mm: float = GOAL_MM.field()
     include_unsettled: bool = INCLUDE_UNSETTLED.field()
-    fit_linear: str = FIT_LINEAR.field()
-    joints: str = JOINTS.field()
-    min_partition_vertices: int = MIN_PARTITION_VERTICES.field()
+    base_skinning: str = BASE_SKINNING.field()
+    bones_to_read: str = BONES_TO_READ.field()
+    min_vertices_per_part: int = MIN_VERTICES_PER_PART.field()
     influence_tolerance: float = INFLUENCE.field()
 
     def __post_init__(self):
         for setting in settings_of(TrainingConfig):
             value = getattr(self, setting.name)
-            if not (_is_joints_option(value) if setting is JOINTS else setting.is_valid(value)):
+            if not (_is_joints_option(value) if setting is BONES_TO_READ else setting.is_valid(value)):
                 raise TrainingError(
                     f"The training setting {setting.name} cannot be {value!r}; see python -m trainer --help."
                 )
@@ -102,7 +102,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add an option for each setting to a parser, for example `--batch-size` for `batch_size`."""
     group = parser.add_argument_group("training settings")
     for setting in settings_of(TrainingConfig):
-        setting.add_option(group, **({"type": parse_joints} if setting is JOINTS else {}))
+        setting.add_option(group, **({"type": parse_joints} if setting is BONES_TO_READ else {}))
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainingConfig:

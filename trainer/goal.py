@@ -47,7 +47,7 @@ def evaluate_goal(
     if training_p999_mm > UNDERFITTING_RATIO * p999:
         text += (
             f"The training poses are at {training_p999_mm:.3g} mm, so the networks are too small or the basis too "
-            "coarse: train with --hidden 128 128 and a smaller --tolerance-mm."
+            "coarse: train with --hidden 128 128 and a smaller --detail-mm."
         )
     else:
         text += "Narrow the range of motion to what is animated, or accept this error."

@@ -158,7 +158,7 @@ def partition_data(
 
 
 def prepare_partition(
-    partition: PartitionData, split: Split, tolerance_mm: float, seed: int, metres_per_unit: float = 1.0
+    partition: PartitionData, split: Split, detail_mm: float, seed: int, metres_per_unit: float = 1.0
 ) -> PreparedPartition:
     """Standardize the features of a partition, fit its linear part, and convert the remainder to coefficients.
 
@@ -166,7 +166,7 @@ def prepare_partition(
     components, because its mean is its best approximation.
 
     Args:
-        tolerance_mm: rms error that the components may leave, mm.
+        detail_mm: rms error that the components may leave, mm.
         seed: seed of the sample of poses from which the basis is computed.
         metres_per_unit: as in `Rig`.
     """
@@ -177,7 +177,7 @@ def prepare_partition(
     columns = np.flatnonzero(is_varying) if partition.columns is None else partition.columns[is_varying]
     mean, scale = training[:, is_varying].mean(axis=0).astype(np.float32), scale[is_varying].astype(np.float32)
     mm_per_unit = 1000 * metres_per_unit
-    tolerance = tolerance_mm / mm_per_unit
+    tolerance = detail_mm / mm_per_unit
     residuals = np.asarray(partition.read_residuals(), np.float32)
     vertex_count = residuals.shape[1]
     fit = JointFit(np.zeros(0, np.int64), np.zeros((0, vertex_count), np.float32))
@@ -217,12 +217,12 @@ def prepare_partitions(
         metres_per_unit: as in `Rig`.
         on_progress: called after each partition with the number of partitions that are prepared.
     """
-    prepared, fine_tolerance_mm = [], config.tolerance_mm / FINE_TOLERANCE_FACTOR
+    prepared, fine_tolerance_mm = [], config.detail_mm / FINE_TOLERANCE_FACTOR
     for partition in partitions:
         prepared.append(prepare_partition(partition, split, fine_tolerance_mm, config.seed, metres_per_unit))
         on_progress(len(prepared))
     errors, vertex_counts = [p.basis.error_by_count for p in prepared], [p.vertex_count for p in prepared]
-    tolerance = config.tolerance_mm / (1000 * metres_per_unit)
+    tolerance = config.detail_mm / (1000 * metres_per_unit)
     counts = allocate_components(errors, vertex_counts, tolerance, config.hidden[-1] + 1)
     return [
         replace(p, basis=p.basis.truncate(count), coefficients=np.ascontiguousarray(p.coefficients[:, :count]))

@@ -144,7 +144,7 @@ class _Job:
         if chosen.problem:
             self.warn_of_card(chosen.card, chosen.problem)
         self.log(_training_size_sentence(self.recording))
-        if merges := merges_sentence(self.recording, self.config.min_partition_vertices):
+        if merges := merges_sentence(self.recording, self.config.min_vertices_per_part):
             self.log(merges)
         warnings = check_recording(self.recording)
         for warning in warnings:
@@ -162,7 +162,7 @@ class _Job:
     @property
     def _tolerance(self) -> float:
         """The tolerance, mesh units."""
-        return self.config.tolerance_mm / (1000 * self.recording.rig.metres_per_unit)
+        return self.config.detail_mm / (1000 * self.recording.rig.metres_per_unit)
 
     def fit_inputs(self, parts: list[Partition]) -> NetworkInputs:
         """Fit the inputs of the networks. A warm start keeps the inputs of the checkpoint."""
@@ -203,7 +203,7 @@ class _Job:
 
         def send_progress(epoch: int, training_mm: float, validation_mm: float) -> None:
             errors = {"training_mm": round(training_mm, 6), "validation_mm": round(validation_mm, 6)}
-            self.sink.send(MessageType.PROGRESS, epoch=epoch, epochs=config.epochs, **errors)
+            self.sink.send(MessageType.PROGRESS, epoch=epoch, epochs=config.passes, **errors)
 
         try:
             return train(prepared, self.split, config, self.device, send_progress, initial)

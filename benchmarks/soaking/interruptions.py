@@ -24,7 +24,7 @@ from .cases import CaseFailedError, is_sentence, print_case, run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 POSES = 40
-TRAINING_OPTIONS = ("--epochs", "3", "--hidden", "4", "4")
+TRAINING_OPTIONS = ("--passes", "3", "--hidden", "4", "4")
 KILLED_PROCESSES = ("record", "train", "write")
 DISK_VERBS = ("record", "train", "bind", "evaluate")
 DISK_FULL_STATUS = 75

@@ -17,7 +17,7 @@ from trainer.train import train_model
 from .cases import CaseFailedError, print_case, run_case
 from .odd_values import mutate_bytes, mutate_json, to_json_text
 
-CONFIG = TrainingConfig(epochs=1, hidden=(4,), tolerance_mm=0.1)
+CONFIG = TrainingConfig(passes=1, hidden=(4,), detail_mm=0.1)
 ODD_NUMBERS = np.float32([0, -1, 1e3, 1e-30, 1e30, 3e38, np.inf, -np.inf, np.nan])
 MAX_MUTATED_BYTES = 1 << 30
 """A recording with a larger file is not mutated again."""

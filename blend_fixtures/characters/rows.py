@@ -72,7 +72,7 @@ def _action_row(build: Callable[[], object], text: str) -> Row:
 
 def _settled_row(build: Callable[[], object], text: str) -> Row:
     """Return a row whose target is simulated; the model is trained and compared on settled poses."""
-    target = TargetSettings(targets.TARGET, max_settle_frames=80, repeatability_poses=0)
+    target = TargetSettings(targets.TARGET, settle_frames=80, repeatability_poses=0)
     return _tube_row(
         TARGETS,
         build,
@@ -99,7 +99,7 @@ ROWS: tuple[Row, ...] = (
         SKINNING,
         skinning.stretched,
         "a bone with Stretch To, delta mush",
-        recording=_recording_settings(sample=("bone:upper", "bone:target")),
+        recording=_recording_settings(bones_to_pose=("bone:upper", "bone:target")),
     ),
     _tube_row(MODIFIERS, stacks.corrective_smooth, "Corrective Smooth, bound"),
     _tube_row(MODIFIERS, stacks.lattice, "Lattice with a driven shape key"),
@@ -125,13 +125,15 @@ ROWS: tuple[Row, ...] = (
         CONTROL_RIGS,
         control_rigs.ik_fk,
         "an arm with IK and FK, posed by its control bones and by a custom property that blends between the two",
-        recording=_recording_settings(poses=120, sample=("collection:Controls",), controls=('armature_object/["ik"]',)),
+        recording=_recording_settings(
+            poses=120, bones_to_pose=("collection:Controls",), extra_inputs=('armature_object/["ik"]',)
+        ),
     ),
     _tube_row(
         CONTROL_RIGS,
         control_rigs.face_slider,
         "a slider bone that drives a shape key, a bone that follows a control bone",
-        recording=_recording_settings(sample=("collection:Controls",)),
+        recording=_recording_settings(bones_to_pose=("collection:Controls",)),
     ),
     _tube_row(INPUTS, controls.custom_property, "a custom property that drives a shape key"),
     _tube_row(
@@ -146,19 +148,19 @@ ROWS: tuple[Row, ...] = (
         INPUTS,
         controls.undriven_strength,
         "a modifier's strength set by hand",
-        recording=_recording_settings(controls=('mesh_object/modifiers["Cast"].factor=0:0.4',)),
+        recording=_recording_settings(extra_inputs=('mesh_object/modifiers["Cast"].factor=0:0.4',)),
     ),
     _tube_row(
         INPUTS,
         controls.lattice_shape_key,
         "a lattice's shape key set by hand",
-        recording=_recording_settings(controls=('object:lattice/data.shape_keys.key_blocks["thick"].value',)),
+        recording=_recording_settings(extra_inputs=('object:lattice/data.shape_keys.key_blocks["thick"].value',)),
     ),
     _tube_row(
         INPUTS,
         controls.dial,
         "another object's location, which drives a shape key",
-        recording=_recording_settings(controls=("object:dial/location[0]=0:0.5",)),
+        recording=_recording_settings(extra_inputs=("object:dial/location[0]=0:0.5",)),
     ),
     Row(
         "face",
@@ -193,7 +195,7 @@ ROWS: tuple[Row, ...] = (
         MESHES,
         meshes.through_a_lattice,
         "no weights: a lattice follows the bones and deforms the mesh; fitted linear skinning",
-        training=("--fit-linear", "smooth"),
+        training=("--base-skinning", "smooth"),
     ),
     Row(
         "five_hundred_bones",

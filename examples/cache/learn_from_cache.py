@@ -65,7 +65,7 @@ def main() -> None:
     import_cache(options.cache.resolve(), bpy.data.objects[options.object]).name = TARGET
     target_file = out / "target.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(target_file))
-    target_options = "--object", options.object, "--target", TARGET, "--action", options.action
+    target_options = "--object", options.object, "--learn-from", TARGET, "--action", options.action
     run_verb("record", target_file, out / "recording", *target_options)
     run_verb("check-recording", out / "recording")
     model = out / "model" / f"{options.object}.onnx"

@@ -88,7 +88,7 @@ def read_arguments() -> argparse.Namespace:
     turn_options = {"nargs": 4, "metavar": ("JOINT", "X", "Y", "Z"), "help": "rotate a joint; degrees"}
     control_options = {"nargs": 2, "metavar": ("OWNER/PATH", "VALUE"), "help": "set a control"}
     parser.add_argument("--turn", **turn_options, action="append", default=[])
-    parser.add_argument("--control", **control_options, action="append", default=[])
+    parser.add_argument("--extra-input", **control_options, action="append", default=[])
     parser.add_argument("--recording", type=Path, help="folder of the recording, for the faces of the .obj file")
     arguments = parser.parse_args()
     try:

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     if not recording.rig.has_weights:
         raise RecordingError(
             f"The rig of '{options.recording}' has no skin weights, and its residuals follow from fitted ones; train "
-            "with --fit-linear smooth, which checks the recording."
+            "with --base-skinning smooth, which checks the recording."
         )
     if recording.info.repeatability:
         print(recording.info.repeatability.sentence())

@@ -110,13 +110,13 @@ def run(options: argparse.Namespace) -> None:
         strips=tuple(options.strip),
         target=target,
     )
-    if options.target and len(rigs) > 1:
-        raise WrongUsageError("--target is of one mesh; give --object.")
+    if options.learn_from and len(rigs) > 1:
+        raise WrongUsageError("--learn-from is of one mesh; give --object.")
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
     with atomic_write_all(*(path for path, _ in outputs)) as (errors, *pictures):
         for picture in pictures:
             ((name, (scene_rig, model)),) = rigs.items()
-            reference_name = f"target '{options.target}'" if options.target else "true rig"
+            reference_name = f"target '{options.learn_from}'" if options.learn_from else "true rig"
             poses = representative_poses(evaluations[name].held_out)
             draw_comparison(scene_rig, model, poses, picture, is_heat_map=True, reference_label=reference_name)
         content = to_json_by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
@@ -137,7 +137,7 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
         settings = FilmSettings(
             fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base * time_ratio(),
             times_ms={variant: times.median(variant) for variant in (RIG, LINEAR, FDDA) if variant in times.times},
-            reference_label=f"Target {options.target}" if options.target else LABELS[RIG],
+            reference_label=f"Target {options.learn_from}" if options.learn_from else LABELS[RIG],
         )
         with model_disabled(scene_rig.mesh_object):
             progress.run(film(scene_rig, model, evaluation.actions[0], clip.frames.start, options.video, settings))

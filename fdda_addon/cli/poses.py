@@ -19,6 +19,7 @@ from .files import add_rig_options, open_file
 from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
 from .record_options import add_pose_options
+from .target import pose_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -31,17 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     info, index = None, {}
-    settings = RecordingSettings(
-        **({} if options.poses is None else {"poses": options.poses}),
-        seed=options.seed,
-        spread=options.spread,
-        margin=options.margin,
-        actions=tuple(options.action),
-        sample=tuple(options.sample),
-        controls=tuple(options.control),
-        strips=tuple(options.strip),
-        mirror=options.mirror,
-    )
+    settings = RecordingSettings(**pose_settings(options))
     if options.recording:
         if settings != RecordingSettings():
             raise WrongUsageError("--recording has its own poses; leave the other options of poses out.")

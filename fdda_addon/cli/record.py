@@ -76,11 +76,10 @@ def _find_rig(options: argparse.Namespace) -> "SceneRig":
 
 
 def _make_job(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Progress]":
-    from ..core.settings import POSES, settings_of, values_from
     from ..recording.plan import RecordingSettings
     from ..recording.refinement import RefinementSettings, refine
     from ..recording.run import record
-    from .target import requested_poses, target_settings
+    from .target import pose_settings, requested_poses, target_settings
 
     poses = requested_poses(scene_rig, options)
     pose_options = {} if poses is None else {"poses": poses}
@@ -88,13 +87,9 @@ def _make_job(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[P
         settings = RefinementSettings(seed=options.seed, resume=options.resume, **pose_options)
         return refine(scene_rig, options.recording, options.refine, settings)
     settings = RecordingSettings(
-        actions=tuple(options.action),
         resume=options.resume,
         overwrite=options.overwrite,
-        sample=tuple(options.sample),
-        controls=tuple(options.control),
-        strips=tuple(options.strip),
         target=target_settings(options),
-        **(values_from(options, settings_of(RecordingSettings)) | {"poses": POSES.default} | pose_options),
+        **(pose_settings(options) | pose_options),
     )
     return record(scene_rig, options.recording, settings)

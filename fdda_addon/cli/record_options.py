@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 from ..core.errors import WrongUsageError
-from ..core.settings import MARGIN, MIRROR, POSES, REFINEMENT_POSES, REPEATABILITY_POSES, SEED, SPREAD
+from ..core.settings import MIRROR, OVERSHOOT, POSES, REFINEMENT_POSES, REPEATABILITY_POSES, SEED, SPREAD
 from .files import add_rig_argument
 from .target import add_target_options, target_settings
 
@@ -44,7 +44,7 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose poses."""
     default_text = f"(default {POSES.default}, with --refine {REFINEMENT_POSES})"
     POSES.add_option(parser, default=None, help=f"number of random poses {default_text}")
-    for setting in (SEED, SPREAD, MARGIN, MIRROR):
+    for setting in (SEED, SPREAD, OVERSHOOT, MIRROR):
         setting.add_option(parser)
     parser.add_argument(
         "--action",
@@ -61,7 +61,7 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
         help="also record all frames of this NLA strip; repeatable",
     )
     parser.add_argument(
-        "--sample",
+        "--bones-to-pose",
         action="append",
         default=[],
         metavar="WHAT",
@@ -70,7 +70,7 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
         "each limb from a random frame of the actions of --action, with noise); repeatable",
     )
     parser.add_argument(
-        "--control",
+        "--extra-input",
         action="append",
         default=[],
         metavar="NAME[=LOW:HIGH]",
@@ -91,14 +91,14 @@ def check_options(options: argparse.Namespace) -> None:
         options.action,
         options.strip,
         options.mirror,
-        options.sample,
-        options.control,
-        options.target,
+        options.bones_to_pose,
+        options.extra_input,
+        options.learn_from,
     )
     if options.refine and (any(new_recording_options) or options.poses == 0):
         raise WrongUsageError(
-            "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
-            "--control and --target out."
+            "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --bones-to-pose, "
+            "--extra-input and --learn-from out."
         )
     if options.all and options.object:
         raise WrongUsageError("--all records all meshes, and --object those that it names; give one of them.")

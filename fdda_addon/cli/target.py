@@ -5,7 +5,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..core.errors import WrongUsageError
-from ..core.settings import MAX_SETTLE_FRAMES, PRE_ROLL, REST_THRESHOLD_MM, TARGET, settings_of, values_from
+from ..core.settings import LEARN_FROM, PRE_ROLL, REST_THRESHOLD_MM, SETTLE_FRAMES, settings_of, values_from
 
 if TYPE_CHECKING:
     from ..rig.pose_setter import TargetSettings
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 
 def add_target_options(parser: argparse.ArgumentParser) -> None:
-    """Add the option --target and the options of its settings."""
-    for setting in (TARGET, PRE_ROLL, MAX_SETTLE_FRAMES, REST_THRESHOLD_MM):
+    """Add the option --learn-from and the options of its settings."""
+    for setting in (LEARN_FROM, PRE_ROLL, SETTLE_FRAMES, REST_THRESHOLD_MM):
         setting.add_option(parser)
 
 
@@ -26,10 +26,26 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
     """
     from ..rig.pose_setter import TargetSettings
 
-    if (options.pre_roll or options.max_settle_frames) and not options.target:
-        raise WrongUsageError("--pre-roll and --max-settle-frames need a target; give --target OBJECT.")
+    if (options.pre_roll or options.settle_frames) and not options.learn_from:
+        raise WrongUsageError("--pre-roll and --settle-frames need a target; give --learn-from OBJECT.")
     settings = [setting for setting in settings_of(TargetSettings) if hasattr(options, setting.name)]
-    return TargetSettings(options.target, **values_from(options, settings))
+    return TargetSettings(options.learn_from, **values_from(options, settings))
+
+
+def pose_settings(options: argparse.Namespace) -> dict[str, object]:
+    """Return the arguments of `RecordingSettings` that choose poses, from the options of `add_pose_options`."""
+    from ..recording.plan import RecordingSettings
+
+    values = values_from(options, settings_of(RecordingSettings))
+    lists = {
+        "actions": options.action,
+        "strips": options.strip,
+        "bones_to_pose": options.bones_to_pose,
+        "extra_inputs": options.extra_input,
+    }
+    return {name: value for name, value in values.items() if value is not None} | {
+        n: tuple(v) for n, v in lists.items()
+    }
 
 
 def requested_poses(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
@@ -42,16 +58,11 @@ def requested_poses(scene_rig: "SceneRig", options: argparse.Namespace) -> int |
 
     if (
         options.poses is not None
-        or not options.target
-        or options.max_settle_frames
+        or not options.learn_from
+        or options.settle_frames
         or not (options.action or options.strip)
     ):
         return options.poses
-    settings = RecordingSettings(
-        actions=tuple(options.action),
-        sample=tuple(options.sample),
-        controls=tuple(options.control),
-        target=TargetSettings(options.target),
-    )
+    settings = RecordingSettings(**pose_settings(options), target=TargetSettings(options.learn_from))
     selection, _ = read_sample_selection(scene_rig, settings)
     return 0 if depends_on_time(scene_rig, settings, selection.controls) else None

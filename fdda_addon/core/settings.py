@@ -120,8 +120,8 @@ SPREAD = Setting(
     ui={"min": 0.05, "step": 10},
 )
 """Standard deviation of random poses, as a ratio of half the range of motion."""
-MARGIN = Setting(
-    "margin",
+OVERSHOOT = Setting(
+    "overshoot",
     1.0,
     "Take a quarter of the random poses from limits that are wider by this factor, and rotate locked axes too, so that "
     "the model stays accurate beyond the limits. 1 to stay within the limits",
@@ -138,8 +138,8 @@ MIRROR = Setting(
     "Record each frame of the actions a second time with left and right swapped. The armature must be symmetric",
     "Also Record Mirrored",
 )
-TARGET = Setting(
-    "target",
+LEARN_FROM = Setting(
+    "learn_from",
     "",
     "Learn the shape of another mesh object with the same vertices, for example a simulated or cached copy. Empty to "
     "learn from the rig itself",
@@ -153,8 +153,8 @@ PRE_ROLL = Setting(
     "Pre-Roll",
     ui={"soft_max": 100},
 )
-MAX_SETTLE_FRAMES = Setting(
-    "max_settle_frames",
+SETTLE_FRAMES = Setting(
+    "settle_frames",
     0,
     "Maximum number of frames to hold each random pose until the simulation comes to rest. 0 to record no random poses",
     "Settle",
@@ -174,8 +174,8 @@ REFINEMENT_POSES = 250
 
 TRAINING_SEED = Setting("seed", 0, "Random seed of the training", "Seed", high=(1 << 63) - 1)
 """PyTorch takes no larger seeds."""
-TOLERANCE_MM = Setting(
-    "tolerance_mm",
+DETAIL_MM = Setting(
+    "detail_mm",
     0.04,
     "Smallest deformation worth learning, in mm; smaller is more accurate and slower. 0.05 is invisible in a close-up "
     "of a face, 0.5 in a full figure",
@@ -184,8 +184,8 @@ TOLERANCE_MM = Setting(
     ui={"min": 0.001, "soft_max": 1.0, "precision": 3, "step": 1},
 )
 """Allowed rms error of the principal components alone, over training poses and all vertices, mm."""
-EPOCHS = Setting(
-    "epochs",
+PASSES = Setting(
+    "passes",
     200,
     "How often to train on every recorded pose; more is more accurate and takes longer",
     "Training Passes",
@@ -199,8 +199,8 @@ GOAL_MM = Setting(
     "Goal (mm)",
     ui={"default": 0.5, "min": 0.001, "soft_max": 10.0, "precision": 2, "step": 10},
 )
-MIN_PARTITION_VERTICES = Setting(
-    "min_partition_vertices",
+MIN_VERTICES_PER_PART = Setting(
+    "min_vertices_per_part",
     8,
     "Merge body parts with fewer vertices into a neighbor: a tongue of 5 vertices becomes part of the jaw. 0 to merge "
     "none",

@@ -15,7 +15,7 @@ from ..core.errors import ModelError
 from ..core.mathematics.metrics import viewport_colors
 from ..core.mathematics.partition import make_merged_partitions, partition_colors
 from ..core.sentences.counts import format_count
-from ..core.settings import MIN_PARTITION_VERTICES
+from ..core.settings import MIN_VERTICES_PER_PART
 from ..rig.reading import read_rig
 from ..runtime.model_files import network_of
 from ..runtime.opened_model import open_model
@@ -53,14 +53,14 @@ def paint_errors(mesh_object: bpy.types.Object) -> None:
     _paint(mesh_object, Paint(ERRORS))
 
 
-def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PARTITION_VERTICES.default) -> None:
+def paint_partitions(scene_rig: SceneRig, min_vertices_per_part: int = MIN_VERTICES_PER_PART.default) -> None:
     """Show the partitions of the bound model as colors, or the partitions of the rig if no model can be read.
 
     Args:
-        min_partition_vertices: smallest number of vertices in a partition of the rig.
+        min_vertices_per_part: smallest number of vertices in a partition of the rig.
     """
     rig = read_rig(scene_rig)
-    partitions = make_merged_partitions(rig, min_partition_vertices)
+    partitions = make_merged_partitions(rig, min_vertices_per_part)
     if scene_rig.mesh_object.fdda.is_bound:
         with suppress(ModelError):
             opened_model = open_model(scene_rig, network_of(scene_rig.mesh_object))

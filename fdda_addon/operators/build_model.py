@@ -33,7 +33,7 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
         mesh_objects = [mesh_object, *(o for o in character.mesh_objects if o != mesh_object)]
         if mesh_object.library is not None:
             raise RigError(f"'{mesh_object.name}' is linked; make its model in the file that it comes from.")
-        if mesh_object.fdda.settings.fit_linear == "RIG" and mesh_object.fdda.settings.joints == "ALL":
+        if mesh_object.fdda.settings.base_skinning == "RIG" and mesh_object.fdda.settings.bones_to_read == "ALL":
             check_has_weights(character)
         recording, model = recording_folder(mesh_object), model_file(mesh_object)
         is_missing = not is_recorded(recording)

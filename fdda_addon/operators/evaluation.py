@@ -63,7 +63,7 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
             target = target_settings(mesh_object.fdda.settings)
             with model_disabled(mesh_object):
                 if self._action:
-                    job = evaluate_action(scene_rig, network, self._action, replace(target, max_settle_frames=0))
+                    job = evaluate_action(scene_rig, network, self._action, replace(target, settle_frames=0))
                 else:
                     settings = EvaluationSettings(
                         self.poses, self.seed, surface=False, target=replace(target, pre_roll=0)
@@ -82,7 +82,7 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
             )
             model_errors, skinning_errors = stored.total["fdda"], stored.total["linear"]
             of_mesh = f" of '{mesh_object.name}'" if len(result) > 1 else ""
-            target = mesh_object.fdda.settings.target
+            target = mesh_object.fdda.settings.learn_from
             reference = f"'{target}'" if target else "the rig"
             sentences.append(
                 f"The model{of_mesh} is {model_errors.mean:.2f} mm from {reference} on average "
@@ -152,7 +152,7 @@ class FDDA_OT_color_mesh(EvaluationOperator, bpy.types.Operator):
                 view.range_mm = heat_map.suggested_range_mm(scene_rig.mesh_object) or view.range_mm
         elif self.colors == "PARTITIONS":
             scene_rig = self.rig(context)
-            heat_map.paint_partitions(scene_rig, scene_rig.mesh_object.fdda.settings.min_partition_vertices)
+            heat_map.paint_partitions(scene_rig, scene_rig.mesh_object.fdda.settings.min_vertices_per_part)
         else:
             scene_rig = self.rig(context)
             heat_map.clear(scene_rig.mesh_object)

@@ -45,7 +45,7 @@ def recording_plan(rig: SceneRig) -> list[JobStep]:
     """Return the steps of a recording with the settings of a rig."""
     settings = rig.mesh_object.fdda.settings
     pose_count = planned_pose_count(rig)
-    return recording_steps(pose_count, bool(settings.target))
+    return recording_steps(pose_count, bool(settings.learn_from))
 
 
 def is_recorded(path: Path) -> bool:

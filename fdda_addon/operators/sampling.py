@@ -29,7 +29,7 @@ class FDDA_OT_use_selected_bones(RigOperator, bpy.types.Operator):
         if not names:
             raise RigError(f"No bone of '{rig.armature_object.name}' is selected; select bones in Pose Mode.")
         settings = rig.mesh_object.fdda.settings
-        settings.sample = "SELECTED"
+        settings.bones_to_pose = "SELECTED"
         settings.sampled_bones.clear()
         for name in names:
             settings.sampled_bones.add().name = name
@@ -59,11 +59,11 @@ class FDDA_OT_add_control(RigOperator, bpy.types.Operator):
             except RigError:
                 # The bones to pose have not been chosen yet.
                 recording_options = RecordingSettings()
-            listed_controls(rig, replace(recording_options, controls=(name,)))
-        if name and name in settings.controls:
+            listed_controls(rig, replace(recording_options, extra_inputs=(name,)))
+        if name and name in settings.extra_inputs:
             raise RigError(f"'{name}' is already in the list.")
-        settings.controls.add().name = name
-        settings.control_index = len(settings.controls) - 1
+        settings.extra_inputs.add().name = name
+        settings.extra_input_index = len(settings.extra_inputs) - 1
         return f"Added {name or 'an input'}."
 
 
@@ -83,14 +83,14 @@ class FDDA_OT_add_control_bones(RigOperator, bpy.types.Operator):
         names = [f"bone:{bone.name}" for bone in rig.armature_object.pose.bones if is_selected(bone)]
         if not names:
             raise RigError(f"No bone of '{rig.armature_object.name}' is selected; select control bones in Pose Mode.")
-        new_names = [name for name in names if name not in settings.controls]
+        new_names = [name for name in names if name not in settings.extra_inputs]
         if not new_names:
             raise RigError("The selected bones are already in the list.")
         actions = recorded_actions(rig)
-        controls = listed_controls(rig, RecordingSettings(controls=tuple(new_names), actions=actions))
+        controls = listed_controls(rig, RecordingSettings(extra_inputs=tuple(new_names), actions=actions))
         for name in new_names:
-            settings.controls.add().name = name
-        settings.control_index = len(settings.controls) - 1
+            settings.extra_inputs.add().name = name
+        settings.extra_input_index = len(settings.extra_inputs) - 1
         bone_names = [name.removeprefix("bone:") for name in new_names]
         return f"Added {describe_control_bones(rig.armature_object, bone_names, controls)}"
 
@@ -104,12 +104,12 @@ class FDDA_OT_remove_control(RigOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         settings = self.rig(context).mesh_object.fdda.settings
-        index = settings.control_index
-        if not 0 <= index < len(settings.controls):
+        index = settings.extra_input_index
+        if not 0 <= index < len(settings.extra_inputs):
             raise RigError("No extra input is active; click one in the list.")
-        name = settings.controls[index].name
-        settings.controls.remove(index)
-        settings.control_index = max(0, index - 1)
+        name = settings.extra_inputs[index].name
+        settings.extra_inputs.remove(index)
+        settings.extra_input_index = max(0, index - 1)
         return f"Removed {name or 'the input'}."
 
 

@@ -13,7 +13,7 @@ from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.progress import Job, Progress
 from ..core.recording.index import read_index
-from ..core.settings import EPOCHS, GOAL_MM, MIN_PARTITION_VERTICES, TOLERANCE_MM, TRAINING_SEED, values_from
+from ..core.settings import DETAIL_MM, GOAL_MM, MIN_VERTICES_PER_PART, PASSES, TRAINING_SEED, values_from
 from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, training_steps
 from ..models.former_model import add_former_model, keep_former_model
@@ -88,10 +88,10 @@ class TrainingOperator(JobOperator):
     def training_plan(self, mesh_objects: Sequence[bpy.types.Object], pose_count: int) -> list[JobStep]:
         """Return the steps of a training on a recording of meshes with this number of poses."""
         settings = mesh_objects[0].fdda.settings
-        fits_weights = settings.fit_linear != "RIG" or settings.joints != "ALL"
+        fits_weights = settings.base_skinning != "RIG" or settings.bones_to_read != "ALL"
         group_count = max(len(mesh_object.vertex_groups) for mesh_object in mesh_objects)
         counts = group_count, sum(len(mesh_object.data.vertices) for mesh_object in mesh_objects), pose_count
-        return training_steps(*counts, settings.epochs, fits_weights)
+        return training_steps(*counts, settings.passes, fits_weights)
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
         if not bpy.app.background and is_detached(model):
@@ -106,11 +106,14 @@ class TrainingOperator(JobOperator):
         keep_former_model(model)
         settings = mesh_object.fdda.settings
         arguments = [str(recording), str(model), TRAINING_SEED.option, str(settings.training_seed)]
-        values = values_from(settings, [TOLERANCE_MM, EPOCHS, MIN_PARTITION_VERTICES, *[GOAL_MM] * settings.use_goal])
+        values = values_from(settings, [DETAIL_MM, PASSES, MIN_VERTICES_PER_PART, *[GOAL_MM] * settings.use_goal])
         arguments += [text for name, value in values.items() for text in (f"--{name.replace('_', '-')}", str(value))]
-        if settings.fit_linear != "RIG":
-            arguments += ["--fit-linear", settings.fit_linear.lower()]
-        arguments += ["--joints", str(settings.joint_count) if settings.joints == "NUMBER" else settings.joints.lower()]
+        if settings.base_skinning != "RIG":
+            arguments += ["--base-skinning", settings.base_skinning.lower()]
+        arguments += [
+            "--bones-to-read",
+            str(settings.bone_count) if settings.bones_to_read == "NUMBER" else settings.bones_to_read.lower(),
+        ]
         if warm_start:
             arguments += ["--warm-start"]
         return Training(arguments) if bpy.app.background else DetachedTraining(arguments, model)

@@ -115,7 +115,7 @@ def _sampling_settings(scene_rig: SceneRig) -> tuple:
         settings = recording_settings(scene_rig)
     except RigError as error:
         return (str(error),)
-    return settings.poses > 0, settings.sample, settings.controls
+    return settings.poses > 0, settings.bones_to_pose, settings.extra_inputs
 
 
 @persistent

@@ -83,7 +83,7 @@ def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[s
 
 def lacks_limits(rig: SceneRig) -> bool:
     """Return whether random poses rotate all bones by the default angle, because no bone has limits."""
-    return rig.mesh_object.fdda.settings.sample == "WEIGHTS" and not has_any_limits(rig)
+    return rig.mesh_object.fdda.settings.bones_to_pose == "WEIGHTS" and not has_any_limits(rig)
 
 
 @draw_cached
@@ -106,7 +106,7 @@ def _have_limits(bones: Iterable[bpy.types.PoseBone]) -> bool:
 def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
     """Return the channels that random poses set, by bone; None for "Deforming Bones" or before the first check."""
     check = checks.last_check(rig)
-    if rig.mesh_object.fdda.settings.sample == "WEIGHTS" or check is None or not check.channels:
+    if rig.mesh_object.fdda.settings.bones_to_pose == "WEIGHTS" or check is None or not check.channels:
         return None
 
     by_bone: dict[str, list[Channel]] = {}
@@ -164,7 +164,7 @@ def draw_limits(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
         if channels is None:
             _draw_limits(body.box(), rig, bone)
         elif bone.name in channels:
-            if rig.mesh_object.fdda.settings.sample in {"ACTIONS", "REMIX"}:
+            if rig.mesh_object.fdda.settings.bones_to_pose in {"ACTIONS", "REMIX"}:
                 sampling.draw_channels(body.box(), bone, channels[bone.name])
             else:
                 _draw_limits(body.box(), rig, bone)

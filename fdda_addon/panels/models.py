@@ -51,7 +51,7 @@ def _compared_channels(
     mesh_object: bpy.types.Object, channels: "tuple[Channel, ...]", info: "ModelInfo"
 ) -> "tuple[Channel, ...]":
     """Return the rig's ranges to compare with those of a model; the model's own if the user chose the posed bones."""
-    if mesh_object.fdda.settings.sample != "WEIGHTS":
+    if mesh_object.fdda.settings.bones_to_pose != "WEIGHTS":
         return info.limits
     return tuple(channel for channel in channels if channel.kind != CONTROL)
 

@@ -65,7 +65,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         limits.draw_limits(layout, context, rig)
         sampling.draw_extra_inputs(layout, rig)
         if (advanced := draw_advanced(layout, "fdda_poses_advanced")) is not None:
-            for name in ("seed", "spread", "margin"):
+            for name in ("seed", "spread", "overshoot"):
                 advanced.prop(rig.mesh_object.fdda.settings, name)
 
 

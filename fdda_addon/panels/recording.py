@@ -125,8 +125,8 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
             draw_wrapped(layout, context, f"{_describe_poses(rig)} will go into '{path.name}'.")
     if check is not None and check.problems:
         draw_wrapped(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
-    if settings.target:
-        draw_wrapped(layout, context, f"It learns from '{settings.target}' (Advanced).", "INFO")
+    if settings.learn_from:
+        draw_wrapped(layout, context, f"It learns from '{settings.learn_from}' (Advanced).", "INFO")
     if content.measured_sentence:
         draw_wrapped(layout, context, content.measured_sentence)
     if content.sentence:
@@ -139,11 +139,11 @@ def _draw_settings(column: bpy.types.UILayout, context: bpy.types.Context, setti
     # The label is above the field, because a narrow sidebar would cut it off beside the field.
     field = column.column(align=True)
     field.use_property_split = False
-    field.label(text=settings.bl_rna.properties["target"].name)
-    field.prop_search(settings, "target", context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
-    if settings.target:
+    field.label(text=settings.bl_rna.properties["learn_from"].name)
+    field.prop_search(settings, "learn_from", context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
+    if settings.learn_from:
         column.prop(settings, "pre_roll")
-        column.prop(settings, "max_settle_frames")
+        column.prop(settings, "settle_frames")
 
 
 def _draw_record(

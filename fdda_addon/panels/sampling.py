@@ -40,12 +40,12 @@ def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, r
     settings = rig.mesh_object.fdda.settings
     column = layout.column()
     column.label(text="Bones to Pose")
-    column.prop(settings, "sample", text="")
-    if settings.sample == "COLLECTION":
+    column.prop(settings, "bones_to_pose", text="")
+    if settings.bones_to_pose == "COLLECTION":
         column.prop_search(settings, "bone_collection", rig.armature_object.data, "collections_all", text="")
-    elif settings.sample in {"ACTIONS", "REMIX"} and not recorded_actions(rig):
+    elif settings.bones_to_pose in {"ACTIONS", "REMIX"} and not recorded_actions(rig):
         draw_wrapped(column, context, "Check the actions below that show how the rig moves.", "INFO")
-    elif settings.sample == "SELECTED":
+    elif settings.bones_to_pose == "SELECTED":
         count = len(settings.sampled_bones)
         if not count:
             draw_wrapped(column, context, "Select bones in Pose Mode, then press the button.", "INFO")
@@ -94,18 +94,18 @@ def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     """Draw the extra inputs that the user has added, and those that were detected."""
     settings, check = rig.mesh_object.fdda.settings, checks.last_check(rig)
     detected = check.automatic_controls if check is not None else ()
-    count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)
+    count = len(check.rig.controls) if check is not None and check.rig else len(settings.extra_inputs)
     header, body = layout.panel("fdda_controls", default_closed=True)
     header.label(text=f"Extra Inputs ({count})" if count else "Extra Inputs")
     if body is None:
         return
     row = body.row()
-    row.template_list("FDDA_UL_controls", "", settings, "controls", settings, "control_index", rows=2)
+    row.template_list("FDDA_UL_controls", "", settings, "extra_inputs", settings, "extra_input_index", rows=2)
     buttons = row.column(align=True)
     buttons.operator("fdda.add_control", text="", icon="ADD").object = rig.mesh_object.name
     buttons.operator("fdda.remove_control", text="", icon="REMOVE").object = rig.mesh_object.name
-    if 0 <= settings.control_index < len(settings.controls):
-        control = settings.controls[settings.control_index]
+    if 0 <= settings.extra_input_index < len(settings.extra_inputs):
+        control = settings.extra_inputs[settings.extra_input_index]
         column = body.column(align=True)
         column.prop(control, "name", text="", placeholder="Shape key or data path")
         # Each channel of a control bone has the range of the bone.

@@ -92,14 +92,14 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
             settings = rig.mesh_object.fdda.settings
             # The labels are above the fields, because a narrow sidebar would cut them off beside the fields.
-            for name in ("fit_linear", "joints"):
+            for name in ("base_skinning", "bones_to_read"):
                 field = advanced.column(align=True)
                 field.use_property_split = False
                 field.label(text=settings.bl_rna.properties[name].name)
                 field.prop(settings, name, text="")
-            if settings.joints == "NUMBER":
-                advanced.prop(settings, "joint_count")
-            for name in ("min_partition_vertices", "epochs", "tolerance_mm", "training_seed"):
+            if settings.bones_to_read == "NUMBER":
+                advanced.prop(settings, "bone_count")
+            for name in ("min_vertices_per_part", "passes", "detail_mm", "training_seed"):
                 advanced.prop(settings, name)
             draw_path(advanced, settings, "model", default_model(rig.mesh_object))
 

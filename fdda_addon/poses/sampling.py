@@ -110,7 +110,7 @@ def sampled_channels(
         raise RigError(
             f"No bone of '{armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved by "
             "constraints; unlock an axis, give it a Limit Rotation, choose the bones that an animator poses "
-            "(--sample), or record actions alone, with 0 random poses (--action NAME --poses 0)."
+            "(--bones-to-pose), or record actions alone, with 0 random poses (--action NAME --poses 0)."
         )
     return tuple(channels)
 

@@ -19,18 +19,18 @@ from bpy.props import (
 
 from ..core.errors import OutputError
 from ..core.settings import (
-    EPOCHS,
+    DETAIL_MM,
     GOAL_MM,
-    MARGIN,
-    MAX_SETTLE_FRAMES,
-    MIN_PARTITION_VERTICES,
+    LEARN_FROM,
+    MIN_VERTICES_PER_PART,
     MIRROR,
+    OVERSHOOT,
+    PASSES,
     POSES,
     PRE_ROLL,
     SEED,
+    SETTLE_FRAMES,
     SPREAD,
-    TARGET,
-    TOLERANCE_MM,
     TRAINING_SEED,
     Setting,
 )
@@ -101,8 +101,8 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     poses: make_property(POSES)
     seed: make_property(SEED)
     spread: make_property(SPREAD)
-    margin: make_property(MARGIN)
-    sample: EnumProperty(
+    overshoot: make_property(OVERSHOOT)
+    bones_to_pose: EnumProperty(
         name="Bones to Pose",
         description="Bones that random poses move",
         items=(
@@ -124,9 +124,9 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     )
     bone_collection: StringProperty(name="Collection", description="Bone collection with the bones that animators pose")
     sampled_bones: CollectionProperty(type=FDDA_PG_bone)
-    controls: CollectionProperty(type=FDDA_PG_control)
-    control_index: IntProperty(name="Extra Input", description="Active input of the list")
-    fit_linear: EnumProperty(
+    extra_inputs: CollectionProperty(type=FDDA_PG_control)
+    extra_input_index: IntProperty(name="Extra Input", description="Active input of the list")
+    base_skinning: EnumProperty(
         name="Base Skinning",
         description="Skin weights of the linear skinning that the model corrects",
         items=(
@@ -136,7 +136,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         ),
         default="RIG",
     )
-    joints: EnumProperty(
+    bones_to_read: EnumProperty(
         name="Bones to Read",
         description="The bones that the model reads; what the others do is learned, where it follows from these",
         items=(
@@ -146,12 +146,12 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         ),
         default="ALL",
     )
-    joint_count: IntProperty(
+    bone_count: IntProperty(
         name="Number of Bones", description="How many bones the model reads", default=50, min=1, soft_max=500
     )
-    target: make_property(TARGET)
+    learn_from: make_property(LEARN_FROM)
     pre_roll: make_property(PRE_ROLL)
-    max_settle_frames: make_property(MAX_SETTLE_FRAMES)
+    settle_frames: make_property(SETTLE_FRAMES)
     mirror: make_property(MIRROR)
     recording: StringProperty(
         name="Folder",
@@ -159,17 +159,17 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    min_partition_vertices: make_property(MIN_PARTITION_VERTICES)
+    min_vertices_per_part: make_property(MIN_VERTICES_PER_PART)
     model: StringProperty(
         name="Model",
         description="File to write the trained model to. Empty for a file in a folder next to the .blend file",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    tolerance_mm: make_property(TOLERANCE_MM)
+    detail_mm: make_property(DETAIL_MM)
     use_goal: BoolProperty(name="Goal (mm)", description="Report after the training whether the goal is met")
     goal_mm: make_property(GOAL_MM)
-    epochs: make_property(EPOCHS)
+    passes: make_property(PASSES)
     training_seed: make_property(TRAINING_SEED)
 
 

@@ -22,8 +22,8 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
     return RecordingSettings(
         actions=actions,
         resume=resume,
-        sample=_sample_options(settings, actions),
-        controls=_control_options(settings),
+        bones_to_pose=_sample_options(settings, actions),
+        extra_inputs=_control_options(settings),
         target=target_settings(settings),
         **(values_from(settings, settings_of(RecordingSettings)) | {"mirror": settings.mirror and bool(actions)}),
     )
@@ -39,9 +39,9 @@ def complete_settings(scene_rig: SceneRig) -> "RecordingSettings | None":
 
 def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
     """Return the settings of the target object of a character."""
-    if not settings.target:
+    if not settings.learn_from:
         return TargetSettings()
-    return TargetSettings(settings.target, settings.pre_roll, settings.max_settle_frames)
+    return TargetSettings(settings.learn_from, settings.pre_roll, settings.settle_frames)
 
 
 def copy_settings(mesh_object: bpy.types.Object, source_object: bpy.types.Object) -> None:
@@ -49,9 +49,9 @@ def copy_settings(mesh_object: bpy.types.Object, source_object: bpy.types.Object
     settings, source = mesh_object.fdda.settings, source_object.fdda.settings
     settings.recording = source.recording or default_recording(source_object)
     settings.model = source.model or default_model(source_object)
-    for name in (*(setting.name for setting in settings_of(RecordingSettings)), "sample", "bone_collection"):
+    for name in (*(setting.name for setting in settings_of(RecordingSettings)), "bones_to_pose", "bone_collection"):
         setattr(settings, name, getattr(source, name))
-    for name, attributes in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
+    for name, attributes in (("sampled_bones", ("name",)), ("extra_inputs", ("name", "has_range", "low", "high"))):
         collection = getattr(settings, name)
         collection.clear()
         for entry in getattr(source, name):
@@ -62,18 +62,18 @@ def copy_settings(mesh_object: bpy.types.Object, source_object: bpy.types.Object
 
 def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
     """Return the bones that random poses move, in the syntax of `poses.sampling.parse_sample_selection`."""
-    if settings.sample == "COLLECTION":
+    if settings.bones_to_pose == "COLLECTION":
         if not settings.bone_collection:
             raise RigError(
                 "Bones to Pose is set to Bone Collection, but no collection is chosen; choose one in Training Poses."
             )
         return (f"collection:{settings.bone_collection}",)
-    if settings.sample in {"ACTIONS", "REMIX"}:
+    if settings.bones_to_pose in {"ACTIONS", "REMIX"}:
         if not actions:
-            label = settings.bl_rna.properties["sample"].enum_items[settings.sample].name
+            label = settings.bl_rna.properties["bones_to_pose"].enum_items[settings.bones_to_pose].name
             raise RigError(f"Bones to Pose is set to {label}, but no action is checked; check one below it.")
-        return tuple(f"action:{name}" for name in actions) if settings.sample == "ACTIONS" else ("remix",)
-    if settings.sample == "SELECTED":
+        return tuple(f"action:{name}" for name in actions) if settings.bones_to_pose == "ACTIONS" else ("remix",)
+    if settings.bones_to_pose == "SELECTED":
         if not settings.sampled_bones:
             raise RigError(
                 "Bones to Pose is set to Selected Bones, but none is chosen; select bones and press Use Selected Bones."
@@ -86,7 +86,7 @@ def _control_options(settings: FDDA_PG_character) -> tuple[str, ...]:
     """Return the named extra inputs in the syntax of `scene.controls.parse_controls`."""
     return tuple(
         f"{control.name}={control.low!r}:{control.high!r}" if control.has_range else control.name
-        for control in settings.controls
+        for control in settings.extra_inputs
         if control.name
     )
 

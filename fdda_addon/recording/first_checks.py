@@ -196,6 +196,6 @@ def check_saturation(recorded: RecordedRig) -> str:
             sentences.append(
                 f"The surface of '{scene_rig.mesh_object.name}' changes only between {low:.3g} and {high:.3g} in the "
                 f"range {control.low:g} to {control.high:g} of '{control.name}'. Give the range that is used: "
-                f"--control '{control.name}={low:.3g}:{high:.3g}', or Soft Min and Soft Max of the property."
+                f"--extra-input '{control.name}={low:.3g}:{high:.3g}', or Soft Min and Soft Max of the property."
             )
     return " ".join(sentences)

@@ -12,7 +12,7 @@ from ..core.mathematics.remix import PoseSampler
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
 from ..core.rig import Rig
-from ..core.settings import MARGIN, MIRROR, POSES, SEED, SPREAD
+from ..core.settings import MIRROR, OVERSHOOT, POSES, SEED, SPREAD
 from ..poses.clip import find_clips
 from ..poses.control_bones import split_control_bones
 from ..poses.remix import read_remix
@@ -46,28 +46,28 @@ class RecordingSettings:
         poses: number of random poses.
         seed: seed of the random poses.
         spread: standard deviation of the random poses as a ratio of half the range of motion.
-        margin: factor that widens the range of motion for some random poses (`mathematics.poses.make_margin`); 1 for no
-            margin.
+        overshoot: factor that widens the range of motion for some random poses (`mathematics.poses.make_margin`); 1 for
+            none.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
         influence_poses: number of base poses from which joints are moved alone, to find what they influence.
         resume: continue an interrupted recording.
         overwrite: replace a recording in the folder.
-        sample: control bones that the random poses move, in the syntax of `sampling.parse_sample_selection`; empty for
+        bones_to_pose: bones that the random poses move, in the syntax of `sampling.parse_sample_selection`; empty for
             the default bones.
-        controls: inputs besides the automatic controls, in the syntax of `split_control_bones` and `parse_controls`.
+        extra_inputs: inputs besides the automatic ones, in the syntax of `split_control_bones` and `parse_controls`.
         target: settings of the target whose surface is recorded.
     """
 
     poses: int = POSES.field()
     seed: int = SEED.field()
     spread: float = SPREAD.field()
-    margin: float = MARGIN.field()
+    overshoot: float = OVERSHOOT.field()
     actions: tuple[str, ...] = ()
     influence_poses: int = INFLUENCE_POSES
     resume: bool = False
-    sample: tuple[str, ...] = ()
-    controls: tuple[str, ...] = ()
+    bones_to_pose: tuple[str, ...] = ()
+    extra_inputs: tuple[str, ...] = ()
     strips: tuple[str, ...] = ()
     mirror: bool = MIRROR.field()
     target: TargetSettings = NO_TARGET
@@ -136,7 +136,7 @@ def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseS
         RigError: as `select_bones`.
     """
     remix = None
-    if REMIX in settings.sample and settings.poses:
+    if REMIX in settings.bones_to_pose and settings.poses:
         remix = read_remix(scene_rig, find_actions(settings))
     return PoseSampler(settings.seed, settings.spread, remix)
 
@@ -165,7 +165,7 @@ def read_sample_selection(
     """
     actions = find_actions(settings)
     dependencies = read_dependencies(scene_rig, actions, has_random_poses=settings.poses > 0)
-    control_bones, number_texts = split_control_bones(scene_rig, settings.controls)
+    control_bones, number_texts = split_control_bones(scene_rig, settings.extra_inputs)
 
     listed_names = set()
 
@@ -175,7 +175,7 @@ def read_sample_selection(
             listed_names.add(control.name)
             yield control
 
-    selection = parse_sample_selection(scene_rig, settings.sample, find_controls, control_bones, actions)
+    selection = parse_sample_selection(scene_rig, settings.bones_to_pose, find_controls, control_bones, actions)
     # The selected actions may key numbers that act through shape keys alone.
     unlisted_names = dependencies.key_numbers - listed_names
     controls = tuple(control for control in selection.controls if control.name not in unlisted_names)
@@ -197,10 +197,10 @@ def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[C
     Raises:
         RigError: the rig lacks a control, or its range is unknown.
     """
-    if not settings.controls:
+    if not settings.extra_inputs:
         return ()
-    control_bones, number_texts = split_control_bones(scene_rig, settings.controls)
-    selection = select_bones(scene_rig, settings.sample, control_bones, find_actions(settings))
+    control_bones, number_texts = split_control_bones(scene_rig, settings.extra_inputs)
+    selection = select_bones(scene_rig, settings.bones_to_pose, control_bones, find_actions(settings))
     number_controls = parse_controls(scene_rig, number_texts, sampled_numbers(scene_rig, selection))
     return (*controls_of_bones(scene_rig, selection), *number_controls)
 
@@ -216,7 +216,7 @@ def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tu
     Raises:
         RigError: an action or strip of the settings does not exist.
     """
-    name = REMIX if REMIX in settings.sample else ""
+    name = REMIX if REMIX in settings.bones_to_pose else ""
     sources = [Source(RANDOM, settings.poses, name)] if settings.poses else []
     clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
@@ -230,4 +230,4 @@ def make_recording_margin(
 ) -> Margin | None:
     """Make the margin of the random poses; `channels` are sampled within the range of motion."""
     fixed_channels = locked_channels(scene_rig.armature_object, channels)
-    return make_margin(channels, fixed_channels, settings.margin, settings.poses if channels else 0)
+    return make_margin(channels, fixed_channels, settings.overshoot, settings.poses if channels else 0)

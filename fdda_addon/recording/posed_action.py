@@ -43,11 +43,11 @@ def recorded_settings(info: RecordingInfo) -> RecordingSettings:
         poses=sum(source.poses for source in sampling.sources if source.kind == RANDOM),
         seed=sampling.seed,
         spread=sampling.spread,
-        margin=sampling.margin.factor if sampling.margin else 1.0,
+        overshoot=sampling.margin.factor if sampling.margin else 1.0,
         actions=names[ACTION],
         strips=names[STRIP],
         mirror=any(source.kind == MIRRORED for source in sampling.sources),
-        sample=(REMIX,) if REMIX in names[RANDOM] else (),
+        bones_to_pose=(REMIX,) if REMIX in names[RANDOM] else (),
     )
 
 

@@ -35,7 +35,7 @@ from .reference_joints import find_fixed_joints, find_references
 from .repeatability import measure_repeatability
 
 MISSING_WEIGHTS = (
-    "'{}' has no skin weights on deforming bones, so its training needs fitted ones: --fit-linear smooth, or Base "
+    "'{}' has no skin weights on deforming bones, so its training needs fitted ones: --base-skinning smooth, or Base "
     "Skinning in the sidebar."
 )
 

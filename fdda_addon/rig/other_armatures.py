@@ -74,7 +74,7 @@ def check_other_armatures(
             raise RigError(
                 f"A driver of '{scene_rig.mesh_object.name}' reads '{path}' of a second armature, "
                 f"'{armature_object.name}', which is no input of the model; name it as a control with a range "
-                f"(--control '{OTHER_OBJECT}{armature_object.name}/{path}=LOW:HIGH'), or lock it."
+                f"(--extra-input '{OTHER_OBJECT}{armature_object.name}/{path}=LOW:HIGH'), or lock it."
             )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.mathematics.poses import Channel
 from ..core.recording.target import RecordedTarget
-from ..core.settings import MAX_SETTLE_FRAMES, PRE_ROLL, REPEATABILITY_POSES, REST_THRESHOLD_MM, TARGET
+from ..core.settings import LEARN_FROM, PRE_ROLL, REPEATABILITY_POSES, REST_THRESHOLD_MM, SETTLE_FRAMES
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from .target import Target
@@ -25,16 +25,16 @@ class TargetSettings:
     Attributes:
         name: name of its object; empty for the rig itself.
         pre_roll: frames before the first frame of an action, in which the rig moves from the rest pose to that frame.
-        max_settle_frames: largest number of frames for which a random pose is held until the target is at rest; 0 to
+        settle_frames: largest number of frames for which a random pose is held until the target is at rest; 0 to
             hold no pose.
         rest_threshold_mm: the target is at rest when no vertex moves by more in a frame, mm.
         repeatability_poses: number of held poses, or frames of actions, that are set a second time, from another
             direction.
     """
 
-    name: str = TARGET.default
+    name: str = LEARN_FROM.default
     pre_roll: int = PRE_ROLL.field()
-    max_settle_frames: int = MAX_SETTLE_FRAMES.field()
+    settle_frames: int = SETTLE_FRAMES.field()
     rest_threshold_mm: float = REST_THRESHOLD_MM.field()
     repeatability_poses: int = REPEATABILITY_POSES.field()
 

@@ -131,7 +131,7 @@ class SimulatedPoseSetter(PoseSetter):
         description = super().recorded_target
         if self._settler is None:
             return description
-        settling = {"max_settle_frames": self._settler.max_frames, "rest_threshold_mm": self._settler.rest_threshold_mm}
+        settling = {"settle_frames": self._settler.max_frames, "rest_threshold_mm": self._settler.rest_threshold_mm}
         return replace(description, **settling)
 
     @property

@@ -32,7 +32,7 @@ def make_pose_setter(
         RigError: as `find_target` and `check_clips`, or the target cannot be set to these poses.
     """
     if not settings.name:
-        if settings.pre_roll or settings.max_settle_frames:
+        if settings.pre_roll or settings.settle_frames:
             raise RigError("A pre-roll and settling need a target; name one, or leave both out.")
         return DIRECT_POSE_SETTER
     target = find_target(scene_rig, settings.name, controls)
@@ -41,24 +41,22 @@ def make_pose_setter(
             f"The target '{target.name}' follows frames ({target.caches[0].description}), so it cannot show random "
             "poses; record 0 random poses, and the action that it was made with."
         )
-    if random_pose_count and target.follows == SIMULATION and not settings.max_settle_frames:
+    if random_pose_count and target.follows == SIMULATION and not settings.settle_frames:
         raise RigError(
             f"The target '{target.name}' is a simulation ({target.simulations[0].description}): what it shows in a "
             "random pose depends on the pose before; let it settle, or record 0 of them, and actions."
         )
-    if settings.max_settle_frames and (target.follows != SIMULATION or any(not c.is_simulation for c in target.caches)):
+    if settings.settle_frames and (target.follows != SIMULATION or any(not c.is_simulation for c in target.caches)):
         raise RigError(
             f"The target '{target.name}' cannot settle: {_reason_against_settling(target)}; leave settling out."
         )
-    if settings.max_settle_frames and clips:
+    if settings.settle_frames and clips:
         raise RigError(
             f"Settled poses are random ones, and '{clips[0].name}' is to be recorded too, frame by frame; leave it "
             "out, or make a recording of each."
         )
     check_clips(target, clips, settings.pre_roll)
-    settler = (
-        Settler(target, settings.max_settle_frames, settings.rest_threshold_mm) if settings.max_settle_frames else None
-    )
+    settler = Settler(target, settings.settle_frames, settings.rest_threshold_mm) if settings.settle_frames else None
     if target.simulations:
         return SimulatedPoseSetter(target, settings.pre_roll, settler)
     return PoseSetter(target, settings.pre_roll)

@@ -47,7 +47,7 @@ def describe_missing_ranges(
     if named:
         sentences.append(
             f"The surface of '{mesh_name}' depends on {format_with_noun(named, 'number')} without a range, so the "
-            "model keeps the value in the recording. Make it an input with a range: --control "
+            "model keeps the value in the recording. Make it an input with a range: --extra-input "
             f"'{named[0]}=LOW:HIGH', or Soft Min and Soft Max in the settings of the property."
         )
     if nameless:
@@ -80,7 +80,7 @@ def describe_independent_objects(
         f"The surface of '{scene_rig.mesh_object.name}' depends on the place of {format_with_noun(names, 'object')}, "
         f"which no parent or constraint attaches to '{scene_rig.armature_object.name}': the model keeps the place in "
         "the recording. If one has to move with the character, parent it to the armature or a bone; if something else "
-        "moves it, make that an extra input (--control)."
+        "moves it, make that an extra input (--extra-input)."
     )
 
 
@@ -233,7 +233,7 @@ def _keyed_input(sources: Sources, datablock: bpy.types.ID, curve: bpy.types.FCu
         return TimeInput(description, "remove them")
     low, high = value_range(curve)
     path = f"{name}[{curve.array_index}]" if is_array else name
-    remedy = f"name what they set as a control (--control '{path}={low:g}:{high:g}'), or remove them"
+    remedy = f"name what they set as a control (--extra-input '{path}={low:g}:{high:g}'), or remove them"
     return TimeInput(description, remedy)
 
 

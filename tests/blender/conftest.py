@@ -90,7 +90,7 @@ def elbow_files(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
             build_elbow()
             save_copy(files.rig)
             assert run("record", files.rig, files.recording, "--poses", 150) == 0
-            train(files.recording, files.model, "--epochs", 40)
+            train(files.recording, files.model, "--passes", 40)
             assert run("bind", files.rig, files.model, files.bound) == 0
     return files
 

@@ -56,12 +56,12 @@ def face_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_copy(folder / "face.blend")
     control_face.add_speech()
     save_copy(folder / "speech.blend")
-    bones = ("--sample", FACE, "--sample", "bone:lower", "--target", TARGET)
-    for name, options in (("with", ("--control", FACE)), ("without", ())):
+    bones = ("--bones-to-pose", FACE, "--bones-to-pose", "bone:lower", "--learn-from", TARGET)
+    for name, options in (("with", ("--extra-input", FACE)), ("without", ())):
         recording = folder / f"{name}_recording"
         options = ("--object", "elbow", "--poses", 300, "--spread", 10, *bones, *options)
         assert run("record", folder / "face.blend", recording, *options) == 0
-        train(recording, folder / f"{name}.onnx", "--epochs", 80)
+        train(recording, folder / f"{name}.onnx", "--passes", 80)
     return folder
 
 
@@ -69,7 +69,7 @@ def test_a_face_is_learned_only_with_its_control_bones(face_folder, tmp_path):
     means = {}
     for name in ("with", "without"):
         report = tmp_path / f"{name}.json"
-        options = ("--object", "elbow", "--target", TARGET, "--poses", 0, "--action", control_face.SPEECH)
+        options = ("--object", "elbow", "--learn-from", TARGET, "--poses", 0, "--action", control_face.SPEECH)
         files = (face_folder / "speech.blend", face_folder / f"{name}.onnx", "--json", report)
         assert run("evaluate", *files, *options) == 0
         (errors,) = json.loads(report.read_text())["actions"]
@@ -157,7 +157,7 @@ def test_a_model_of_another_rig_names_the_missing_control_bone(face_folder, tmp_
 
 def test_locked_and_driven_channels_are_left_out(face):
     bones = face.armature_object.pose.bones
-    settings = RecordingSettings(controls=(FACE,))
+    settings = RecordingSettings(extra_inputs=(FACE,))
     assert {control.path for control in listed_controls(face, settings)} == PATHS
     bones["brow"].lock_location[0] = True
     bones["mouth"].driver_add("scale", 2)
@@ -165,23 +165,23 @@ def test_locked_and_driven_channels_are_left_out(face):
     paths = {control.path for control in listed_controls(face, settings)}
     assert paths == PATHS - {path for path in PATHS if "location[0]" in path or "lid" in path or "scale" in path}
     with pytest.raises(RigError, match="No channel of the 1 control bones of 'elbow_rig', such as 'still', may move"):
-        listed_controls(face, RecordingSettings(controls=("bone:still",)))
+        listed_controls(face, RecordingSettings(extra_inputs=("bone:still",)))
     with pytest.raises(RigError, match="'elbow_rig' has no bone collection 'Mouth'; its collections: 'Face'"):
-        listed_controls(face, RecordingSettings(controls=("collection:Mouth",)))
+        listed_controls(face, RecordingSettings(extra_inputs=("collection:Mouth",)))
 
 
 def test_control_bones_are_posed_besides_the_default_bones(face):
     """Their locations without limits take the ranges of recorded actions; without any they are reported."""
-    rig, channels = read_sampled_rig(face, RecordingSettings(controls=("bone:brow",)))
+    rig, channels = read_sampled_rig(face, RecordingSettings(extra_inputs=("bone:brow",)))
     assert {channel.name for channel in channels} == {"upper", "lower", "brow", "lid", "mouth"}
     assert set(rig.joint_names) == {"upper", "lower"}, "bones that are posed and have no weights are no joints"
     brow = face.armature_object.pose.bones["brow"]
     brow.constraints.remove(brow.constraints[0])
     brow.lock_rotation[0] = False
-    controls = listed_controls(face, RecordingSettings(controls=("bone:brow",)))
+    controls = listed_controls(face, RecordingSettings(extra_inputs=("bone:brow",)))
     assert len(controls) == 2 and bones_without_location_range(face.armature_object, ["brow"], controls) == ["brow"]
     control_face.add_speech()
-    settings = RecordingSettings(controls=("bone:brow",), actions=(control_face.SPEECH,))
+    settings = RecordingSettings(extra_inputs=("bone:brow",), actions=(control_face.SPEECH,))
     controls = listed_controls(face, settings)
     assert {control.path[-11:] for control in controls if "location" in control.path} == {"location[0]", "location[2]"}
     assert bones_without_location_range(face.armature_object, ["brow"], controls) == []
@@ -219,7 +219,7 @@ def test_cosine_and_sine_are_read_from_the_matrix(face, axis):
 
 
 def test_constraints_of_control_bones_are_read_unless_drivers_read_the_channels(face):
-    bones, controls = face.armature_object.pose.bones, listed_controls(face, RecordingSettings(controls=(FACE,)))
+    bones, controls = face.armature_object.pose.bones, listed_controls(face, RecordingSettings(extra_inputs=(FACE,)))
     bones["brow"].location = (0.5, 0, 0)
     bones["lid"].rotation_euler[1], bones["mouth"].scale[2] = 2.0, 3.0
     bones["still"].rotation_euler = (0.3, 0.6, 0)
@@ -257,7 +257,7 @@ def test_a_constraint_along_an_axis_that_is_no_input_warns(bound_face):
 def test_sixty_control_bones_are_read_through_sixty_dependencies():
     control_face.many_control_bones(60)
     rig = find_rig("elbow")
-    controls = listed_controls(rig, RecordingSettings(controls=(FACE,)))
+    controls = listed_controls(rig, RecordingSettings(extra_inputs=(FACE,)))
     reader = ControlReader(rig, controls)
     assert len(controls) == 60 * 9 and len(reader.sources) == 60
     buffer = rig.mesh_object
@@ -273,7 +273,7 @@ def test_sixty_control_bones_are_read_through_sixty_dependencies():
 
 def test_a_collection_takes_no_range(face):
     with pytest.raises(RigError, match="has no bone collection 'Face=0:1'"):
-        listed_controls(face, RecordingSettings(controls=(f"{FACE}=0:1",)))
+        listed_controls(face, RecordingSettings(extra_inputs=(f"{FACE}=0:1",)))
 
 
 def test_custom_properties_without_a_range_are_named(face, capfd):
@@ -285,7 +285,7 @@ def test_custom_properties_without_a_range_are_named(face, capfd):
         """The custom property 'pu"ff' of 'mouth' and 1 more has no range and is no input; set Soft Min and Soft Max """
         "in the settings of the property."
     )
-    controls = listed_controls(face, RecordingSettings(controls=("bone:mouth",)))
+    controls = listed_controls(face, RecordingSettings(extra_inputs=("bone:mouth",)))
     sentence = describe_control_bones(armature_object, ["mouth"], controls)
     assert sentence == f"1 control bone with 2 inputs. {expected}"
 
@@ -296,7 +296,7 @@ def test_custom_properties_without_a_range_are_named(face, capfd):
     assert f"Info: Added {sentence}" in capfd.readouterr().out
     mouth.id_properties_ui("strap").update(soft_min=0.0, soft_max=1.0)
     listed = ("bone:mouth", """armature_object/pose.bones["mouth"]["pu\\"ff"]=0:1""")
-    controls = listed_controls(face, RecordingSettings(controls=listed))
+    controls = listed_controls(face, RecordingSettings(extra_inputs=listed))
     assert describe_control_bones(armature_object, ["mouth"], controls) == "1 control bone with 4 inputs."
 
 
@@ -316,6 +316,6 @@ def test_locations_without_a_range_are_named_unless_an_axis_has_one(face):
 def test_control_bones_with_brackets_in_their_names_are_counted_one_by_one(face):
     bones = face.armature_object.pose.bones
     bones["eye"].name, bones["lid"].name = "upper]eye", "upper]lid"
-    controls = listed_controls(face, RecordingSettings(controls=("bone:upper]eye", "bone:upper]lid")))
+    controls = listed_controls(face, RecordingSettings(extra_inputs=("bone:upper]eye", "bone:upper]lid")))
     sentence = describe_control_bones(face.armature_object, ["upper]eye", "upper]lid"], controls)
     assert sentence.startswith("2 control bones with 8 inputs.")

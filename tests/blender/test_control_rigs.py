@@ -38,9 +38,9 @@ def character(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     files = Character(folder / "rig.blend", folder / "recording", folder / "model.onnx")
     command = [sys.executable, "-m", rigify.__name__, request.param, files.rig]
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL, timeout=300)
-    sample = ("--sample", f"action:{rigify.REHEARSAL}", "--action", rigify.REHEARSAL)
+    sample = ("--bones-to-pose", f"action:{rigify.REHEARSAL}", "--action", rigify.REHEARSAL)
     assert run("record", files.rig, files.recording, "--poses", 150, *sample) == 0
-    train(files.recording, files.model, "--epochs", 50)
+    train(files.recording, files.model, "--passes", 50)
     return files
 
 

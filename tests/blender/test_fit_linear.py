@@ -83,7 +83,7 @@ def make_fitted_character(tmp_path_factory: pytest.TempPathFactory) -> Callable[
             build()
             save_copy(files[0])
             assert run("record", *files[:2], "--object", ELBOW, "--poses", 120) == 0
-            train(*files[1:], "--epochs", 25, "--fit-linear", kind)
+            train(*files[1:], "--passes", 25, "--base-skinning", kind)
             characters[kind] = FittedCharacter(*files)
         return characters[kind]
 
@@ -154,7 +154,7 @@ def test_a_mesh_without_weights_is_recorded_and_needs_fitted_ones(refusal, tmp_p
         assert run("record", tmp_path / f"{name}.blend", tmp_path / name, "--object", ELBOW, "--poses", 12) == 0
         assert MISSING_WEIGHTS.format(ELBOW) in capfd.readouterr().out
         text = refusal("train", tmp_path / name, tmp_path / "m.onnx")
-        assert text.startswith("The vertices of 'elbow' follow no bone by skin weights") and "--fit-linear" in text
+        assert text.startswith("The vertices of 'elbow' follow no bone by skin weights") and "--base-skinning" in text
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "cloth.blend"))
     settings = bpy.data.objects[ELBOW].fdda.settings
     settings.recording = str(tmp_path / "other")
@@ -171,7 +171,7 @@ def test_all_meshes_are_those_with_an_armature_modifier_and_others_are_named(tmp
     assert [path.name for path in (tmp_path / "recordings").iterdir()] == ["body"]
     assert (
         "Left out: the mesh 'elbow', because no Armature modifier deforms it. Other modifiers follow the armature; "
-        "record such a mesh by itself (--object 'elbow' --fit-linear smooth)."
+        "record such a mesh by itself (--object 'elbow' --base-skinning smooth)."
     ) in capfd.readouterr().out
 
 
@@ -186,7 +186,7 @@ def test_the_times_of_a_mesh_without_armature_modifier_lack_linear_skinning(make
 
 def test_fitting_to_too_few_poses_is_refused(refusal, tmp_path):
     assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 9) == 0
-    text = refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--fit-linear", "hard")
+    text = refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--base-skinning", "hard")
     assert text.startswith(
         "Skin weights are fitted to at least 10 poses, and the recording has 9; record more, or leave --fit"
     )
@@ -197,5 +197,5 @@ def test_a_python_without_scipy_is_named(refusal, elbow_files, tmp_path, monkeyp
     packages.mkdir()
     (packages / "sitecustomize.py").write_text("import sys\nsys.modules['scipy'] = None\n")
     import_from(packages, monkeypatch)
-    text = refusal("train", elbow_files.recording, tmp_path / "m.onnx", "--fit-linear", "smooth")
+    text = refusal("train", elbow_files.recording, tmp_path / "m.onnx", "--base-skinning", "smooth")
     assert "'scipy'" in text

@@ -86,7 +86,7 @@ def test_joints_influence_their_chain_and_shape_keys_what_they_move(
     monkeypatch.setattr(meshes, "CHAINS", 6)
     monkeypatch.setattr(meshes, "BONES_PER_CHAIN", 8)
     build()
-    settings = RecordingSettings(poses=1, sample=sample)
+    settings = RecordingSettings(poses=1, bones_to_pose=sample)
     drain(record(find_rig(), tmp_path / "recording", settings))
     recording = skin_recording(read_recording(tmp_path / "recording"))
     chain_and_bone = [tuple(map(int, name.split(".")[1:])) for name in recording.rig.joint_names]

@@ -62,7 +62,7 @@ def limb_files(tmp_path_factory) -> LimbFiles:
     limb_with_helpers()
     save_copy(files[0])
     assert run("record", *files[:2], "--poses", 300) == 0
-    train(*files[1:], "--epochs", 60, "--joints", "auto")
+    train(*files[1:], "--passes", 60, "--bones-to-read", "auto")
     return LimbFiles(*files)
 
 
@@ -75,7 +75,7 @@ def trained(rig: SceneRig, folder: Path, *options: object, settings: RecordingSe
     """Record a rig, unless it is recorded, and train a model with key joints; return the metadata of the model."""
     if not folder.exists():
         drain(record(rig, folder / "recording", settings))
-    train(folder / "recording", folder / "model.onnx", "--epochs", 1, "--joints", *(options or ("auto",)))
+    train(folder / "recording", folder / "model.onnx", "--passes", 1, "--bones-to-read", *(options or ("auto",)))
     return read_model_info(folder / "model.onnx")
 
 
@@ -304,7 +304,7 @@ def test_a_bone_that_a_control_moves_follows_from_the_control(tmp_path):
     info = trained(rig, tmp_path / "without", settings=settings)
     assert len(info.joints) == 3
     assert "No random pose moves 1 of the others ('push.1') relative to their parents, so" in info.skin_sentence
-    settings = dataclasses.replace(settings, controls=('armature_object/["puff"]',))
+    settings = dataclasses.replace(settings, extra_inputs=('armature_object/["puff"]',))
     info = trained(rig, tmp_path / "with", settings=settings)
     assert info.joint_names == MAIN_BONES and any(partition.controls for partition in info.partitions)
 
@@ -356,13 +356,13 @@ def test_a_root_that_follows_another_is_moved_with_it(tmp_path):
 def test_the_sidebar_trains_with_other_joints_without_recording_again(tmp_path):
     rig = build_limb()
     settings, files = rig.mesh_object.fdda.settings, (tmp_path / "recording", tmp_path / "model.onnx")
-    settings.poses, settings.epochs = 160, 1
+    settings.poses, settings.passes = 160, 1
     assert bpy.ops.fdda.record(object="limb", folder=str(files[0])) == {"FINISHED"}
     recorded = (files[0] / "recording.json").read_bytes()
     sampling = read_index(files[0])["sampling"]
     sampling["sources"] = [source for source in sampling["sources"] if source["kind"] != "alone"]
-    for joints, fit_linear, joint_count in (("ALL", "RIG", 7), ("AUTO", "RIG", 3), ("NUMBER", "HARD", 5)):
-        settings.joints, settings.joint_count, settings.fit_linear = joints, 5, fit_linear
+    for joints, base_skinning, joint_count in (("ALL", "RIG", 7), ("AUTO", "RIG", 3), ("NUMBER", "HARD", 5)):
+        settings.bones_to_read, settings.bone_count, settings.base_skinning = joints, 5, base_skinning
         content = read_folder(files[0], read_rig(rig), sampling)
         assert (content.state, content.sentence) == (FolderState.COMPLETE, "")
         paths = {"recording": str(files[0]), "model": str(files[1])}
@@ -383,8 +383,8 @@ def test_the_sidebar_trains_with_other_joints_without_recording_again(tmp_path):
 def test_too_few_random_poses_are_refused(refusal, tmp_path):
     rig = build_limb()
     drain(record(rig, tmp_path / "recording", dataclasses.replace(SETTINGS, poses=20)))
-    assert refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--joints", "auto").startswith(
+    assert refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--bones-to-read", "auto").startswith(
         "Key joints are chosen by at least 40 random poses, and the recording has 20; record more (--poses), "
-        "or leave --joints"
+        "or leave --bones-to-read"
     )
-    assert run("train", tmp_path / "recording", tmp_path / "m.onnx", "--joints", "0") == 2
+    assert run("train", tmp_path / "recording", tmp_path / "m.onnx", "--bones-to-read", "0") == 2

@@ -14,7 +14,7 @@ from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import skin_recording
-from fdda_addon.core.settings import MIN_PARTITION_VERTICES
+from fdda_addon.core.settings import MIN_VERTICES_PER_PART
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW, ELBOW_RIG, run, train
@@ -135,16 +135,16 @@ class TestSmallPartitions:
             ((13,), "2 partitions of fewer than 13 vertices are merged: 'tip' into 'lower', 'nail'", [156, 144]),
             ((0,), "", [156, 132, 9, 3]),
         ):
-            options = [argument for value in options for argument in ("--min-partition-vertices", value)]
+            options = [argument for value in options for argument in ("--min-vertices-per-part", value)]
             capfd.readouterr()
-            assert run("train", tmp_path / "r", tmp_path / "m.onnx", "--epochs", 1, *options) == 0
+            assert run("train", tmp_path / "r", tmp_path / "m.onnx", "--passes", 1, *options) == 0
             printed = "".join(capfd.readouterr())
             assert line in printed and ("merged" in printed) == bool(line)
             assert [p.vertices for p in read_model_info(tmp_path / "m.onnx").partitions] == sizes
 
     def test_the_model_and_its_evaluation_have_them(self, rig, tmp_path, capsys):
         assert run("record", rig, tmp_path / "r", "--poses", 60) == 0
-        train(tmp_path / "r", tmp_path / "m.onnx", "--epochs", 20)
+        train(tmp_path / "r", tmp_path / "m.onnx", "--passes", 20)
         assert run("evaluate", rig, tmp_path / "m.onnx", "--json", tmp_path / "e.json", "--poses", 20) == 0
         evaluation = json.loads((tmp_path / "e.json").read_text(encoding="utf-8"))
         sizes = {p["joint"]: p["vertices"] for p in evaluation["partitions"]}
@@ -159,4 +159,4 @@ class TestSmallPartitions:
 
     def test_the_sidebar_has_the_same_default(self, rig):
         bpy.ops.wm.open_mainfile(filepath=str(rig))
-        assert bpy.data.objects[ELBOW].fdda.settings.min_partition_vertices == MIN_PARTITION_VERTICES
+        assert bpy.data.objects[ELBOW].fdda.settings.min_vertices_per_part == MIN_VERTICES_PER_PART

@@ -149,7 +149,7 @@ def test_contradicting_options_of_record_are_refused(elbow_files, recording, cap
 
 def test_training_refines_until_the_goal_is_met(elbow_files, recording, tmp_path, capfd):
     model = tmp_path / "m.onnx"
-    quick = ("--epochs", 4, "--hidden", 8)
+    quick = ("--passes", 4, "--hidden", 8)
     train(recording, model, *quick)
     goal_mm = 0.9 * read_model_info(model).held_out_mm["p999"]
     assert run("train", recording, model, *quick, "--goal-mm", goal_mm, "--refine", elbow_files.rig, "--poses", 40) == 0

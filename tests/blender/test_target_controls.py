@@ -15,7 +15,7 @@ from fdda_addon.scene.blend_file import save_copy
 from .conftest import run
 
 SLIDE = 'armature_object/pose.bones["slider"].location[0]'
-ARM = ("--sample", "bone:lower", "--sample", "bone:slider")
+ARM = ("--bones-to-pose", "bone:lower", "--bones-to-pose", "bone:slider")
 
 
 def face() -> None:
@@ -52,7 +52,7 @@ def test_a_control_that_moves_the_target_through_other_bones_is_an_input(tmp_pat
     face()
     save_copy(tmp_path / "rig.blend")
     control = SLIDE if bounds[0] == -0.05 else f"{SLIDE}={bounds[0]}:{bounds[1]}"
-    recording = recorded(tmp_path, "--target", "flesh", "--poses", 20, *ARM, "--control", control)
+    recording = recorded(tmp_path, "--learn-from", "flesh", "--poses", 20, *ARM, "--extra-input", control)
     assert list(recording.rig.joint_names) == ["upper", "lower"]
     partition = next(p for p in skin_recording(recording).partitions if recording.rig.joint_names[p.joint] == "lower")
     assert partition.controls == (0,)
@@ -69,7 +69,7 @@ def test_a_control_of_a_bone_that_is_a_joint_is_an_input(tmp_path):
     targets.target_copy()
     save_copy(tmp_path / "rig.blend")
     bend = 'armature_object/pose.bones["lower"].rotation_euler[0]'
-    recording = recorded(tmp_path, "--target", "flesh", "--poses", 20, "--control", bend)
+    recording = recorded(tmp_path, "--learn-from", "flesh", "--poses", 20, "--extra-input", bend)
     assert [partition.controls for partition in skin_recording(recording).partitions] == [(0,), (0,)]
     assert np.ptp(recording.controls) > 0.5
 
@@ -100,10 +100,10 @@ def test_a_keyed_property_that_is_a_control_does_not_bind_the_target_to_frames(t
     keyed_smile()
     save_copy(tmp_path / "rig.blend")
     action = bpy.data.objects["elbow_rig"].animation_data.action.name
-    options = ("--object", "elbow", "--target", "flesh", "--poses", 20)
+    options = ("--object", "elbow", "--learn-from", "flesh", "--poses", 20)
     assert run("record", tmp_path / "rig.blend", tmp_path / "without", *options) == 1
     assert "follows frames (the keys of '[\"smile\"]' of 'elbow_rig')" in capsys.readouterr().err
-    recording = recorded(tmp_path, "--target", "flesh", "--poses", 20, "--control", SMILE, "--action", action)
+    recording = recorded(tmp_path, "--learn-from", "flesh", "--poses", 20, "--extra-input", SMILE, "--action", action)
     assert recording.info.target.follows == "pose"
     assert np.ptp(np.array(recording.controls)[:20, 0]) > 0.5
     # Half of the vertices move by 50 mm with the property.

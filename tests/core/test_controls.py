@@ -50,7 +50,7 @@ def test_influences_follow_from_poses_in_which_inputs_move_alone(tmp_path):
     partitions = make_partitions(rig, {0: (1,), 1: (2,)}, {1: (1,), 3: (0,)})
     arrays = random_poses(POSE_COUNT), random_positions(POSE_COUNT), control_values(POSE_COUNT)
     write_recording(tmp_path / "r", rig, partitions, recording_info(POSE_COUNT), *arrays)
-    skinned = read_skinned(tmp_path / "r", min_partition_vertices=0)
+    skinned = read_skinned(tmp_path / "r", min_vertices_per_part=0)
     assert [(p.joint, p.influencing, p.controls) for p in skinned.partitions] == [
         *((0, (1,), ()), (1, (2,), (1,)), (2, (), ()), (3, (), (0,)))
     ]
@@ -58,7 +58,7 @@ def test_influences_follow_from_poses_in_which_inputs_move_alone(tmp_path):
     for partition in skinned.partitions:
         residuals = SkinnedRecording.compute_partition_residuals(skinned, partition)
         np.testing.assert_allclose(residuals, skinned.residuals[:, partition.vertices], atol=1e-6)
-    (merged,) = read_skinned(tmp_path / "r", min_partition_vertices=100).partitions
+    (merged,) = read_skinned(tmp_path / "r", min_vertices_per_part=100).partitions
     assert merged.influencing == (1, 2) and merged.controls == (0, 1)
     assert read_skinned(tmp_path / "r", influence_tolerance=2.0).partitions[0].influencing == ()
 
@@ -70,7 +70,7 @@ def test_positions_that_stop_being_finite_are_influenced(tmp_path):
     first_vertex = make_partitions(rig)[3].vertices[0]
     positions[6 + 1 + 0, first_vertex] = np.nan
     np.save(tmp_path / "r" / "positions.npy", positions)
-    skinned = skin_recording(read_recording(tmp_path / "r"), min_partition_vertices=0, note=notes.append)
+    skinned = skin_recording(read_recording(tmp_path / "r"), min_vertices_per_part=0, note=notes.append)
     assert skinned.partitions[3].influencing == (0,) and len(skinned.rows) == 6
     assert "are not finite in 1 tests of its influences, as when 'root' moves from the rest pose" in notes[0]
 

@@ -127,7 +127,7 @@ def test_residuals_larger_than_bones_are_reported(clean_recording):
         "Residuals are larger than bones and vertices of 1 of 4 partitions, most of 'lower', 696 mm rms where bone and "
         "vertices are 254 mm long: "
     )
-    assert text.endswith("or have weights fitted (--fit-linear smooth).")
+    assert text.endswith("or have weights fitted (--base-skinning smooth).")
 
 
 def test_one_huge_residual_is_reported(clean_recording):

@@ -36,7 +36,7 @@ class Character:
 
 def train_character(recording: Path) -> Character:
     model = recording.with_suffix(".onnx")
-    assert train([str(recording), str(model), "--epochs", "20", "--hidden", "16", "16", "--batch-size", "16"]) == 0
+    assert train([str(recording), str(model), "--passes", "20", "--hidden", "16", "16", "--batch-size", "16"]) == 0
     return Character(model, recording)
 
 

@@ -74,7 +74,7 @@ def test_a_control_that_is_not_set_has_its_value_nearest_to_zero(
     assert low > 0.2
     value, other_value = (0.9, low) if is_set else (low, 0.9)
     positions = run_and_load(
-        tmp_path, controlled_chain.model, *TURN_OPTIONS, *(["--control", CONTROL_NAME, value] if is_set else [])
+        tmp_path, controlled_chain.model, *TURN_OPTIONS, *(["--extra-input", CONTROL_NAME, value] if is_set else [])
     )
     assert np.abs(positions - expected_positions(controlled_chain.model, ROTATIONS, (value,))).max() < 1e-5
     assert np.abs(positions - expected_positions(controlled_chain.model, ROTATIONS, (other_value,))).max() > 5e-3
@@ -94,11 +94,11 @@ def test_unknown_joints_and_controls_are_reported_in_one_sentence(
     for arguments, sentence in (
         (["--turn", "elbow", 1, 2, 3], "The model has no joint elbow; it has: bone_0, bone_1, bone_2, bone_3."),
         (["--turn", "", 1, 2, 3], "The model has no joint ''; it has: bone_0, bone_1, bone_2, bone_3."),
-        (["--control", "smile", 1], "The model has no control smile; it has: none."),
+        (["--extra-input", "smile", 1], "The model has no control smile; it has: none."),
     ):
         result = run_example(tmp_path, chain.model, output_path, *arguments)
         assert (result.returncode, result.stderr, output_path.exists()) == (1, sentence + "\n", False)
-    result = run_example(tmp_path, controlled_chain.model, output_path, "--control", "smile", 1)
+    result = run_example(tmp_path, controlled_chain.model, output_path, "--extra-input", "smile", 1)
     assert result.stderr == f"The model has no control smile; it has: {CONTROL_NAME}.\n"
 
 

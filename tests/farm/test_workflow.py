@@ -18,7 +18,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = [sys.executable, str(Path(__file__).with_name("programs.py"))]
-DEFAULTS = {"record": {"poses": 20}, "train": {"epochs": 2, "hidden": [8]}, "evaluate": {"poses": 4}}
+DEFAULTS = {"record": {"poses": 20}, "train": {"passes": 2, "hidden": [8]}, "evaluate": {"poses": 4}}
 STREAMS = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
 
 
@@ -67,7 +67,7 @@ def test_a_character_is_made_once_and_again_after_a_change(tmp_path):
     assert farm.run("elbow").returncode == 0 and farm.new_calls() == [], "the rig has the same content"
     (output / "elbow.blend").unlink()
     assert farm.run("elbow").returncode == 0 and farm.new_calls() == ["bind"]
-    farm.plan["characters"]["elbow"]["train"] = {"epochs": 3}
+    farm.plan["characters"]["elbow"]["train"] = {"passes": 3}
     os.utime(output / "elbow.blend")
     assert farm.run("elbow").returncode == 1 and farm.new_calls() == ["evaluate", "train"]
     assert "elbow.blend' has changed since" in (work / "bind/log").read_text(), "the work of others is not overwritten"

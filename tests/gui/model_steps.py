@@ -61,7 +61,7 @@ def check_the_trainer(_folder: Path) -> Iterator[float]:
 def train(folder: Path) -> Iterator[float]:
     """Press Train: Blender stays responsive, and the model is more accurate than linear skinning."""
     job = extension_module("jobs.job")
-    epochs = arm_object().fdda.settings.epochs
+    epochs = arm_object().fdda.settings.passes
     yield from sidebar.press_button("fdda.train")
     yield from wait_until(lambda: job.current() is not None, 10, "the button starts no training")
     longest_wait, state = 0.0, job.current()

@@ -50,7 +50,7 @@ def choose_the_bones_to_pose(folder: Path) -> Iterator[float]:
     bone_name = next(bone.name for bone in bones if len(bone.children) == 1)
     for bone in bones:
         (bone if hasattr(bone, "select") else bone.bone).select = bone.name == bone_name
-    settings.sample = "SELECTED"
+    settings.bones_to_pose = "SELECTED"
     yield from redraw_window()
     yield from sidebar.press_button("fdda.use_selected_bones")
     require(
@@ -60,7 +60,7 @@ def choose_the_bones_to_pose(folder: Path) -> Iterator[float]:
     posed_bones = [bone.name for bone in bones if max(map(abs, bone.rotation_euler)) > 1e-6]
     require(posed_bones == [bone_name], f"the random pose moves {posed_bones}, not only {bone_name}")
     yield from save_screenshot(folder / "chosen_bone.png")
-    settings.sample = "WEIGHTS"
+    settings.bones_to_pose = "WEIGHTS"
     yield from redraw_window()
 
 

@@ -63,7 +63,7 @@ def play_with_the_tab_open(folder: Path) -> Iterator[float]:
 
 def adjust_last_operation_after_training(folder: Path) -> Iterator[float]:
     """Press Train, and F9 after its end: nothing is trained again, and the model file is unchanged."""
-    arm_object().fdda.settings.epochs = EPOCHS
+    arm_object().fdda.settings.passes = EPOCHS
     yield from sidebar.open_section("training")
     yield from sidebar.press_button("fdda.train")
     yield from wait_for_job("train", 120)

@@ -229,7 +229,7 @@ def close_the_file_while_it_trains(folder: Path) -> Iterator[float]:
     job = extension_module("jobs.job")
     work = folder / "work" / "elsewhere"
     shutil.copytree(folder / "work" / "arm_recording", work / "arm_recording")
-    arm_object().fdda.settings.epochs, arm_object().fdda.settings.model = ENDLESS_EPOCHS, "//long/arm.onnx"
+    arm_object().fdda.settings.passes, arm_object().fdda.settings.model = ENDLESS_EPOCHS, "//long/arm.onnx"
     bpy.ops.wm.save_mainfile()
     yield 1.5
     yield from sidebar.open_section("training")
@@ -257,7 +257,7 @@ def record_train_and_bind(folder: Path) -> Iterator[float]:
     yield 0.5
     bpy.ops.fdda.add_sample_arm(density="1")
     settings = arm_object().fdda.settings
-    settings.poses, settings.epochs = 60, 20
+    settings.poses, settings.passes = 60, 20
     bpy.ops.wm.save_as_mainfile(filepath=str(folder_of_file / BLEND_FILE_NAME))
     yield from redraw_window()
     yield from sidebar.open_section("rig")

@@ -15,7 +15,7 @@ from trainer.__main__ import main  # Imported first, because torch reads the var
 from .chain import write_chain
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-QUICK_OPTIONS = ("--epochs", "40", "--hidden", "24", "24", "--batch-size", "16")
+QUICK_OPTIONS = ("--passes", "40", "--hidden", "24", "24", "--batch-size", "16")
 
 
 def start_trainer(*arguments: str | Path, **options) -> subprocess.Popen:

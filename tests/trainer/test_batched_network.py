@@ -15,7 +15,7 @@ from trainer.preparation import PartitionData, prepare_partition
 
 from .chain import chain_angles
 
-CONFIG = TrainingConfig(epochs=30, hidden=(16, 16), batch_size=16, tolerance_mm=0.01, learning_rate=0.01)
+CONFIG = TrainingConfig(passes=30, hidden=(16, 16), batch_size=16, detail_mm=0.01, learning_rate=0.01)
 
 
 def make_partition_data(inputs: int, vertices: int, seed: int, poses: int = 150) -> PartitionData:
@@ -29,7 +29,7 @@ def make_partition_data(inputs: int, vertices: int, seed: int, poses: int = 150)
 
 def train_partitions(partitions, config=CONFIG, **options):
     split = split_poses(np.arange(len(partitions[0].features)), config.validation_fraction, config.seed)
-    prepared = [prepare_partition(p, split, config.tolerance_mm, config.seed) for p in partitions]
+    prepared = [prepare_partition(p, split, config.detail_mm, config.seed) for p in partitions]
     return prepared, train(prepared, split, config, torch.device("cpu"), **options)
 
 
@@ -78,7 +78,7 @@ def test_the_training_returns_the_weights_of_the_best_epoch():
 
 def test_one_seed_gives_the_same_weights_and_another_does_not():
     partitions = [make_partition_data(3, 10, 2), make_partition_data(2, 5, 3)]
-    config = TrainingConfig(epochs=3, hidden=(8,), batch_size=16)
+    config = TrainingConfig(passes=3, hidden=(8,), batch_size=16)
     first, second = ([p.network for p in train_partitions(partitions, config)[1]] for _ in range(2))
     for first_network, second_network in zip(first, second, strict=True):
         for first_array, second_array in zip(
@@ -87,7 +87,7 @@ def test_one_seed_gives_the_same_weights_and_another_does_not():
             strict=True,
         ):
             np.testing.assert_array_equal(first_array, second_array)
-    reseeded_config = TrainingConfig(seed=1, epochs=3, hidden=(8,), batch_size=16)
+    reseeded_config = TrainingConfig(seed=1, passes=3, hidden=(8,), batch_size=16)
     assert not np.array_equal(
         train_partitions(partitions, reseeded_config)[1][0].network.weights[0], first[0].weights[0]
     )
@@ -133,7 +133,7 @@ def test_irrelevant_inputs_are_suppressed(monkeypatch):
 
 def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
     partitions = [make_partition_data(3, 10, 2), make_partition_data(5, 7, 1)]
-    config = replace(CONFIG, epochs=3)
+    config = replace(CONFIG, passes=3)
     before = train_partitions(partitions, config)[1]
     loop_run = _Loop.run
 
@@ -151,7 +151,7 @@ def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
 def test_a_warm_start_keeps_the_outputs():
     partitions = [make_partition_data(3, 10, 2), make_partition_data(5, 7, 1)]
     prepared, first = train_partitions(partitions)
-    paused_config = replace(CONFIG, epochs=10, learning_rate=1e-12)
+    paused_config = replace(CONFIG, passes=10, learning_rate=1e-12)
     restarted = train_partitions(partitions, paused_config, initial=[p.network for p in first])[1]
     for partition, former in zip(restarted, first, strict=True):
         np.testing.assert_allclose(partition.curves.validation_mm, min(former.curves.validation_mm), rtol=1e-3)

@@ -30,7 +30,7 @@ from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_ch
 from .conftest import QUICK_OPTIONS
 from .test_low_rank import INFLUENCING, JOINTS, POSES, VERTICES, sliding_residuals
 
-CONFIG = TrainingConfig(epochs=60, hidden=(16, 16), batch_size=16)
+CONFIG = TrainingConfig(passes=60, hidden=(16, 16), batch_size=16)
 VERTEX_COUNT = 40
 
 

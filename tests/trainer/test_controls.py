@@ -81,7 +81,7 @@ def controlled_recording(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def model(controlled_recording) -> Path:
     path = controlled_recording.parent / "model.onnx"
-    assert main([str(controlled_recording), str(path), *QUICK_OPTIONS, "--epochs", "100"]) == 0
+    assert main([str(controlled_recording), str(path), *QUICK_OPTIONS, "--passes", "100"]) == 0
     return path
 
 
@@ -239,7 +239,7 @@ def test_a_warm_start_requires_the_same_controls(controlled_recording, model, tm
         shutil.copy(path, tmp_path)
     model_copy = tmp_path / "model.onnx"
     error_before = json.loads(model.with_name("report.json").read_text())["fdda"]["held_out"]["mean"]
-    assert main([str(controlled_recording), str(model_copy), *QUICK_OPTIONS, "--epochs", "10", "--warm-start"]) == 0
+    assert main([str(controlled_recording), str(model_copy), *QUICK_OPTIONS, "--passes", "10", "--warm-start"]) == 0
     error_after = json.loads((tmp_path / "report.json").read_text())["fdda"]["held_out"]["mean"]
     assert error_after < 1.5 * error_before
     reordered_rig = controlled_rig(PUFF, BULGE, LOCKED)

@@ -45,7 +45,7 @@ def run_module(*arguments) -> subprocess.CompletedProcess:
 
 def test_an_ascii_terminal_shows_escaped_names(recording, tmp_path):
     model = tmp_path / "modèle.onnx"
-    process = run_module("trainer", recording, model, "--epochs", "2", "--hidden", "8")
+    process = run_module("trainer", recording, model, "--passes", "2", "--hidden", "8")
     assert process.returncode == 0, process.stderr
     assert rb"\u524d\u8155.L" in process.stdout and b"Wurzel \\xdf" in process.stdout
     assert model.exists()
@@ -56,6 +56,6 @@ def test_an_ascii_terminal_shows_escaped_names(recording, tmp_path):
 @pytest.mark.skipif(systems.WINDOWS, reason="On Windows every file name is text.")
 def test_a_model_name_that_is_not_utf_8_is_written(recording, tmp_path):
     model = os.fsencode(tmp_path) + b"/m\xff.onnx"
-    process = run_module("trainer", recording, model, "--epochs", "2", "--hidden", "8")
+    process = run_module("trainer", recording, model, "--passes", "2", "--hidden", "8")
     assert process.returncode == 0, process.stderr
     assert os.path.exists(model) and (tmp_path / "report.html").exists()

@@ -34,14 +34,14 @@ def train_chain(folder: Path, poses: int, *options: str) -> list[dict]:
 
 def test_too_few_components_are_the_cause(tmp_path):
     """With a tolerance of two millimeters, components do not represent most of the error."""
-    partitions = train_chain(tmp_path, 200, "--epochs", "60", "--tolerance-mm", "2")
+    partitions = train_chain(tmp_path, 200, "--passes", "60", "--detail-mm", "2")
     analyses = [p["largest_errors"] for p in partitions if p["held_out"]["max"] > 1]
     assert analyses and all(a["truncation"] > 0.8 and a["cause"] == TOO_FEW_COMPONENTS for a in analyses)
 
 
 def test_too_few_poses_are_the_cause(tmp_path):
     """With forty poses and many epochs, the training poses are accurate and the other poses are not."""
-    partitions = train_chain(tmp_path, 40, "--epochs", "300", "--tolerance-mm", "0.001", "--held-out-fraction", "0.4")
+    partitions = train_chain(tmp_path, 40, "--passes", "300", "--detail-mm", "0.001", "--held-out-fraction", "0.4")
     analysis = max(partitions, key=lambda p: p["held_out"]["max"])["largest_errors"]
     assert analysis["generalization"] > 1.5 and analysis["cause"] in (TOO_FEW_POSES, EXTREME_POSES)
 
@@ -66,7 +66,7 @@ def test_dropped_components_are_the_cause_only_if_most_of_the_error_is_in_them(
         pose_chain(rig, angles),
         residuals.astype(np.float32),
     )
-    options = ("--epochs", "60", "--tolerance-mm", str(tolerance_mm))
+    options = ("--passes", "60", "--detail-mm", str(tolerance_mm))
     assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *options]) == 0
     dropped = [p for p in json.loads((tmp_path / "report.json").read_text())["partitions"] if p["dropped"]]
     assert dropped and {p["largest_errors"]["cause"] for p in dropped} == {cause}

@@ -113,7 +113,7 @@ def test_half_rotating_joints_follow_from_the_main_joints():
     poses = chain_poses(followers=("half",))
     choice = choose(poses)
     # The half of the last main joint and its main joint rotate about other points, so one of them could be enough.
-    assert len(choice.joints) == BONES and choice.report.unexplained_mm < choice.report.tolerance_mm
+    assert len(choice.joints) == BONES and choice.report.unexplained_mm < choice.report.detail_mm
     # The vertices around a removed joint need the joint from whose rotation its own follows.
     for joint in set(range(BONES, 2 * BONES)) - set(choice.joints.tolist()):
         rotated = (joint - BONES + 1) % BONES
@@ -141,7 +141,7 @@ def test_independent_joints_are_all_kept():
     assert len(choice.joints) == len(poses.rig.joints) and choice.report.independent == ()
     assert choice.report.sentence() == (
         f"Key joints: all {2 * BONES} joints are read, because each moves by more than "
-        f"{choice.report.tolerance_mm:.2f} mm in ways that the others do not explain."
+        f"{choice.report.detail_mm:.2f} mm in ways that the others do not explain."
     )
 
 
@@ -289,7 +289,7 @@ def split(folder: Path, poses: FitPoses, random_count: int, **settings: object) 
 
 def test_weights_are_fitted_to_key_joints(tmp_path):
     poses = chain_poses(followers=("half", "still"))
-    skinned, messages = split(tmp_path / "r", poses, 120, joints="auto")
+    skinned, messages = split(tmp_path / "r", poses, 120, bones_to_read="auto")
     names, rig = poses.rig.joint_names, skinned.rig
     assert skinned.fit.key_joints.joints == len(rig.joints) == skinned.pose_matrices.shape[1] < len(names)
     assert rig.meshes[0].fingerprint.has_key_joints and set(rig.joint_names) < set(names)
@@ -305,12 +305,12 @@ def test_weights_are_fitted_to_key_joints(tmp_path):
     assert messages[-1][1]["text"] == skinned.fit.sentence()
 
 
-@pytest.mark.parametrize("fit_linear", ["", "hard"])
-def test_without_removable_joints_the_weights_are_the_own_or_fitted_ones(fit_linear, tmp_path):
+@pytest.mark.parametrize("base_skinning", ["", "hard"])
+def test_without_removable_joints_the_weights_are_the_own_or_fitted_ones(base_skinning, tmp_path):
     poses = chain_poses(followers=("free",))
-    skinned, messages = split(tmp_path / "r", poses, 160, joints="auto", fit_linear=fit_linear)
-    assert (skinned.fit.kind if skinned.fit else "") == fit_linear and skinned.key_joints.joints == 2 * BONES
-    assert np.array_equal(skinned.rig.skin_weights, poses.rig.skin_weights) == (not fit_linear)
+    skinned, messages = split(tmp_path / "r", poses, 160, bones_to_read="auto", base_skinning=base_skinning)
+    assert (skinned.fit.kind if skinned.fit else "") == base_skinning and skinned.key_joints.joints == 2 * BONES
+    assert np.array_equal(skinned.rig.skin_weights, poses.rig.skin_weights) == (not base_skinning)
     assert skinned.key_joints.sentence() in [values.get("text") for _, values in messages]
 
 
@@ -334,7 +334,7 @@ def test_a_rig_without_weights_needs_a_fit(tmp_path):
         is_dependency=np.zeros(BONES + 1, bool),
         is_sampled=np.arange(BONES + 1) < BONES,
     )
-    with pytest.raises(TrainingError, match=r"follow no bone by skin weights, .*--fit-linear smooth"):
+    with pytest.raises(TrainingError, match=r"follow no bone by skin weights, .*--base-skinning smooth"):
         split(tmp_path / "r", poses, 160)
-    skinned, _ = split(tmp_path / "fitted", poses, 160, fit_linear="smooth")
+    skinned, _ = split(tmp_path / "fitted", poses, 160, base_skinning="smooth")
     assert skinned.fit.held_out.rms_mm["fitted"] < 0.05 * skinned.fit.held_out.rms_mm["rig"]

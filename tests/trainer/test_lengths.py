@@ -32,7 +32,7 @@ UNITS_AND_DISTANCES = {
     "millimeters, 128 meters away": (1024.0, 128.0),
 }
 """Mesh units per meter, and meters from the origin: powers of two, so that units round alike."""
-STABLE_OPTIONS = ("--epochs", "80", "--learning-rate", "0.003", "--seed", "1")
+STABLE_OPTIONS = ("--passes", "80", "--learning-rate", "0.003", "--seed", "1")
 """At the default learning rate, short trainings multiply rounding errors: equal errors then differ by a tenth.
 With the default seed, a component near the threshold is dropped at the origin only."""
 OTHER_UNITS = [name for name in UNITS_AND_DISTANCES if name != METER]
@@ -84,7 +84,7 @@ def prepared(recording) -> list:
     rig, split = recording.rig, split_recording(recording, config)
     inputs = make_inputs(rig, recording.partitions)
     partitions = partition_data(recording, inputs)
-    return [prepare_partition(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
+    return [prepare_partition(p, split, config.detail_mm, config.seed, rig.metres_per_unit) for p in partitions]
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)

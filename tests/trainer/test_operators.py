@@ -23,11 +23,11 @@ def models(recording, tmp_path_factory) -> list[bytes]:
         write_chain(folder / f"chain_{joints}", pose_count=60, joint_count=joints)
     trainings = [(recording, "--activation", name, "--hidden", "24", "24") for name in ACTIVATIONS]
     trainings += [(folder / f"chain_{joints}", "--hidden", "16") for joints in (1, 12)]
-    trainings += [(recording, "--hidden", "300", "200", "100", "50"), (recording, "--tolerance-mm", "10000")]
+    trainings += [(recording, "--hidden", "300", "200", "100", "50"), (recording, "--detail-mm", "10000")]
     contents = []
     for index, (path, *options) in enumerate(trainings):
         model = folder / f"{index}.onnx"
-        assert main([str(path), str(model), "--epochs", "5", *options]) == 0
+        assert main([str(path), str(model), "--passes", "5", *options]) == 0
         contents.append(model.read_bytes())
     return contents
 

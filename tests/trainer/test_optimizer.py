@@ -30,5 +30,5 @@ def test_a_warm_up_of_one_step_starts_at_the_maximum():
 def test_a_training_imports_no_compiler(recording, tmp_path):
     """PyTorch's compiler takes long to import, and a training does not need it."""
     code = "import sys; from trainer.__main__ import main; print(main(sys.argv[1:]), 'torch._dynamo' in sys.modules)"
-    arguments = [recording, tmp_path / "model.onnx", "--epochs", "1", "--hidden", "8"]
+    arguments = [recording, tmp_path / "model.onnx", "--passes", "1", "--hidden", "8"]
     assert output_of("-c", code, *arguments)[-1] == "0 False"

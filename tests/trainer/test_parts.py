@@ -80,7 +80,7 @@ def test_a_divided_partition_is_one_partition_of_the_model(divided):
 def test_a_warm_start_keeps_the_parts(divided, monkeypatch):
     before = json.loads((divided / "report.json").read_text())
     monkeypatch.setattr(parts, "PART_PARAMETERS", 1e9)
-    options = (*QUICK_OPTIONS, "--epochs", "10", "--warm-start")
+    options = (*QUICK_OPTIONS, "--passes", "10", "--warm-start")
     assert main([str(divided / "recording"), str(divided / "model.onnx"), *options]) == 0
     after = json.loads((divided / "report.json").read_text())
     assert [p["parts"] for p in after["partitions"]] == [2, 2, 2]

@@ -30,7 +30,7 @@ from .tube import INFLUENCING, JOINTS, POSES, smoothed, write_tube
 
 
 def select_frames(recording: SkinnedRecording) -> SurfaceFrames:
-    return select_surface_frames(recording, split_recording(recording, TrainingConfig()), tolerance_mm=0.04)
+    return select_surface_frames(recording, split_recording(recording, TrainingConfig()), detail_mm=0.04)
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +178,7 @@ def test_a_mesh_without_faces_has_no_surface_frames(recording):
 
 def test_vertices_within_the_tolerance_have_no_surface_frames(recording):
     split = split_recording(recording, TrainingConfig())
-    assert select_surface_frames(recording, split, tolerance_mm=100.0) is NO_SURFACE_FRAMES
+    assert select_surface_frames(recording, split, detail_mm=100.0) is NO_SURFACE_FRAMES
 
 
 def test_a_degenerate_surface_gives_finite_values(recording, surface_frames):
@@ -208,7 +208,7 @@ def test_the_model_has_surface_frames(model_path):
 )
 def test_the_graph_agrees_with_pytorch_in_other_rigs(tmp_path, tube_options):
     write_tube(tmp_path / "tube", **tube_options)
-    assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK_OPTIONS, "--epochs", "4"]) == 0
+    assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK_OPTIONS, "--passes", "4"]) == 0
     assert "surface_frame_features" in {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
 
 

@@ -165,7 +165,7 @@ def test_the_report_has_the_errors_of_the_model(report, trained, recording, sess
 @pytest.mark.parametrize("activation", [name for name in ACTIVATIONS if name != TrainingConfig.activation])
 def test_every_activation_and_any_depth_can_be_exported(tmp_path, recording, activation):
     model = tmp_path / "m.onnx"
-    options = ["--epochs", "2", "--activation", activation, "--hidden", *(["8"] if activation == "tanh" else ["8"] * 3)]
+    options = ["--passes", "2", "--activation", activation, "--hidden", *(["8"] if activation == "tanh" else ["8"] * 3)]
     assert main([str(recording), str(model), *options]) == 0
     assert read_model_info(model).parity_mm < 1e-2
 
@@ -173,7 +173,7 @@ def test_every_activation_and_any_depth_can_be_exported(tmp_path, recording, act
 def test_a_rig_of_one_joint_is_exported(tmp_path):
     rig = write_chain(tmp_path / "one", pose_count=12, joint_count=1)
     model = tmp_path / "m.onnx"
-    assert main([str(tmp_path / "one"), str(model), "--epochs", "1"]) == 0
+    assert main([str(tmp_path / "one"), str(model), "--passes", "1"]) == 0
     session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
     positions, confidence = run_model(session, rig.rest_matrices[None])
     np.testing.assert_allclose(positions[0], rig.rest_positions, atol=1e-5)

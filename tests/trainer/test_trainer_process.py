@@ -53,7 +53,7 @@ def test_a_message_is_flushed_immediately(monkeypatch):
 
 
 def test_progress_as_text(recording, tmp_path, capsys):
-    assert main([str(recording), str(tmp_path / "m.onnx"), "--epochs", "20", "--hidden", "8"]) == 0
+    assert main([str(recording), str(tmp_path / "m.onnx"), "--passes", "20", "--hidden", "8"]) == 0
     output = capsys.readouterr()
     lines = output.out.splitlines()
     assert lines[0] == "Training 3 partitions, 90 vertices, 120 poses, on cpu."
@@ -71,7 +71,7 @@ def test_a_second_training_gives_the_same_model(recording, trained, tmp_path):
 
 
 def run_failing_training(arguments, capsys) -> str:
-    assert main([*map(str, arguments), "--messages", "--epochs", "2"]) == 1
+    assert main([*map(str, arguments), "--messages", "--passes", "2"]) == 1
     output = capsys.readouterr()
     messages = decode_messages(output.out)
     assert messages[-1].type is MessageType.FAILED
@@ -158,7 +158,7 @@ def test_a_full_disk_leaves_the_old_files(recording, trained, tmp_path, max_file
 
     old_model = trained.joinpath("model.onnx").read_bytes()
     (tmp_path / "m.onnx").write_bytes(old_model)
-    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages", preexec_fn=limit_file_size)
+    process = start_trainer(recording, tmp_path / "m.onnx", "--passes", "2", "--messages", preexec_fn=limit_file_size)
     output, error_text = process.communicate(timeout=120)
     assert process.returncode == 1
     assert decode_messages(output)[-1].type is MessageType.FAILED
@@ -182,7 +182,7 @@ def test_a_stopped_training_writes_nothing(recording, tmp_path, monkeypatch, sto
     stop_file, folder = tmp_path / "stop", tmp_path / "models"
     folder.mkdir()
     monkeypatch.setenv(STOP_FILE_VARIABLE, str(stop_file))
-    process = start_trainer(recording, folder / "m.onnx", "--epochs", "100000", "--messages")
+    process = start_trainer(recording, folder / "m.onnx", "--passes", "100000", "--messages")
     lines = []
     for line in process.stdout:
         lines.append(line)
@@ -198,7 +198,7 @@ def test_a_stopped_training_writes_nothing(recording, tmp_path, monkeypatch, sto
 @ONLY_POSIX
 def test_a_training_whose_reader_was_killed_writes_nothing(recording, tmp_path):
     """The export sends no more messages, so the trainer has to notice by itself."""
-    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages")
+    process = start_trainer(recording, tmp_path / "m.onnx", "--passes", "2", "--messages")
     while "Exporting the model" not in process.stdout.readline():
         pass
     process.stdout.close()

@@ -12,9 +12,9 @@ from trainer.config import TrainingConfig, add_options, config_from_arguments
 @pytest.mark.parametrize(
     "name, value",
     [
-        ("epochs", 0),
-        ("tolerance_mm", 0.0),
-        ("tolerance_mm", float("nan")),
+        ("passes", 0),
+        ("detail_mm", 0.0),
+        ("detail_mm", float("nan")),
         ("learning_rate", float("inf")),
         ("hidden", ()),
         ("hidden", (0,)),
@@ -37,7 +37,7 @@ def test_every_setting_is_an_option():
     parser = argparse.ArgumentParser()
     add_options(parser)
     option_text = (
-        "--seed 3 --tolerance-mm 0.2 --hidden 8 9 10 --activation gelu --epochs 7 --batch-size 5 --learning-rate 0.1 "
+        "--seed 3 --detail-mm 0.2 --hidden 8 9 10 --activation gelu --passes 7 --batch-size 5 --learning-rate 0.1 "
         "--weight-decay 0.3 --validation-fraction 0.3 --held-out-fraction 0.2 --goal-mm 0.5 --include-unsettled"
     )
     assert config_from_arguments(parser.parse_args(option_text.split())) == TrainingConfig(

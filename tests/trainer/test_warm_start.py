@@ -57,12 +57,12 @@ def prepare_recording(path, config, checkpoint):
     split = split_recording(recording, config)
     inputs = make_inputs(recording.rig, recording.partitions, checkpoint.input_states)
     data = partition_data(recording, inputs)
-    prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
+    prepared = [prepare_partition(partition, split, config.detail_mm, config.seed) for partition in data]
     return split, prepared
 
 
 def test_networks_start_with_nearly_their_former_outputs(recording, trained, grown_recording):
-    config = TrainingConfig(tolerance_mm=1e-4)
+    config = TrainingConfig(detail_mm=1e-4)
     checkpoint = read_checkpoint(checkpoint_path(trained / "model.onnx"))
     _, prepared = prepare_recording(grown_recording, config, checkpoint)
     networks = initial_networks(checkpoint, prepared)
@@ -85,14 +85,14 @@ def test_networks_start_with_nearly_their_former_outputs(recording, trained, gro
 
 def test_a_warm_start_continues_the_training(grown_recording, model, trained):
     first_error = json.loads((trained / "report.json").read_text())["fdda"]["held_out"]["mean"]
-    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--epochs", "12", "--warm-start"]) == 0
+    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--passes", "12", "--warm-start"]) == 0
     report = json.loads((model.parent / "report.json").read_text())
     # After six epochs from random weights, the error is several times as large.
     assert report["fdda"]["held_out"]["mean"] < 1.5 * first_error
-    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--epochs", "6"]) == 0
+    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--passes", "6"]) == 0
     cold_start_report = json.loads((model.parent / "report.json").read_text())
     assert cold_start_report["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
-    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--epochs", "12", "--warm-start"]) == 0
+    assert main([str(grown_recording), str(model), *QUICK_OPTIONS, "--passes", "12", "--warm-start"]) == 0
     assert report["training"]["warm_start"] and report["poses"] == 120 + ADDED_POSES
     history = read_checkpoint(checkpoint_path(model)).history
     assert [entry["poses"] for entry in history] == [120 + ADDED_POSES] * 2

@@ -32,7 +32,7 @@ WARNING_NAMES = ["duplicate-poses", "hidden-inputs"]
 
 def test_warnings_are_sent_before_the_training_and_reported(suspicious_recording, tmp_path, capsys):
     assert (
-        main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--messages", *QUICK_OPTIONS[2:], "--epochs", "2"])
+        main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--messages", *QUICK_OPTIONS[2:], "--passes", "2"])
         == 0
     )
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
@@ -62,7 +62,7 @@ def test_a_strict_training_fails_before_it_starts(suspicious_recording, tmp_path
 
 
 def test_the_text_output_has_the_warnings(report, suspicious_recording, tmp_path, capsys):
-    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), *QUICK_OPTIONS[2:], "--epochs", "1"]) == 0
+    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), *QUICK_OPTIONS[2:], "--passes", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines[2:4]] == [f"Warning ({name})" for name in WARNING_NAMES]
     assert report["warnings"] == []

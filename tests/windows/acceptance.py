@@ -57,12 +57,12 @@ def test_verbs_from_the_rig_to_a_bake(folder: Path):
     rig, recording, model = folder / "arm.blend", folder / "recording", folder / "arm.onnx"
     run_verb(folder, "build-arm", rig)
     run_verb(folder, "record", rig, recording, "--poses", POSE_COUNT)
-    run_verb(folder, "train", recording, model, "--epochs", EPOCH_COUNT)
+    run_verb(folder, "train", recording, model, "--passes", EPOCH_COUNT)
     first_model_bytes = model.read_bytes()
     held_out_errors = json.loads((folder / "report.json").read_text(encoding="utf-8"))["fdda"]["held_out"]
     # The same training misses this goal, so poses are added.
     goal_options = ("--goal-mm", 0.95 * held_out_errors["p999"], "--poses", ADDED_POSE_COUNT)
-    run_verb(folder, "train", recording, model, "--epochs", EPOCH_COUNT, "--refine", rig, *goal_options)
+    run_verb(folder, "train", recording, model, "--passes", EPOCH_COUNT, "--refine", rig, *goal_options)
     assert len(np.load(next(recording.glob("*pose*.npy")), mmap_mode="r")) >= POSE_COUNT + ADDED_POSE_COUNT
     assert model.read_bytes() != first_model_bytes
 

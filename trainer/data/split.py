@@ -79,7 +79,7 @@ def split_recording(recording: SkinnedRecording, config: TrainingConfig) -> Spli
     if not is_usable.all() and usable_count < MIN_POSES:
         raise TrainingError(
             f"Only {usable_count} of the {len(is_usable)} poses of the recording came to rest and training takes at "
-            f"least {MIN_POSES}; hold them for more frames (record --max-settle-frames), or take all with "
+            f"least {MIN_POSES}; hold them for more frames (record --settle-frames), or take all with "
             "--include-unsettled."
         )
     if (count := int((~always_trains).sum())) < MIN_POSES:

@@ -59,13 +59,13 @@ class _Candidate:
     residual: np.ndarray
 
 
-def select_surface_frames(recording: SkinnedRecording, split: Split, tolerance_mm: float) -> SurfaceFrames:
+def select_surface_frames(recording: SkinnedRecording, split: Split, detail_mm: float) -> SurfaceFrames:
     """Select the vertices of each partition that explain most of its residuals, and fit their surface frames.
 
     Args:
         recording: recording of the training. A mesh without faces has no surface frames.
         split: split of its poses; only training poses are evaluated.
-        tolerance_mm: as in `TrainingConfig`. Vertices that the joints alone place within the tolerance are no
+        detail_mm: as in `TrainingConfig`. Vertices that the joints alone place within the tolerance are no
             candidates.
 
     Returns:
@@ -78,7 +78,7 @@ def select_surface_frames(recording: SkinnedRecording, split: Split, tolerance_m
     matrices = np.array(recording.pose_matrices[training])
     skin = skin_matrices(matrices, rig.rest_matrices)
     is_usable = _may_be_candidate(rig)
-    min_mean_square = (tolerance_mm / (1000 * rig.metres_per_unit)) ** 2
+    min_mean_square = (detail_mm / (1000 * rig.metres_per_unit)) ** 2
     candidates: list[_Candidate] = []
     for index, partition in enumerate(recording.partitions):
         regression = joint_regression(rig, partition, skin)

@@ -42,7 +42,7 @@ class SurfaceFrameFeatures(SurfaceFrames, FeatureBlock):
 
     @classmethod
     def fit(cls, recording: SkinnedRecording, split: Split, config: TrainingConfig) -> State:
-        surface_frames = select_surface_frames(recording, split, config.tolerance_mm)
+        surface_frames = select_surface_frames(recording, split, config.detail_mm)
         return dict(vars(surface_frames)) if len(surface_frames) else {}
 
     @classmethod

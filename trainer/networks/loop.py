@@ -153,7 +153,7 @@ class _Loop:
             self.model.parameters(),
             config.learning_rate,
             config.weight_decay,
-            config.epochs * step_count,
+            config.passes * step_count,
             WARM_UP_FRACTION,
         )
         order_generator = torch.Generator().manual_seed(config.seed + 1)
@@ -162,8 +162,8 @@ class _Loop:
             [partition.basis.truncation_rms * partition.mm_per_unit for partition in constant],
             [partition.validation_truncation.mean() * partition.mm_per_unit for partition in constant],
         )
-        rescaling_epochs = {round(fraction * config.epochs) for fraction in RELEVANCE_EPOCH_FRACTIONS} - {0}
-        for epoch in range(1, config.epochs + 1):
+        rescaling_epochs = {round(fraction * config.passes) for fraction in RELEVANCE_EPOCH_FRACTIONS} - {0}
+        for epoch in range(1, config.passes + 1):
             if epoch - 1 in rescaling_epochs:
                 self.rescale_inputs_by_relevance()
             training_mm = self._train_epoch(optimizer, order_generator)

@@ -46,7 +46,8 @@ def read_initial_checkpoint(
     if checkpoint.deformation != recording.digest():
         raise TrainingError(
             f"The checkpoint '{path}' is of other skin weights, joints or partitions; train with the same "
-            "--fit-linear, --joints, --min-partition-vertices and --influence-tolerance, or without --warm-start."
+            "--base-skinning, --bones-to-read, --min-vertices-per-part and --influence-tolerance, or without "
+            "--warm-start."
         )
     if checkpoint.holdout != holdout:
         raise TrainingError(
@@ -65,7 +66,7 @@ def warm_start_config(config: TrainingConfig) -> TrainingConfig:
     """Return the settings of a warm start: fewer epochs at a lower learning rate."""
     return replace(
         config,
-        epochs=max(1, round(config.epochs * WARM_START_EPOCHS_RATIO)),
+        passes=max(1, round(config.passes * WARM_START_EPOCHS_RATIO)),
         learning_rate=config.learning_rate * WARM_START_RATE_RATIO,
     )
 

@@ -92,7 +92,7 @@ def read_fit_poses(recording: Recording, has_key_joints: bool, vertices: np.ndar
     if has_key_joints and random_count < MIN_RANDOM_POSES:
         raise RecordingError(
             f"Key joints are chosen by at least {MIN_RANDOM_POSES} random poses, and the recording has {random_count}; "
-            "record more (--poses), or leave --joints out."
+            "record more (--poses), or leave --bones-to-read out."
         )
     vertex_count = recording.rig.vertex_count if vertices is None else len(vertices)
     poses = choose_fit_poses(pose_count, vertex_count, random_count)
@@ -123,7 +123,7 @@ def choose_fit_poses(pose_count: int, vertex_count: int, random_count: int = 0) 
     if pose_count < MIN_POSES:
         raise RecordingError(
             f"Skin weights are fitted to at least {MIN_POSES} poses, and the recording has {pose_count}; record more, "
-            "or leave --fit-linear out."
+            "or leave --base-skinning out."
         )
     min_pose_count = 3 * MIN_RANDOM_POSES // 2 if random_count else MIN_POSES
     fit_pose_count = min(pose_count, MAX_FIT_POSES, max(min_pose_count, MAX_FIT_BYTES // (12 * vertex_count)))

@@ -34,7 +34,7 @@ REFERENCE_POSES = 48
 
 
 def split_deformation(recording: Recording, config: TrainingConfig, sink: MessageSink) -> SkinnedRecording:
-    """Split the deformation of a recording, with the settings `fit_linear`, `joints` and those of partitions.
+    """Split the deformation of a recording, with the settings `base_skinning`, `joints` and those of partitions.
 
     Args:
         recording: the recording.
@@ -47,20 +47,20 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
     """
     rig, joint_count = recording.rig, len(recording.rig.joints)
     joints, choice, fit = np.arange(joint_count), None, None
-    has_key_joints, unweighted = config.joints != ALL, rig.unweighted_vertices
-    if has_key_joints or config.fit_linear or len(unweighted):
-        vertices = None if has_key_joints or config.fit_linear else unweighted
+    has_key_joints, unweighted = config.bones_to_read != ALL, rig.unweighted_vertices
+    if has_key_joints or config.base_skinning or len(unweighted):
+        vertices = None if has_key_joints or config.base_skinning else unweighted
         poses = read_fit_poses(recording, has_key_joints, vertices)
         if has_key_joints:
             choice = choose_key_joints(
                 poses,
-                config.joints,
+                config.bones_to_read,
                 lambda done, total: sink.send(MessageType.PREPARING, stage=KEY_JOINTS_STAGE, done=done, total=total),
             )
         removes_joints = choice is not None and len(choice.joints) < joint_count
         if choice and not removes_joints:
             sink.send(MessageType.LOG, text=choice.report.sentence())
-        fits_all = removes_joints or bool(config.fit_linear)
+        fits_all = removes_joints or bool(config.base_skinning)
         if fits_all or len(unweighted):
             if not fits_all:
                 meshes = zip(rig.meshes, rig.mesh_slices, strict=True)
@@ -68,7 +68,7 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
                 subject = format_with_noun(names, "mesh", "meshes")
                 sink.send(MessageType.LOG, text=f"Skin weights are fitted for the {subject}, which have none.")
                 poses = poses.of_vertices(unweighted) if vertices is None else poses
-            kind, weighted = config.fit_linear or DEFAULT_KIND, choice.weighted_joints if removes_joints else joints
+            kind, weighted = config.base_skinning or DEFAULT_KIND, choice.weighted_joints if removes_joints else joints
             training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
             fitted_joints, weights = fit_skin(
                 training.with_joints(weighted) if removes_joints else training,
@@ -104,7 +104,7 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
         rig,
         joints,
         follow,
-        config.min_partition_vertices,
+        config.min_vertices_per_part,
         config.influence_tolerance,
         lambda text: sink.send(MessageType.LOG, text=text),
     )
@@ -156,8 +156,8 @@ def check_has_weights(recording: Recording) -> None:
     if not recording.rig.has_weights:
         raise TrainingError(
             f"The vertices of '{recording.rig.meshes[0].name}' follow no bone by skin weights, so there is no linear "
-            "skinning to learn from; have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint "
-            "weights and record again."
+            "skinning to learn from; have one fitted (--base-skinning smooth, or Base Skinning in the sidebar), or "
+            "paint weights and record again."
         )
 
 

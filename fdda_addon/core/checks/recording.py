@@ -8,7 +8,7 @@ from ..mathematics.features import float32_rounding, joint_features_in_metres
 from ..recording.skinned import SkinnedRecording
 from ..rig import Rig
 from ..sentences.counts import format_count
-from ..settings import MIN_PARTITION_VERTICES
+from ..settings import MIN_VERTICES_PER_PART
 from .flips import check_flips
 from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
@@ -115,7 +115,7 @@ def _check_large_residuals(recording: SkinnedRecording, scan: ResidualScan) -> l
             large_residuals.append((rms / size, rms, size, joint_name(rig, partition.joint)))
     advice = (
         "linear skinning is no start there; look at the skin weights and whether mesh and armature match in the rest "
-        "pose, or have weights fitted (--fit-linear smooth)."
+        "pose, or have weights fitted (--base-skinning smooth)."
     )
     if large_residuals:
         _, rms, size, name = max(large_residuals)
@@ -159,8 +159,8 @@ def _check_controls(recording: SkinnedRecording) -> list[RecordingWarning]:
         it = "it" if len(names) == 1 else "them"
         text = (
             f"{format_with_noun(names, 'shape key')} {'has' if len(names) == 1 else 'have'} one value in all poses, so "
-            f"a model cannot learn {it}: record an action that moves {it}, or bones that drive {it} (--sample), or "
-            f"mute {it}."
+            f"a model cannot learn {it}: record an action that moves {it}, or bones that drive {it} (--bones-to-pose), "
+            f"or mute {it}."
         )
         warnings.append(RecordingWarning("dead-controls", text[0].upper() + text[1:]))
     if not dead_controls:
@@ -264,7 +264,7 @@ def _check_still_vertices(
 
 def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarning]:
     small_partitions = [
-        partition for partition in recording.partitions if len(partition.vertices) < MIN_PARTITION_VERTICES.default
+        partition for partition in recording.partitions if len(partition.vertices) < MIN_VERTICES_PER_PART.default
     ]
     if not small_partitions or len(recording.partitions) == 1:
         return []
@@ -272,7 +272,7 @@ def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarnin
     min_vertex_count = min(len(partition.vertices) for partition in small_partitions)
     text = (
         f"{format_with_noun(names, 'partition')} {'has' if len(small_partitions) == 1 else 'have'} fewer than "
-        f"{MIN_PARTITION_VERTICES.default} vertices (the smallest {min_vertex_count}), and a network each: train with "
-        f"--min-partition-vertices {MIN_PARTITION_VERTICES.default} to merge them into others."
+        f"{MIN_VERTICES_PER_PART.default} vertices (the smallest {min_vertex_count}), and a network each: train with "
+        f"--min-vertices-per-part {MIN_VERTICES_PER_PART.default} to merge them into others."
     )
     return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]

@@ -163,8 +163,8 @@ def unsettled_sentence(index: dict) -> str:
     unsettled = index.get("unsettled", [])
     if not unsettled:
         return ""
-    frames = index["target"]["max_settle_frames"]
+    frames = index["target"]["settle_frames"]
     return (
         f"{len(unsettled)} of {index['complete']} poses did not come to rest in {frames} frames: "
-        f"{format_list(unsettled)}. A training leaves them out; more frames (--max-settle-frames) let them rest."
+        f"{format_list(unsettled)}. A training leaves them out; more frames (--settle-frames) let them rest."
     )

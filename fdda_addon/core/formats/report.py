@@ -77,7 +77,7 @@ _REPORT_KEYS = {
     "joints": int,
     "controls?": [str],
     "poses": int,
-    "training": {"seconds": float, "device": str, "epochs": int, "training_poses": int, "held_out_poses": int},
+    "training": {"seconds": float, "device": str, "passes": int, "training_poses": int, "held_out_poses": int},
     "parity": float,
     "constant_bytes?": int,
     "fdda": {"training": _ERROR_STATISTICS, "held_out": _ERROR_STATISTICS},

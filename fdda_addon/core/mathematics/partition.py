@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rig import Rig
-from ..settings import MIN_PARTITION_VERTICES
+from ..settings import MIN_VERTICES_PER_PART
 
 INFLUENCE_TOLERANCE = 1e-4
 """A joint influences a partition when it changes a local residual by more than this ratio of the rig's size."""
@@ -87,12 +87,12 @@ def make_partitions(
     )
 
 
-def make_merged_partitions(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES.default) -> tuple[Partition, ...]:
+def make_merged_partitions(rig: Rig, min_vertices: int = MIN_VERTICES_PER_PART.default) -> tuple[Partition, ...]:
     """Partition the mesh by main joint, and merge small partitions as in `small_partition_merges`."""
     return make_partitions(rig, merged=small_partition_merges(rig, min_vertices))
 
 
-def small_partition_merges(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES.default) -> dict[int, int]:
+def small_partition_merges(rig: Rig, min_vertices: int = MIN_VERTICES_PER_PART.default) -> dict[int, int]:
     """Choose the partitions into which small partitions are merged.
 
     The smallest partition is merged first, into the partition whose joint has the most weight on its vertices, else

@@ -18,7 +18,7 @@ from ..mathematics.partition import (
 from ..mathematics.skin_fit import SkinFit
 from ..mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
 from ..rig import Fingerprint, Rig
-from ..settings import MIN_PARTITION_VERTICES
+from ..settings import MIN_VERTICES_PER_PART
 from .index import ALONE, RecordingInfo
 from .influences import add_influences, detect_influences
 from .reader import Recording
@@ -109,7 +109,7 @@ def skin_recording(
     rig: Rig | None = None,
     joints: np.ndarray | None = None,
     follow: Callable[[Partition, np.ndarray], np.ndarray] = lambda partition, influences: influences,
-    min_partition_vertices: int = MIN_PARTITION_VERTICES.default,
+    min_vertices_per_part: int = MIN_VERTICES_PER_PART.default,
     influence_tolerance: float = INFLUENCE_TOLERANCE,
     note: Callable[[str], None] = lambda text: None,
 ) -> SkinnedRecording:
@@ -123,13 +123,13 @@ def skin_recording(
         joints: (K,) indices of these joints in the recording; None for all.
         follow: returns the (K + C,) bool inputs of the model from which a partition follows, for the partition and
             the (J + C,) bool inputs of the recording that influence it.
-        min_partition_vertices: partitions with fewer vertices are merged into others; 0 to merge no partitions.
+        min_vertices_per_part: partitions with fewer vertices are merged into others; 0 to merge no partitions.
         influence_tolerance: as in `detect_influences`.
         note: receives a note about positions that are not finite.
     """
     rig = recording.rig if rig is None else rig
     joints = np.arange(len(rig.joints)) if joints is None else joints
-    partitions = make_merged_partitions(rig, min_partition_vertices)
+    partitions = make_merged_partitions(rig, min_vertices_per_part)
     influences = np.zeros((len(partitions), len(recording.rig.joints) + len(rig.controls)), bool)
     if recording.info.alone is None:
         # A target that depends on time does not follow a moved joint immediately: influences cannot be detected.

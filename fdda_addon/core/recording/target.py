@@ -22,20 +22,20 @@ class RecordedTarget:
         object_name: name of the target object.
         follows: `POSE`, `FRAMES` or `SIMULATION`.
         pre_roll: number of frames in which the rig moved from the rest pose to the first frame of an action.
-        max_settle_frames: largest number of frames for which a random pose was held; 0 where poses were not held.
+        settle_frames: largest number of frames for which a random pose was held; 0 where poses were not held.
         rest_threshold_mm: the target is at rest when no vertex moves by more than this between two frames, mm.
     """
 
     object_name: str
     follows: str
     pre_roll: int = 0
-    max_settle_frames: int = 0
+    settle_frames: int = 0
     rest_threshold_mm: float = 0.0
 
     def to_json(self) -> dict:
         settle_values = (
-            {"max_settle_frames": self.max_settle_frames, "rest_threshold_mm": self.rest_threshold_mm}
-            if self.max_settle_frames
+            {"settle_frames": self.settle_frames, "rest_threshold_mm": self.rest_threshold_mm}
+            if self.settle_frames
             else {}
         )
         return {"object": self.object_name, "follows": self.follows, "pre_roll": self.pre_roll, **settle_values}
@@ -47,12 +47,12 @@ class RecordedTarget:
             read_name(value["object"]),
             value["follows"],
             value["pre_roll"],
-            value.get("max_settle_frames", 0),
+            value.get("settle_frames", 0),
             value.get("rest_threshold_mm", 0.0),
         )
         if target.follows not in FOLLOWS_VALUES:
             raise ValueError(f"its target follows {target.follows!r}")
-        for frame_count in (target.pre_roll, target.max_settle_frames):
+        for frame_count in (target.pre_roll, target.settle_frames):
             if type(frame_count) is not int or frame_count < 0:
                 raise ValueError(f"its target has {frame_count!r} frames")
         if type(target.rest_threshold_mm) not in (int, float) or not 0 <= target.rest_threshold_mm < math.inf:

@@ -4,17 +4,17 @@
 import re
 
 PHRASES = (
-    ("--fit-linear smooth, or Base Skinning in the sidebar", "Base Skinning in the sidebar"),
-    ("--fit-linear smooth", "Base Skinning"),
+    ("--base-skinning smooth, or Base Skinning in the sidebar", "Base Skinning in the sidebar"),
+    ("--base-skinning smooth", "Base Skinning"),
     ("--controls collection:NAME", "Bone Collection"),
     ("for --controls", "for"),
     ("give --poses or --action", "set Random Poses, or check an action"),
     ("give --action or --strip", "check an action or a strip"),
-    ("--sample", "Bones to Pose"),
-    ("--control ", "Extra Inputs, "),
-    ("--control", "Extra Inputs"),
-    ("--min-partition-vertices", "Min Vertices per Part"),
-    ("--max-settle-frames", "Settle Frames"),
+    ("--bones-to-pose", "Bones to Pose"),
+    ("--extra-input ", "Extra Inputs, "),
+    ("--extra-input", "Extra Inputs"),
+    ("--min-vertices-per-part", "Min Vertices per Part"),
+    ("--settle-frames", "Settle Frames"),
 )
 """Phrases with options, and the words of the window."""
 

@@ -37,7 +37,7 @@ def row_parameter(row: Row) -> object:
 @pytest.mark.parametrize("row", [row_parameter(row) for row in ROWS])
 def test_a_character_is_recorded_trained_and_played(row: Row, tmp_path: Path):
     for recording, model in record_row(row, tmp_path):
-        train(recording, model, "--epochs", row.epochs, *row.training, *SMALL)
+        train(recording, model, "--passes", row.epochs, *row.training, *SMALL)
     results = compare_row(row, tmp_path)
     assert tuple(result.mesh for result in results) == row.meshes
     for result in results:

@@ -35,7 +35,7 @@ def face_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_copy(folder / "face.blend")
     options = ("--poses", 200, "--spread", 10)
     assert run("record", folder / "face.blend", folder / "recording", *options) == 0
-    train(folder / "recording", folder / "face.onnx", "--epochs", 60)
+    train(folder / "recording", folder / "face.onnx", "--passes", 60)
     return folder
 
 

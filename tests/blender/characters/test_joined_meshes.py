@@ -51,7 +51,7 @@ def dressed(tmp_path_factory: pytest.TempPathFactory) -> Files:
     dressed_limb()
     save_copy(rig)
     recorded = output_of("record", rig, recording, "--all", *OPTIONS)
-    trained = output_of("train", recording, model, "--epochs", 8, "--hidden", 16)
+    trained = output_of("train", recording, model, "--passes", 8, "--hidden", 16)
     fdda_addon.unregister()
     return Files(folder, rig, recording, model, recorded, trained)
 
@@ -127,7 +127,7 @@ def test_a_model_has_all_meshes_and_its_report_a_line_for_each(dressed):
 
 def test_poses_are_added_and_training_continues(dressed, tmp_path, capfd):
     recording, model = tmp_path / "r", tmp_path / "m.onnx"
-    options = ("--epochs", 4, "--hidden", 16)
+    options = ("--passes", 4, "--hidden", 16)
     assert run("record", dressed.rig, recording, "--all", *OPTIONS) == 0
     assert run("train", recording, model, *options) == 0
     assert run("record", dressed.rig, recording, "--refine", model, "--poses", 5) == 0

@@ -30,7 +30,7 @@ def two(tmp_path) -> tuple[bpy.types.Object, bpy.types.Object]:
     bpy.context.view_layer.objects.active = rig.armature_object
     rig.mesh_object.fdda.settings.poses = 30
     for mesh_object in (rig.mesh_object, other):
-        mesh_object.fdda.settings.epochs = 4
+        mesh_object.fdda.settings.passes = 4
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "two.blend"))
     return bpy.data.objects[ELBOW], bpy.data.objects["elbow.001"]
 

@@ -51,7 +51,7 @@ def two(tmp_path_factory: pytest.TempPathFactory, commands: dict[str, CommandOut
     for name in (BODY, SLEEVE):
         options = ("--object", name, "--poses", POSES, "--action", "elbow_wave")
         assert run("record", made.rig, made.recordings / name, *options) == 0
-    commands["train"] = output_of("train", made.recordings, made.models, "--epochs", 8, "--hidden", 16)
+    commands["train"] = output_of("train", made.recordings, made.models, "--passes", 8, "--hidden", 16)
     assert run("bind", made.rig, made.models, made.bound) == 0
     fdda_addon.unregister()
     return made

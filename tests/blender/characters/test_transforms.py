@@ -40,7 +40,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, P
     finally:
         fdda_addon.unregister()
     for _, model in files.values():
-        train(model.with_name("recording"), model, "--epochs", 40)
+        train(model.with_name("recording"), model, "--passes", 40)
     return files
 
 

@@ -80,7 +80,7 @@ def characters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Character]
             save_copy(rig)
             assert run("record", rig, recording, "--poses", 120) == 0
         for _, recording, model, _ in files.values():
-            train(recording, model, "--epochs", 40)
+            train(recording, model, "--passes", 40)
         for rig, _, model, evaluation in files.values():
             assert run("evaluate", rig, model, "--json", evaluation, "--poses", 100) == 0
     finally:
@@ -149,7 +149,7 @@ def test_files_of_a_character_in_metres_say_nothing(characters):
 def test_the_gain_of_fitted_weights_is_in_millimetres(characters, tmp_path):
     models = [tmp_path / name / "model.onnx" for name in (IN_METRES, IN_CENTIMETRES)]
     for name, model in zip((IN_METRES, IN_CENTIMETRES), models, strict=True):
-        train(characters[name].recording, model, "--epochs", 1, "--fit-linear", "hard")
+        train(characters[name].recording, model, "--passes", 1, "--base-skinning", "hard")
     fits = [SkinFit.from_json(read_model_info(model).training["fit"]) for model in models]
     for way, rms in fits[0].held_out.rms_mm.items():
         assert fits[1].held_out.rms_mm[way] == pytest.approx(rms, rel=AGREE)

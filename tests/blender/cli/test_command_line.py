@@ -45,11 +45,11 @@ def test_help_prints_the_usage(arguments, capfd):
         ["record", "a.blend", "b", "--spread", "inf"],
         ["record", "a.blend", "b", "--color"],
         ["record", "a.blend", "b", "--overwrite", "--resume"],
-        ["record", "a.blend", "b", "--max-settle-frames", "3"],
+        ["record", "a.blend", "b", "--settle-frames", "3"],
         ["record", "a.blend", "b", "--pre-roll", "3"],
-        ["record", "a.blend", "b", "--target", "flesh", "--max-settle-frames", "-1"],
-        ["record", "a.blend", "b", "--target", "flesh", "--rest-threshold-mm", "nan"],
-        ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--max-settle-frames", "3"],
+        ["record", "a.blend", "b", "--learn-from", "flesh", "--settle-frames", "-1"],
+        ["record", "a.blend", "b", "--learn-from", "flesh", "--rest-threshold-mm", "nan"],
+        ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--settle-frames", "3"],
         ["build-arm", "a.blend", "--density", "4"],
         ["bind", "a.blend", "m.onnx"],
         ["evaluate", "a.blend", "m.onnx"],
@@ -63,7 +63,7 @@ def test_help_prints_the_usage(arguments, capfd):
         ["train", "recording", "m.onnx", "--activation", "step"],
         ["train", "recording", "m.onnx", "--color", "red"],
         ["train", "recording", "m.onnx", "--learning-rate", "-1"],
-        ["train", "recording", "m.onnx", "--epochs", "0.5"],
+        ["train", "recording", "m.onnx", "--passes", "0.5"],
     ],
     ids=" ".join,
 )
@@ -89,12 +89,12 @@ def test_a_full_disk_ends_with_the_status_for_another_try(tmp_path, monkeypatch,
 
 def test_train_passes_its_options_to_the_trainer(elbow_files, tmp_path, capfd):
     model = tmp_path / "m.onnx"
-    options = ["--epochs", 3, "--hidden", 8, 16, "--activation", "tanh", "--seed", 9, "--learning-rate", "0.002"]
+    options = ["--passes", 3, "--hidden", 8, 16, "--activation", "tanh", "--seed", 9, "--learning-rate", "0.002"]
     assert run("train", elbow_files.recording, model, *options) == 0
     from fdda_addon.core.formats.model import read_model_info
 
     training = read_model_info(model).training
-    assert (training["epochs"], training["hidden"], training["activation"], training["seed"]) == (3, [8, 16], "tanh", 9)
+    assert (training["passes"], training["hidden"], training["activation"], training["seed"]) == (3, [8, 16], "tanh", 9)
     assert training["learning_rate"] == 0.002
     captured = capfd.readouterr()
     assert captured.out.splitlines()[-1].startswith(f"{model}: trained in ")

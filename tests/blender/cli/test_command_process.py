@@ -144,7 +144,7 @@ def test_a_recording_that_is_killed_resumes(elbow_files, tmp_path):
 )
 def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow_files, tmp_path, signal_name):
     """Only the process of the verb gets the signal, as from a batch system."""
-    process = start_verb("train", elbow_files.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
+    process = start_verb("train", elbow_files.recording, tmp_path / "m.onnx", "--passes", 1_000_000)
     for line in process.stderr:
         if line.startswith("training: "):
             break

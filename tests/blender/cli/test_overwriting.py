@@ -44,12 +44,12 @@ VERBS = {
         "the JSON of a check",
     ),
     "check-recording over a rig": ("check-recording recording --json rig.blend", "rig.blend", "the JSON of a check"),
-    "train over a rig": ("train recording rig.blend --epochs 1", "rig.blend", "a model"),
-    "train over a note": ("train recording notes.txt --epochs 1", "notes.txt", "a model"),
+    "train over a rig": ("train recording rig.blend --passes 1", "rig.blend", "a model"),
+    "train over a note": ("train recording notes.txt --passes 1", "notes.txt", "a model"),
     "train over its recording": ("train recording recording/positions.npy", "recording/positions.npy", "a model"),
     "train over an index": (f"train recording {RECORDING}", RECORDING, "a model"),
     "refining over the rig": (
-        "train recording rig.blend --goal-mm 1 --refine rig.blend --epochs 1",
+        "train recording rig.blend --goal-mm 1 --refine rig.blend --passes 1",
         "rig.blend",
         "a model",
     ),
@@ -101,7 +101,7 @@ def test_report_and_checkpoint_are_checked_too(place, capfd, monkeypatch):
         ("new.checkpoint.npz", "the checkpoint of a training"),
     ):
         (place / name).write_text('{"mine": 1}')
-        text = Refusal(place, capfd)("train", "recording", "new.onnx", "--epochs", "1")
+        text = Refusal(place, capfd)("train", "recording", "new.onnx", "--passes", "1")
         assert text == f"Cannot write '{name}': {IS_OTHER.format(kind)}"
         (place / name).unlink()
 
@@ -137,7 +137,7 @@ def test_verbs_overwrite_what_they_wrote_before(place, monkeypatch):
     monkeypatch.chdir(place)
     verbs = (
         "check-recording recording --json w.json",
-        "train recording new.onnx --epochs 1",
+        "train recording new.onnx --passes 1",
         "bind rig.blend m.onnx bound.blend",
         "evaluate rig.blend m.onnx --json e.json --poses 2 --heatmap e.png",
         "benchmark rig.blend m.onnx --json b.json --frames 2",
@@ -155,7 +155,7 @@ def test_verbs_overwrite_files_of_another_kind_with_overwrite(place, monkeypatch
     assert done("evaluate rig.blend m.onnx --json notes.txt --poses 2 --overwrite")
     assert json.loads((place / "notes.txt").read_text())["unit"] == "mm"
     (place / "mine.onnx").write_text("a note")
-    assert done("train recording mine.onnx --epochs 1 --overwrite")
+    assert done("train recording mine.onnx --passes 1 --overwrite")
     assert (place / "mine.onnx").stat().st_size > 1000
     before = (place / "rig.blend").read_bytes()
     assert done("bind rig.blend m.onnx rig.blend --overwrite")

@@ -138,7 +138,7 @@ def test_a_mesh_without_faces_has_no_normals(rig, tmp_path, capfd):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "wire.blend"))
     model = tmp_path / "wire.onnx"
     assert run("record", tmp_path / "wire.blend", tmp_path / "recording", "--poses", 20) == 0
-    train(tmp_path / "recording", model, "--epochs", 2)
+    train(tmp_path / "recording", model, "--passes", 2)
     assert run("evaluate", tmp_path / "wire.blend", model, "--json", tmp_path / "e.json", "--poses", 3) == 0
     report = json.loads((tmp_path / "e.json").read_text())
     assert report["normals"] is None and report["edges"] is None

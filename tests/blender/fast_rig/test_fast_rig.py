@@ -44,7 +44,7 @@ def studio_files(tmp_path_factory) -> Path:
         collection.objects.link(scene_object)
     save_copy(folder / "full.blend")
     assert run("record", folder / "full.blend", folder / "recording", "--object", ELBOW, "--poses", 60) == 0
-    train(folder / "recording", folder / "model.onnx", "--epochs", 3)
+    train(folder / "recording", folder / "model.onnx", "--passes", 3)
     return folder
 
 

@@ -21,7 +21,7 @@ from ..arm_and_face import IK, recorded, saved
 def test_shape_keys_are_recorded_in_the_given_or_default_range(face):
     assert bpy.ops.fdda.add_control(name="flexed") == {"FINISHED"}
     assert bpy.ops.fdda.add_control(name="thin") == {"FINISHED"}
-    control = face.mesh_object.fdda.settings.controls["flexed"]
+    control = face.mesh_object.fdda.settings.extra_inputs["flexed"]
     control.has_range, control.low, control.high = True, 0.25, 0.75
     check = checks.check_now(face)
     assert check.problems == () and check.automatic_controls == ()
@@ -52,10 +52,10 @@ def test_an_unknown_control_is_a_problem_and_an_unnamed_one_is_not(face):
     settings = face.mesh_object.fdda.settings
     assert bpy.ops.fdda.add_control() == {"FINISHED"}
     assert checks.check_now(face).problems == (), "it is being filled in"
-    settings.controls[0].name = "smile"
+    settings.extra_inputs[0].name = "smile"
     assert checks.check_now(face).problems[0].startswith("'elbow' has no control 'smile/'")
     assert bpy.ops.fdda.remove_control() == {"FINISHED"}
-    assert not settings.controls and checks.check_now(face).problems == ()
+    assert not settings.extra_inputs and checks.check_now(face).problems == ()
     with pytest.raises(RuntimeError, match="No extra input is active; click one in the list"):
         bpy.ops.fdda.remove_control()
 
@@ -76,7 +76,7 @@ def test_a_full_data_path_is_shortened(face, path, name):
     path = "bpy.data." + path.replace("KEYS", keys.name).replace(
         'armatures["elbow_rig"]', f'armatures["{armature.name}"]'
     )
-    control = face.mesh_object.fdda.settings.controls.add()
+    control = face.mesh_object.fdda.settings.extra_inputs.add()
     control.name = path
     assert control.name == (name or path)
 
@@ -84,14 +84,14 @@ def test_a_full_data_path_is_shortened(face, path, name):
 def test_a_full_data_path_is_added_by_its_short_name(face):
     path = 'bpy.data.objects["elbow"].data.shape_keys.key_blocks["flexed"].value'
     assert bpy.ops.fdda.add_control(name=path) == {"FINISHED"}
-    assert [control.name for control in face.mesh_object.fdda.settings.controls] == ["flexed"]
+    assert [control.name for control in face.mesh_object.fdda.settings.extra_inputs] == ["flexed"]
     with pytest.raises(RuntimeError, match="'flexed' is already in the list"):
         bpy.ops.fdda.add_control(name=path)
 
 
 def test_an_empty_range_is_a_problem(face):
     bpy.ops.fdda.add_control(name="thin")
-    control = face.mesh_object.fdda.settings.controls[0]
+    control = face.mesh_object.fdda.settings.extra_inputs[0]
     control.has_range, control.low, control.high = True, 1.0, 0.5
     (problem,) = checks.check_now(face).problems
     assert problem.startswith("The control 'shape_keys/key_blocks[\"thin\"].value' has no range; give one")

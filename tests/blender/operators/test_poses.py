@@ -84,8 +84,8 @@ def test_rest_pose_resets_the_bones_and_can_be_undone(saved):
 
 def test_poses_of_the_margin_are_shown_as_they_are_recorded(saved):
     settings = saved.mesh_object.fdda.settings
-    settings.poses, settings.margin = 8, 2.0
-    recording_settings = RecordingSettings(poses=8, margin=2.0)
+    settings.poses, settings.overshoot = 8, 2.0
+    recording_settings = RecordingSettings(poses=8, overshoot=2.0)
     channels = sampled_channels(saved, read_rig(saved))
     margin = make_recording_margin(saved, recording_settings, channels)
     bones = saved.armature_object.pose.bones

@@ -48,13 +48,13 @@ def wave(rig: SceneRig) -> bpy.types.Action:
 
 class TestBones:
     def test_by_default_bones_with_weights_are_sampled(self, arm):
-        assert recording_settings(arm).sample == ()
+        assert recording_settings(arm).bones_to_pose == ()
         assert checks.check_now(arm).problems == ()
         assert sampled_channels_by_bone(arm) is None, "the list has the joints"
 
     def test_the_bones_of_a_collection_are_sampled(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample = "COLLECTION"
+        settings.bones_to_pose = "COLLECTION"
         assert checks.check_now(arm).problems == (
             "Bones to Pose is set to Bone Collection, but no collection is chosen; choose one in Training Poses.",
         )
@@ -73,14 +73,14 @@ class TestBones:
 
     def test_a_missing_bone_collection_is_a_problem(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample, settings.bone_collection = "COLLECTION", "Face"
+        settings.bones_to_pose, settings.bone_collection = "COLLECTION", "Face"
         assert checks.check_now(arm).problems == (
             "'elbow_rig' has no bone collection 'Face'; its collections: 'Controls'.",
         )
 
     def test_the_keyed_channels_of_checked_actions_are_sampled(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample = "ACTIONS"
+        settings.bones_to_pose = "ACTIONS"
         with pytest.raises(RuntimeError, match="but no action is checked; check one"):
             bpy.ops.fdda.record()
         action = wave(arm)
@@ -95,7 +95,7 @@ class TestBones:
         assert (ik.low, ik.high) == pytest.approx((0.0, 0.5))
 
     def test_the_ranges_follow_the_keys(self, arm):
-        arm.mesh_object.fdda.settings.sample = "ACTIONS"
+        arm.mesh_object.fdda.settings.bones_to_pose = "ACTIONS"
         action = wave(arm)
         bone = arm.armature_object.pose.bones["fk_lower"]
         bone.constraints.remove(bone.constraints[0])
@@ -120,7 +120,7 @@ class TestBones:
 
     def test_the_bones_that_were_selected_are_stored_and_sampled(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample = "SELECTED"
+        settings.bones_to_pose = "SELECTED"
         select(arm)
         assert checks.check_now(arm).problems[0].endswith("select bones and press Use Selected Bones.")
         with pytest.raises(RuntimeError, match="No bone of 'elbow_rig' is selected; select bones in Pose Mode"):
@@ -135,11 +135,11 @@ class TestBones:
         assert {channel.kind for channel in recording.info.sampling.channels} >= {LOCATION}
         bpy.ops.wm.save_mainfile()
         bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-        assert recording_settings(find_rig()).sample == ("bone:ik_hand", "bone:ik_pole")
+        assert recording_settings(find_rig()).bones_to_pose == ("bone:ik_hand", "bone:ik_pole")
 
     def test_a_recording_with_other_sampled_bones_is_reported(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
+        settings.bones_to_pose, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
         recorded(arm)
         checks.check_now(arm)
         assert cached_content(arm, recording_folder(arm.mesh_object)).sentence == ""
@@ -151,7 +151,7 @@ class TestBones:
 
     def test_choosing_other_control_bones_does_not_read_the_mesh_again(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
+        settings.bones_to_pose, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
         first = checks.check_now(arm)
         select(arm, "fk_upper")
         bpy.ops.fdda.use_selected_bones()
@@ -167,7 +167,7 @@ def sampled_by_bone_now(rig: SceneRig) -> dict:
 class TestPreview:
     def test_previewed_poses_and_controls_are_those_that_are_recorded(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
+        settings.bones_to_pose, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
         bpy.ops.fdda.add_control(name=IK)
         recording = recorded(arm)
         names = recording.rig.joint_names
@@ -186,12 +186,12 @@ class TestPreview:
         assert keys["flexed"].value == keys["thin"].value == 0
 
     def test_the_rest_pose_works_without_sampled_bones(self, arm):
-        arm.mesh_object.fdda.settings.sample = "SELECTED"
+        arm.mesh_object.fdda.settings.bones_to_pose = "SELECTED"
         arm.armature_object.pose.bones["fk_upper"].rotation_euler[0] = 0.5
         assert bpy.ops.fdda.rest_pose() == {"FINISHED"}
         assert arm.armature_object.pose.bones["fk_upper"].rotation_euler[0] == 0
 
     def test_poses_are_previewed_even_if_only_actions_are_recorded(self, arm):
         settings = arm.mesh_object.fdda.settings
-        settings.sample, settings.bone_collection, settings.poses = "COLLECTION", control_rigs.CONTROLS, 0
+        settings.bones_to_pose, settings.bone_collection, settings.poses = "COLLECTION", control_rigs.CONTROLS, 0
         assert bpy.ops.fdda.preview_pose(number=1) == {"FINISHED"}

@@ -27,7 +27,7 @@ def recorded_folder(tmp_path: Path) -> Path:
 
 def train(rig: SceneRig, elbow_files, **options) -> set[str]:
     settings = rig.mesh_object.fdda.settings
-    settings.epochs, settings.tolerance_mm, settings.training_seed = 6, 0.2, 3
+    settings.passes, settings.detail_mm, settings.training_seed = 6, 0.2, 3
     return bpy.ops.fdda.train(recording=str(elbow_files.recording), **options)
 
 
@@ -36,7 +36,7 @@ def test_a_model_is_trained_with_the_settings_and_learning_curves_are_stored(sav
     assert train(saved, elbow_files) == {"FINISHED"}
     model = tmp_path / "models" / "a.onnx"
     training = read_model_info(model).training
-    assert (training["epochs"], training["tolerance_mm"], training["seed"]) == (6, 0.2, 3)
+    assert (training["passes"], training["detail_mm"], training["seed"]) == (6, 0.2, 3)
     state = job.state_of("train")
     assert (state.done, state.total) == (6, 6) and state.outcome.startswith("Trained 'a.onnx' in ")
     assert [len(state.curves[name]) for name in ("training", "validation")] == [6, 6]
@@ -82,7 +82,7 @@ def test_a_canceled_training_writes_no_model(saved, elbow_files, tmp_path, monke
             bpy.ops.fdda.cancel()
 
     monkeypatch.setattr(job.JobState, "show", cancel)
-    saved.mesh_object.fdda.settings.epochs = 10_000
+    saved.mesh_object.fdda.settings.passes = 10_000
     options = {"recording": str(elbow_files.recording), "model": str(tmp_path / "m.onnx")}
     assert bpy.ops.fdda.train(**options) == {"CANCELLED"}
     assert job.state_of("train").outcome == "Training canceled; no model was written."
@@ -91,7 +91,7 @@ def test_a_canceled_training_writes_no_model(saved, elbow_files, tmp_path, monke
 
 def test_refining_adds_poses_and_training_continues_from_the_checkpoint(saved, elbow_files, tmp_path):
     settings = saved.mesh_object.fdda.settings
-    settings.poses, settings.epochs, settings.use_goal, settings.goal_mm = 20, 2, True, 0.001
+    settings.poses, settings.passes, settings.use_goal, settings.goal_mm = 20, 2, True, 0.001
     assert bpy.ops.fdda.record() == {"FINISHED"}
     with pytest.raises(RuntimeError, match="There is no checkpoint"):
         bpy.ops.fdda.train(warm_start=True)

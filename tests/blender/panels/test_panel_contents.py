@@ -132,14 +132,14 @@ class TestFolder:
 
     def test_the_settings_belong_to_the_character_and_are_saved(self, saved, tmp_path):
         settings = saved.mesh_object.fdda.settings
-        settings.seed, settings.recording, settings.tolerance_mm = 4, "//takes/one", 0.25
+        settings.seed, settings.recording, settings.detail_mm = 4, "//takes/one", 0.25
         bpy.data.actions["elbow_wave"].fdda.record = True
         bpy.ops.wm.save_mainfile()
         bpy.ops.wm.read_factory_settings(use_empty=True)
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "elbow.blend"))
         mesh_object = bpy.data.objects[ELBOW]
         settings = mesh_object.fdda.settings
-        assert (settings.poses, settings.seed, settings.tolerance_mm) == (5, 4, 0.25)
+        assert (settings.poses, settings.seed, settings.detail_mm) == (5, 4, 0.25)
         assert recording_folder(mesh_object) == tmp_path / "takes" / "one"
         assert model_file(mesh_object) == tmp_path / "elbow_model" / "elbow.onnx"
         # Another file of the folder has a mesh of this name too.
@@ -207,7 +207,7 @@ class TestTraining:
         trainings = []
 
         def steps():
-            with Training([str(elbow_files.recording), str(tmp_path / "m.onnx"), "--epochs", "100000"]) as training:
+            with Training([str(elbow_files.recording), str(tmp_path / "m.onnx"), "--passes", "100000"]) as training:
                 trainings.append(training)
                 yield from training.messages(wait=False)
 

@@ -185,7 +185,7 @@ def test_a_section_without_a_rig_draws(name: str):
 
 
 def test_lists_draw_their_items(active: bpy.types.Object):
-    control = active.fdda.settings.controls.add()
+    control = active.fdda.settings.extra_inputs.add()
     control.name, control.has_range = "flex", True
     assert list_items("poses") == [
         "Record elbow_wave 1…30",

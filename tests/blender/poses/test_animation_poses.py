@@ -83,7 +83,7 @@ def add_strips(rig: SceneRig, action: bpy.types.Action, start: int = 40, name: s
 @pytest.mark.parametrize(("old", "new"), [(100, 200), (100, 30)])
 def test_time_stretching_does_not_change_the_recorded_frames(figure, tmp_path, old, new):
     shown = positions_in_frames(figure, range(1, FRAMES + 1))
-    strip_recording_options = {"strips": ("swing",), "poses": 3, "controls": ("Smile",)}
+    strip_recording_options = {"strips": ("swing",), "poses": 3, "extra_inputs": ("Smile",)}
     add_strips(figure, bpy.data.actions[WAVE])
     expected = positions_of(record_and_read(figure, tmp_path / "expected", **strip_recording_options))
     render = bpy.context.scene.render
@@ -141,7 +141,7 @@ def test_mirroring_exchanges_controls_of_left_and_right_bones(figure, tmp_path):
     figure.armature_object.pose.bones["arm.R"]["fist"] = 0.25
     names = [f'armature_object/pose.bones["arm.{side}"]["fist"]=0:1' for side in "LR"]
     before = scene_state(figure)
-    recording = record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True, controls=tuple(names))
+    recording = record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True, extra_inputs=tuple(names))
     assert_same_state(before, scene_state(figure))
     controls = np.array(recording.controls[: 2 * FRAMES])
     assert np.ptp(controls[:FRAMES, 0]) > 0.9 and (controls[:FRAMES, 1] == 0.25).all()
@@ -196,7 +196,9 @@ def test_an_action_with_curves_for_shape_keys_moves_them(figure, tmp_path):
     slot = keys.animation_data.action_slot.identifier
     before = scene_state(figure)
     for controls in ((), ("Smile",)):
-        recording = record_and_read(figure, tmp_path / f"recording{len(controls)}", actions=(WAVE,), controls=controls)
+        recording = record_and_read(
+            figure, tmp_path / f"recording{len(controls)}", actions=(WAVE,), extra_inputs=controls
+        )
         still_recording = record_and_read(figure, tmp_path / f"still{len(controls)}", actions=("own",))
         assert (keys.animation_data.action, keys.animation_data.action_slot.identifier) == (own_action, slot)
         assert keys.key_blocks["Smile"].value == pytest.approx(0.3)
@@ -223,7 +225,7 @@ def test_random_controls_are_reset_before_actions(figure, tmp_path):
     """Otherwise a recording that is resumed in an action would differ from an uninterrupted one."""
     name = 'armature_object/pose.bones["arm.R"]["fist"]'
     figure.armature_object.pose.bones["arm.R"]["fist"] = 0.5
-    recording = record_and_read(figure, tmp_path / "recording", poses=5, actions=(WAVE,), controls=(f"{name}=0:1",))
+    recording = record_and_read(figure, tmp_path / "recording", poses=5, actions=(WAVE,), extra_inputs=(f"{name}=0:1",))
     values = np.delete(recording.controls, recording.info.alone_poses, axis=0)
     values = values[:, [c.name for c in recording.rig.controls].index(name)]
     assert np.ptp(values[:5]) > 0 and (values[5:] == 0.5).all()
@@ -235,7 +237,7 @@ def test_resumed_recordings_have_the_same_bytes(figure, tmp_path, stop_pose):
     add_strips(figure, bpy.data.actions[WAVE])
     name = 'armature_object/pose.bones["arm.R"]["fist"]=0:1'
     settings = {"poses": 10, "actions": (WAVE,), "strips": ("swing",), "mirror": True, "influence_poses": 1}
-    settings = RecordingSettings(**settings, controls=(name,))
+    settings = RecordingSettings(**settings, extra_inputs=(name,))
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     drain(record(figure, whole, settings))
     steps = record(figure, resumed, settings)
@@ -262,7 +264,7 @@ def trained_folder(tmp_path_factory):
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "figure.blend"))
     options = ("--poses", 0, "--action", WAVE, "--mirror")
     assert run("record", folder / "figure.blend", folder / "recording", *options) == 0
-    train(folder / "recording", folder / "figure.onnx", "--epochs", 30)
+    train(folder / "recording", folder / "figure.onnx", "--passes", 30)
     return folder
 
 

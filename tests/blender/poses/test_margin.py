@@ -26,7 +26,7 @@ from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 pytestmark = pytest.mark.one_blender_version
 
-SETTINGS = RecordingSettings(poses=40, margin=2.0, influence_poses=2, actions=("elbow_wave",))
+SETTINGS = RecordingSettings(poses=40, overshoot=2.0, influence_poses=2, actions=("elbow_wave",))
 INSIDE = 30
 """Number of random poses inside the range of motion. They come first, and the other 10 are in the margin."""
 
@@ -75,7 +75,7 @@ def test_poses_of_the_margin_leave_the_limits_and_locked_axes(rig, tmp_path):
 
 def test_poses_inside_and_frames_are_those_of_a_recording_without_a_margin(rig, tmp_path):
     """After the poses of the margin, axes are locked and limits are active again for the frames of the action."""
-    without = recorded(rig, tmp_path / "without", replace(SETTINGS, margin=1.0))
+    without = recorded(rig, tmp_path / "without", replace(SETTINGS, overshoot=1.0))
     recording = recorded(rig, tmp_path / "with")
     for name in ("pose_matrices", "residuals"):
         ours, theirs = np.array(getattr(recording, name)), np.array(getattr(without, name))
@@ -114,7 +114,7 @@ def test_a_resumed_recording_equals_an_uninterrupted_one_bit_for_bit(rig, tmp_pa
 def test_a_recording_cannot_be_resumed_with_another_margin(rig, tmp_path):
     drain(record(opened(rig), tmp_path / "r", SETTINGS), stop_after=10)
     with pytest.raises(RecordingError, match=r"recorded differently \(sampling\.margin"):
-        drain(record(opened(rig), tmp_path / "r", replace(SETTINGS, margin=1.5, resume=True)))
+        drain(record(opened(rig), tmp_path / "r", replace(SETTINGS, overshoot=1.5, resume=True)))
 
 
 def test_only_limits_that_would_change_a_pose_are_muted():
@@ -138,12 +138,12 @@ def test_only_limits_that_would_change_a_pose_are_muted():
 
 
 def test_record_accepts_margins_from_1_to_4(rig, tmp_path, capfd):
-    assert run("record", rig, tmp_path / "r", "--poses", 20, "--margin", 1.5) == 0
+    assert run("record", rig, tmp_path / "r", "--poses", 20, "--overshoot", 1.5) == 0
     margin = read_recording(tmp_path / "r").info.sampling.margin
     assert (margin.factor, margin.poses) == (1.5, 5)
     for value in ("0.5", "4.5", "nan"):
-        assert run("record", rig, tmp_path / "s", "--margin", value) == 2
-        assert f"--margin: must be a number, 1 or more and at most 4, not '{value}'" in capfd.readouterr().err
+        assert run("record", rig, tmp_path / "s", "--overshoot", value) == 2
+        assert f"--overshoot: must be a number, 1 or more and at most 4, not '{value}'" in capfd.readouterr().err
     assert not (tmp_path / "s").exists()
 
 
@@ -158,8 +158,8 @@ def test_a_margin_at_least_halves_the_error_beyond_the_range(tmp_path):
     errors = {}
     for margin in ("1", "2"):
         recording, model, out = tmp_path / margin, tmp_path / f"{margin}.onnx", tmp_path / f"{margin}.json"
-        assert run("record", rig, recording, "--poses", 200, "--margin", margin) == 0
-        train(recording, model, "--epochs", 60)
+        assert run("record", rig, recording, "--poses", 200, "--overshoot", margin) == 0
+        train(recording, model, "--passes", 60)
         assert run("evaluate", rig, model, "--json", out, "--poses", 40, "--range-scale", 2) == 0
         errors[margin] = _errors(out)
     assert errors["2"][1] < errors["1"][1] / 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`--sample remix`: random poses that combine the limbs of recorded actions."""
+"""`--bones-to-pose remix`: random poses that combine the limbs of recorded actions."""
 
 import bpy
 import numpy as np
@@ -89,13 +89,13 @@ def test_frames_of_an_action_that_does_not_key_a_bone_have_its_rest_pose(waving)
 
 def test_a_recording_remixes_its_actions(waving, tmp_path):
     save_copy(tmp_path / "rig.blend")
-    options = ("--sample", "remix", "--action", WAVE, "--poses", 30, "--seed", 4)
+    options = ("--bones-to-pose", "remix", "--action", WAVE, "--poses", 30, "--seed", 4)
     assert run("record", tmp_path / "rig.blend", tmp_path / "recording", *options) == 0
     recording = read_recording(tmp_path / "recording")
     random_source, action_source = recording.info.sampling.sources
     assert (random_source.kind, random_source.name, random_source.poses) == ("random", "remix", 30)
     assert action_source.poses == 40
-    settings = RecordingSettings(poses=30, seed=4, sample=("remix",), actions=(WAVE,))
+    settings = RecordingSettings(poses=30, seed=4, bones_to_pose=("remix",), actions=(WAVE,))
     rig = find_rig()
     _, channels = read_sampled_rig(rig, settings)
     sampler = make_pose_sampler(rig, settings)
@@ -105,13 +105,13 @@ def test_a_recording_remixes_its_actions(waving, tmp_path):
 
 def test_remixed_poses_need_actions(waving):
     with pytest.raises(RigError, match=r"Remixed poses combine the limbs of recorded actions; name some \(--action"):
-        read_sampled_rig(waving, RecordingSettings(sample=("remix",)))
+        read_sampled_rig(waving, RecordingSettings(bones_to_pose=("remix",)))
 
 
 def test_an_action_that_moves_no_bone_is_refused(waving):
     bpy.data.actions.new("still")
     with pytest.raises(RigError, match="There is no pose to remix: 'still' moves no bone of 'elbow_rig'"):
-        read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=("still",)))
+        read_sampled_rig(waving, RecordingSettings(bones_to_pose=("remix",), actions=("still",)))
 
 
 def add_actions_without_motion(armature_object: bpy.types.Object) -> None:
@@ -132,18 +132,18 @@ def add_actions_without_motion(armature_object: bpy.types.Object) -> None:
 def test_a_single_pose_is_refused(waving):
     add_actions_without_motion(waving.armature_object)
     with pytest.raises(RigError, match="There is only one pose to remix: nothing of 'elbow_rig' moves in 'one frame'"):
-        read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=(STILL,)))
-    read_sampled_rig(waving, RecordingSettings(sample=("remix",), actions=(STILL, WAVE)))
+        read_sampled_rig(waving, RecordingSettings(bones_to_pose=("remix",), actions=(STILL,)))
+    read_sampled_rig(waving, RecordingSettings(bones_to_pose=("remix",), actions=(STILL, WAVE)))
 
 
 def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "waving.blend"))
     settings = waving.mesh_object.fdda.settings
-    settings.sample = "REMIX"
+    settings.bones_to_pose = "REMIX"
     with pytest.raises(RigError, match="is set to Limbs from the Checked Actions, but no action is checked"):
         recording_settings(waving)
     bpy.data.actions[WAVE].fdda.record = True
-    assert recording_settings(waving).sample == ("remix",)
+    assert recording_settings(waving).bones_to_pose == ("remix",)
     assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
 
 
@@ -152,7 +152,7 @@ def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
     [
         (["--action", WAVE], True),
         (["--action", WAVE, "--action", STILL], True),
-        (["--action", WAVE, "--sample", "remix"], False),
+        (["--action", WAVE, "--bones-to-pose", "remix"], False),
         (["--action", WAVE, "--poses", 0], False),
         ([], False),
         # There is no motion of bones to combine.
@@ -168,4 +168,4 @@ def test_recording_actions_with_random_poses_suggests_to_remix(waving, tmp_path,
     save_copy(path)
     poses = [] if "--poses" in options else ["--poses", 12]
     assert run("record", path, tmp_path / "recording", *poses, *options) == 0
-    assert ("with --sample remix they combine limbs" in capsys.readouterr().out) == has_hint
+    assert ("with --bones-to-pose remix they combine limbs" in capsys.readouterr().out) == has_hint

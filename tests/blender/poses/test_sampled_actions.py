@@ -175,11 +175,20 @@ def test_euler_angles_of_several_actions_do_not_wrap(figure):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"controls": ("collection:Empty", "bone:spine")}, "The bone collection 'Empty' of 'figure_rig' has no bones;"),
-        ({"sample": ("collection:Empty", "bone:spine")}, "The bone collection 'Empty' of 'figure_rig' has no bones;"),
-        ({"sample": ("selected", "bone:spine")}, "No bone of 'figure_rig' is selected; select bones in Pose Mode"),
         (
-            {"sample": ("action:nothing", "bone:spine")},
+            {"extra_inputs": ("collection:Empty", "bone:spine")},
+            "The bone collection 'Empty' of 'figure_rig' has no bones;",
+        ),
+        (
+            {"bones_to_pose": ("collection:Empty", "bone:spine")},
+            "The bone collection 'Empty' of 'figure_rig' has no bones;",
+        ),
+        (
+            {"bones_to_pose": ("selected", "bone:spine")},
+            "No bone of 'figure_rig' is selected; select bones in Pose Mode",
+        ),
+        (
+            {"bones_to_pose": ("action:nothing", "bone:spine")},
             "The action 'nothing' chooses nothing to sample: it keys no bone",
         ),
     ],

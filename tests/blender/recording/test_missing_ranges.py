@@ -14,7 +14,7 @@ from fdda_addon.scene.scene_rig import find_rig
 
 
 def notes_of_recording(folder: Path, *controls: str) -> str:
-    settings = RecordingSettings(poses=4, influence_poses=1, controls=controls)
+    settings = RecordingSettings(poses=4, influence_poses=1, extra_inputs=controls)
     return " ".join(step.note for step in record(find_rig("elbow"), folder / "recording", settings))
 
 

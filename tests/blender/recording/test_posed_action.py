@@ -40,9 +40,9 @@ def files(request, tmp_path) -> tuple[Path, Path]:
             bone.rotation_mode = request.param
 
     rig = save_elbow(tmp_path / "rig.blend", change)
-    options = ("--poses", POSES, "--action", "elbow_wave", "--control", "Fat", "--control", "Thin")
+    options = ("--poses", POSES, "--action", "elbow_wave", "--extra-input", "Fat", "--extra-input", "Thin")
     # The action moves no bone of another rotation mode.
-    options += ("--sample", "remix") if request.param == "ZYX" else ()
+    options += ("--bones-to-pose", "remix") if request.param == "ZYX" else ()
     assert run("record", rig, tmp_path / "recording", *options) == 0
     return rig, tmp_path / "recording"
 

@@ -92,12 +92,12 @@ def test_motion_of_the_character_changes_no_error(build: Callable[[], None], tmp
     build()
     bpy.context.view_layer.update()
     scene_rig = find_rig("elbow")
-    settings = RecordingSettings(poses=60, sample=("collection:Controls",), influence_poses=4)
+    settings = RecordingSettings(poses=60, bones_to_pose=("collection:Controls",), influence_poses=4)
     for _ in record(scene_rig, tmp_path / "recording", settings):
         pass
     recorded_rig = read_recording(tmp_path / "recording").rig
     assert (recorded_rig.references < 0).sum() == 1
-    train(tmp_path / "recording", tmp_path / "elbow.onnx", "--epochs", 10, *SMALL)
+    train(tmp_path / "recording", tmp_path / "elbow.onnx", "--passes", 10, *SMALL)
     network = Network(tmp_path / "elbow.onnx")
     assert network.info.joints == recorded_rig.joints
     assert [j.reference for j in network.info.joints] == [j.reference for j in recorded_rig.joints]

@@ -26,7 +26,16 @@ def change(build, work, path: Path) -> Path:
 
 def refused(refusal: Refusal, rig: Path, *options: object, target: str = "flesh") -> str:
     return refusal(
-        "record", rig, rig.parent / "recording", "--object", "elbow", "--target", target, "--action", ACTION, *options
+        "record",
+        rig,
+        rig.parent / "recording",
+        "--object",
+        "elbow",
+        "--learn-from",
+        target,
+        "--action",
+        ACTION,
+        *options,
     )
 
 
@@ -106,7 +115,10 @@ def test_a_missing_file_is_refused(refusal, capfd, tmp_path):
         bpy.data.cache_files[0].filepath = str(gone / "flesh.abc")
 
     rig = change(targets.target_alembic, lose_file, tmp_path / "other.blend")
-    assert run("record", rig, tmp_path / "recording", "--object", "elbow", "--target", "flesh", "--action", ACTION) == 1
+    assert (
+        run("record", rig, tmp_path / "recording", "--object", "elbow", "--learn-from", "flesh", "--action", ACTION)
+        == 1
+    )
     # Blender says something itself.
     assert f"plays the file '{gone / 'flesh.abc'}', which is not there" in capfd.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "recording").exists()
@@ -182,17 +194,17 @@ def test_mirrored_frames_of_a_cache_are_refused(refusal, tmp_path):
 
 def test_settling_and_pre_roll_without_a_simulation_are_refused(refusal, tmp_path):
     rig = built(targets.target_pc2, tmp_path / "rig.blend")
-    assert refused(refusal, rig, "--poses", 0, "--max-settle-frames", 5) == (
+    assert refused(refusal, rig, "--poses", 0, "--settle-frames", 5) == (
         "The target 'flesh' cannot settle: the modifier 'Cache' of 'flesh' has a fixed range of frames; leave settling "
         "out."
     )
     assert refused(refusal, rig, "--pre-roll", 5).startswith("The target 'flesh' is no simulation, so there is nothing")
     rig = built(targets.target_copy, tmp_path / "copy.blend")
-    assert "cannot settle: it follows the pose at once;" in refused(refusal, rig, "--max-settle-frames", 5)
+    assert "cannot settle: it follows the pose at once;" in refused(refusal, rig, "--settle-frames", 5)
 
 
 def test_a_target_for_several_meshes_is_refused(refusal, tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
-    assert refusal("record", rig, tmp_path / "out", "--all", "--target", "flesh").startswith(
+    assert refusal("record", rig, tmp_path / "out", "--all", "--learn-from", "flesh").startswith(
         "A target belongs to one mesh; record the meshes one by one"
     )

@@ -30,7 +30,7 @@ from .test_targets import built, of_flesh, recorded, residuals
 SIMULATIONS = (targets.target_soft_body, targets.target_cloth, targets.target_geometry_nodes)
 ROOT = Path(__file__).resolve().parents[3]
 SLOW_SIMULATIONS = [pytest.param(build, marks=pytest.mark.slow) for build in SIMULATIONS[:2]]
-SETTLED = ("--target", "flesh", "--max-settle-frames", 80)
+SETTLED = ("--learn-from", "flesh", "--settle-frames", 80)
 
 
 def played(rig: Path) -> np.ndarray:
@@ -113,7 +113,7 @@ def test_random_poses_of_a_simulation_have_to_settle(refusal, tmp_path):
     assert refused(refusal, rig, "--poses", 5).startswith(
         "The target 'flesh' is a simulation (the modifier 'Cloth' of 'flesh'): what it shows in a random pose depends"
     )
-    assert refused(refusal, rig, "--poses", 5, "--max-settle-frames", 9).startswith(
+    assert refused(refusal, rig, "--poses", 5, "--settle-frames", 9).startswith(
         f"Settled poses are random ones, and '{ACTION}' is to be recorded too, frame by frame;"
     )
 
@@ -137,7 +137,7 @@ def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
         "object": "flesh",
         "follows": "simulation",
         "pre_roll": 0,
-        "max_settle_frames": 80,
+        "settle_frames": 80,
         "rest_threshold_mm": 0.1,
     }
 
@@ -173,7 +173,7 @@ def complete_poses(recording: Path) -> int:
 
 def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
     rig = built(targets.target_soft_body, tmp_path / "rig.blend")
-    hasty = "--target", "flesh", "--max-settle-frames", 12, "--poses", 5
+    hasty = "--learn-from", "flesh", "--settle-frames", 12, "--poses", 5
     recording = recorded(rig, tmp_path / "recording", *hasty)
     assert recording.info.unsettled == (0, 1, 2, 3, 4)
     assert "5 of 5 poses did not come to rest in 12 frames: 0, 1, 2 and 2 more" in capfd.readouterr().out
@@ -190,7 +190,7 @@ def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
     assert capfd.readouterr().out.startswith("The same pose from two directions: ")
     assert recording.info.unsettled == ()
     model, errors = tmp_path / "elbow.onnx", tmp_path / "errors.json"
-    train(recording.path, model, "--epochs", 60)
+    train(recording.path, model, "--passes", 60)
     options = ["--object", "elbow", *SETTLED, "--poses", 6, "--json", errors]
     assert run("evaluate", rig, model, *options) == 0
     found = json.loads(errors.read_text())
@@ -201,7 +201,7 @@ def test_the_training_report_has_the_repeatability_of_settled_poses(tmp_path):
     rig = built(targets.target_geometry_nodes, tmp_path / "rig.blend")
     recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 12, "--repeatability-poses", 2)
     model, errors = tmp_path / "elbow.onnx", tmp_path / "errors.json"
-    train(recording.path, model, "--epochs", 2, "--hidden", 8)
+    train(recording.path, model, "--passes", 2, "--hidden", 8)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["repeatability"] == recording.info.repeatability.to_json()
     assert "two ways to the same pose" in (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -295,7 +295,7 @@ def test_other_simulations_keep_their_state(tmp_path):
     for frame in range(1, 13):
         bpy.context.scene.frame_set(frame)
     before = evaluated_positions(bpy.data.objects["flag"])
-    settings = RecordingSettings(poses=4, target=TargetSettings("flesh", max_settle_frames=40))
+    settings = RecordingSettings(poses=4, target=TargetSettings("flesh", settle_frames=40))
     drain(record(find_rig("elbow"), tmp_path / "recording", settings))
     assert bpy.context.scene.frame_current == 12
     assert np.array_equal(evaluated_positions(bpy.data.objects["flag"]), before)

@@ -36,7 +36,7 @@ def recorded(rig: Path, path: Path, *options: object) -> Recording:
 
 
 def of_flesh(rig: Path, path: Path, *options: object) -> Recording:
-    return recorded(rig, path, "--target", "flesh", "--action", ACTION, *options)
+    return recorded(rig, path, "--learn-from", "flesh", "--action", ACTION, *options)
 
 
 def residuals(recording: Recording) -> np.ndarray:
@@ -77,7 +77,7 @@ def test_a_target_has_the_recording_of_the_rig_that_it_copies(build, own, tmp_pa
 
 def test_a_copy_is_recorded_in_random_poses_and_its_influences_are_found(tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
-    recording = recorded(rig, tmp_path / "recording", "--target", "flesh", "--poses", 20)
+    recording = recorded(rig, tmp_path / "recording", "--learn-from", "flesh", "--poses", 20)
     assert (tmp_path / "own").exists() is False
     assert run("record", rig, tmp_path / "own", "--object", "flesh", "--poses", 20) == 0
     own = read_recording(tmp_path / "own")
@@ -111,9 +111,9 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
     rig = built(targets.target_alembic, tmp_path / "rig.blend")
     of_flesh(rig, tmp_path / "recording")
     model, bound_path = tmp_path / "elbow.onnx", tmp_path / "bound.blend"
-    train(tmp_path / "recording", model, "--epochs", 60)
+    train(tmp_path / "recording", model, "--passes", 60)
     errors = tmp_path / "errors.json"
-    options = ["--object", "elbow", "--target", "flesh", "--poses", 0, "--action", ACTION, "--json", errors]
+    options = ["--object", "elbow", "--learn-from", "flesh", "--poses", 0, "--action", ACTION, "--json", errors]
     assert run("evaluate", rig, model, *options) == 0
     found = json.loads(errors.read_text())
     assert found["poses"] == FRAMES
@@ -146,7 +146,7 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     mesh_object = bpy.data.objects["elbow"]
     bpy.context.view_layer.objects.active = mesh_object
     settings = mesh_object.fdda.settings
-    settings.target, settings.poses, settings.max_settle_frames = "flesh", 0, 0
+    settings.learn_from, settings.poses, settings.settle_frames = "flesh", 0, 0
     bpy.data.actions[ACTION].fdda.record = True
     bpy.context.window_manager.fdda.all_meshes = False
     assert bpy.ops.fdda.record() == {"FINISHED"}
@@ -157,14 +157,14 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     with pytest.raises(RuntimeError, match="The target 'flesh' follows frames"):
         bpy.ops.fdda.record(folder=str(tmp_path / "random"))
     model = tmp_path / "elbow.onnx"
-    train(recording.path, model, "--epochs", 30)
+    train(recording.path, model, "--passes", 30)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
     from fdda_addon.evaluation import last_evaluation
     from fdda_addon.runtime.binding import bind
     from fdda_addon.scene.scene_rig import find_rig
 
     mesh_object = bpy.data.objects["elbow"]
-    mesh_object.fdda.settings.target = "flesh"
+    mesh_object.fdda.settings.learn_from = "flesh"
     bind(find_rig("elbow"), model)
     bpy.context.view_layer.objects.active = mesh_object
     assert bpy.ops.fdda.evaluate(source="ACTION", action=ACTION) == {"FINISHED"}

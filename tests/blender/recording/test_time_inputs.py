@@ -37,7 +37,7 @@ def keyed(path: str, owner: str, control: str) -> tuple[str, str]:
     words = f"the keys of '{path}' of '{owner}'"
     return (
         words,
-        f"name what they set as a control (--control '{control}'), or remove them" if control else "remove them",
+        f"name what they set as a control (--extra-input '{control}'), or remove them" if control else "remove them",
     )
 
 
@@ -135,7 +135,7 @@ PLAYED = {
 def test_keyed_controls_are_accepted(build, tmp_path):
     """The keyed property is detected or named as a control and sampled; recording does not change its keys."""
     rig, (named, expected) = build_rig(build), PLAYED[build]
-    settings = RecordingSettings(poses=8, influence_poses=1, controls=named)
+    settings = RecordingSettings(poses=8, influence_poses=1, extra_inputs=named)
     assert check_recordable_rig(rig, settings).problems == ()
     before = scene_state(rig)
     drain(record(rig, tmp_path / "recording", settings))

@@ -17,7 +17,7 @@ APART = 1e-3
 SENTENCE = (
     "The surface of 'elbow' depends on the place of {}, which no parent or constraint attaches to 'elbow_rig': the "
     "model keeps the place in the recording. If one has to move with the character, parent it to the armature or a "
-    "bone; if something else moves it, make that an extra input (--control)."
+    "bone; if something else moves it, make that an extra input (--extra-input)."
 )
 
 
@@ -81,6 +81,6 @@ def test_objects_that_do_not_move_with_the_armature_are_named(build, loose_model
 def test_an_object_that_controls_move_is_not_named(tmp_path):
     rig = build_rig(free_hook)
     controls = tuple(f"object:handle/location[{axis}]=-0.1:0.1" for axis in range(3))
-    settings = RecordingSettings(poses=4, influence_poses=1, controls=controls)
+    settings = RecordingSettings(poses=4, influence_poses=1, extra_inputs=controls)
     steps = list(record(rig, tmp_path / "recording", settings))
     assert not [step.note for step in steps if "disk" not in step.note and step.note]

@@ -45,7 +45,7 @@ SENTENCES = {
     second_armature.driver_of_a_bone: ALL,
     second_armature.driver_of_a_channel: (
         f"A driver of 'elbow' reads '{READS}' of a second armature, 'muscle_rig', which is no input of the model; name "
-        f"it as a control with a range (--control 'object:muscle_rig/{READS}=LOW:HIGH'), or lock it."
+        f"it as a control with a range (--extra-input 'object:muscle_rig/{READS}=LOW:HIGH'), or lock it."
     ),
 }  # fmt: skip
 

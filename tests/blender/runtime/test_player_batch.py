@@ -131,7 +131,7 @@ def test_only_characters_that_moved_are_evaluated(bound_elbow, calls):
 
 def test_different_models_side_by_side(bound_elbow, elbow_files, tmp_path, calls):
     other = tmp_path / "other.onnx"
-    train(elbow_files.recording, other, "--epochs", 3, "--hidden", 8, "--seed", 5)
+    train(elbow_files.recording, other, "--passes", 3, "--hidden", 8, "--seed", 5)
     bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
     crowd = crowd_of(bpy.data.objects[ELBOW], 4)
     for mesh_object in crowd[2:]:
@@ -173,7 +173,7 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
     try:
         assert run("build-arm", rig, "--density", 3) == 0
         assert run("record", rig, recording, "--poses", 40) == 0
-        train(recording, model, "--epochs", 2)
+        train(recording, model, "--passes", 2)
         assert run("bind", rig, model, bound_path) == 0
     finally:
         fdda_addon.unregister()

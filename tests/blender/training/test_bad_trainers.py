@@ -148,7 +148,7 @@ def test_a_trainer_whose_disk_is_full_is_reported(elbow_files, train_refusal, tm
     code = "\n".join(["import os, sys", "if 'trainer' in sys.orig_argv:", *(f"    {line}" for line in lines), ""])
     (packages / "sitecustomize.py").write_text(code)
     import_from(packages, monkeypatch)
-    text = train_refusal("--epochs", 1, status=TRY_AGAIN)
+    text = train_refusal("--passes", 1, status=TRY_AGAIN)
     assert is_silent or "No space left on device; make room, end other programs, or try again." in text
 
 

@@ -24,7 +24,7 @@ sys.path.insert(0, {root!r})
 from pathlib import Path
 from fdda_addon.training import detached_process
 detached_process.user_folder = lambda: Path({user!r})
-with detached_process.DetachedTraining([{recording!r}, {model!r}, "--epochs", "{epochs}"], Path({model!r})) as training:
+with detached_process.DetachedTraining([{recording!r}, {model!r}, "--passes", "{epochs}"], Path({model!r})) as training:
     next(training.messages())
     training.detach()
 """
@@ -53,7 +53,7 @@ def test_a_detached_training_continues_and_is_read_from_its_start(elbow_files, t
         message_types = [message.type for message in training.messages()]
     assert message_types[0] is MessageType.STARTED and message_types.count(MessageType.PROGRESS) == 30
     assert message_types[-1] is MessageType.FINISHED
-    assert read_model_info(model).training["epochs"] == 30
+    assert read_model_info(model).training["passes"] == 30
     assert not detached_process.is_detached(model)
 
 
@@ -107,7 +107,7 @@ def test_attaching_to_a_failed_training_shows_its_error(tmp_path):
 def test_a_training_that_is_not_detached_ends_with_its_block(elbow_files, tmp_path):
     model = tmp_path / "m.onnx"
     with detached_process.DetachedTraining(
-        [str(elbow_files.recording), str(model), "--epochs", "100000"], model
+        [str(elbow_files.recording), str(model), "--passes", "100000"], model
     ) as training:
         next(training.messages())
         process = training._process

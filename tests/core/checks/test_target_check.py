@@ -103,7 +103,7 @@ def test_a_low_repeatability_is_reported(swinging_recording):
 
 def test_sentence_about_unsettled_poses():
     assert unsettled_sentence({"complete": 9}) == ""
-    index = {"complete": 9, "unsettled": [1, 4], "target": {"max_settle_frames": 30}}
+    index = {"complete": 9, "unsettled": [1, 4], "target": {"settle_frames": 30}}
     assert unsettled_sentence(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
 
 
@@ -123,7 +123,7 @@ def test_target_is_read_back_from_json():
     for change in (
         {"follows": "wind"},
         {"pre_roll": -1},
-        {"max_settle_frames": 1.5},
+        {"settle_frames": 1.5},
         {"rest_threshold_mm": float("nan")},
         {"object": 3},
     ):

@@ -20,7 +20,7 @@ REPORT = {
     "vertices": 300,
     "joints": 2,
     "poses": 150,
-    "training": {"seconds": 1.5, "device": "cpu", "epochs": 2, "training_poses": 120, "held_out_poses": 15},
+    "training": {"seconds": 1.5, "device": "cpu", "passes": 2, "training_poses": 120, "held_out_poses": 15},
     "parity": 1e-4,
     "fdda": {"training": ERRORS, "held_out": ERRORS},
     "linear": {"held_out": ERRORS},

@@ -10,7 +10,7 @@ from fdda_addon.core.sentences.window import for_window
     ("text", "expected"),
     [
         (
-            "have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint weights.",
+            "have one fitted (--base-skinning smooth, or Base Skinning in the sidebar), or paint weights.",
             "have one fitted (Base Skinning in the sidebar), or paint weights.",
         ),
         ("keep more bones with --controls collection:NAME.", "keep more bones with Bone Collection."),
@@ -22,7 +22,7 @@ from fdda_addon.core.sentences.window import for_window
             "continue it with --resume, or replace it with --overwrite.",
             "continue it with Resume, or replace it with Overwrite.",
         ),
-        ("more frames (--max-settle-frames) let them rest", "more frames (Settle Frames) let them rest"),
+        ("more frames (--settle-frames) let them rest", "more frames (Settle Frames) let them rest"),
         ("The file 'a--b.blend' -- or none - stays.", "The file 'a--b.blend' -- or none - stays."),
     ],
 )
