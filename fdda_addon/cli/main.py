@@ -29,6 +29,10 @@ VERBS = {
     "fast-rig": ("fast_rig", "save a fast rig: the character without what its model and controls do not need"),
     "evaluate": ("evaluate", "compare a model with its rig on poses that are in no recording"),
     "benchmark": ("benchmark", "measure the time per frame of rig, linear skinning and model"),
+    "export-skinning": (
+        "export_skinning",
+        "save a copy whose meshes follow fitted skin weights alone, for game engines",
+    ),
     "poses": ("poses", "save a copy of a file with an action of recorded or random poses, one per frame"),
     "bake": ("bake", "write the deformed mesh of an action to a file that plays without the add-on"),
 }

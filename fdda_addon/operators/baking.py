@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operator that bakes the deformed meshes of a character to a file, which plays without the add-on."""
+"""Operators that write a character to files that play without the add-on: baked caches, and fitted skin weights."""
 
 from pathlib import Path
 
@@ -9,6 +9,9 @@ from ..baking.run import BakeSettings, bake_file
 from ..core.errors import OutputError
 from ..core.files.temporary import temporary_folder
 from ..core.progress import Job
+from ..core.recording.index import read_index
+from ..jobs.verb_process import VerbProcess
+from ..properties.character import recording_folder
 from ..runtime.model_files import write_models
 from ..scene.blend_file import save_copy
 from .job import FileJobOperator
@@ -87,4 +90,48 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
         return f"Baked {text} to {Path(self.filepath).name}."
 
 
-CLASSES = (FDDA_OT_bake,)
+class FDDA_OT_export_skinning(FileJobOperator, bpy.types.Operator):
+    bl_idname = "fdda.export_skinning"
+    bl_label = "Export Skinning"
+    bl_description = (
+        "Write a copy of this file whose recorded meshes follow bones by fitted skin weights alone, ready for glTF and "
+        "FBX. Game engines play it without a model"
+    )
+    bl_options = {"REGISTER"}
+    verb, title = "export_skinning", "Export Skinning"
+    changes_scene = False
+
+    filepath: bpy.props.StringProperty(
+        name="File", description="File to write, .blend", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    filter_glob: bpy.props.StringProperty(default="*.blend", options={"HIDDEN"})
+    influences: bpy.props.IntProperty(
+        name="Bones per Vertex", description="Largest number of bones that move a vertex", default=4, min=1, max=16
+    )
+
+    def suggested_path(self, context: bpy.types.Context) -> str:
+        read_index(recording_folder(self.rig(context).mesh_object))
+        return f"//{Path(bpy.data.filepath).stem or 'character'}_skinned.blend"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        self.layout.prop(self, "influences")
+
+    def steps(self, context: bpy.types.Context) -> Job[str]:
+        mesh_object = self.rig(context).mesh_object
+        recording = recording_folder(mesh_object)
+        if not self.filepath:
+            raise OutputError("No file was chosen; give the name of a .blend file.")
+        out = bpy.path.ensure_ext(bpy.path.abspath(self.filepath), ".blend")
+        with temporary_folder() as folder:
+            file = folder / "rig.blend"
+            save_copy(file)
+            options = [f"--influences={self.influences}", f"--object={mesh_object.name}"]
+            with VerbProcess("export-skinning", [str(file), str(recording), out, *options]) as process:
+                return (yield from process.steps())
+
+    def finish(self, _context: bpy.types.Context, result: str) -> str:
+        print(result, end="")
+        return f"Wrote {Path(self.filepath).name}; the console has the errors."
+
+
+CLASSES = (FDDA_OT_bake, FDDA_OT_export_skinning)

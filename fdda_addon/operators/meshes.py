@@ -22,7 +22,7 @@ MENU_OPERATORS = (
     ),
     ("fdda.human_limits", "fdda.copy_limits", "fdda.mirror_limits", "fdda.set_limits", "fdda.clear_limits"),
     ("fdda.add_control", "fdda.add_control_bones", "fdda.remove_control"),
-    ("fdda.record", "fdda.delete_recording"),
+    ("fdda.record", "fdda.export_skinning", "fdda.delete_recording"),
     ("fdda.check_trainer", "fdda.train", "fdda.refine", "fdda.create_trainer_environment"),
     ("fdda.bind", "fdda.set_mode", "fdda.bake", "fdda.fast_rig", "fdda.relink", "fdda.unbind"),
     ("fdda.evaluate", "fdda.render_comparison", "fdda.show_rig", "fdda.color_mesh", "fdda.fit_color_range"),

@@ -70,7 +70,7 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_recording"
     bl_label = "Recording"
     bl_options = {"DEFAULT_CLOSED"}
-    verbs = ("record",)
+    verbs = ("record", "export_skinning")
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
@@ -93,6 +93,7 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
             return
         _draw_folder(layout, context, rig)
         draw_job(layout, context, "record", ("ERROR",))
+        draw_job(layout, context, "export_skinning")
         if (advanced := draw_advanced(layout, "fdda_recording_advanced")) is not None:
             _draw_settings(advanced, context, rig.mesh_object.fdda.settings)
 
@@ -131,6 +132,8 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_wrapped(layout, context, content.measured_sentence)
     if content.sentence:
         draw_wrapped(layout, context, content.sentence, "INFO" if content.state is FolderState.COMPLETE else "ERROR")
+    if content.state is FolderState.COMPLETE:
+        layout.operator("fdda.export_skinning", text="Export Skinning…", icon="EXPORT").object = rig.mesh_object.name
     if content.is_recording:
         layout.operator("fdda.delete_recording", text="Delete Recording…", icon="TRASH").object = rig.mesh_object.name
 

@@ -96,12 +96,25 @@ def read_fit_poses(recording: Recording, has_key_joints: bool, vertices: np.ndar
         )
     vertex_count = recording.rig.vertex_count if vertices is None else len(vertices)
     poses = choose_fit_poses(pose_count, vertex_count, random_count)
+    return select_poses(recording, poses, vertices, int((poses < random_count).sum()))
+
+
+def select_poses(
+    recording: Recording, poses: np.ndarray, vertices: np.ndarray | None = None, random_count: int = 0
+) -> FitPoses:
+    """Read poses of a recording.
+
+    Args:
+        poses: (n,) indices of the poses.
+        vertices: indices of the vertices to read; None for all.
+        random_count: number of random poses, which come first.
+    """
     rig, roles = recording.rig, np.zeros((2, len(recording.rig.joints)), bool)
     roles[0, list(recording.info.bones.dependencies)] = True
     sampled = {channel.name for channel in recording.info.sampling.channels if channel.kind != CONTROL}
     roles[1] = [name in sampled for name in rig.joint_names]
     matrices, controls = (np.array(array[poses]) for array in (recording.pose_matrices, recording.controls))
-    fit_poses = FitPoses(rig, matrices, recording.positions[:0], controls, *roles, int((poses < random_count).sum()))
+    fit_poses = FitPoses(rig, matrices, recording.positions[:0], controls, *roles, random_count)
     if vertices is None:
         return replace(fit_poses, positions=np.array(recording.positions[poses]))
     positions = np.stack([recording.positions[pose][vertices] for pose in poses])

@@ -41,19 +41,25 @@ MIN_RIDGE_RATIO = 1e-12
 
 
 def fit_skin(
-    poses: FitPoses, kind: str, on_progress: Callable[[int], None] = lambda done: None
+    poses: FitPoses,
+    kind: str,
+    on_progress: Callable[[int], None] = lambda done: None,
+    influences: int = INFLUENCES,
+    max_pruning_loss: float = MAX_PRUNING_LOSS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit the weights of a rig's V vertices to poses.
 
     Args:
-        kind: "hard" for one joint per vertex, "smooth" for at most four.
+        kind: "hard" for one joint per vertex, "smooth" for at most I.
         on_progress: called often with the number of fitted vertices.
+        influences: largest number of joints per vertex, I.
+        max_pruning_loss: as `MAX_PRUNING_LOSS`.
 
     Returns:
-        (V, 4) int32 joints, the heaviest first, and (V, 4) float32 weights. Each row sums to 1; unused slots are 0.
+        (V, I) int32 joints, the heaviest first, and (V, I) float32 weights. Each row sums to 1; unused slots are 0.
     """
-    solver, vertex_count = _Solver(poses), poses.rig.vertex_count
-    joints, weights = (np.zeros((vertex_count, INFLUENCES), dtype) for dtype in (np.int32, np.float32))
+    solver, vertex_count = _Solver(poses, influences, max_pruning_loss), poses.rig.vertex_count
+    joints, weights = (np.zeros((vertex_count, influences), dtype) for dtype in (np.int32, np.float32))
     max_candidates = RIG_CANDIDATES + SINGLE_CANDIDATES + ADDED_CANDIDATES
     vertex_elements = max(16 * max_candidates**2, *solver.skin_rows.shape)
     for block in block_slices(vertex_count, vertex_elements):
@@ -67,6 +73,7 @@ class _Solver:
 
     Attributes:
         poses, pose_count, joint_count: the n poses of J joints.
+        influences, max_pruning_loss: as for `fit_skin`.
         skin_rows: (3 n, 4 J) float64, skin matrices of all poses.
         gram, gram_blocks: (4 J, 4 J) and (J, J, 16), products of the skin matrices.
         character_size: largest extent of the rig, mesh units.
@@ -74,8 +81,8 @@ class _Solver:
         joint_heads: (J, 3) float64, mesh units.
     """
 
-    def __init__(self, poses: FitPoses):
-        self.poses = poses
+    def __init__(self, poses: FitPoses, influences: int, max_pruning_loss: float):
+        self.poses, self.influences, self.max_pruning_loss = poses, influences, max_pruning_loss
         rig = poses.rig
         self.pose_count, self.joint_count = len(poses.pose_matrices), len(rig.joints)
         skin = skin_matrices(poses.pose_matrices, rig.rest_matrices)[:, :, :3].astype(np.float64)
@@ -121,7 +128,7 @@ class _Block:
         return np.einsum("jkv,vk->vj", moments.reshape(-1, 4, len(self.rest)), self.rest)
 
     def fit(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """Fit the block; returns (B, 4) int32 joints and (B, 4) float32 weights as in `fit_skin`."""
+        """Fit the block; returns (B, I) int32 joints and (B, I) float32 weights as in `fit_skin`."""
         solver, outer = self._solver, (self.rest[:, :, None] * self.rest[:, None]).reshape(-1, 16)
         skinned_squares = outer @ solver.gram_blocks[range(solver.joint_count), range(solver.joint_count)].T
         single_errors = np.maximum(skinned_squares - 2 * self.joint_moments + self.recorded_squares[:, None], 0)
@@ -131,7 +138,7 @@ class _Block:
         preferences = np.where(self.rig_weights > 0, -self.rig_weights, preferences)
         scores = np.sqrt(single_errors / solver.pose_count) + TIE_RATIO * solver.character_size * preferences
         if kind == "hard":
-            return _pad_influences(scores.argmin(axis=1)[:, None], np.ones((len(scores), 1)))
+            return _pad_influences(scores.argmin(axis=1)[:, None], np.ones((len(scores), 1)), solver.influences)
         heaviest = np.argsort(-self.rig_weights, axis=1, kind="stable")[:, :RIG_CANDIDATES]
         is_rig_candidate = np.zeros(scores.shape, bool)
         np.put_along_axis(is_rig_candidate, heaviest, True, axis=1)
@@ -146,7 +153,7 @@ class _Block:
             candidates, weights = (np.take_along_axis(array, slot_order, axis=1) for array in (candidates, weights))
             candidates = np.concatenate([candidates, self._steepest_joints(candidates, weights)], axis=1)
             weights, squared_errors = self._solve(candidates)
-        return _pad_influences(*self._prune(candidates, weights, squared_errors))
+        return _pad_influences(*self._prune(candidates, weights, squared_errors), solver.influences)
 
     def _steepest_joints(self, candidates: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return (B, n) further joints: those where adding weight lowers the error fastest."""
@@ -162,7 +169,7 @@ class _Block:
     def _prune(
         self, candidates: np.ndarray, weights: np.ndarray, squared_errors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Remove weights until each vertex has at most four and each weight lowers the error noticeably.
+        """Remove weights until each vertex has at most I and each weight lowers the error noticeably.
 
         The smallest weight is removed first. Then the remaining weights are solved again.
 
@@ -180,12 +187,12 @@ class _Block:
                 np.arange(len(vertices)), np.where(is_still_allowed, weights[vertices], np.inf).argmin(axis=1)
             ] = False
             new_weights, squared_errors = self._solve(candidates, is_still_allowed, vertices)
-            is_required = is_allowed[vertices].sum(axis=1) > INFLUENCES
+            is_required = is_allowed[vertices].sum(axis=1) > self._solver.influences
             is_accepted = is_required | (squared_errors <= max_squared_errors[vertices])
             vertices, new_weights = vertices[is_accepted], new_weights[is_accepted]
             squared_errors, is_still_allowed = squared_errors[is_accepted], is_still_allowed[is_accepted]
             weights[vertices], is_allowed[vertices] = new_weights, is_still_allowed & (new_weights > MIN_WEIGHT)
-            # The limit for fewer than four weights is relative to the error with four weights.
+            # The limit for fewer than I weights is relative to the error with I weights.
             max_squared_errors[vertices] = np.where(
                 is_required[is_accepted], self._max_squared_errors(squared_errors), max_squared_errors[vertices]
             )
@@ -193,7 +200,7 @@ class _Block:
 
     def _max_squared_errors(self, squared_errors: np.ndarray) -> np.ndarray:
         """Return the maximum squared errors with fewer weights; `squared_errors` are the errors with more weights."""
-        return squared_errors * (1 + MAX_PRUNING_LOSS) ** 2 + self._solver.tie_squared_error
+        return squared_errors * (1 + self._solver.max_pruning_loss) ** 2 + self._solver.tie_squared_error
 
     def _solve(
         self, candidates: np.ndarray, is_allowed: np.ndarray | None = None, vertices: np.ndarray | None = None
@@ -273,12 +280,12 @@ def simplex_weights(errors: np.ndarray, is_usable: np.ndarray, ridge: float) -> 
     return solutions / solutions.sum(axis=1, keepdims=True)
 
 
-def _pad_influences(joints: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert (B, C) joints and weights to (B, 4) int32 and float32, the heaviest first; unused slots are 0."""
-    slot_order = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
+def _pad_influences(joints: np.ndarray, weights: np.ndarray, influences: int) -> tuple[np.ndarray, np.ndarray]:
+    """Convert (B, C) joints and weights to (B, I) int32 and float32, the heaviest first; unused slots are 0."""
+    slot_order = np.argsort(-weights, axis=1, kind="stable")[:, :influences]
     joints, weights = (np.take_along_axis(array, slot_order, axis=1) for array in (joints, weights))
     weights = np.where(weights > 0, weights / weights.sum(axis=1, keepdims=True), 0)
-    padding = ((0, 0), (0, INFLUENCES - weights.shape[1]))
+    padding = ((0, 0), (0, influences - weights.shape[1]))
     return np.pad(np.where(weights > 0, joints, 0), padding).astype(np.int32), np.pad(weights, padding).astype(
         np.float32
     )

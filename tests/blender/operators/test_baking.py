@@ -81,3 +81,12 @@ def test_no_operator_reuses_the_path_or_object_of_its_last_call():
         if p.type == "STRING" and (p.subtype in subjects or p.identifier in {"object", "action", "bone"})
     ]
     assert len(found) > 20 and [entry for entry in found if not entry[2]] == []
+
+
+def test_the_skinning_of_the_recorded_mesh_is_exported(saved, elbow_files, tmp_path):
+    saved.mesh_object.fdda.settings.recording = str(elbow_files.recording)
+    out = tmp_path / "skinned.blend"
+    assert bpy.ops.fdda.export_skinning(filepath=str(out)) == {"FINISHED"}
+    bpy.ops.wm.open_mainfile(filepath=str(out))
+    assert [modifier.type for modifier in bpy.data.objects[ELBOW].modifiers] == ["ARMATURE"]
+    assert {group.name for group in bpy.data.objects[ELBOW].vertex_groups} == {"upper", "lower"}
