@@ -21,7 +21,7 @@ from fdda_addon.cli.main import main as run_verb
 from fdda_addon.core.files.output import write_json
 
 POSES, HELD_OUT_POSES = 600, 160
-HELD_OUT_SEED, HELD_OUT_MARGIN = 1, 2.0
+HELD_OUT_SEED, HELD_OUT_OVERSHOOT = 1, 2.0
 """Of the random poses that are held out a quarter lies outside the range of motion, up to twice as wide."""
 SMOOTHING_ITERATIONS = 10
 MAX_FRAMES = 400
@@ -94,7 +94,7 @@ def record(name: str, folder: Path, poses: int = POSES) -> None:
     sampled = [option for action in actions for option in ("--bones-to-pose", f"action:{action}")]
     recorded = [option for action in actions for option in ("--action", action)]
     _run("record", rig, folder / "recording", "--poses", poses, "--overwrite", *sampled, *recorded)
-    options = ["--seed", HELD_OUT_SEED, "--overshoot", HELD_OUT_MARGIN, *sampled]
+    options = ["--seed", HELD_OUT_SEED, "--overshoot", HELD_OUT_OVERSHOOT, *sampled]
     options += ["--action", held_out] if held_out else []
     _run("record", rig, folder / "held_out", "--poses", HELD_OUT_POSES, "--overwrite", *options)
     write_json(folder / "character.json", {"name": name, "poses": poses, "actions": actions, "held_out": held_out})

@@ -110,8 +110,8 @@ class Character:
 def kinds_of_poses(recording: SkinnedRecording) -> dict[str, np.ndarray]:
     """Return the indices of the poses of each kind that a held-out recording has."""
     is_random = np.concatenate([np.full(s.poses, s.kind == RANDOM) for s in recording.info.sampling.sources])
-    random, margin = np.flatnonzero(is_random), recording.info.sampling.margin
-    within, beyond = np.split(random, [len(random) - (margin.poses if margin else 0)])
+    random, overshoot = np.flatnonzero(is_random), recording.info.sampling.overshoot
+    within, beyond = np.split(random, [len(random) - (overshoot.poses if overshoot else 0)])
     kinds = {ACTION: np.flatnonzero(~is_random), WITHIN: within, BEYOND: beyond}
     return {kind: poses for kind, poses in kinds.items() if len(poses)}
 

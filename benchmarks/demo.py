@@ -24,7 +24,7 @@ from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.training.process import trainer_command
 
 POSES, REFINED_POSES, HELD_OUT_POSES = 3000, 1000, 200
-MARGIN = 2.0
+OVERSHOOT = 2.0
 EPOCHS = 50
 """Four times the default number of poses for a quarter of the default epochs: as many training steps.
 
@@ -65,7 +65,7 @@ def main(folder: Path) -> int:
     refine = ["record", rig, recording, "--refine", model]
     for title, arguments in (
         ("1. The rig", ["build-arm", rig]),
-        ("2. Recording", ["record", rig, recording, "--poses", POSES, "--overshoot", MARGIN]),
+        ("2. Recording", ["record", rig, recording, "--poses", POSES, "--overshoot", OVERSHOOT]),
         ("3. Training", ["train", recording, model, "--passes", EPOCHS]),
         ("Refinement: more poses where the error is largest", [*refine, "--poses", REFINED_POSES]),
         ("", ["train", recording, model, "--passes", EPOCHS, "--warm-start"]),

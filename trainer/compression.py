@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .data.split import MARGIN_POSE_WEIGHT, Split
+from .data.split import OVERSHOOT_POSE_WEIGHT, Split
 from .fits.basis import Basis
 from .fits.low_rank import factorize, may_factorize
 from .networks.networks import Network, TrainedPartition
@@ -22,7 +22,7 @@ MIN_DROPPED_PART = 0.1
 def drop_components(prepared: Sequence[TrainedPartition], split: Split) -> list[TrainedPartition]:
     """Drop the components that lower the mean error too little, or raise it.
 
-    The error is measured on the validation poses. Margin poses and refined poses also count, with a lower weight,
+    The error is measured on the validation poses. Overshoot poses and refined poses also count, with a lower weight,
     because components may represent what only happens in extreme poses. These are all training poses.
 
     A network cannot predict a component that depends on more than its inputs, or on details that the poses do not show.
@@ -78,14 +78,14 @@ def _component_gains(partition: TrainedPartition, change: np.ndarray, split: Spl
     coefficients = partition.network.evaluate(partition.inputs[partition.validation])
     errors = partition.validation_residuals - partition.basis.reconstruct(coefficients)
     error, gains = _gains_in_poses(partition, coefficients, errors, change)
-    extremes = np.union1d(split.margin, split.refined)
+    extremes = np.union1d(split.overshoot, split.refined)
     if len(extremes):
         poses = extremes[:: -(-len(extremes) // len(partition.validation))]
         coefficients = partition.network.evaluate(partition.inputs[poses])
         # What the components do not represent is small in these poses, and left out.
         errors = (partition.coefficients[poses] - coefficients) @ partition.basis.components
         extreme_error, extreme_gains = _gains_in_poses(partition, coefficients, errors, change)
-        ratio = MARGIN_POSE_WEIGHT * len(extremes) / (len(split.training) - len(extremes))
+        ratio = OVERSHOOT_POSE_WEIGHT * len(extremes) / (len(split.training) - len(extremes))
         error, gains = error + ratio * extreme_error, gains + ratio * extreme_gains
     return error, gains
 

@@ -131,7 +131,7 @@ OVERSHOOT = Setting(
     metavar="F",
     ui={"step": 10},
 )
-"""Factor by which the range of motion is scaled for poses of the margin (`poses.Margin`); 1 for no margin."""
+"""Factor by which the range of motion is scaled for overshoot poses (`poses.Overshoot`); 1 for no overshoot."""
 MIRROR = Setting(
     "mirror",
     False,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import bpy
 
 from ..core.controls import Control
-from ..core.mathematics.poses import CONTROL, Channel, Margin, make_margin
+from ..core.mathematics.poses import CONTROL, Channel, Overshoot, make_overshoot
 from ..core.mathematics.remix import PoseSampler
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
@@ -46,8 +46,8 @@ class RecordingSettings:
         poses: number of random poses.
         seed: seed of the random poses.
         spread: standard deviation of the random poses as a ratio of half the range of motion.
-        overshoot: factor that widens the range of motion for some random poses (`mathematics.poses.make_margin`); 1 for
-            none.
+        overshoot: factor that widens the range of motion for some random poses (`mathematics.poses.make_overshoot`); 1
+            for none.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
         influence_poses: number of base poses from which joints are moved alone, to find what they influence.
@@ -221,13 +221,13 @@ def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tu
     clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
     sampled_channels_of_recording = channels if settings.poses else ()
-    margin = make_recording_margin(scene_rig, settings, sampled_channels_of_recording)
-    return Sampling(settings.seed, settings.spread, sampled_channels_of_recording, tuple(sources), margin)
+    overshoot = make_recording_overshoot(scene_rig, settings, sampled_channels_of_recording)
+    return Sampling(settings.seed, settings.spread, sampled_channels_of_recording, tuple(sources), overshoot)
 
 
-def make_recording_margin(
+def make_recording_overshoot(
     scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]
-) -> Margin | None:
-    """Make the margin of the random poses; `channels` are sampled within the range of motion."""
+) -> Overshoot | None:
+    """Make the overshoot of the random poses; `channels` are sampled within the range of motion."""
     fixed_channels = locked_channels(scene_rig.armature_object, channels)
-    return make_margin(channels, fixed_channels, settings.overshoot, settings.poses if channels else 0)
+    return make_overshoot(channels, fixed_channels, settings.overshoot, settings.poses if channels else 0)

@@ -16,7 +16,7 @@ from ..rig.shape_keys import set_keys_undriven
 from ..rig.simulated_poses import reversible_frames
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, make_pose_sampler, make_recording_margin
+from .plan import RecordingSettings, make_pose_sampler, make_recording_overshoot
 
 REPEATABILITY_INDEX_OFFSET = 1 << 36
 """First index of the random poses from which a pose is approached again to measure the repeatability.
@@ -29,7 +29,7 @@ class PosePlan:
 
     Attributes:
         total, random_count: number of all poses, and of random poses, which come first.
-        in_range_count: number of random poses inside the range of motion; the poses of the margin follow them.
+        in_range_count: number of random poses inside the range of motion; the overshoot poses follow them.
     """
 
     def __init__(
@@ -54,25 +54,25 @@ class PosePlan:
         self.pose_setter = pose_setter
         self.random_count = settings.poses
         self.total = settings.poses + sum(len(clip.frames) for clip in clips)
-        self._margin = make_recording_margin(self._scene_rig, settings, self._channels)
-        self.in_range_count = settings.poses - (self._margin.poses if self._margin else 0)
+        self._overshoot = make_recording_overshoot(self._scene_rig, settings, self._channels)
+        self.in_range_count = settings.poses - (self._overshoot.poses if self._overshoot else 0)
         self._sampler = make_pose_sampler(self._scene_rig, settings)
 
     def show_poses(self, player: ClipPlayer, pose_indices: Container[int]) -> Iterator[int]:
         """Set the poses with the given indices, one per iteration, and yield each index.
 
-        Limit constraints are disabled while a pose of the margin is set.
+        Limit constraints are disabled while an overshoot pose is set.
         """
-        random_count, margin = self.random_count, self._margin
+        random_count, overshoot = self.random_count, self._overshoot
         with self._random_poses_prepared():
             set_pose = Poser(self._scene_rig, self._channels).set
             for index in range(self.in_range_count):
                 if index in pose_indices:
                     self.pose_setter.set_pose(self._make_transition(self._channels, index, set_pose))
                     yield index
-            if margin:
-                set_pose = Poser(self._scene_rig, margin.channels).set
-                with SuspendedLimits(self._scene_rig.armature_object, margin.channels) as limits:
+            if overshoot:
+                set_pose = Poser(self._scene_rig, overshoot.channels).set
+                with SuspendedLimits(self._scene_rig.armature_object, overshoot.channels) as limits:
 
                     def set_beyond_range(values: np.ndarray) -> None:
                         set_pose(values)
@@ -80,7 +80,9 @@ class PosePlan:
 
                     for index in range(self.in_range_count, random_count):
                         if index in pose_indices:
-                            self.pose_setter.set_pose(self._make_transition(margin.channels, index, set_beyond_range))
+                            self.pose_setter.set_pose(
+                                self._make_transition(overshoot.channels, index, set_beyond_range)
+                            )
                             yield index
         clip_start = random_count
         for clip in self._clips:
@@ -96,7 +98,7 @@ class PosePlan:
 
     @property
     def repeatable_poses(self) -> list[int]:
-        """Return the ascending indices of the poses that `show_poses_again` can set, without poses of the margin."""
+        """Return the ascending indices of the poses that `show_poses_again` can set, without overshoot poses."""
         if not self.pose_setter.depends_on_history:
             return []
         if self.pose_setter.is_settling:

@@ -43,7 +43,7 @@ def recorded_settings(info: RecordingInfo) -> RecordingSettings:
         poses=sum(source.poses for source in sampling.sources if source.kind == RANDOM),
         seed=sampling.seed,
         spread=sampling.spread,
-        overshoot=sampling.margin.factor if sampling.margin else 1.0,
+        overshoot=sampling.overshoot.factor if sampling.overshoot else 1.0,
         actions=names[ACTION],
         strips=names[STRIP],
         mirror=any(source.kind == MIRRORED for source in sampling.sources),

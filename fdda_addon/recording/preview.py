@@ -11,7 +11,13 @@ from ..scene.armature import Poser, clear_pose, pose_values
 from ..scene.control_names import control_default
 from ..scene.controls import can_be_set, is_driven, owner_of, set_control
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, make_pose_sampler, make_recording_margin, read_sample_selection, read_sampled_rig
+from .plan import (
+    RecordingSettings,
+    make_pose_sampler,
+    make_recording_overshoot,
+    read_sample_selection,
+    read_sampled_rig,
+)
 
 _shown_pose: "tuple[int, np.ndarray] | None" = None
 """Session id of the armature object that shows a random pose, and the values of the pose."""
@@ -20,7 +26,7 @@ _shown_pose: "tuple[int, np.ndarray] | None" = None
 def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: int) -> int:
     """Set one of the random poses of a recording.
 
-    Limit constraints stay on, so a pose of the margin is shown within the limits that they enforce; a recording
+    Limit constraints stay on, so an overshoot pose is shown within the limits that they enforce; a recording
     suspends them.
 
     Args:
@@ -39,10 +45,10 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
     settings = replace(settings, poses=max(1, settings.poses))
     index = min(index, settings.poses - 1)
     _, channels = read_sampled_rig(scene_rig, settings)
-    margin = make_recording_margin(scene_rig, settings, channels)
+    overshoot = make_recording_overshoot(scene_rig, settings, channels)
     sampler = make_pose_sampler(scene_rig, settings)
-    if margin and index >= settings.poses - margin.poses:
-        channels, sampler = margin.channels, replace(sampler, remix=None)
+    if overshoot and index >= settings.poses - overshoot.poses:
+        channels, sampler = overshoot.channels, replace(sampler, remix=None)
     clear_pose(scene_rig.armature_object)
     Poser(scene_rig, channels).set(sampler.draw_pose(channels, index))
     scene_rig.armature_object.update_tag(refresh={"DATA"})

@@ -157,7 +157,7 @@ def test_poses_that_training_refuses_are_not_recorded(tmp_path):
 
 CHANNEL_LIMIT = {"bone": "upper", "kind": "rotation", "axis": 0, "low": -1.0, "high": 1.0}
 POSE_SOURCE = {"kind": "random", "poses": 12, "name": "", "frames": [0, 0]}
-MARGIN = {"factor": 2.0, "poses": 3, "limits": [CHANNEL_LIMIT]}
+OVERSHOOT = {"factor": 2.0, "poses": 3, "limits": [CHANNEL_LIMIT]}
 FINGERPRINT_HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
 
 
@@ -180,15 +180,15 @@ FINGERPRINT_HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c
             ("name", 5, "5 is not a name"), ("frames", [1], "has the frames (1,)"),
             ("frames", [0, "x"], "has the frames (0, 'x')"), ("name", "n" * 5000, "a name has 5000 characters"),
         )],
-        *[(("margin", {**MARGIN, key: value}), words) for key, value, words in (
-            ("factor", 1, "its margin is 1 times"), ("factor", 99, "its margin is 99 times"),
+        *[(("overshoot", {**OVERSHOOT, key: value}), words) for key, value, words in (
+            ("factor", 1, "its overshoot is 1 times"), ("factor", 99, "its overshoot is 99 times"),
             ("factor", True, "True times"),
             ("factor", float("nan"), "nan times"), ("factor", "2", "'2' times"),
-            ("poses", -1, "its margin has -1 poses"),
+            ("poses", -1, "its overshoot has -1 poses"),
             ("poses", 1.5, "has 1.5 poses"), ("poses", 10**6, "1000000 of its"), ("limits", {}, "are not a list"),
             ("limits", [{**CHANNEL_LIMIT, "axis": 7}], "its range of motion"),
         )],
-        *[(("margin", value), "is damaged") for value in ([], None, 2, {}, {"factor": 2.0})],
+        *[(("overshoot", value), "is damaged") for value in ([], None, 2, {}, {"factor": 2.0})],
         (("units", {"length": float("nan")}), "it holds NaN, which is no number"),
     ],
 )  # fmt: skip

@@ -102,7 +102,7 @@ def test_components_without_truncation_error_have_a_finite_error():
         assert np.isfinite(changed.basis.error_by_count).all()
 
 
-@pytest.mark.parametrize("kind", ["margin", "refined"])
+@pytest.mark.parametrize("kind", ["overshoot", "refined"])
 def test_a_component_for_extreme_poses_stays(kind):
     rng = np.random.default_rng(0)
     inside, beyond = rng.uniform(-1, 1, 200), rng.uniform(1, 2, 100) * rng.choice([-1, 1], 100)

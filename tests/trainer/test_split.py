@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.mathematics.poses import Margin
+from fdda_addon.core.mathematics.poses import Overshoot
 from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from trainer.config import TrainingConfig
@@ -91,17 +91,17 @@ def test_all_refined_poses_are_training_poses(recording):
     assert np.array_equal(after.refined, np.arange(100, 107)) and not len(before.refined)
 
 
-def test_all_margin_poses_are_training_poses(recording):
+def test_all_overshoot_poses_are_training_poses(recording):
     sampling = recording.info.sampling
-    with_margin = replace(sampling, margin=Margin(2.0, 50, sampling.channels))
-    recording_with_margin = replace(recording, info=replace(recording.info, sampling=with_margin))
-    result = split(recording_with_margin, Source(RANDOM, 200), Source(ACTION, 100, "walk", (1, 1)))
-    assert np.array_equal(result.margin, np.arange(150, 200))
-    assert np.isin(result.margin, result.training).all()
+    with_overshoot = replace(sampling, overshoot=Overshoot(2.0, 50, sampling.channels))
+    recording_with_overshoot = replace(recording, info=replace(recording.info, sampling=with_overshoot))
+    result = split(recording_with_overshoot, Source(RANDOM, 200), Source(ACTION, 100, "walk", (1, 1)))
+    assert np.array_equal(result.overshoot, np.arange(150, 200))
+    assert np.isin(result.overshoot, result.training).all()
     split_alone = split(recording, Source(RANDOM, 150))
     assert np.array_equal(result.held_out[result.held_out < 200], split_alone.held_out)
     weights = result.weights()
-    assert np.array_equal(result.training[weights == 0.1], result.margin) and set(weights) == {0.1, 1.0}
+    assert np.array_equal(result.training[weights == 0.1], result.overshoot) and set(weights) == {0.1, 1.0}
 
 
 def test_too_few_poses_are_refused(recording):

@@ -14,9 +14,9 @@ from fdda_addon.core.sentences.counts import format_count
 from ..config import TrainingConfig
 
 MIN_POSES = 10
-MARGIN_POSE_WEIGHT = 0.1
-"""Weight of a margin pose in the basis; other poses have weight 1. Margin poses have residuals many times as large, but
-the components are meant for the range of motion."""
+OVERSHOOT_POSE_WEIGHT = 0.1
+"""Weight of an overshoot pose in the basis; other poses have weight 1. Their residuals are many times as large, but the
+components are meant for the range of motion."""
 BLOCK_FRAMES = 10
 """Number of consecutive frames that stay in one part of a split, because adjacent frames are nearly the same pose."""
 
@@ -29,19 +29,19 @@ class Split:
         training: poses from which basis and weights are computed.
         validation: poses that select the best weights.
         held_out: poses that measure the error; nothing is computed from them or selected by them.
-        margin: the poses of `training` that lie outside the range of motion.
+        overshoot: the poses of `training` that lie outside the range of motion.
         refined: the poses of `training` that were added where errors were largest.
     """
 
     training: np.ndarray
     validation: np.ndarray
     held_out: np.ndarray
-    margin: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    overshoot: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     refined: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def weights(self) -> np.ndarray:
-        """Return (n,) float64 weights of the training poses: 1, and `MARGIN_POSE_WEIGHT` for poses of the margin."""
-        return np.where(np.isin(self.training, self.margin), MARGIN_POSE_WEIGHT, 1.0)
+        """Return (n,) float64 weights of the training poses: 1, and `OVERSHOOT_POSE_WEIGHT` for overshoot poses."""
+        return np.where(np.isin(self.training, self.overshoot), OVERSHOOT_POSE_WEIGHT, 1.0)
 
 
 def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float = 0.0) -> Split:
@@ -57,7 +57,7 @@ def split_recording(recording: SkinnedRecording, config: TrainingConfig) -> Spli
     """Split the poses of a recording.
 
     Random poses are split one by one. Frames of animation are split in blocks, because the error on a frame is too low
-    if adjacent frames are training poses. All refined poses and poses of the margin are training poses, because they do
+    if adjacent frames are training poses. All refined poses and overshoot poses are training poses, because they do
     not represent the range of motion. Held-out poses stay held out when a recording is extended. Poses in which the
     target did not come to rest are left out, unless the settings include them.
 
@@ -68,10 +68,10 @@ def split_recording(recording: SkinnedRecording, config: TrainingConfig) -> Spli
     always_trains = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in sources])
     is_refined = always_trains.copy()
     is_random = np.concatenate([np.full(s.poses, s.kind == RANDOM) for s in sources])
-    margin_poses = np.zeros(0, np.int64)
-    if margin := recording.info.sampling.margin:
-        margin_poses = np.flatnonzero(is_random)[is_random.sum() - margin.poses :]
-        always_trains[margin_poses], is_random[margin_poses] = True, False
+    overshoot_poses = np.zeros(0, np.int64)
+    if overshoot := recording.info.sampling.overshoot:
+        overshoot_poses = np.flatnonzero(is_random)[is_random.sum() - overshoot.poses :]
+        always_trains[overshoot_poses], is_random[overshoot_poses] = True, False
     is_usable = np.ones(len(always_trains), bool)
     if not config.include_unsettled:
         is_usable[list(recording.info.unsettled)] = False
@@ -86,7 +86,7 @@ def split_recording(recording: SkinnedRecording, config: TrainingConfig) -> Spli
         raise TrainingError(
             f"The recording has {format_count(count, 'pose')} and training takes at least {MIN_POSES}; record more."
         )
-    is_random, margin_poses = is_random & is_usable, margin_poses[is_usable[margin_poses]]
+    is_random, overshoot_poses = is_random & is_usable, overshoot_poses[is_usable[overshoot_poses]]
     fractions = config.validation_fraction, config.seed, config.held_out_fraction
     splits = [split_poses(np.flatnonzero(is_random), *fractions)] if is_random.any() else []
     if blocks := _frame_blocks(sources):
@@ -98,7 +98,7 @@ def split_recording(recording: SkinnedRecording, config: TrainingConfig) -> Spli
         for name in ("training", "validation", "held_out")
     )
     training = np.append(training, np.flatnonzero(always_trains & is_usable))
-    return Split(training, validation, held_out, margin_poses, np.flatnonzero(is_refined & is_usable))
+    return Split(training, validation, held_out, overshoot_poses, np.flatnonzero(is_refined & is_usable))
 
 
 def _frame_blocks(sources: tuple[Source, ...]) -> list[list[int]]:

@@ -15,12 +15,12 @@ DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 
 MAX_CHANNEL_NAME_LENGTH = 2100
 """Largest number of characters of a channel's name in a file; the name of a control has an owner and a path."""
-MARGIN_POSE_RATIO = 0.25
-"""Ratio of the random poses that lie in the margin (`Margin`)."""
-MAX_MARGIN = 4.0
+OVERSHOOT_POSE_RATIO = 0.25
+"""Ratio of the random poses that lie in the overshoot (`Overshoot`)."""
+MAX_OVERSHOOT = 4.0
 """Largest scale of the range of motion; animators need no wider poses."""
 LOCKED_AXIS_ANGLE = np.pi / 4
-"""Largest rotation of a locked axis in the margin, radians, for each unit by which the factor exceeds 1."""
+"""Largest rotation of a locked axis in the overshoot, radians, for each unit by which the factor exceeds 1."""
 RANGE_TOLERANCE = 1e-4
 """Largest difference of two limits that count as equal, radians or meters. Blender stores them as float32."""
 
@@ -114,7 +114,7 @@ def widen_ranges(channels: tuple[Channel, ...], factor: float) -> tuple[Channel,
 
 
 @dataclass(frozen=True)
-class Margin:
+class Overshoot:
     """Random poses outside of the range of motion, for animation that exceeds the limits.
 
     Attributes:
@@ -133,35 +133,37 @@ class Margin:
         return {"factor": self.factor, "poses": self.poses, "limits": limits}
 
     @staticmethod
-    def from_json(value: dict) -> "Margin":
-        """Read a margin from a file.
+    def from_json(value: dict) -> "Overshoot":
+        """Read an overshoot from a file.
 
         Raises:
             KeyError, TypeError, ValueError: it is damaged.
         """
         factor, poses = value["factor"], value["poses"]
-        if type(factor) not in (int, float) or not 1 < factor <= MAX_MARGIN:
-            raise ValueError(f"its margin is {factor!r} times the range")
+        if type(factor) not in (int, float) or not 1 < factor <= MAX_OVERSHOOT:
+            raise ValueError(f"its overshoot is {factor!r} times the range")
         if type(poses) is not int or poses < 0:
-            raise ValueError(f"its margin has {poses!r} poses")
+            raise ValueError(f"its overshoot has {poses!r} poses")
         if not isinstance(value["limits"], list):
-            raise TypeError("the limits of its margin are not a list")
-        return Margin(float(factor), poses, tuple(Channel.from_json(channel) for channel in value["limits"]))
+            raise TypeError("the limits of its overshoot are not a list")
+        return Overshoot(float(factor), poses, tuple(Channel.from_json(channel) for channel in value["limits"]))
 
 
-def make_margin(channels: tuple[Channel, ...], locked: tuple[Channel, ...], factor: float, poses: int) -> Margin | None:
-    """Make the margin of random poses; None for a factor of 1 or too few poses.
+def make_overshoot(
+    channels: tuple[Channel, ...], locked: tuple[Channel, ...], factor: float, poses: int
+) -> Overshoot | None:
+    """Make the overshoot of random poses; None for a factor of 1 or too few poses.
 
     Controls keep their ranges, because their properties clamp them, and scales stay above zero.
 
     Args:
         channels: channels of the poses inside the range of motion.
-        locked: locked rotation axes of the same bones, which the margin rotates (`LOCKED_AXIS_ANGLE`).
-        factor: scale of the range of motion; 1 for no margin.
+        locked: locked rotation axes of the same bones, which the overshoot rotates (`LOCKED_AXIS_ANGLE`).
+        factor: scale of the range of motion; 1 for no overshoot.
         poses: number of all random poses.
     """
-    margin_poses = round(poses * MARGIN_POSE_RATIO)
-    if factor == 1 or not margin_poses:
+    overshoot_poses = round(poses * OVERSHOOT_POSE_RATIO)
+    if factor == 1 or not overshoot_poses:
         return None
     scaled_channels = []
     for channel, scaled_channel in zip(channels, widen_ranges(channels, factor), strict=True):
@@ -173,7 +175,9 @@ def make_margin(channels: tuple[Channel, ...], locked: tuple[Channel, ...], fact
             )
         scaled_channels.append(scaled_channel)
     angle = LOCKED_AXIS_ANGLE * (factor - 1)
-    return Margin(factor, margin_poses, (*scaled_channels, *(replace(axis, low=-angle, high=angle) for axis in locked)))
+    return Overshoot(
+        factor, overshoot_poses, (*scaled_channels, *(replace(axis, low=-angle, high=angle) for axis in locked))
+    )
 
 
 def bones_with_changed_range(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> list[str]:

@@ -11,7 +11,7 @@ from ..controls import read_controls
 from ..errors import OutputError, RecordingError, os_error_text
 from ..files.input_file import read_input
 from ..files.output import atomic_write, to_json_text
-from ..mathematics.poses import CONTROL, Channel, Margin
+from ..mathematics.poses import CONTROL, Channel, Overshoot
 from ..mathematics.surface import MIN_CORNERS
 from ..rig import read_joints, read_meshes, read_name
 from ..unit import read_unit
@@ -61,17 +61,17 @@ class Source:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How poses are chosen; `margin` describes random poses outside of the range of motion and may be None."""
+    """How poses are chosen; `overshoot` describes random poses outside of the range of motion and may be None."""
 
     seed: int
     spread: float
     channels: tuple[Channel, ...]
     sources: tuple[Source, ...]
-    margin: Margin | None = None
+    overshoot: Overshoot | None = None
 
     def to_json(self) -> dict:
         return {
-            **({"margin": self.margin.to_json()} if self.margin else {}),
+            **({"overshoot": self.overshoot.to_json()} if self.overshoot else {}),
             "seed": self.seed,
             "spread": self.spread,
             "limits": [channel.to_json() for channel in self.channels],
@@ -284,12 +284,12 @@ def _read_sampling(value: dict) -> Sampling:
     if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
         raise TypeError("its range of motion or its sources are not a list")
     sources = tuple(_read_source(source) for source in value["sources"])
-    margin = Margin.from_json(value["margin"]) if "margin" in value else None
+    overshoot = Overshoot.from_json(value["overshoot"]) if "overshoot" in value else None
     random_pose_count = sum(source.poses for source in sources if source.kind == RANDOM)
-    if margin and margin.poses > random_pose_count:
-        raise ValueError(f"{margin.poses} of its {random_pose_count} random poses lie in the margin")
+    if overshoot and overshoot.poses > random_pose_count:
+        raise ValueError(f"{overshoot.poses} of its {random_pose_count} random poses lie in the overshoot")
     channels = tuple(Channel.from_json(channel) for channel in value["limits"])
-    return Sampling(seed, float(spread), channels, sources, margin)
+    return Sampling(seed, float(spread), channels, sources, overshoot)
 
 
 def _read_source(value: dict) -> Source:

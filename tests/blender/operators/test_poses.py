@@ -9,7 +9,7 @@ import pytest
 
 from fdda_addon.core.mathematics.poses import sample_pose
 from fdda_addon.poses.sampling import sampled_channels
-from fdda_addon.recording.plan import RecordingSettings, make_recording_margin
+from fdda_addon.recording.plan import RecordingSettings, make_recording_overshoot
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene import undo
 from fdda_addon.scene.scene_rig import SceneRig
@@ -82,14 +82,14 @@ def test_rest_pose_resets_the_bones_and_can_be_undone(saved):
     assert bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] == pytest.approx(angle)
 
 
-def test_poses_of_the_margin_are_shown_as_they_are_recorded(saved):
+def test_poses_of_the_overshoot_are_shown_as_they_are_recorded(saved):
     settings = saved.mesh_object.fdda.settings
     settings.poses, settings.overshoot = 8, 2.0
     recording_settings = RecordingSettings(poses=8, overshoot=2.0)
     channels = sampled_channels(saved, read_rig(saved))
-    margin = make_recording_margin(saved, recording_settings, channels)
+    overshoot = make_recording_overshoot(saved, recording_settings, channels)
     bones = saved.armature_object.pose.bones
-    for number, expected_channels in ((5, channels), (6, margin.channels), (7, margin.channels)):
+    for number, expected_channels in ((5, channels), (6, overshoot.channels), (7, overshoot.channels)):
         bpy.ops.fdda.preview_pose(number=number)
         shown = [bones[c.name].rotation_euler[c.axis] for c in expected_channels]
         np.testing.assert_allclose(shown, sample_pose(expected_channels, 0, number), atol=1e-6)

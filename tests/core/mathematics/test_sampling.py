@@ -6,9 +6,9 @@ import pytest
 
 from fdda_addon.core.mathematics.poses import (
     Channel,
-    Margin,
+    Overshoot,
     bones_with_changed_range,
-    make_margin,
+    make_overshoot,
     sample_pose,
     widen_ranges,
 )
@@ -90,12 +90,12 @@ def test_range_changes_name_the_bones():
     assert bones_with_changed_range(CHANNELS, other_channels) == ["c", "b"]
 
 
-def test_a_margin_widens_ranges_about_their_middles_and_unlocks_axes():
+def test_an_overshoot_widens_ranges_about_their_middles_and_unlocks_axes():
     locked_channels = (Channel("a", "rotation", 1, 0.0, 0.0),)
     other_channels = (Channel("b", "scale", 0, 0.5, 1.5), Channel("shape_keys/x", "control", 0, 0.0, 1.0))
-    margin = make_margin((*CHANNELS, *other_channels), locked_channels, 3.0, 100)
-    assert (margin.factor, margin.poses) == (3.0, 25)
-    bounds = [(c.name, c.kind, c.axis, round(c.low, 6), round(c.high, 6)) for c in margin.channels]
+    overshoot = make_overshoot((*CHANNELS, *other_channels), locked_channels, 3.0, 100)
+    assert (overshoot.factor, overshoot.poses) == (3.0, 25)
+    bounds = [(c.name, c.kind, c.axis, round(c.low, 6), round(c.high, 6)) for c in overshoot.channels]
     assert bounds == [
         ("a", "rotation", 0, -5.0, 7.0),
         ("a", "rotation", 2, 0.0, 0.75),
@@ -104,9 +104,9 @@ def test_a_margin_widens_ranges_about_their_middles_and_unlocks_axes():
         ("shape_keys/x", "control", 0, 0.0, 1.0),
         ("a", "rotation", 1, round(-np.pi / 2, 6), round(np.pi / 2, 6)),
     ]
-    assert Margin.from_json(margin.to_json()) == margin
+    assert Overshoot.from_json(overshoot.to_json()) == overshoot
 
 
-def test_a_factor_of_one_or_no_poses_give_no_margin():
-    assert make_margin(CHANNELS, (), 1.0, 100) is None
-    assert make_margin((), (), 2.0, 0) is None
+def test_a_factor_of_one_or_no_poses_give_no_overshoot():
+    assert make_overshoot(CHANNELS, (), 1.0, 100) is None
+    assert make_overshoot((), (), 2.0, 0) is None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Random poses in the margin around the range of motion, for which the rig's own limits are muted."""
+"""Random poses in the overshoot around the range of motion, for which the rig's own limits are muted."""
 
 import json
 import math
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.one_blender_version
 
 SETTINGS = RecordingSettings(poses=40, overshoot=2.0, influence_poses=2, actions=("elbow_wave",))
 INSIDE = 30
-"""Number of random poses inside the range of motion. They come first, and the other 10 are in the margin."""
+"""Number of random poses inside the range of motion. They come first, and the other 10 are in the overshoot."""
 
 
 @pytest.fixture
@@ -58,13 +58,13 @@ def angles(rotations: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1)))
 
 
-def test_poses_of_the_margin_leave_the_limits_and_locked_axes(rig, tmp_path):
+def test_poses_of_the_overshoot_leave_the_limits_and_locked_axes(rig, tmp_path):
     recording = recorded(rig, tmp_path / "r")
-    margin = recording.info.sampling.margin
-    assert (margin.factor, margin.poses) == (2.0, 10)
+    overshoot = recording.info.sampling.overshoot
+    assert (overshoot.factor, overshoot.poses) == (2.0, 10)
     own, turned = recording.info.sampling.channels, bends(recording)
     (bend,) = (c for c in own if c.name == "lower")
-    # Inside the range of motion the bone rotates about one axis only; in the margin it rotates about all axes.
+    # Inside the range of motion the bone rotates about one axis only; in the overshoot it rotates about all axes.
     about = np.eye(3)[bend.axis]
     off_axis = np.degrees(np.arccos(np.clip(turned @ about @ about, -1, 1)))
     assert off_axis[:INSIDE].max() < 0.1 < 5 < off_axis[INSIDE : SETTINGS.poses].max()
@@ -73,15 +73,15 @@ def test_poses_of_the_margin_leave_the_limits_and_locked_axes(rig, tmp_path):
     assert angles(turned)[INSIDE : SETTINGS.poses].max() > math.degrees(middle + half) + 5
 
 
-def test_poses_inside_and_frames_are_those_of_a_recording_without_a_margin(rig, tmp_path):
-    """After the poses of the margin, axes are locked and limits are active again for the frames of the action."""
+def test_poses_inside_and_frames_are_those_of_a_recording_without_an_overshoot(rig, tmp_path):
+    """After the overshoot poses, axes are locked and limits are active again for the frames of the action."""
     without = recorded(rig, tmp_path / "without", replace(SETTINGS, overshoot=1.0))
     recording = recorded(rig, tmp_path / "with")
-    for name in ("pose_matrices", "residuals"):
+    for name in ("pose_matrices", "positions"):
         ours, theirs = np.array(getattr(recording, name)), np.array(getattr(without, name))
         assert np.array_equal(ours[:INSIDE], theirs[:INSIDE])
         assert np.array_equal(ours[SETTINGS.poses :], theirs[SETTINGS.poses :])
-    assert without.info.sampling.margin is None
+    assert without.info.sampling.overshoot is None
     assert recording.info.sampling.channels == without.info.sampling.channels
 
 
@@ -111,9 +111,9 @@ def test_a_resumed_recording_equals_an_uninterrupted_one_bit_for_bit(rig, tmp_pa
     assert file_contents(tmp_path / "broken") == file_contents(tmp_path / "whole")
 
 
-def test_a_recording_cannot_be_resumed_with_another_margin(rig, tmp_path):
+def test_a_recording_cannot_be_resumed_with_another_overshoot(rig, tmp_path):
     drain(record(opened(rig), tmp_path / "r", SETTINGS), stop_after=10)
-    with pytest.raises(RecordingError, match=r"recorded differently \(sampling\.margin"):
+    with pytest.raises(RecordingError, match=r"recorded differently \(sampling\.overshoot"):
         drain(record(opened(rig), tmp_path / "r", replace(SETTINGS, overshoot=1.5, resume=True)))
 
 
@@ -137,17 +137,17 @@ def test_only_limits_that_would_change_a_pose_are_muted():
     assert not limit.mute
 
 
-def test_record_accepts_margins_from_1_to_4(rig, tmp_path, capfd):
+def test_record_accepts_overshoots_from_1_to_4(rig, tmp_path, capfd):
     assert run("record", rig, tmp_path / "r", "--poses", 20, "--overshoot", 1.5) == 0
-    margin = read_recording(tmp_path / "r").info.sampling.margin
-    assert (margin.factor, margin.poses) == (1.5, 5)
+    overshoot = read_recording(tmp_path / "r").info.sampling.overshoot
+    assert (overshoot.factor, overshoot.poses) == (1.5, 5)
     for value in ("0.5", "4.5", "nan"):
         assert run("record", rig, tmp_path / "s", "--overshoot", value) == 2
         assert f"--overshoot: must be a number, 1 or more and at most 4, not '{value}'" in capfd.readouterr().err
     assert not (tmp_path / "s").exists()
 
 
-def test_a_margin_at_least_halves_the_error_beyond_the_range(tmp_path):
+def test_an_overshoot_at_least_halves_the_error_beyond_the_range(tmp_path):
     """The rig is evaluated without its limits, so that `evaluate` can pose it beyond the range of motion."""
     found = fresh_elbow()
     for bone in found.armature_object.pose.bones:
@@ -156,12 +156,12 @@ def test_a_margin_at_least_halves_the_error_beyond_the_range(tmp_path):
     rig = tmp_path / "elbow.blend"
     save_copy(rig)
     errors = {}
-    for margin in ("1", "2"):
-        recording, model, out = tmp_path / margin, tmp_path / f"{margin}.onnx", tmp_path / f"{margin}.json"
-        assert run("record", rig, recording, "--poses", 200, "--overshoot", margin) == 0
+    for overshoot in ("1", "2"):
+        recording, model, out = tmp_path / overshoot, tmp_path / f"{overshoot}.onnx", tmp_path / f"{overshoot}.json"
+        assert run("record", rig, recording, "--poses", 200, "--overshoot", overshoot) == 0
         train(recording, model, "--passes", 60)
         assert run("evaluate", rig, model, "--json", out, "--poses", 40, "--range-scale", 2) == 0
-        errors[margin] = _errors(out)
+        errors[overshoot] = _errors(out)
     assert errors["2"][1] < errors["1"][1] / 2
     assert errors["2"][0] < 1.5 * errors["1"][0]
 
