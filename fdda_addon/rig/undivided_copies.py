@@ -25,10 +25,10 @@ def find_read_meshes(scene_rig: SceneRig, controls: Iterable[Control]) -> list[b
         RigError: a control is a property of such a mesh, which a copy would not have.
     """
     meshes = scene_rig.mesh_objects
-    read = (
-        {o for mesh_object in meshes for o in deforming_mesh_objects(scene_rig, mesh_object)} if meshes[1:] else set()
-    )
-    read_meshes = [o for o in meshes if o in read and read_stack(o).downstream]
+    if len(meshes) == 1:
+        return []
+    read = {read_object for mesh_object in meshes for read_object in deforming_mesh_objects(scene_rig, mesh_object)}
+    read_meshes = [mesh_object for mesh_object in meshes if mesh_object in read and read_stack(mesh_object).downstream]
     for control in controls:
         if (owner := owner_of(scene_rig, control.owner)) in read_meshes:
             raise RigError(
@@ -41,9 +41,12 @@ def find_read_meshes(scene_rig: SceneRig, controls: Iterable[Control]) -> list[b
 
 @contextmanager
 def undivided_copies(mesh_objects: Iterable[bpy.types.Object]) -> Iterator[dict[bpy.types.Object, bpy.types.Object]]:
-    """Copy mesh objects without their downstream modifiers; yield the copies by mesh object, and remove them afterwards.
+    """Copy mesh objects without their downstream modifiers, and remove the copies afterwards.
 
     The copies have the meshes and shape keys of the objects.
+
+    Yields:
+        The copies by mesh object.
     """
     copies = {}
     try:
