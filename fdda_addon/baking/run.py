@@ -89,9 +89,6 @@ def bake_file(rig: Path, model: Path, out: Path, settings: BakeSettings, object_
 
     Returns:
         A description of the written files, one per line.
-
-    Raises:
-        FDDAError: as `output_files` and `export.write_bake`.
     """
     files = output_files(out, settings, (rig, model))
     arguments = [str(rig), str(model), str(out), f"--samples={settings.samples}"]

@@ -77,12 +77,6 @@ def export_skinning(
         influences: largest number of bones per vertex.
         held_out_actions: names of recorded actions to which nothing is fitted, so that their errors are measured.
         model: a model whose errors are measured, too.
-
-    Raises:
-        RecordingError: the recording cannot be read, or lacks an action.
-        RigError: the recording is of another rig, or the rig is linked.
-        TrainingError: the fit failed.
-        ModelError: the model does not fit the recording.
     """
     recording = read_recording(recording_path)
     _check_rig(scene_rig, recording)

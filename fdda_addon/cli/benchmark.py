@@ -106,11 +106,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _open_armature(options: argparse.Namespace) -> bpy.types.Object:
-    """Open the file, and return the armature of its character, or of the mesh object of the options.
-
-    Raises:
-        FDDAError: the file cannot be opened, or has no character or several.
-    """
+    """Open the file, and return the armature of its character, or of the mesh object of the options."""
     open_file(options.rig)
     rigs = [find_rig(options.object)] if options.object else find_rigs()
     names = sorted({rig.armature_object.name for rig in rigs})

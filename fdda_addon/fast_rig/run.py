@@ -220,9 +220,6 @@ def _evaluate_full_rig(poses: ComparedPoses) -> Job[tuple[Evaluation, list[str]]
     """Evaluate the full rig; return also the names of the objects that do not repeat.
 
     Simulated objects may depend on the poses before.
-
-    Raises:
-        RigError: the bones do not repeat.
     """
     full = yield from evaluate_poses(poses, "full rig")
     # Of an action, only objects, which may be simulated: its first frame may depend on the pose before.

@@ -28,11 +28,7 @@ from .rig_operator import RigOperator
 def record_character(
     character: SceneRig, shown_object: bpy.types.Object, path: Path, resume: bool = False
 ) -> Iterator[object]:
-    """Record the meshes of a character with the settings of the mesh that the sidebar shows, which the others get, too.
-
-    Raises:
-        FDDAError: the errors of `recording.run.record`.
-    """
+    """Record the meshes of a character with the settings of the mesh that the sidebar shows, which the others get."""
     with ExitStack() as stack:
         for mesh_object in character.mesh_objects:
             stack.enter_context(model_disabled(mesh_object))

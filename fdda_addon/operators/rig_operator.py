@@ -81,11 +81,7 @@ class RigOperator:
         return together or [self.rig(context)]
 
     def character(self, context: bpy.types.Context) -> SceneRig:
-        """Return the rig of all meshes to apply the operator to.
-
-        Raises:
-            RigError: there is no rig.
-        """
+        """Return the rig of all meshes to apply the operator to."""
         return join_rigs(self.rigs(context))
 
     def bound_rig(self, context: bpy.types.Context) -> SceneRig:

@@ -38,11 +38,7 @@ class PoseAppender:
         self._batch: list[tuple] = []
 
     def append_current_pose(self) -> None:
-        """Evaluate the current pose, and append its batch when the batch is full.
-
-        Raises:
-            FDDAError: an earlier pose could not be appended.
-        """
+        """Evaluate the current pose, and append its batch when the batch is full."""
         self._batch.append((*self._evaluator.evaluate(), self._pose_setter.is_at_rest))
         self.pose_count += 1
         # A pose that took seconds to settle is written at once.

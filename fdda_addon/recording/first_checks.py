@@ -95,9 +95,6 @@ def check_follows_pose(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer
 
     Returns:
         The mean time of an evaluation, seconds.
-
-    Raises:
-        RigError: the surface differs between frames.
     """
     scene, start_time, evaluation_count = bpy.context.scene, time.perf_counter(), 0
     frame, subframe = scene.frame_current, scene.frame_subframe

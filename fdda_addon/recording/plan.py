@@ -95,11 +95,7 @@ class RecordedRig:
 
 
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
-    """Read the rig with the controls of the settings, and find the channels of its random poses.
-
-    Raises:
-        RigError: the rig cannot be read, or has nothing to sample.
-    """
+    """Read the rig with the controls of the settings, and find the channels of its random poses."""
     selection, extra_joints = read_sample_selection(scene_rig, settings)
     # A shape key that moves no vertex is no input.
     moving_keys = {
@@ -130,11 +126,7 @@ def random_pose_channels(scene_rig: SceneRig, rig: Rig, selection: SampleSelecti
 
 
 def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseSampler:
-    """Make the sampler of the random poses of a recording.
-
-    Raises:
-        RigError: as `select_bones`.
-    """
+    """Make the sampler of the random poses of a recording."""
     remix = None
     if REMIX in settings.bones_to_pose and settings.poses:
         remix = read_remix(scene_rig, find_actions(settings))
@@ -142,11 +134,7 @@ def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseS
 
 
 def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings, controls: Iterable[Control]) -> bool:
-    """Return whether the target of the settings depends on more than pose and controls, as a simulation does.
-
-    Raises:
-        RigError: as `find_target`.
-    """
+    """Return whether the target of the settings depends on more than pose and controls, as a simulation does."""
     name = settings.target.name
     return bool(name) and find_target(scene_rig, name, controls).follows != POSE
 
@@ -159,9 +147,6 @@ def read_sample_selection(
     If control bones are sampled, the joints are the weighted bones and other bones on which the mesh depends. The
     inputs of a model are the bones that follow control bones, not the control bones themselves. A target may depend on
     every bone that has a range of motion.
-
-    Raises:
-        RigError: the rig lacks a bone, control, collection or action of the settings.
     """
     actions = find_actions(settings)
     dependencies = read_dependencies(scene_rig, actions, has_random_poses=settings.poses > 0)
@@ -192,11 +177,7 @@ def read_sample_selection(
 
 
 def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Control, ...]:
-    """Return the controls that are listed in the settings.
-
-    Raises:
-        RigError: the rig lacks a control, or its range is unknown.
-    """
+    """Return the controls that are listed in the settings."""
     if not settings.extra_inputs:
         return ()
     control_bones, number_texts = split_control_bones(scene_rig, settings.extra_inputs)
@@ -211,11 +192,7 @@ def find_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:
 
 
 def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
-    """Make the description of the poses of a recording with these settings.
-
-    Raises:
-        RigError: an action or strip of the settings does not exist.
-    """
+    """Make the description of the poses of a recording with these settings."""
     name = REMIX if REMIX in settings.bones_to_pose else ""
     sources = [Source(RANDOM, settings.poses, name)] if settings.poses else []
     clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)

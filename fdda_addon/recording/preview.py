@@ -36,9 +36,6 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
 
     Returns:
         The index of the pose that is shown: `index`, or the index of the last random pose if that is smaller.
-
-    Raises:
-        RigError: there is no channel to sample.
     """
     global _shown_pose
 

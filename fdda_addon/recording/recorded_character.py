@@ -13,10 +13,6 @@ def find_recorded_character(path: Path, object_name: str = "") -> SceneRig:
     Args:
         path: folder of the recording.
         object_name: name of the mesh object of a recording of one mesh; several meshes have their recorded names.
-
-    Raises:
-        RecordingError: the recording cannot be read.
-        RigError: the scene lacks a mesh of the recording.
     """
     names = [mesh["name"] for mesh in read_index(path)["meshes"]]
     return find_character(names) if len(names) > 1 else find_rig(object_name)

@@ -70,12 +70,6 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
 
     Yields:
         Progress of the stages "probes" and "poses".
-
-    Raises:
-        RigError: the rig cannot be recorded.
-        RecordingError: the recording is incomplete, or of a target, another rig or another range of motion.
-        ModelError: the model cannot be read, or is of another rig.
-        OutputError: the recording cannot be written.
     """
     recording, stacks = _read_rig_recording(path), []
     for _, part in scene_rig.parts:
@@ -187,11 +181,7 @@ def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[
 
 
 def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> int:
-    """Count the poses that were added to a recording since a model was trained on it.
-
-    Raises:
-        RecordingError: the poses were not chosen for this model.
-    """
+    """Count the poses that were added to a recording since a model was trained on it."""
     added_count = recording.info.poses - len(recording.info.alone_poses) - info.trained_poses
     last_source = recording.info.sampling.sources[-1]
     if added_count == 0 or (

@@ -259,9 +259,6 @@ class PoseEvaluator:
         Returns:
             pose_matrices (J, 4, 4) and positions (V, 3), both float32, mesh-object space, mesh units, and the values of
             the controls, (C,) float32.
-
-        Raises:
-            RigError: an object has a scale of zero, or the mesh objects move against each other.
         """
         depsgraph = bpy.context.evaluated_depsgraph_get()
         mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)

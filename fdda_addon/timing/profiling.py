@@ -35,9 +35,6 @@ def profile_frame(armature_object: bpy.types.Object) -> Job[FrameProfile]:
 
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards. Bound
     models do not play while the parts of the frame are measured. In a window, it also draws.
-
-    Raises:
-        RigError: as `check_full_rig` and `check_posable`, or there is no action and no bone that random poses may move.
     """
     rigs = rigs_of_armature(armature_object)
     with ExitStack() as stack:

@@ -20,9 +20,6 @@ def fit_skin(recording: Path, out: Path, influences: int, held_out_actions: tupl
     Args:
         influences: largest number of bones per vertex.
         held_out_actions: names of recorded actions to which nothing is fitted.
-
-    Raises:
-        TrainingError: the trainer failed.
     """
     options = [f"--influences={influences}", *(f"--hold-out={name}" for name in held_out_actions)]
     with _SkinFitProcess([str(recording), str(out), *options]) as process:

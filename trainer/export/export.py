@@ -259,9 +259,6 @@ def build_model(
     Args:
         held_out_poses: indices of the held-out poses.
         training_info: settings and versions for the metadata.
-
-    Raises:
-        TrainingError: the model differs from the trained networks.
     """
     model = build_graph(trained_model)
     onnx.checker.check_model(model)
@@ -280,11 +277,6 @@ def build_model(
 
 
 def write_model(path: Path, content: bytes) -> None:
-    """Write the model file, and check that the add-on can read its metadata.
-
-    Raises:
-        OSError: the file cannot be written.
-        ModelError: the metadata cannot be read.
-    """
+    """Write the model file, and check that the add-on can read its metadata."""
     path.write_bytes(content)
     read_model_info(path)

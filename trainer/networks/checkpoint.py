@@ -82,11 +82,7 @@ class Checkpoint:
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write a checkpoint."""
     metadata = {"version": VERSION, **vars(checkpoint), "meshes": [m.to_json() for m in checkpoint.meshes]}
     metadata["partitions"] = len(checkpoint.partitions)
     del metadata["input_states"]
@@ -166,11 +162,7 @@ def _read_input_states(arrays: np.lib.npyio.NpzFile) -> dict[str, State]:
 
 
 def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) -> None:
-    """Check the dtypes, shapes and values of a partition's arrays.
-
-    Raises:
-        ValueError: arrays contradict each other, or hold values that are not numbers.
-    """
+    """Check the dtypes, shapes and values of a partition's arrays."""
     network = partition.network
     arrays = [partition.feature_mean, partition.feature_scale, partition.basis_mean, partition.basis_components]
     for array in (*arrays, *network.weights, *network.biases):

@@ -48,10 +48,6 @@ def train(
 
     Returns:
         The partitions with their networks and learning curves. The network of a constant partition has no outputs.
-
-    Raises:
-        TrainingError: the training diverged.
-        RuntimeError: the device cannot run the training, for instance because its memory is too small.
     """
     # Inactive units lead to denormal numbers in the optimizer, which take twice the time.
     torch.set_flush_denormal(True)

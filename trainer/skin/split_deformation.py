@@ -40,10 +40,6 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
         recording: the recording.
         config: settings of the training.
         sink: receives the progress and the results of the fit.
-
-    Raises:
-        RecordingError: there are too few poses for a fit.
-        TrainingError: the rig has no skin weights, and none are fitted.
     """
     rig, joint_count = recording.rig, len(recording.rig.joints)
     joints, choice, fit = np.arange(joint_count), None, None

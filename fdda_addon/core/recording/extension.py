@@ -26,10 +26,6 @@ class RecordingExtension(RecordingWriter):
             poses: number of poses to append.
             model_name: file name of the model that the poses refine.
             added_count: number of poses at the end of the recording that were already added for this model.
-
-        Raises:
-            RecordingError: another process writes the recording.
-            OutputError: the files cannot be opened for writing.
         """
         self._recorded_count, self._added_count, self._model_name = recording.info.poses, added_count, model_name
         super().__init__(

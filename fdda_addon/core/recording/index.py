@@ -202,11 +202,7 @@ def read_index(path: Path) -> dict:
 
 
 def _read_json(path: Path, check: Callable[[dict], object]) -> dict:
-    """Read a JSON file and check its value; `check` may raise the errors of damaged JSON.
-
-    Raises:
-        RecordingError: the file is missing or damaged.
-    """
+    """Read a JSON file and check its value; `check` may raise the errors of damaged JSON."""
     try:
         # Python accepts NaN and infinity, which JSON does not permit.
         invalid_constants: list[str] = []
@@ -322,11 +318,7 @@ def read_info(index: dict) -> RecordingInfo:
 
 
 def write_index(path: Path, index: dict) -> None:
-    """Replace the index of a recording.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Replace the index of a recording."""
     write_json(path / INDEX_NAME, {key: value for key, value in index.items() if key != "bones"})
 
 
