@@ -19,7 +19,38 @@ from fdda_addon.core.settings import (
     settings_of,
 )
 
+HIDDEN = Setting("hidden", (64, 64), "Units of each hidden layer", low=1, high=4096)
+ACTIVATION = Setting("activation", "silu", "Of the hidden layers", choices=("silu", "gelu", "tanh", "relu"))
+BATCH_SIZE = Setting("batch_size", 64, "Poses per step", low=1)
+LEARNING_RATE = Setting("learning_rate", 1e-2, "Maximum of the one-cycle schedule", low=ABOVE_ZERO)
+WEIGHT_DECAY = Setting("weight_decay", 0.2, "Of AdamW")
+VALIDATION_FRACTION = Setting(
+    "validation_fraction",
+    0.05,
+    "Part of the poses that selects the best weights and does not train",
+    low=ABOVE_ZERO,
+    high=0.4,
+)
+HELD_OUT_FRACTION = Setting(
+    "held_out_fraction",
+    0.1,
+    "Part of the poses that measures the error, and neither trains nor selects weights",
+    low=ABOVE_ZERO,
+    high=0.4,
+)
+INCLUDE_UNSETTLED = Setting("include_unsettled", False, "Also use poses in which the target did not come to rest")
+BASE_SKINNING = Setting(
+    "base_skinning",
+    "",
+    "Skin weights to fit: hard for one joint per vertex, smooth for at most four; the rig's own if left out",
+    choices=FIT_KINDS,
+)
 BONES_TO_READ = Setting("bones_to_read", ALL, "Joints that the model reads: auto for the fewest, all, or their number")
+INFLUENCE = Setting(
+    "influence_tolerance",
+    INFLUENCE_TOLERANCE,
+    "An input influences a partition when it changes residuals by more, in character sizes",
+)
 
 
 @dataclass(frozen=True)
@@ -32,47 +63,20 @@ class TrainingConfig:
 
     seed: int = TRAINING_SEED.field()
     detail_mm: float = DETAIL_MM.field()
-    hidden: tuple[int, ...] = Setting("hidden", (64, 64), "Units of each hidden layer", low=1, high=4096).field()
-    activation: str = Setting(
-        "activation", "silu", "Of the hidden layers", choices=("silu", "gelu", "tanh", "relu")
-    ).field()
+    hidden: tuple[int, ...] = HIDDEN.field()
+    activation: str = ACTIVATION.field()
     passes: int = PASSES.field()
-    batch_size: int = Setting("batch_size", 64, "Poses per step", low=1).field()
-    learning_rate: float = Setting("learning_rate", 1e-2, "Maximum of the one-cycle schedule", low=ABOVE_ZERO).field()
-    weight_decay: float = Setting("weight_decay", 0.2, "Of AdamW").field()
-    validation_fraction: float = Setting(
-        "validation_fraction",
-        0.05,
-        "Part of the poses that selects the best weights and does not train",
-        "",
-        ABOVE_ZERO,
-        0.4,
-    ).field()
-    held_out_fraction: float = Setting(
-        "held_out_fraction",
-        0.1,
-        "Part of the poses that measures the error, and is used for nothing else",
-        "",
-        ABOVE_ZERO,
-        0.4,
-    ).field()
+    batch_size: int = BATCH_SIZE.field()
+    learning_rate: float = LEARNING_RATE.field()
+    weight_decay: float = WEIGHT_DECAY.field()
+    validation_fraction: float = VALIDATION_FRACTION.field()
+    held_out_fraction: float = HELD_OUT_FRACTION.field()
     goal_mm: float = GOAL_MM.field()
-    include_unsettled: bool = Setting(
-        "include_unsettled", False, "Also use poses in which the target did not come to rest"
-    ).field()
-    base_skinning: str = Setting(
-        "base_skinning",
-        "",
-        "Skin weights to fit: hard for one joint per vertex, smooth for at most four; the rig's own if left out",
-        choices=FIT_KINDS,
-    ).field()
+    include_unsettled: bool = INCLUDE_UNSETTLED.field()
+    base_skinning: str = BASE_SKINNING.field()
     bones_to_read: str = BONES_TO_READ.field()
     min_vertices_per_part: int = MIN_VERTICES_PER_PART.field()
-    influence_tolerance: float = Setting(
-        "influence_tolerance",
-        INFLUENCE_TOLERANCE,
-        "An input influences a partition when it changes residuals by more, in character sizes",
-    ).field()
+    influence_tolerance: float = INFLUENCE.field()
 
     def __post_init__(self):
         for setting in settings_of(TrainingConfig):

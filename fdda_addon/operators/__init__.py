@@ -10,6 +10,7 @@ MODULES: tuple[str, ...] = (
     "sampling",
     "poses",
     "limits",
+    "remedies",
     "recording",
     "training",
     "playback",

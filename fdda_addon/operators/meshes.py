@@ -12,7 +12,7 @@ from .rig_operator import RigOperator
 
 MENU_OPERATORS = (
     ("fdda.add_sample_arm", "fdda.build_model"),
-    ("fdda.measure", "fdda.profile_frame"),
+    ("fdda.measure", "fdda.profile_frame", "fdda.merge_vertices", "fdda.fit_base_skinning", "fdda.select_unlimited"),
     (
         "fdda.preview_pose",
         "fdda.rest_pose",

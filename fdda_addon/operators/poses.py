@@ -2,6 +2,7 @@
 """Operators on poses and limits: preview random poses, reset the pose, set the limits of a bone, select a bone."""
 
 import math
+from collections.abc import Collection
 from contextlib import suppress
 
 import bpy
@@ -16,6 +17,7 @@ from ..recording.posed_action import make_posed_action
 from ..recording.preview import show_random_pose, show_rest_pose, shows_random_pose
 from ..runtime.binding import model_disabled
 from ..scene.compatibility import select_bone
+from ..scene.scene_rig import SceneRig
 from .job import JobOperator
 from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator
 
@@ -206,17 +208,23 @@ class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
         bone = armature_object.pose.bones.get(self.bone)
         if bone is None:
             raise RigError(f"'{armature_object.name}' has no bone '{self.bone}'.")
-        mesh_object = self.rig(context).mesh_object
-        if context.mode != "POSE":
-            if context.mode != "OBJECT":
-                bpy.ops.object.mode_set(mode="OBJECT")
-            context.view_layer.objects.active = armature_object
-            bpy.ops.object.mode_set(mode="POSE")
-            context.window_manager.fdda.mesh = mesh_object.name
-        for other_bone in armature_object.pose.bones:
-            select_bone(other_bone, other_bone == bone)
-        armature_object.data.bones.active = bone.bone
+        select_bones(context, self.rig(context), {self.bone})
         return ""
+
+
+def select_bones(context: bpy.types.Context, rig: SceneRig, names: Collection[str]) -> None:
+    """Select bones in Pose Mode, and deselect the others."""
+    armature_object = rig.armature_object
+    if context.mode != "POSE":
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        context.view_layer.objects.active = armature_object
+        bpy.ops.object.mode_set(mode="POSE")
+        context.window_manager.fdda.mesh = rig.mesh_object.name
+    for bone in armature_object.pose.bones:
+        select_bone(bone, bone.name in names)
+        if bone.name in names:
+            armature_object.data.bones.active = bone.bone
 
 
 CLASSES = (

@@ -9,7 +9,7 @@ from ..jobs import job
 from ..properties.character import file_problem
 from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
-from . import checks, curves, limits
+from . import checks, curves, findings, limits
 from .frame_profile import draw_profile, draw_times
 from .recording import read_content
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
@@ -36,7 +36,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
     def is_done(cls, context: bpy.types.Context) -> bool:
         rig = panel_rig(context)[0]
         check = checks.last_check(rig) if rig else None
-        return check is not None and not check.problems
+        return check is not None and not check.problems and not findings.find(rig)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
@@ -66,6 +66,11 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         column.label(text=f"{rig.armature_object.name}: {count_text}", icon="ARMATURE_DATA")
         for problem in check.problems if check else ():
             draw_wrapped(layout.box(), context, problem, "ERROR")
+        for finding in findings.find(rig):
+            box = layout.box().column(align=True)
+            draw_wrapped(box, context, finding.text, "ERROR")
+            if finding.operator:
+                box.operator(finding.operator).object = rig.mesh_object.name
         if check:
             mesh_object = rig.mesh_object
             column = layout.column(align=True)
@@ -98,6 +103,8 @@ def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         button.object = listed_rig.mesh_object.name
         if listed_rig.mesh_object.fdda.is_bound:
             row.label(text="", icon="LINKED")
+        elif findings.find(listed_rig):
+            row.label(text="", icon="ERROR")
     if len(rigs) > MAX_MESHES:
         box.label(text=f"and {len(rigs) - MAX_MESHES} more; select one to see it")
     box.prop(context.window_manager.fdda, "all_meshes", text=f"Apply to All {len(rigs)} Meshes")

@@ -12,6 +12,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.mathematics.poses import DEFAULT_RANGE, LOCATION, ROTATION, SCALE
+from ..core.rig import Rig
 
 AXES = "xyz"
 RANGE_NAME = "FDDA Range"
@@ -47,6 +48,21 @@ def rotation_ranges(bone: bpy.types.PoseBone) -> tuple[RotationRange, RotationRa
     """Return the range of each rotation axis of a bone."""
     constraint = find_local_limit(bone, "LIMIT_ROTATION")
     return tuple(_rotation_range(bone, constraint, axis) for axis in range(3))
+
+
+def unlimited_bones(armature_object: bpy.types.Object, rig: Rig) -> list[str]:
+    """Return the joints that random poses rotate by the default angle about all axes, because they state no limits.
+
+    Roots are left out: nothing limits how a character is turned.
+    """
+    bones = armature_object.pose.bones
+    return [
+        joint.name
+        for joint in rig.joints
+        if joint.name in bones
+        and joint.parent >= 0
+        and all(each.source == DEFAULT and not each.is_locked for each in rotation_ranges(bones[joint.name]))
+    ]
 
 
 def _rotation_range(bone: bpy.types.PoseBone, constraint: bpy.types.Constraint | None, axis: int) -> RotationRange:

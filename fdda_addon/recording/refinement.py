@@ -26,7 +26,6 @@ from ..rig.reading import PoseEvaluator, read_rig
 from ..rig.shape_keys import set_keys_undriven
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
-from ..rig.undivided_copies import find_read_meshes, undivided_copies
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
@@ -86,13 +85,8 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         yield Progress("poses", settings.poses, settings.poses)
         return
     recorded_count = len(recording.pose_matrices) - added_count
-    read_meshes = find_read_meshes(scene_rig, rig.controls)
-    with (
-        temporary_rig_state(scene_rig, rig, channels, (), read_meshes),
-        set_keys_undriven(scene_rig, channels),
-        undivided_copies(read_meshes) as copies,
-    ):
-        evaluator, poser = PoseEvaluator(scene_rig, rig, None, copies), Poser(scene_rig, channels)
+    with temporary_rig_state(scene_rig, rig, channels), set_keys_undriven(scene_rig, channels):
+        evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
         probe_poses = np.stack(
             [
                 _draw_probe_pose(channels, settings.seed, PROBE_INDEX + recorded_count + i)
@@ -110,7 +104,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         chosen_poses = choose_poses(
             probes, channels, _channels_by_partition(rig, partitions, channels), base_poses, rng
         )
-        recorded_evaluator = PoseEvaluator(scene_rig, recording.rig, None, copies)
+        recorded_evaluator = PoseEvaluator(scene_rig, recording.rig)
         with (
             RecordingExtension(recording, settings.poses - added_count, model.name, added_count) as extension,
             PoseAppender(recorded_evaluator, extension, rig.vertex_count) as appender,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import RecordingError
+from ..core.errors import RecordingError, RigError
 from ..core.mathematics.poses import Channel
 from ..core.progress import Progress
 from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
@@ -18,13 +18,12 @@ from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
 from ..core.rig import Rig
 from ..poses.clip import find_clips
-from ..rig.dependencies import read_dependencies
-from ..rig.modifier_stack import check_evaluable
+from ..rig.dependencies import deforming_mesh_objects, read_dependencies
+from ..rig.modifier_stack import check_evaluable, read_stack
 from ..rig.reading import PoseEvaluator
 from ..rig.target_poses import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
-from ..rig.undivided_copies import find_read_meshes, undivided_copies
 from ..rig.unread_bones import describe_bones
 from ..scene.scene_rig import SceneRig, check_full_rig
 from .alone_poses import AlonePosePlan, plan_alone_poses
@@ -69,8 +68,8 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     for _, part in scene_rig.parts:
         check_full_rig(part.mesh_object)
         stacks.append(check_evaluable(part))
+    _check_readers(scene_rig)
     rig, channels = read_sampled_rig(scene_rig, settings)
-    read_meshes = find_read_meshes(scene_rig, rig.controls)
     notes = [] if rig.has_weights else [MISSING_WEIGHTS.format(scene_rig.mesh_object.name)]
     if not settings.target.name:
         actions = find_actions(settings)
@@ -82,13 +81,12 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     target = pose_setter.target
+    recorded = RecordedRig(scene_rig, rig, PoseEvaluator(scene_rig, rig, target))
     check_disk_space(path, recording_bytes(rig, plan.total))
     with ExitStack() as exit_stack:
         if target:
             exit_stack.enter_context(target.prepared())
-        player = exit_stack.enter_context(temporary_rig_state(scene_rig, rig, channels, clips, read_meshes))
-        copies = exit_stack.enter_context(undivided_copies(read_meshes))
-        recorded = RecordedRig(scene_rig, rig, PoseEvaluator(scene_rig, rig, target, copies))
+        player = exit_stack.enter_context(temporary_rig_state(scene_rig, rig, channels, clips))
         seconds_per_pose, alone = None, None
         if target:
             yield from check_target_moves(recorded, plan, player)
@@ -130,6 +128,21 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             count = settings.target.repeatability_poses
             yield from measure_repeatability(recorded.evaluator, plan, player, writer, count)
             yield Progress("poses", total, total)
+
+
+def _check_readers(scene_rig: SceneRig) -> None:
+    """Raise a RigError if a mesh is deformed by another one that has downstream modifiers, which a recording disables.
+
+    An example is a shirt with a Surface Deform modifier on a body that a later modifier subdivides.
+    """
+    for mesh_object in scene_rig.mesh_objects if scene_rig.other_meshes else ():
+        for read_object in deforming_mesh_objects(scene_rig, mesh_object):
+            if read_object in scene_rig.mesh_objects and (names := read_stack(read_object).downstream):
+                raise RigError(
+                    f"'{mesh_object.name}' follows the surface of '{read_object.name}' with its modifier '{names[0]}', "
+                    f"which is off while '{read_object.name}' is recorded; switch it off in the viewport, or record "
+                    f"'{mesh_object.name}' by itself."
+                )
 
 
 def _make_info(

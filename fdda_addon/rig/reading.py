@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reads the rig of a scene and its poses into arrays."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
-from types import MappingProxyType
 
 import bpy
 import numpy as np
@@ -235,21 +234,13 @@ class PoseReader:
 class PoseEvaluator:
     """Evaluates the current pose of a scene and reads pose matrices, positions and controls."""
 
-    def __init__(
-        self,
-        scene_rig: SceneRig,
-        rig: Rig,
-        target: Target | None = None,
-        copies: Mapping[bpy.types.Object, bpy.types.Object] = MappingProxyType({}),
-    ):
+    def __init__(self, scene_rig: SceneRig, rig: Rig, target: Target | None = None):
         """Prepare to read a rig.
 
         Args:
             target: the target whose positions replace those of the rig.
-            copies: objects whose positions are read in place of those of mesh objects (`undivided_copies`).
         """
         self._scene_rig, self._rig, self._target = scene_rig, rig, target
-        self._position_objects = [copies.get(mesh_object, mesh_object) for mesh_object in scene_rig.mesh_objects]
         self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
         self._controls = ControlReader(scene_rig, rig.controls)
 
@@ -268,7 +259,7 @@ class PoseEvaluator:
         else:
             mesh_objects = self._scene_rig.mesh_objects
             positions = join_positions(
-                [mesh_io.evaluated_positions(each, depsgraph) for each in self._position_objects], self._rig.meshes
+                [mesh_io.evaluated_positions(each, depsgraph) for each in mesh_objects], self._rig.meshes
             )
             for part, other in zip(self._rig.meshes[1:], mesh_objects[1:], strict=True):
                 self._check_transform(part, mesh_object, other.evaluated_get(depsgraph))

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Prepares a rig for posing, and restores everything that posing changes."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-
-import bpy
 
 from ..core.mathematics.poses import CONTROL, Channel
 from ..core.rig import Rig
@@ -19,11 +17,7 @@ from .modifier_stack import downstream_disabled
 
 @contextmanager
 def temporary_rig_state(
-    scene_rig: SceneRig,
-    rig: Rig,
-    channels: tuple[Channel, ...] = (),
-    clips: tuple[Clip, ...] = (),
-    unchanged_meshes: Collection[bpy.types.Object] = (),
+    scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...] = (), clips: tuple[Clip, ...] = ()
 ) -> Iterator[ClipPlayer]:
     """Set a rig to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
 
@@ -33,7 +27,6 @@ def temporary_rig_state(
         scene_rig, rig: the rig.
         channels: the channels of the random poses that will be set.
         clips: the clips that the yielded player will show.
-        unchanged_meshes: mesh objects whose downstream modifiers stay on.
 
     Yields:
         The player of the clips.
@@ -42,7 +35,7 @@ def temporary_rig_state(
     with ExitStack() as stack:
         player = stack.enter_context(clip_player([(scene_rig, names)], clips))
         stack.enter_context(hidden_comparison_objects())
-        for mesh_object in (o for o in scene_rig.mesh_objects if o not in unchanged_meshes):
+        for mesh_object in scene_rig.mesh_objects:
             stack.enter_context(downstream_disabled(mesh_object))
         stack.enter_context(unstretched_time())
         stack.enter_context(temporary_controls(scene_rig, names))

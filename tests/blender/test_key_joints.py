@@ -146,6 +146,10 @@ def edit_bone(rig: SceneRig, name: str, **settings: object) -> None:
     change_in_edit_mode(rig.armature_object, change)
 
 
+def bone_of(rig: SceneRig) -> bpy.types.Bone:
+    return rig.armature_object.data.bones["half.1"]
+
+
 def constraint_of(rig: SceneRig, name: str = "half.1") -> bpy.types.Constraint:
     return rig.armature_object.pose.bones[name].constraints[0]
 

@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.joint_option import parse_joints
 from fdda_addon.core.mathematics.key_joints import KeyJointReport, select_joints
-from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit
+from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, weights_match
 from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig, rig_differences
 
 REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
@@ -112,3 +112,21 @@ def test_a_fit_with_key_joints_is_read_back():
     fit = SkinFit("smooth", 100, ERRORS, ERRORS, REPORT)
     assert SkinFit.from_json(fit.to_json()) == fit
     assert fit.sentence().startswith(f"{REPORT.sentence()} Linear skinning with fitted weights (smooth), mm: 1.00 rms")
+
+
+@pytest.mark.parametrize(
+    ("fit", "options", "matches"),
+    [
+        (None, ("", "all"), True),
+        (None, ("", "auto"), True),
+        (None, ("smooth", "all"), False),
+        (SkinFit("hard", 100, ERRORS, ERRORS), ("hard", "auto"), True),
+        (SkinFit("hard", 100, ERRORS, ERRORS), ("", "auto"), False),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("", "auto"), True),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("hard", "auto"), False),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("smooth", "all"), False),
+        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("", "60"), False),
+    ],
+)
+def test_a_recording_has_the_weights_that_options_ask_for(fit, options, matches):
+    assert weights_match(fit, *options) is matches

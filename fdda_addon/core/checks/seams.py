@@ -34,6 +34,12 @@ def check_seams(recording: SkinnedRecording) -> list[RecordingWarning]:
     return find_open_seams(recording.rig, (recording.compute_residuals(np.array([pose]))[0] for pose in poses))
 
 
+def count_split_vertices(rig: Rig) -> int:
+    """Count the vertices that lie on others along cuts of the mesh; 0 if these are few."""
+    count = len(np.unique(_seam_pairs(rig)))
+    return count if count > MAX_TORN_RATIO * rig.vertex_count else 0
+
+
 def find_open_seams(rig: Rig, residuals: Iterable[np.ndarray]) -> list[RecordingWarning]:
     """Return the warning "open-seams" if cuts open in the poses; none if the faces of the rig are unknown.
 

@@ -1,28 +1,30 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names in sentences what the window has in place of options of the command line."""
+"""Names in sentences the fields of the window in place of options of the command line."""
 
 import re
 
 PHRASES = (
-    ("--base-skinning smooth, or Base Skinning in the sidebar", "Base Skinning in the sidebar"),
+    ("--base-skinning smooth, or Base Skinning", "Base Skinning"),
     ("--base-skinning smooth", "Base Skinning"),
     ("--controls collection:NAME", "Bone Collection"),
     ("for --controls", "for"),
     ("give --poses or --action", "set Random Poses, or check an action"),
     ("give --action or --strip", "check an action or a strip"),
-    ("--bones-to-pose", "Bones to Pose"),
-    ("--extra-input ", "Extra Inputs, "),
     ("--extra-input", "Extra Inputs"),
-    ("--min-vertices-per-part", "Min Vertices per Part"),
-    ("--settle-frames", "Settle Frames"),
 )
-"""Phrases with options, and the words of the window."""
+"""Phrases with options, and the words of the window where these differ."""
+SMALL_WORDS = {"To", "Per", "Of"}
 
 
 def for_window(text: str) -> str:
-    """Return a text with the labels of the window in place of options; others become words: "--resume" is "Resume"."""
+    """Return a text with fields of the window in place of options: "--bones-to-pose" is "Bones to Pose"."""
     if "--" not in text:
         return text
     for phrase, label in PHRASES:
         text = text.replace(phrase, label)
-    return re.sub(r"(?<![\w-])--([a-z][a-z-]*)", lambda match: match[1].replace("-", " ").title(), text)
+    return re.sub(r"(?<![\w-])--([a-z][a-z-]*)", lambda match: _title(match[1]), text)
+
+
+def _title(option: str) -> str:
+    words = option.replace("-", " ").title().split()
+    return " ".join(word.lower() if word in SMALL_WORDS else word for word in words)

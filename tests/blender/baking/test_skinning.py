@@ -34,15 +34,10 @@ def add_bones(rig) -> None:
     armature_object.data.bones["upper"].bbone_segments = 4
 
 
-def keep_armature(rig) -> None:
-    """Let the own weights alone deform the mesh, so that no fit can be better."""
-    rig.mesh_object.modifiers.remove(rig.mesh_object.modifiers["CorrectiveSmooth"])
-
-
-@pytest.fixture(params=[lambda rig: None, keep_armature, add_bones], ids=["smooth", "linear", "cage"])
+@pytest.fixture(params=["own weights", "cage"])
 def files(request, tmp_path, capfd) -> tuple[Path, Path, str]:
     """The paths of a recording and of a file with its exported skinning, and the output of the verb."""
-    rig = save_elbow(tmp_path / "rig.blend", request.param)
+    rig = save_elbow(tmp_path / "rig.blend", add_bones if request.param == "cage" else lambda rig: None)
     recording, out = tmp_path / "recording", tmp_path / "out.blend"
     options = ("--object", ELBOW, "--poses", POSES, "--action", "elbow_wave")
     assert run("record", rig, recording, *options) == 0
@@ -86,7 +81,7 @@ def test_the_copy_follows_fitted_weights_alone_and_its_glb_equals_it(files, tmp_
     error = 1000 * np.linalg.norm(expected - recording.positions[poses], axis=2).mean()
     assert rows["elbow_wave, fitted weights"] == pytest.approx(error, abs=2e-3)
     if recording.rig.has_weights:
-        assert rows["held-out poses, fitted weights"] <= rows["held-out poses, own weights"]
+        assert rows["held-out poses, fitted weights"] < rows["held-out poses, own weights"]
     for scene_object in scene.objects:
         scene_object.select_set(scene_object in (mesh_object, armature_object))
     frames = (1, 9, 20)

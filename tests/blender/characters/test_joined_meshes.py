@@ -154,26 +154,10 @@ def add_a_hat_with_another_armature() -> None:
     skin(cage("hat", 1.3), other)
 
 
-def test_a_body_is_recorded_undivided_while_others_follow_its_divided_surface(dressed, tmp_path):
-    """The cuff was bound to the body as it is, so it has no Surface Deform here."""
-
-    def change() -> None:
-        subdivide_the_body()
-        bpy.data.objects.remove(bpy.data.objects[CUFF])
-
-    rig, options = changed(dressed, tmp_path / "rig.blend", change), ("--poses", 0, "--action", "elbow_wave")
-    assert run("record", rig, tmp_path / "both", "--all", *options) == 0
-    both = read_recording(tmp_path / "both")
-    for name, vertices in zip((BODY, SLEEVE), both.rig.mesh_slices, strict=True):
-        assert run("record", rig, tmp_path / name, "--object", name, *options) == 0
-        alone = read_recording(tmp_path / name)
-        assert np.abs(both.positions[:FRAMES, vertices] - alone.positions[:FRAMES]).max() < 1e-6
-    assert not [o for o in bpy.data.objects if o.type == "MESH" and o.name not in NAMES and "FDDA" not in o.name]
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
+        (subdivide_the_body, "follows the surface of 'elbow' with its modifier 'Subdivision', which is off while"),
         (parent_the_cuff_to_a_bone, "The object 'cuff' moves against 'elbow', and meshes of one recording move"),
         (add_a_hat_with_another_armature, "'elbow' follows the armature 'elbow_rig' and 'hat' follows 'hat_rig'"),
     ],

@@ -210,6 +210,7 @@ def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path, capf
         "ratio_quartiles",
         "is_faster",
         "is_estimate",
+        "processor_share",
         "constant_bytes",
     ]
     assert (report["unit"], report["vertices"]) == ("ms", 300)

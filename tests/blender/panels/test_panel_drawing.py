@@ -12,9 +12,10 @@ import pytest
 
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.operators.meshes import MENU_OPERATORS
-from fdda_addon.panels import MODULES, checks, models, playback
+from fdda_addon.panels import MODULES, checks, findings, models, playback
 from fdda_addon.panels.timed_value import timed_values
 from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
+from fdda_addon.scene.compatibility import is_selected
 from fdda_addon.scene.scene_rig import SceneRig
 
 from ..conftest import ELBOW_RIG
@@ -209,3 +210,63 @@ def test_the_button_in_the_header_of_a_section_opens_the_manual(monkeypatch: pyt
     page, _, anchor = address.partition("#")
     assert anchor == "training-poses"
     assert f'id="{anchor}"' in Path(url2pathname(urlsplit(page).path)).read_text(encoding="utf-8")
+
+
+def split_vertices(mesh_object: bpy.types.Object) -> None:
+    """Give each face its own vertices, as importers of game formats do."""
+    import bmesh  # bpy brings it, so it is there after bpy has loaded.
+
+    edited = bmesh.new()
+    edited.from_mesh(mesh_object.data)
+    bmesh.ops.split_edges(edited, edges=edited.edges)
+    edited.to_mesh(mesh_object.data)
+    edited.free()
+
+
+def remove_weights(mesh_object: bpy.types.Object) -> None:
+    mesh_object.vertex_groups.clear()
+
+
+def leave_only_skinning(mesh_object: bpy.types.Object) -> None:
+    mesh_object.modifiers.remove(mesh_object.modifiers["CorrectiveSmooth"])
+
+
+def remove_limits(mesh_object: bpy.types.Object) -> None:
+    bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]
+    for constraint in list(bone.constraints):
+        bone.constraints.remove(constraint)
+    other = bpy.data.objects[ELBOW_RIG].pose.bones["upper"].constraints.new("LIMIT_ROTATION")
+    other.use_limit_x, other.owner_space = True, "LOCAL"
+
+
+@pytest.mark.parametrize(
+    ("change", "text", "button"),
+    [
+        (split_vertices, "vertices lie on others along cuts, which come apart.", "merge_vertices"),
+        (remove_weights, "No vertex of elbow has weights on deforming bones.", "fit_base_skinning"),
+        (leave_only_skinning, "Only linear skinning deforms elbow: a model is not worth it.", ""),
+        (remove_limits, "1 of 2 bones have no rotation limits, and turn by ±45°.", "select_unlimited"),
+    ],
+)
+def test_what_makes_a_good_model_unlikely_has_a_remedy(saved: SceneRig, change, text: str, button: str):
+    bpy.context.view_layer.objects.active = saved.mesh_object
+    checks.check_now(saved)
+    assert not findings.find(saved) and bpy.types.FDDA_PT_rig.is_done(bpy.context)
+    vertex_count = len(saved.mesh_object.data.vertices)
+    change(saved.mesh_object)
+    bpy.context.view_layer.update()
+    checks.unregister()
+    checks.check_now(saved)
+    (finding,) = findings.find(saved)
+    assert finding.text.endswith(text) and finding.operator == (f"fdda.{button}" if button else "")
+    assert not bpy.types.FDDA_PT_rig.is_done(bpy.context)
+    assert " ".join(finding.text.split()) in " ".join(" ".join(texts_of(draw_section("rig"))).split())
+    if button:
+        assert getattr(bpy.ops.fdda, button)() == {"FINISHED"}
+    if button == "select_unlimited":
+        bones = saved.armature_object.pose.bones
+        assert bpy.context.mode == "POSE" and [bone.name for bone in bones if is_selected(bone)] == ["lower"]
+    elif button:
+        checks.unregister()
+        checks.check_now(saved)
+        assert not findings.find(saved) and len(saved.mesh_object.data.vertices) == vertex_count

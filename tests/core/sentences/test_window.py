@@ -23,6 +23,10 @@ from fdda_addon.core.sentences.window import for_window
             "continue it with Resume, or replace it with Overwrite.",
         ),
         ("more frames (--settle-frames) let them rest", "more frames (Settle Frames) let them rest"),
+        (
+            "more bones (--bones-to-pose), or --min-vertices-per-part 8",
+            "more bones (Bones to Pose), or Min Vertices per Part 8",
+        ),
         ("The file 'a--b.blend' -- or none - stays.", "The file 'a--b.blend' -- or none - stays."),
     ],
 )

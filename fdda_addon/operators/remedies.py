@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators that mend what the section "Rig" finds before a recording."""
+
+import bpy
+import numpy as np
+
+from ..core.checks.seams import POSITION_DIGITS
+from ..core.errors import RigError
+from ..core.sentences.counts import format_count
+from ..poses.motion_range import unlimited_bones
+from ..rig.reading import read_rig
+from .poses import select_bones
+from .rig_operator import RigOperator
+
+
+class FDDA_OT_merge_vertices(RigOperator, bpy.types.Operator):
+    bl_idname = "fdda.merge_vertices"
+    bl_label = "Merge by Distance"
+    bl_description = (
+        "Merge the vertices that lie on each other, as importers of game formats leave them. Normals and UV maps stay"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+    waits_for_all_jobs = True
+    modes = frozenset({"OBJECT", "POSE"})
+
+    def apply(self, context: bpy.types.Context) -> str:
+        import bmesh  # bpy brings it, so it is there after bpy has loaded.
+
+        mesh_object = self.rig(context).mesh_object
+        mesh = mesh_object.data
+        if mesh_object.fdda.is_bound or mesh.library or mesh_object.library:
+            raise RigError(f"'{mesh_object.name}' has a model or is linked; unbind it, or merge in its own file.")
+        count, normals = len(mesh.vertices), [tuple(corner.vector) for corner in mesh.corner_normals]
+        size = np.linalg.norm(np.ptp([vertex.co for vertex in mesh.vertices], axis=0))
+        edited = bmesh.new()
+        try:
+            edited.from_mesh(mesh)
+            bmesh.ops.remove_doubles(edited, verts=edited.verts, dist=size * 10.0**-POSITION_DIGITS)
+            edited.to_mesh(mesh)
+        finally:
+            edited.free()
+        if len(mesh.loops) == len(normals):
+            mesh.normals_split_custom_set(normals)
+        mesh.update()
+        return f"Merged {format_count(count - len(mesh.vertices), 'vertex', 'vertices')} of '{mesh_object.name}'."
+
+
+class FDDA_OT_fit_base_skinning(RigOperator, bpy.types.Operator):
+    bl_idname = "fdda.fit_base_skinning"
+    bl_label = "Fit Base Skinning"
+    bl_description = "Let the training fit skin weights to the recorded poses, with at most four bones per vertex"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def apply(self, context: bpy.types.Context) -> str:
+        self.rig(context).mesh_object.fdda.settings.base_skinning = "SMOOTH"
+        return "The training fits skin weights."
+
+
+class FDDA_OT_select_unlimited(RigOperator, bpy.types.Operator):
+    bl_idname = "fdda.select_unlimited"
+    bl_label = "Select These"
+    bl_description = (
+        "Select the bones without rotation limits in Pose Mode, to set limits in the section Training Poses"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    def apply(self, context: bpy.types.Context) -> str:
+        rig = self.rig(context)
+        names = set(unlimited_bones(rig.armature_object, read_rig(rig)))
+        select_bones(context, rig, names)
+        return f"Selected {format_count(len(names), 'bone')}."
+
+
+CLASSES = (FDDA_OT_merge_vertices, FDDA_OT_fit_base_skinning, FDDA_OT_select_unlimited)
