@@ -13,7 +13,6 @@ Skinning Decomposition with Rigid Bones, 2012. The least-squares solver is `scip
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import nnls
 
 from fdda_addon.core.mathematics.skin_fit import INFLUENCES
 from fdda_addon.core.mathematics.skinning import skin_matrices
@@ -260,6 +259,9 @@ def simplex_weights(errors: np.ndarray, is_usable: np.ndarray, ridge: float) -> 
     Returns:
         (B, C) float64.
     """
+    # Only trainings that fit weights pay for this import.
+    from scipy.optimize import nnls
+
     scales = np.maximum(np.einsum("vjj->vj", errors).mean(axis=1), ridge)
     is_pair_usable = is_usable[:, :, None] & is_usable[:, None]
     diagonal = np.arange(errors.shape[1])

@@ -37,7 +37,7 @@ class ResidualScan:
 
 
 def scan_residuals(recording: SkinnedRecording) -> ResidualScan:
-    """Read the residuals of evenly spaced poses, one pose in memory at a time."""
+    """Read the residuals of evenly spaced poses, a block of poses at a time."""
     pose_count, rig = len(recording.rows), recording.rig
     poses = np.unique(np.linspace(0, pose_count - 1, min(pose_count, MAX_SCANNED_POSES)).round().astype(np.int64))
     vertices_per_partition = min(
@@ -53,13 +53,12 @@ def scan_residuals(recording: SkinnedRecording) -> ResidualScan:
     change = np.zeros(rig.vertex_count, np.float32)
     largest_pose = np.zeros(rig.vertex_count, np.int64)
     first_residuals = recording.compute_residuals(poses[:1])[0]
-    for row, pose in enumerate(poses):
-        residuals = recording.compute_residuals(poses[row : row + 1])[0]
+    for row, residuals in enumerate(recording.iterate_residuals(poses)):
         kept_residuals[row] = residuals[all_vertices]
         squared_lengths = np.einsum("vc,vc->v", residuals, residuals)
         sum_of_squares += squared_lengths
         larger_vertices = np.flatnonzero(squared_lengths > largest)
-        largest[larger_vertices], largest_pose[larger_vertices] = squared_lengths[larger_vertices], pose
+        largest[larger_vertices], largest_pose[larger_vertices] = squared_lengths[larger_vertices], poses[row]
         residuals -= first_residuals
         np.maximum(change, np.einsum("vc,vc->v", residuals, residuals), out=change)
     ends = np.cumsum([len(partition_vertices) for partition_vertices in vertices])[:-1]

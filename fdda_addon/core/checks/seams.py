@@ -31,7 +31,7 @@ MAX_POSES = 50
 def check_seams(recording: SkinnedRecording) -> list[RecordingWarning]:
     """Return the warnings of `find_open_seams` for evenly spaced poses of a recording."""
     poses = np.unique(np.linspace(0, len(recording.rows) - 1, MAX_POSES).round().astype(np.int64))
-    return find_open_seams(recording.rig, (recording.compute_residuals(np.array([pose]))[0] for pose in poses))
+    return find_open_seams(recording.rig, recording.iterate_residuals(poses))
 
 
 def count_split_vertices(rig: Rig) -> int:

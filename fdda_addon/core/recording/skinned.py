@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A recording that is split into linear skinning and residuals, which are computed when they are read."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -77,6 +77,12 @@ class SkinnedRecording:
     def compute_residuals(self, poses: np.ndarray) -> np.ndarray:
         """Compute the (n, V, 3) float32 local residuals of n poses, axes of the main joints, mesh units."""
         return self.skinning.local_residuals(self.pose_matrices[poses], self.read_positions(poses))
+
+    def iterate_residuals(self, poses: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the (V, 3) float32 local residuals of each pose; a block of poses is in memory."""
+        size = max(1, BLOCK_ELEMENTS // (8 * self.rig.vertex_count))
+        for start in range(0, len(poses), size):
+            yield from self.compute_residuals(poses[start : start + size])
 
     def compute_partition_residuals(
         self, partition: Partition, poses: np.ndarray | None = None, vertices: np.ndarray | None = None
