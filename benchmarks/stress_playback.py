@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Apply random operations of users to playing characters and compare the shown meshes with the models' output.
 
-    python benchmarks/stress_playback.py out/stress [--evaluations 20000] [--characters 10] [--seed 0]
+    python benchmarks/stress_playback.py out/stress [--evaluations 20000] [--characters 10] [--meshes 3] [--seed 0]
 
-The operations are frame changes, subframes, poses, undo and redo, renders, modes and strengths, duplicates, deletions,
-saves, and another view layer. Prints how often each operation ran, the largest difference, and the memory that the
-process uses. The exit status is 1 if a character differed from the output of its model.
+The operations are frame changes, subframes, poses, undo and redo, renders, modes and strengths, hidden, moved, unbound
+and bound meshes, duplicates, deletions of characters and of single meshes, saves, and another view layer. Prints how
+often each operation ran, the largest difference, and the memory that the process uses. The exit status is 1 if a
+character differed from the output of its model.
 """
 
 import argparse
@@ -24,15 +25,18 @@ sys.path.insert(0, str(ROOT))
 import fdda_addon  # noqa: E402
 from fdda_addon.core.mathematics.skinning import LinearSkinning  # noqa: E402
 from fdda_addon.rig.reading import PoseReader, read_model_rig  # noqa: E402
+from fdda_addon.runtime.binding import bind, unbind  # noqa: E402
 from fdda_addon.runtime.network import Network  # noqa: E402
-from fdda_addon.scene.scene_rig import SceneRig, armature_modifier  # noqa: E402
+from fdda_addon.scene.control_reader import ControlReader  # noqa: E402
+from fdda_addon.scene.scene_rig import SceneRig, armature_of  # noqa: E402
 
 MAX_DIFFERENCE_M = 1e-5
 """Largest allowed difference between the shown mesh and the output of the model, meters."""
 BONES = ("upper", "lower")
 OPERATION_WEIGHTS = {
     "frame": 30, "subframe": 6, "pose": 30, "pose of several": 6, "undo": 5, "redo": 4, "render": 2, "mode": 6,
-    "strength": 4, "use in render": 2, "duplicate": 2, "delete": 2, "save": 1, "view layer": 3,
+    "strength": 4, "use in render": 2, "hide": 3, "move": 2, "unbind": 2, "bind": 3, "duplicate": 2, "delete": 2,
+    "save": 1, "view layer": 3,
 }  # fmt: skip
 
 
@@ -73,18 +77,24 @@ class PlaybackStress:
         """Duplicate the first character and set up the scene."""
         self._random_generator = np.random.default_rng(seed)
         self._folder, self._max_characters = folder, characters + 2
-        self._first_name = first_object.name
-        self._network = Network(model)
-        rig = read_model_rig(SceneRig(first_object, armature_modifier(first_object).object), self._network.info)
-        rest = self._network.info.rest_matrices
-        self._linear_skinning = LinearSkinning(replace(self._network.linear_rig(rig), rest_matrices=rest))
+        self._first_name, self._model = first_object.name, model
+        self._networks, self._linear_skinning = {}, {}
+        for mesh_object in _meshes_of(armature_of(first_object)):
+            network = Network(model).of_mesh(mesh_object.fdda.model_mesh)
+            rig = network.linear_rig(read_model_rig(_rig_of(mesh_object), network.info))
+            self._networks[mesh_object.fdda.model_mesh] = network
+            self._linear_skinning[mesh_object.fdda.model_mesh] = LinearSkinning(
+                replace(rig, rest_matrices=network.info.rest_matrices)
+            )
         self._second_layer_name = bpy.context.scene.view_layers.new("second").name
         self._set_up_renders()
+        for mesh_object in _meshes_of(armature_of(first_object)):
+            mesh_object["place"] = mesh_object.location
         for _ in range(characters - 1):
             self._duplicate()
         # Half of the characters keep the animation; the others keep the poses that the operations set.
-        for mesh_object in self._characters()[1::2]:
-            armature_modifier(mesh_object).object.animation_data_clear()
+        for armature_object in self._armatures()[1::2]:
+            armature_object.animation_data_clear()
         self.outcome = Outcome()
         bpy.ops.ed.undo_push(message="start")
 
@@ -106,9 +116,15 @@ class PlaybackStress:
     def _characters(self) -> list[bpy.types.Object]:
         return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
 
+    def _armatures(self) -> list[bpy.types.Object]:
+        return list(dict.fromkeys(map(armature_of, self._characters())))
+
     def _random_character(self) -> bpy.types.Object:
         characters = self._characters()
         return characters[self._random_generator.integers(len(characters))]
+
+    def _random_armature(self) -> bpy.types.Object:
+        return armature_of(self._random_character())
 
     def _compare_characters(self, after_operation: str) -> None:
         layers = bpy.context.scene.view_layers
@@ -117,7 +133,7 @@ class PlaybackStress:
                 binding = mesh_object.fdda
                 if binding.status:
                     raise AssertionError(f"{mesh_object.name} {after_operation}: {binding.status}")
-                if binding.mode == "RIG":
+                if binding.mode == "RIG" or mesh_object.hide_viewport:
                     continue
                 shown_positions = _positions(mesh_object.evaluated_get(depsgraph).data)
                 difference = float(np.abs(shown_positions - self._expected_positions(mesh_object, depsgraph)).max())
@@ -129,15 +145,17 @@ class PlaybackStress:
                     )
 
     def _expected_positions(self, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-        info, armature_object = self._network.info, armature_modifier(mesh_object).object
-        reader = PoseReader(SceneRig(mesh_object, armature_object), info.joint_names, info.rest_matrices)
+        network, armature_object = self._networks[mesh_object.fdda.model_mesh], armature_of(mesh_object)
+        scene_rig = _rig_of(mesh_object)
+        reader = PoseReader(scene_rig, network.info.joint_names, network.info.rest_matrices)
+        controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)[None]
         pose = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))[None]
         binding = mesh_object.fdda
         strength = binding.strength if binding.mode == "FDDA" else 0.0
-        model_positions = self._network.positions(pose)[0]
+        model_positions = network.positions(pose, controls)[0]
         if strength == 1:
             return model_positions
-        linear_positions = self._linear_skinning.positions(pose)[0]
+        linear_positions = self._linear_skinning[mesh_object.fdda.model_mesh].positions(pose)[0]
         return linear_positions + np.float32(strength) * (model_positions - linear_positions)
 
     def _set_up_renders(self) -> None:
@@ -158,7 +176,7 @@ class PlaybackStress:
         )
 
     def _pose(self) -> None:
-        armature_object = armature_modifier(self._random_character()).object
+        armature_object = self._random_armature()
         bone = armature_object.pose.bones[BONES[self._random_generator.integers(len(BONES))]]
         bone.rotation_euler = self._random_generator.uniform(-1, 1, 3)
         if self._random_generator.random() < 0.2:
@@ -191,22 +209,58 @@ class PlaybackStress:
     def _use_in_render(self) -> None:
         self._random_character().fdda.use_in_render = bool(self._random_generator.integers(2))
 
+    def _hide(self) -> None:
+        mesh_object = self._random_character()
+        mesh_object.hide_viewport = not mesh_object.hide_viewport
+
+    def _move(self) -> None:
+        """Move a mesh against the others of its character, or all of a character."""
+        mesh_object = self._random_character()
+        moved = (mesh_object, armature_of(mesh_object))[self._random_generator.integers(2)]
+        moved.location = self._random_generator.uniform(-0.2, 0.2, 3)
+        if self._random_generator.integers(2):
+            moved.location = moved.get("place", (0.0, 0.0, 0.0))
+
+    def _unbind(self) -> None:
+        mesh_object = self._random_character()
+        if len(self._characters()) > 3 and not mesh_object.hide_viewport:
+            unbind(mesh_object)
+            self._push_undo_step("unbind")
+
+    def _bind(self) -> None:
+        unbound = [o for o in bpy.context.scene.objects if "place" in o and o.type == "MESH" and not o.fdda.is_bound]
+        for mesh_object in unbound:
+            location, mesh_object.location = mesh_object.location.copy(), mesh_object["place"]
+            bpy.context.view_layer.update()
+            bind(_rig_of(mesh_object), self._model)
+            mesh_object.location = location
+        if unbound:
+            self._push_undo_step("bind")
+
     def _duplicate(self) -> None:
-        source = self._random_character() if self._characters() else bpy.data.objects[self._first_name]
-        if len(self._characters()) >= self._max_characters:
+        if len(self._armatures()) >= self._max_characters:
             return
-        mesh_object, armature_object = source.copy(), armature_modifier(source).object.copy()
-        for copy in (mesh_object, armature_object):
+        armature_object = self._random_armature()
+        copies = {o: o.copy() for o in (armature_object, *_meshes_of(armature_object))}
+        for scene_object, copy in copies.items():
             bpy.context.scene.collection.objects.link(copy)
-        armature_modifier(mesh_object).object = mesh_object.parent = armature_object
+            copy.parent = copies.get(scene_object.parent)
+            for modifier in copy.modifiers:
+                for name in {"object", "target"}.intersection(modifier.bl_rna.properties.keys()):
+                    setattr(modifier, name, copies.get(getattr(modifier, name)))
         self._push_undo_step("duplicate")
 
     def _delete(self) -> None:
-        if len(self._characters()) > 3:
+        """Delete a character, or one of several meshes on which no other depends."""
+        if len(self._armatures()) > 3:
             mesh_object = self._random_character()
-            armature_object = armature_modifier(mesh_object).object
-            for deleted in (mesh_object, armature_object):
-                bpy.data.objects.remove(deleted)
+            armature_object = armature_of(mesh_object)
+            meshes = _meshes_of(armature_object)
+            if len(meshes) > 1 and mesh_object.fdda.model_mesh != "elbow" and self._random_generator.integers(2):
+                bpy.data.objects.remove(mesh_object)
+            else:
+                for deleted in (*meshes, armature_object):
+                    bpy.data.objects.remove(deleted)
             self._push_undo_step("delete")
 
     def _push_undo_step(self, message: str) -> None:
@@ -221,7 +275,7 @@ class PlaybackStress:
         layer = bpy.context.scene.view_layers[self._second_layer_name]
         layer.update()
         for mesh_object in self._characters():
-            if mesh_object.fdda.mode != "RIG":
+            if mesh_object.fdda.mode != "RIG" and not mesh_object.hide_viewport:
                 shown_positions = _positions(mesh_object.evaluated_get(layer.depsgraph).data)
                 difference = float(
                     np.abs(shown_positions - self._expected_positions(mesh_object, layer.depsgraph)).max()
@@ -231,6 +285,15 @@ class PlaybackStress:
                         difference,
                         f"{mesh_object.name} in the other view layer",
                     )
+
+
+def _rig_of(mesh_object: bpy.types.Object) -> SceneRig:
+    return SceneRig(mesh_object, armature_of(mesh_object))
+
+
+def _meshes_of(armature_object: bpy.types.Object) -> list[bpy.types.Object]:
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH"]
+    return [o for o in meshes if armature_of(o) == armature_object]
 
 
 def _positions(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -249,14 +312,15 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--evaluations", type=int, default=20_000)
     parser.add_argument("--characters", type=int, default=10)
+    parser.add_argument("--meshes", type=int, choices=(1, 3), default=1, help="number of meshes of each character")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     fdda_addon.register()
-    bound, model = bind_elbow(options.folder)
+    bound, model = bind_elbow(options.folder, options.meshes)
     bpy.ops.wm.open_mainfile(filepath=str(bound))
     fdda_addon.register()
-    first = next(o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound)
+    first = bpy.data.objects["elbow"]
     start = time.perf_counter()
     stress = PlaybackStress(first, model, options.characters, options.folder, options.seed)
     outcome = stress.run(options.evaluations)
@@ -266,8 +330,9 @@ def main() -> int:
     return int(outcome.largest_difference > MAX_DIFFERENCE_M)
 
 
-def bind_elbow(folder: Path) -> tuple[Path, Path]:
-    """Return the bound file and the model of the elbow; create them if they do not exist."""
+def bind_elbow(folder: Path, mesh_count: int) -> tuple[Path, Path]:
+    """Return the bound file and the model of the elbow, with two meshes around it or none; create missing files."""
+    from blend_fixtures.characters.meshes import dressed_limb
     from blend_fixtures.elbow import build_elbow
     from fdda_addon.cli.main import main as run_verb
     from fdda_addon.scene.blend_file import save_copy
@@ -276,10 +341,10 @@ def bind_elbow(folder: Path) -> tuple[Path, Path]:
     if not bound.exists():
         bpy.ops.wm.read_factory_settings(use_empty=True)
         fdda_addon.register()
-        build_elbow()
+        (build_elbow if mesh_count == 1 else dressed_limb)()
         save_copy(rig)
         for arguments in (
-            ("record", rig, recording, "--poses", 150),
+            ("record", rig, recording, "--all", "--poses", 150),
             ("train", recording, model, "--passes", 40),
             ("bind", rig, model, bound),
         ):

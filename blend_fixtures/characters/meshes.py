@@ -38,8 +38,8 @@ def dressed_limb() -> None:
         for point in mesh_object.shape_key_add(name="puff", from_mix=False).data:
             point.co.yz *= size
     cuff = cage("cuff", 1.3)
-    cuff.parent = bpy.data.objects["elbow_rig"]
-    cuff.location, cuff.rotation_euler = (0.03, -0.02, 0.01), (0.4, 0.0, 0.2)
+    sleeve.parent = cuff.parent = bpy.data.objects["elbow_rig"]
+    cuff.location, cuff.rotation_euler, cuff.scale = (0.03, -0.02, 0.01), (0.4, 0.0, 0.2), (2.0, 2.0, 2.0)
     bpy.context.view_layer.update()
     cuff.data.transform(cuff.matrix_world.inverted())
     modifier = cuff.modifiers.new("SurfaceDeform", "SURFACE_DEFORM")

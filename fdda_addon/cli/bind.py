@@ -8,13 +8,15 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import ModelError, OutputError
+from ..core.errors import FDDAError, ModelError, OutputError
 from ..core.files.file_kind import BLEND
 from ..core.files.open_files import remove_file
 from ..core.files.output import atomic_write, check_outputs
+from ..core.formats.model import read_model_info
 from ..models.entries import bound_entry
 from ..models.model_list import add_bound_model
-from ..runtime.binding import bind
+from ..runtime.binding import bind, unbind
+from ..runtime.model_meshes import describe_missing_meshes, find_mesh
 from ..scene.blend_file import save_copy
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import stored_path
@@ -35,9 +37,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     check_outputs({options.out: BLEND}, (options.rig, options.model), options.overwrite)
-    rigs_and_models = list(open_rigs(options).values())
-    for scene_rig, model in rigs_and_models:
-        _bind(scene_rig, model, options.use_in_render)
+    rigs_and_models, refusals, missing = [], [], ""
+    found = list(open_rigs(options).values())
+    if not (options.object or options.model.is_dir()):
+        info = read_model_info(options.model)
+        missing = describe_missing_meshes(info, {find_mesh(model, info, rig.mesh_object) for rig, model in found})
+    for scene_rig, model in found:
+        try:
+            _bind(scene_rig, model, options.use_in_render)
+            rigs_and_models.append((scene_rig, model))
+        except FDDAError as error:
+            # Of a character, the meshes that have not changed play.
+            if options.model.is_dir():
+                raise
+            refusals.append((scene_rig.mesh_object.name, error))
+            unbind(scene_rig.mesh_object)
+    if not rigs_and_models:
+        raise refusals[0][1]
     models_by_copy: dict[Path, Path] = {}
     try:
         for scene_rig, model in rigs_and_models:
@@ -54,6 +70,10 @@ def run(options: argparse.Namespace) -> None:
         print(f"{copy_path}: a copy of {model}, beside the file that plays it")
     for scene_rig, model in rigs_and_models:
         print(f"{options.out}: '{scene_rig.mesh_object.name}' plays {model.name}")
+    for name, error in refusals:
+        print(f"Left out '{name}': {error}")
+    if missing:
+        print(missing)
 
 
 def _bind(scene_rig: SceneRig, model: Path, use_in_render: bool) -> None:

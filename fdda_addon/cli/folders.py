@@ -8,22 +8,27 @@ import bpy
 
 from ..core.errors import FDDAError, ModelError
 from ..core.formats.model import read_model_info
+from ..runtime.model_meshes import find_model_rigs
 from ..scene.scene_rig import SceneRig, find_rig
 from .files import open_file
 
 
 def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:
-    """Open the rig file, and find the rig of the model, or the rigs of all models in a folder.
+    """Open the rig file, and find the rigs of a model, or of all models in a folder.
 
     Returns:
-        Rig and model, by name of the object. The name is empty for a single model file.
+        Rig and model, by name of the object. The name is empty for a single mesh.
 
     Raises:
         FDDAError: the file cannot be opened or has no rig, a model has no object name, or its object is missing.
     """
     if not options.model.is_dir():
         open_file(options.rig)
-        return {"": (find_rig(options.object), options.model)}
+        info = None if options.object else read_model_info(options.model)
+        if info is None or len(info.meshes) == 1:
+            return {"": (find_rig(options.object), options.model)}
+        rigs = find_model_rigs(options.model, info).values()
+        return {scene_rig.mesh_object.name: (scene_rig, options.model) for scene_rig in rigs}
     folder = options.model
     paths = sorted([*folder.glob("*.onnx"), *folder.glob("*/*.onnx")])
     if not paths:
@@ -32,12 +37,14 @@ def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:
         )
     models: dict[str, Path] = {}
     for path in paths:
-        name = read_model_info(path).meshes[0].name
-        if not name:
-            raise ModelError(f"'{path}' has no object name; give this file instead of the folder, with --object NAME.")
-        if name in models:
-            raise ModelError(f"'{models[name]}' and '{path}' are both models of '{name}'; remove one of them.")
-        models[name] = path
+        for name in (mesh.name for mesh in read_model_info(path).meshes):
+            if not name:
+                raise ModelError(
+                    f"'{path}' has no object name; give this file instead of the folder, with --object NAME."
+                )
+            if name in models:
+                raise ModelError(f"'{models[name]}' and '{path}' are both models of '{name}'; remove one of them.")
+            models[name] = path
     if options.object and options.object not in models:
         names = ", ".join(f"'{name}'" for name in models)
         raise ModelError(f"'{options.model}' has no model of '{options.object}'; it has those of {names}.")

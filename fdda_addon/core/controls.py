@@ -95,6 +95,19 @@ def controls_of_mesh(controls: Iterable[Control], mesh: str) -> tuple[Control, .
     return tuple(own)
 
 
+def owners_from_mesh(first_mesh: str, mesh: str) -> dict[str, str]:
+    """Return how the owners of controls are named if another mesh of the rig comes first; the others keep their names.
+
+    Args:
+        first_mesh: name of the first mesh of the rig.
+        mesh: name of the mesh that comes first.
+    """
+    if mesh == first_mesh:
+        return {}
+    owners = MESH_OBJECT, SHAPE_KEYS
+    return {owner: f"{owner}:{first_mesh}" for owner in owners} | {f"{owner}:{mesh}": owner for owner in owners}
+
+
 def read_controls(values: list) -> tuple[Control, ...]:
     """Read the controls of a recording or model.
 

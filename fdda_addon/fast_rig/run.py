@@ -210,6 +210,8 @@ def _model_nodes(scene_rigs: list[SceneRig]) -> list[Node]:
     for scene_rig in scene_rigs:
         for control in network_of(scene_rig.mesh_object).info.controls:
             owner = owner_of(scene_rig, control.owner)
+            if owner is None:
+                continue  # A control of a mesh that is not here.
             nodes += [Node(owner), driven_node(owner, control.path)]
             if bone_name := split_bone_path(owner, control.path)[0]:
                 nodes.append(Node(scene_rig.armature_object, bone_name))

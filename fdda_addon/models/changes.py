@@ -11,7 +11,7 @@ from ..core.rig import Rig, rig_differences
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_model_rig
 from ..scene.scene_rig import SceneRig
-from .model_list import entry_info
+from .model_list import entry_info_of_mesh
 
 MAX_LISTED_BONES = 3
 """Number of bones that `RigChanges.sentence` names."""
@@ -77,6 +77,6 @@ def find_changes(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> RigChan
     Raises:
         FDDAError: the rig or the model cannot be read.
     """
-    info = entry_info(scene_rig.mesh_object, entry)
+    info = entry_info_of_mesh(scene_rig.mesh_object, entry)
     rig = read_model_rig(scene_rig, info)
     return compare_with_model(entry.name, info, rig, sampled_channels(scene_rig, rig))

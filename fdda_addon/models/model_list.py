@@ -13,6 +13,7 @@ from ..core.formats.model_info import ModelInfo
 from ..evaluation import last_evaluation
 from ..runtime import model_files, packed_model, playback
 from ..runtime.binding import bind, unbind
+from ..runtime.model_meshes import info_of_mesh
 from ..runtime.opened_model import read_matching_rig
 from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig, armature_of
@@ -55,6 +56,24 @@ def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGr
     entry.name = path.stem
     entry.path = stored_path_for(mesh_object, path)
     binding.model_index = len(binding.models) - 1
+    return entry
+
+
+def copy_entry(
+    mesh_object: bpy.types.Object, source_object: bpy.types.Object, source: bpy.types.PropertyGroup
+) -> bpy.types.PropertyGroup:
+    """Add a model in the list of another mesh object to the list of a mesh object, and make its entry active.
+
+    If the list already has the model, the existing entry is used.
+    """
+    binding = mesh_object.fdda
+    path = absolute_path(source_object, source.path)
+    entry = next((entry for entry in binding.models if absolute_path(mesh_object, entry.path) == path), None)
+    if entry is None:
+        entry = binding.models.add()
+        entry.name, entry.path = source.name, stored_path_for(mesh_object, path)
+    entry.packed, entry.packed_bytes = source.packed, source.packed_bytes
+    binding.model_index = list(binding.models).index(entry)
     return entry
 
 
@@ -242,6 +261,11 @@ def entry_info(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
         ) from error
     inputs = (file_status.st_mtime_ns, file_status.st_size)
     return computed_once(("model", path), inputs, lambda: read_model_info(path))
+
+
+def entry_info_of_mesh(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:
+    """Return the metadata of a model of the list for its mesh; raise the errors of `entry_info` and `find_mesh`."""
+    return info_of_mesh(entry_path(mesh_object, entry), entry_info(mesh_object, entry), mesh_object)
 
 
 def _has_content(path: Path, data: bytes) -> bool:

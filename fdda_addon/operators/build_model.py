@@ -51,9 +51,13 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         self.add_trained_models_to_list()
         sentences = []
+        bound_objects: list[bpy.types.Object] = []
         for mesh_object, model in self.meshes_of_trained_models():
-            if (armature_object := armature_of(mesh_object)) is not None:
-                sentences.append(bind_model(SceneRig(mesh_object, armature_object), model))
+            armature_object = armature_of(mesh_object)
+            if armature_object is not None and mesh_object not in bound_objects:
+                sentence, mesh_objects = bind_model(SceneRig(mesh_object, armature_object), model)
+                sentences.append(sentence)
+                bound_objects += mesh_objects
         return f"Trained in {result:.0f} s. {' '.join(sentences)}"
 
     def cancel_message(self, _context: bpy.types.Context) -> str:

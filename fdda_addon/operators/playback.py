@@ -5,6 +5,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.checks.warning import format_list
 from ..core.errors import FDDAError, ModelError
 from ..evaluation import side_by_side
 from ..models import model_list
@@ -12,6 +13,7 @@ from ..models.entries import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
 from ..runtime.binding import unbind
+from ..runtime.model_meshes import describe_missing_meshes, find_model_rigs
 from ..scene.scene_rig import SceneRig, check_full_rig, remaining_rig_note
 from .rig_operator import NEEDS_MODEL, ModelFileOperator, RigOperator
 
@@ -33,12 +35,18 @@ def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
     return None if entry.packed else model_list.entry_path(mesh_object, entry)
 
 
-def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool = False) -> str:
-    """Bind a model, pack it if the preferences say so, and return the message to report.
+def bind_model(
+    scene_rig: SceneRig, path: Path | None = None, pack_large: bool = False, is_alone: bool = False
+) -> tuple[str, list[bpy.types.Object]]:
+    """Bind a model to all its meshes on the armature of a rig, and pack it if the preferences say so.
 
     Args:
         path: file of the model; None for the active model of the Model Library, or else the trained model.
         pack_large: whether to pack a large model too.
+        is_alone: whether to bind the mesh of the rig alone.
+
+    Returns:
+        The message to report, and the mesh objects that play the model.
 
     Raises:
         FDDAError: the file is not a model of this rig, or the model cannot play.
@@ -53,8 +61,20 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
         entry = model_list.add_model(mesh_object, path)
     else:
         entry = model_list.require_active_entry(mesh_object)
-    note = model_list.bind_entry(scene_rig, entry)
-    return f"'{mesh_object.name}' plays {entry.name}.{pack_by_default(mesh_object, entry, pack_large)} {note}".rstrip()
+    notes = [model_list.bind_entry(scene_rig, entry), pack_by_default(mesh_object, entry, pack_large).strip()]
+    info, mesh_objects = model_list.entry_info(mesh_object, entry), [mesh_object]
+    if len(info.meshes) > 1 and not is_alone:
+        rigs = find_model_rigs(model_list.entry_path(mesh_object, entry), info, scene_rig.armature_object)
+        for other_rig in [rig for rig in rigs.values() if rig.mesh_object != mesh_object]:
+            try:
+                model_list.bind_entry(other_rig, model_list.copy_entry(other_rig.mesh_object, mesh_object, entry))
+                mesh_objects.append(other_rig.mesh_object)
+            except FDDAError as error:
+                notes.append(f"Left out '{other_rig.mesh_object.name}': {error}")
+        notes.append(describe_missing_meshes(info, rigs))
+    names = format_list([o.name for o in mesh_objects], len(mesh_objects))
+    message = f"{names} {'plays' if len(mesh_objects) == 1 else 'play'} {entry.name}."
+    return " ".join(filter(None, [message, *notes])), mesh_objects
 
 
 def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pack_large: bool = False) -> str:
@@ -71,7 +91,10 @@ def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGrou
 class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.bind"
     bl_label = "Bind"
-    bl_description = "Use a model instead of the rig's modifiers: the active one of the Model Library, or a file"
+    bl_description = (
+        "Use a model instead of the rig's modifiers: the active one of the Model Library, or a file. It is bound to "
+        "each mesh that it deforms"
+    )
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(
@@ -117,7 +140,13 @@ class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
         if len(rigs) > 1:
             rigs = [rig for rig in rigs if _has_model(rig.mesh_object)] or rigs[:1]
         path = self.chosen_path() if self.filepath else None
-        return " ".join(bind_model(rig, path, self.pack_large) for rig in rigs)
+        messages, bound_objects = [], []
+        for rig in rigs:
+            if rig.mesh_object not in bound_objects:
+                message, mesh_objects = bind_model(rig, path, self.pack_large, is_alone=bool(self.object))
+                messages.append(message)
+                bound_objects += mesh_objects
+        return " ".join(messages)
 
 
 class FDDA_OT_unbind(RigOperator, bpy.types.Operator):

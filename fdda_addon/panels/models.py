@@ -8,7 +8,7 @@ from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.poses import CONTROL, Channel
 from ..models.changes import compare_with_model
 from ..models.entries import active_entry, format_file_size, is_bound
-from ..models.model_list import entry_info
+from ..models.model_list import entry_info, entry_info_of_mesh
 from ..rig.reading import read_model_rig
 from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig, armature_of
@@ -34,7 +34,7 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     problems = {}
     for entry in mesh_object.fdda.models:
         try:
-            info = entry_info(mesh_object, entry)
+            info = entry_info_of_mesh(mesh_object, entry)
             if check is not None and check.rig is not None:
                 rig = rig_of_model(scene_rig, check.rig, info)
                 changes = compare_with_model(

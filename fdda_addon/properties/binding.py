@@ -78,6 +78,13 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         type=bpy.types.Text,
         override=OVERRIDABLE,
     )
+    model_mesh: StringProperty(name="Mesh", description="Name of this mesh in the model", override=OVERRIDABLE)
+    armature: PointerProperty(
+        name="Armature",
+        description="The armature of a mesh without an Armature modifier",
+        type=bpy.types.Object,
+        override=OVERRIDABLE,
+    )
     mode: EnumProperty(
         name="Mode",
         description="What deforms the mesh",

@@ -176,25 +176,42 @@ class PoseReader:
     A pose matrix is P_j = S_j B_j, with B_j the rest matrix and S_j the skin matrix of Blender's Armature modifier.
     If mesh and armature have the same relative transform as in the rest pose, it is the bone's pose matrix in
     mesh-object space. It stays correct if one of the objects moves alone.
+
+    Attributes:
+        transform: the matrix from armature space to the space of the pose matrices in the last pose; None before.
     """
 
-    def __init__(self, scene_rig: SceneRig, names: tuple[str, ...], rest_matrices: np.ndarray):
+    def __init__(
+        self,
+        scene_rig: SceneRig,
+        names: tuple[str, ...],
+        rest_matrices: np.ndarray,
+        mesh_to_model: np.ndarray | None = None,
+    ):
         """Prepare to read joints.
 
         Args:
             names: names of J joints.
             rest_matrices: (J, 4, 4), rest matrices of the joints, mesh-object space.
+            mesh_to_model: (4, 4), from the space of the mesh object to that of another object, in which rest and pose
+                matrices are; None for the identity.
         """
         self._matrix_reader = armature_io.PoseMatrixReader(scene_rig.armature_object, names)
         self._rest_matrices = rest_matrices.astype(np.float64)
         self._inverse_bone_rest = np.linalg.inv(armature_io.rest_matrices(scene_rig.armature_object.data, names))
-        self._armature_to_mesh: Matrix | None = None
+        self._mesh_to_model = None if mesh_to_model is None else Matrix(mesh_to_model)
+        self.transform: Matrix | None = None
         self._left_factor: np.ndarray | None = None
         self._right_factor: np.ndarray | None = None
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
         """Return whether the armature still has the same number of bones."""
         return self._matrix_reader.fits(armature_object)
+
+    def read_transform(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:
+        """Read the matrix from armature space to the space of the pose matrices, of evaluated objects."""
+        armature_to_mesh = _armature_to_mesh_transform(mesh_object, armature_object)
+        return armature_to_mesh if self._mesh_to_model is None else self._mesh_to_model @ armature_to_mesh
 
     def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
         """Read the pose matrices of evaluated objects.
@@ -205,8 +222,8 @@ class PoseReader:
         Raises:
             RigError: an object has a scale of zero.
         """
-        armature_to_mesh = _armature_to_mesh_transform(mesh_object, armature_object)
-        if armature_to_mesh != self._armature_to_mesh:
+        transform = self.read_transform(mesh_object, armature_object)
+        if transform != self.transform:
             for scene_object in (mesh_object, armature_object):
                 if is_flat(scene_object):
                     raise RigError(
@@ -214,8 +231,8 @@ class PoseReader:
                         "driver that sets it."
                     )
             # The factors of P = T pose inv(T bone_rest) rest, with T from armature to mesh; None for identity.
-            self._armature_to_mesh = armature_to_mesh
-            left_factor = np.array(armature_to_mesh, np.float64)
+            self.transform = transform
+            left_factor = np.array(transform, np.float64)
             # Compute one inverse per frame instead of one per joint, because rounding changes T in each frame if an
             # animated parent moves both objects.
             right_factor = self._inverse_bone_rest @ (np.linalg.inv(left_factor) @ self._rest_matrices)

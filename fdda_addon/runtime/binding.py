@@ -10,7 +10,7 @@ import bpy
 from ..core.errors import RigError
 from ..rig.modifier_stack import check_stack
 from ..rig.time_inputs import check_time_inputs
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, armature_modifier
 from ..scene.stored_paths import stored_path_for
 from . import effects, model_files, playback, playback_modifier
 from .opened_model import open_model
@@ -56,6 +56,10 @@ def bind(
     binding = mesh_object.fdda
     binding.model = stored_path_for(mesh_object, model_path)
     binding.packed = packed_text
+    if armature_modifier(mesh_object) is None:
+        # What the armature is found by may be removed, as in a fast rig.
+        binding.armature = scene_rig.armature_object
+    binding.model_mesh = opened_model.network.info.meshes[0].name
     # Without the model, renders of a fast rig would show what is left of its modifiers.
     binding.use_in_render = use_in_render or binding.is_fast_rig
     binding.is_bound = True
@@ -78,7 +82,8 @@ def unbind(mesh_object: bpy.types.Object) -> None:
     session.dispatch(Event.UNBIND, character)
     playback_modifier.remove_modifiers(mesh_object)
     effects.remove_unused_objects()
-    for property_name in ("is_bound", "model", "packed", "use_in_render", "status"):
+    properties = ("is_bound", "model", "packed", "model_mesh", "use_in_render", "status")
+    for property_name in properties if binding.is_fast_rig else (*properties, "armature"):
         binding.property_unset(property_name)
 
 

@@ -26,25 +26,35 @@ def playback_input(driven_object: bpy.types.Object) -> DriverInput:
     return "SINGLE_PROP", driven_object, PLAYBACK_PROPERTY
 
 
-def pose_inputs(buffer: bpy.types.Object, scene_rig: SceneRig, controls: Iterable[Control]) -> list[DriverInput]:
-    """Return the variables whose datablocks a player reads (`evaluated_inputs`).
+def pose_inputs(scene_rig: SceneRig, controls: Iterable[Control]) -> list[DriverInput]:
+    """Return the variables whose datablocks hold the pose (`evaluated_inputs`).
 
     Args:
-        buffer: the position buffer.
         scene_rig: the rig whose pose is read.
         controls: controls on which all controls of the model depend (`ControlReader.sources`).
     """
     return [
-        # Evaluating the geometry of the buffer resets its positions to the stored ones, so it has to come first.
-        ("SINGLE_PROP", buffer, "data.vertices[0].co[0]"),
-        ("TRANSFORMS", scene_rig.mesh_object, ""),
         ("TRANSFORMS", scene_rig.armature_object, ""),
         *(("SINGLE_PROP", owner_of(scene_rig, control.owner), control.path) for control in controls),
     ]
 
 
-def dependency_inputs(scene_rig: SceneRig, joint_names: Iterable[str]) -> list[DriverInput]:
-    """Return the variables that only add dependencies: mode, strength, and the joints of the model.
+def buffer_inputs(buffer: bpy.types.Object, mesh_object: bpy.types.Object) -> list[DriverInput]:
+    """Return the variables of a position buffer and its bound object."""
+    return [
+        # Evaluating the geometry of the buffer resets its positions to the stored ones, so it has to come first.
+        ("SINGLE_PROP", buffer, "data.vertices[0].co[0]"),
+        ("TRANSFORMS", mesh_object, ""),
+    ]
+
+
+def setting_inputs(mesh_object: bpy.types.Object) -> list[DriverInput]:
+    """Return the variables that only add a dependency on mode and strength of a bound object."""
+    return [("SINGLE_PROP", mesh_object, "fdda.mode"), ("SINGLE_PROP", mesh_object, "fdda.strength")]
+
+
+def joint_inputs(scene_rig: SceneRig, joint_names: Iterable[str]) -> list[DriverInput]:
+    """Return the variables that only add dependencies on the joints of a model.
 
     Blender evaluates a bone after its parents, so the last bone of each chain is enough.
     """
@@ -52,11 +62,7 @@ def dependency_inputs(scene_rig: SceneRig, joint_names: Iterable[str]) -> list[D
     # The pose reader reports missing joints.
     bone_names = [name for name in joint_names if name in bones]
     parent_names = {bone.name for name in bone_names for bone in bones[name].parent_recursive}
-    return [
-        ("SINGLE_PROP", scene_rig.mesh_object, "fdda.mode"),
-        ("SINGLE_PROP", scene_rig.mesh_object, "fdda.strength"),
-        *(("TRANSFORMS", scene_rig.armature_object, name) for name in bone_names if name not in parent_names),
-    ]
+    return [("TRANSFORMS", scene_rig.armature_object, name) for name in bone_names if name not in parent_names]
 
 
 def set_driver_inputs(driven_object: bpy.types.Object, inputs: list[DriverInput]) -> None:

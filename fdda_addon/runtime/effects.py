@@ -23,10 +23,8 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
         FDDAError: the model cannot be loaded, or does not fit the rig.
     """
     if effect == Effect.REMOVE_PLAYER:
-        player_batch.unbatch(character.buffer_uid)
-        session.players.pop(character.buffer_uid, None)
+        player_batch.remove_player(character.buffer_uid)
         character.player = None
-        session.needs_scan = True
     elif effect == Effect.FORGET_CHECK:
         session.passed_checks.pop(character.object_uid, None)
     elif effect == Effect.SCHEDULE_CHECK:
@@ -40,7 +38,8 @@ def apply(effect: Effect, character: Character, error: FDDAError | None) -> None
             buffer = _ensure_buffer(character, mesh_object)
             character.buffer_uid = buffer.session_uid
             character.reported.clear()
-            character.player = session.players[buffer.session_uid] = Player(mesh_object, buffer)
+            character.player = Player(mesh_object)
+            player_batch.add_player(buffer.session_uid, character.player)
             if mesh_object.mode not in STABLE_MODES:
                 session.dispatch(Event.EDIT, character)
         elif effect == Effect.CHECK_RIG:
@@ -82,12 +81,10 @@ def _ensure_buffer(character: Character, mesh_object: bpy.types.Object) -> bpy.t
 
 
 def remove_unused_objects() -> None:
-    """Remove the position buffers that no character has, and the batch drivers that play no batch."""
+    """Remove the position buffers that no character has."""
     used_uids = {character.buffer_uid for character in session.characters.values()}
     for buffer in [o for o in bpy.data.objects if position_buffer.is_buffer(o) and o.session_uid not in used_uids]:
-        session.players.pop(buffer.session_uid, None)
         position_buffer.remove_buffer(buffer)
-    player_batch.remove_unused_drivers()
 
 
 def remove_buffers() -> None:

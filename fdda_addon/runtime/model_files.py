@@ -11,18 +11,20 @@ from ..core.formats.model import read_model
 from ..scene.folder_trust import is_trusted
 from ..scene.stored_paths import absolute_path, path_owner, resolve_path
 from . import packed_model
+from .model_meshes import find_mesh
 from .network import Network
 from .session import session
 
 
 def network_of(mesh_object: bpy.types.Object) -> Network:
-    """Return the model of a bound object: its packed model if there is one, else the model in its file.
+    """Return the model of a bound object, for its mesh: its packed model if there is one, else the model in its file.
 
     Raises:
-        ModelError: the model cannot be loaded.
+        ModelError: the model cannot be loaded, or does not deform the mesh.
     """
     packed_text = mesh_object.fdda.packed
-    return load_network(model_path(mesh_object) if packed_text is None else packed_text)
+    network = load_network(model_path(mesh_object) if packed_text is None else packed_text)
+    return network.of_mesh(find_mesh(network.path, network.info, mesh_object))
 
 
 def load_network(source: Path | bpy.types.Text) -> Network:

@@ -3,6 +3,7 @@
 
 import os
 import sys
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from ..core.formats.model import (
     read_model,
     read_skin,
 )
-from ..core.rig import Rig
+from ..core.rig import IDENTITY, STATIC_JOINT, Rig, mesh_slices
 
 MIN_MULTITHREADED_VERTICES = 100_000
 """Smallest number of vertices for which several threads run the model; starting them takes time too."""
@@ -28,11 +29,14 @@ MAX_THREADS = 4
 
 
 class Network:
-    """A model that is loaded into ONNX Runtime.
+    """A model that is loaded into ONNX Runtime, or a view of it that deforms one of its meshes (`of_mesh`).
 
     Attributes:
         path: path of the model file.
-        info: metadata of the model.
+        info: metadata of the model; of a view, that of its mesh.
+        model: the model itself, of a view too.
+        vertices: the vertices of `info` in the output of the model.
+        mesh_to_model: (4, 4) float64, from the space of the mesh object to that of the model; None for the identity.
     """
 
     def __init__(self, path: Path, data: bytes | None = None):
@@ -78,6 +82,36 @@ class Network:
                 f"ONNX Runtime refuses the model '{path}' ({_first_line(error)}); train it again."
             ) from error
         self._execution: Execution | None = None
+        self.model, self.vertices = self, slice(0, self.info.vertex_count)
+        self.mesh_to_model: np.ndarray | None = None
+        self._views: dict[str, Network] = {}
+
+    def of_mesh(self, name: str) -> "Network":
+        """Return a view of the model that deforms one of its meshes, given by its name, in the space of its object."""
+        if len(self.info.meshes) > 1 and name not in self._views:
+            parts = zip(self.info.meshes, mesh_slices(self.info.meshes), strict=True)
+            mesh, vertices = next((mesh, vertices) for mesh, vertices in parts if mesh.name == name)
+            view = self._views[name] = copy(self)
+            view.info, view.vertices = self.info.of_mesh(mesh), vertices
+            view.mesh_to_model = None if mesh.transform == IDENTITY else mesh.matrix
+            view._skin = None if self._skin is None else tuple(values[vertices] for values in self._skin)
+            view._execution, view._views = None, {}
+        return self._views.get(name, self)
+
+    def to_mesh_space(self, positions: np.ndarray) -> np.ndarray:
+        """Transform positions, (..., V, 3) float32, from the space of the model to that of the mesh object."""
+        if self.mesh_to_model is None:
+            return positions
+        matrix = np.linalg.inv(self.mesh_to_model)
+        return positions @ matrix[:3, :3].T.astype(np.float32) + matrix[:3, 3].astype(np.float32)
+
+    def _to_model_space(self, pose_matrices: np.ndarray) -> np.ndarray:
+        """Transform pose matrices, (N, J, 4, 4), from the space of the mesh object to that of the model."""
+        if self.mesh_to_model is None:
+            return pose_matrices
+        model_matrices = self.mesh_to_model @ pose_matrices
+        model_matrices[:, [name == STATIC_JOINT for name in self.info.joint_names]] = np.eye(4)
+        return model_matrices.astype(np.float32)
 
     def positions(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray:
         """Deform the mesh.
@@ -97,10 +131,10 @@ class Network:
         if self._execution is None or pose_count != len(self._execution.poses):
             self._execution = Execution(self, pose_count)
         execution = self._execution
-        execution.poses[:] = pose_matrices
+        execution.poses[:] = self._to_model_space(pose_matrices)
         if self.info.controls:
             execution.controls[:] = self._check_controls(controls, pose_count)
-        return execution.run()
+        return self.to_mesh_space(execution.run()[:, self.vertices])
 
     def confidence(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray | None:
         """Evaluate the confidence of each partition. This takes as long as `positions`, too long for each frame.
@@ -116,7 +150,7 @@ class Network:
         """
         if CONFIDENCE_OUTPUT not in {output.name for output in self._session.get_outputs()}:
             return None
-        inputs = {POSE_INPUT: pose_matrices}
+        inputs = {POSE_INPUT: self._to_model_space(pose_matrices)}
         if self.info.controls:
             inputs[CONTROLS_INPUT] = np.asarray(self._check_controls(controls, len(pose_matrices)), np.float32)
         try:
@@ -153,14 +187,16 @@ class Network:
 class Execution:
     """Input and output arrays of a model for a fixed number of poses. Each thread can run the model on its own arrays.
 
+    All are in the space and the unit of the model, which are those of its first mesh.
+
     Attributes:
-        poses: (N, J, 4, 4) float32, pose matrices, mesh-object space, mesh units. Set them before `run`.
+        poses: (N, J, 4, 4) float32, pose matrices. Set them before `run`.
         controls: (N, C) float32, in the order of `info.controls`. Set them before `run`.
-        positions: (N, V, 3) float32, mesh-object space, mesh units, written by `run`.
+        positions: (N, V, 3) float32, of the vertices of all meshes, written by `run`.
     """
 
     def __init__(self, network: Network, pose_count: int):
-        info = network.info
+        info = network.model.info
         self._path, self._session = network.path, network._session
         self.poses = np.zeros((pose_count, len(info.joints), 4, 4), np.float32)
         self.controls = np.zeros((pose_count, len(info.controls)), np.float32)

@@ -17,7 +17,7 @@ PACKED_MODEL_KEY = "fdda_model"
 
 
 def pack(name: str, data: bytes) -> bpy.types.Text:
-    """Pack a model into the open file.
+    """Pack a model into the open file, unless it is there already.
 
     Args:
         name: name of the model.
@@ -31,6 +31,10 @@ def pack(name: str, data: bytes) -> bpy.types.Text:
     """
     # No model is as large as Blender's limit for a custom property, 2 GB.
     check_model(data, name)
+    # The meshes of a character share a packed model.
+    for text in bpy.data.texts:
+        if text.library is None and text.get(PACKED_MODEL_KEY) == data:
+            return text
     text = bpy.data.texts.new(name)
     text.use_fake_user = False
     text.write(

@@ -20,11 +20,10 @@ from .transitions import SHOWS_MODEL, Event, State
 
 
 def on_evaluate(driven_object: bpy.types.Object) -> None:
-    """Play the models of an evaluated position buffer or batch driver. Raises nothing."""
-    driven_uid = driven_object.original.session_uid
-    player_or_batch = session.players.get(driven_uid) or session.batches.get(driven_uid)
-    if player_or_batch is not None:
-        player_or_batch.play(driven_object)
+    """Play the models whose driver an evaluated position buffer has. Raises nothing."""
+    player_batch = session.batches.get(driven_object.original.session_uid)
+    if player_batch is not None:
+        player_batch.play(driven_object)
 
 
 def on_frame_change(depsgraph: bpy.types.Depsgraph) -> None:
@@ -37,7 +36,7 @@ def on_frame_change(depsgraph: bpy.types.Depsgraph) -> None:
         updated("SCENE")
         or (updated("ARMATURE") and has_copied_armature(depsgraph))
         or (updated("MESH") and changed_meshes(depsgraph))
-        or any(player.has_new_copy for player in session.players.values())
+        or any(c.player is not None and c.player.has_new_copy for c in session.characters.values())
     ):
         _dispatch_changes(depsgraph)
     session.check_rigs()
@@ -143,8 +142,6 @@ def scan() -> None:
     """Follow the bound objects of the file if objects were added or removed, or if a player was removed."""
     if not session.needs_scan and session.scanned_count == len(bpy.data.objects):
         return
-    session.batches.clear()
-    session.moved_buffers.clear()
     bound_objects = {o.session_uid: o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound}
     for character in [c for c in session.characters.values() if c.object_uid not in bound_objects]:
         session.dispatch(Event.UNBIND, character)
@@ -153,6 +150,8 @@ def scan() -> None:
         with session.isolated_errors(character):
             _scan_object(character, mesh_object)
     effects.remove_unused_objects()
+    # Blender also redirects a driver when an object that it reads gets a library override.
+    player_batch.update_drivers()
     session.needs_scan, session.scanned_count = False, len(bpy.data.objects)
 
 
@@ -170,9 +169,6 @@ def _scan_object(character: Character, mesh_object: bpy.types.Object) -> None:
         session.dispatch(Event.ANIMATE_MODEL, character)
     elif not (mesh_object.fdda.is_playing and _reads_buffer(mesh_object, character)):
         session.dispatch(Event.OUTDATE, character)
-    else:
-        # Blender redirects the driver when an object that it reads gets a library override.
-        character.player.update_driver(mesh_object, playback_modifier.buffer_of_object(mesh_object))
 
 
 def _apply_animated_mode(character: Character, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:

@@ -1,72 +1,68 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The player of a bound object: reads its evaluated pose, runs its model and writes the positions."""
+"""The player of a bound object: reads its evaluated pose, and writes the positions that its model has for it."""
 
 import threading
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import bpy
 import numpy as np
 
+from ..core.controls import Control
 from ..core.errors import FDDAError, ModelError, RigError
-from ..core.formats.pose_repair import repair_pose
+from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
 from ..core.mathematics.mask import SkinningBlend
 from ..core.rig import STATIC_JOINT
 from ..rig.modifier_stack import check_shape_readers, find_shape_readers, replaced_range
 from ..rig.reading import PoseReader, read_model_rig
 from ..scene.control_reader import ControlReader
 from ..scene.mask import mask_key, read_mask
-from ..scene.mesh import set_mesh_positions
+from ..scene.mesh import rest_positions, set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
-from . import driver, evaluated_copies, rig_signature
+from . import evaluated_copies, rig_signature
 from .depsgraph_changes import seen_mode
 from .model_files import network_of
-from .network import Execution
 from .session import session
+
+POSE_TOLERANCE = 1e-5
+"""Meshes of a model share a pose if their objects have moved against each other by no more than this part of a mesh."""
 
 
 class ModelInputs(NamedTuple):
     """The inputs of a model for one pose.
 
     Attributes:
-        pose_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
+        pose_matrices: (J, 4, 4) float32, space and unit of the model.
         controls: (C,) float32.
-        strength: 0 for linear skinning alone, 1 for the model.
+        warning: what is wrong with the pose; empty for nothing.
     """
 
     pose_matrices: np.ndarray
     controls: np.ndarray
-    strength: float
+    warning: str = ""
 
 
 class Player:
-    """Plays the model of one bound object.
+    """Plays the model of one bound object (`player_batch`).
 
     Attributes:
         object_uid: session id of the object.
         network: the model of the object.
-        armature_uid, mesh_uid: session ids of the armature data and of the mesh.
+        armature_object_uid, armature_uid, mesh_uid: session ids of the armature object, of its data and of the mesh.
         signature: signature of the rig at its last check (`rig_signature`).
         error: the exception that stopped playback during an evaluation; None if there was none.
         warning, reported_warning: the current warning and the one in the status of the object; empty for none.
         mask: limits the model to a part of the mesh; None for none.
+        strength: 0 for linear skinning alone, 1 for the model.
         needs_recreation: whether the armature object has other data, or other bones than those that the player reads.
-        new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
-        has_moved: whether there were new inputs since the last update of the batches, which resets it.
-        pose_input_count: number of driver variables whose datablocks `play` reads (`driver_inputs`).
         depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer.
         has_new_copy: whether Blender has copied the object with its shape keys since changes were read.
-        lock: the lock that is held from `read_pose` to `write_positions`.
+        lock: the lock that is held while the pose is read and the positions are written.
     """
 
-    def __init__(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object):
+    def __init__(self, mesh_object: bpy.types.Object):
         """Create the player of a bound object.
-
-        Args:
-            mesh_object: the bound object.
-            buffer: its position buffer.
 
         Raises:
             FDDAError: the model cannot be loaded, or no longer fits the object.
@@ -78,7 +74,8 @@ class Player:
         info = self.network.info
         scene_rig = self.scene_rig(mesh_object)
         armature_object, self.mesh_uid = scene_rig.armature_object, mesh_object.data.session_uid
-        self._armature_object_uid, self.armature_uid = armature_object.session_uid, armature_object.data.session_uid
+        self.armature_object_uid, self.armature_uid = armature_object.session_uid, armature_object.data.session_uid
+        self._vertex_count = info.vertex_count
         self._check_vertex_count(mesh_object)
         replaced = replaced_range(mesh_object)
         check_shape_readers(mesh_object, *replaced)
@@ -89,35 +86,23 @@ class Player:
         self.signature = self._read_signature(scene_rig, rig_signature.PARTS)
         rig_signature.check(scene_rig, self.network, self.signature)
         self._pose_reader = self._create_pose_reader(scene_rig)
+        self._model_size = float(np.linalg.norm(np.ptp(self._rest_positions(mesh_object), axis=0)))
         self._control_reader = ControlReader(scene_rig, info.controls)
-        self.pose_input_count = 3 + len(self._control_reader.sources)
         self._mask_key, self.mask = mask_key(mesh_object), read_mask(mesh_object)
         self._blend: SkinningBlend | None = None
-        self._execution = Execution(self.network, 1)
-        self.new_inputs: ModelInputs | None = None
         self.depsgraph_keys: set[tuple[str, int, str]] = set()
-        self.has_moved = self.has_new_copy = False
+        self.has_new_copy = False
         # A render may evaluate on another thread while the window does.
         self.lock = threading.Lock()
-        self._shown_inputs: tuple | None = None
+        self.strength = 1.0
+        self._shown: tuple[ModelInputs, float] | None = None
         self._positions: np.ndarray | None = None
         self.warning, self.reported_warning = "", ""
-        self._execution.poses[0] = info.rest_matrices
-        self._check_finite(self._execution.run())  # The first pose is played after the handlers have run.
-        self.update_driver(mesh_object, buffer)
 
-    def update_driver(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> None:
-        """Make Blender evaluate the position buffer whenever an input of the model has changed."""
-        pose_inputs, dependencies = self.driver_inputs(mesh_object, buffer)
-        driver.set_driver_inputs(buffer, [driver.playback_input(buffer), *pose_inputs, *dependencies])
-
-    def driver_inputs(
-        self, mesh_object: bpy.types.Object, buffer: bpy.types.Object
-    ) -> tuple[list[driver.DriverInput], list[driver.DriverInput]]:
-        """Return the driver variables whose datablocks `play` reads, and those that only add dependencies."""
-        scene_rig = self.scene_rig(mesh_object)
-        dependencies = driver.dependency_inputs(scene_rig, self.network.info.joint_names)
-        return driver.pose_inputs(buffer, scene_rig, self._control_reader.sources), dependencies
+    @property
+    def control_sources(self) -> tuple[Control, ...]:
+        """Return the numbers on which all controls of the model depend (`ControlReader.sources`)."""
+        return self._control_reader.sources
 
     def fits_object(self, mesh_object: bpy.types.Object) -> bool:
         """Return whether the object has the same armature, mesh and number of vertices."""
@@ -128,7 +113,7 @@ class Player:
         armature_object = armature_of(mesh_object)
         return (
             armature_object is not None
-            and armature_object.session_uid == self._armature_object_uid
+            and armature_object.session_uid == self.armature_object_uid
             and mesh_object.data.session_uid == self.mesh_uid
         )
 
@@ -167,94 +152,102 @@ class Player:
                 return False
             self._blend = None if self._blend is None else self._blend.with_mask(new_mask)
             # The shown positions have the previous mask.
-            self._shown_inputs = None
+            self._shown = None
         return True
 
-    def play(self, buffer: bpy.types.Object) -> None:
-        """Write the positions of the evaluated pose to an evaluated position buffer; store exceptions in `error`."""
-        with self.lock, self.capture_errors():
-            _, mesh_object, armature_object, *owners = driver.evaluated_inputs(buffer, self.pose_input_count)
-            if self.read_pose(mesh_object, armature_object, owners):
-                if self.new_inputs is not None:
-                    self.run_model()
-                self.write_positions(buffer, mesh_object)
+    def store_error(self, error: BaseException) -> None:
+        """Store any exception in `error`: a getter would lose it, and SystemExit would end Blender."""
+        message = f"The model '{self.network.path}' cannot be played ({error!r}); bind it again."
+        self.error = error if isinstance(error, FDDAError) else ModelError(message)
 
-    @contextmanager
-    def capture_errors(self) -> Iterator[None]:
-        """Store any exception of the block in `error`: a getter would lose it, and SystemExit would end Blender."""
-        try:
-            yield
-        except BaseException as error:  # SystemExit too.
-            message = f"The model '{self.network.path}' cannot be played ({error!r}); bind it again."
-            self.error = error if isinstance(error, FDDAError) else ModelError(message)
+    def fits_pose(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
+        """Return whether the pose of evaluated objects can be read.
 
-    def read_pose(
-        self,
-        mesh_object: bpy.types.Object | None,
-        armature_object: bpy.types.Object | None,
-        owners: Sequence[bpy.types.ID | None],
-    ) -> bool:
-        """Read the pose of evaluated objects into `new_inputs`.
-
-        Args:
-            mesh_object: the bound object.
-            owners: the datablocks that own `ControlReader.sources`, in their order.
-
-        Returns:
-            Whether there are positions to write.
+        Raises:
+            ModelError: the mesh has another number of vertices.
         """
-        self.new_inputs = None
-        if armature_object is None or mesh_object is None:
-            return False
         data = armature_object.data.original
         if data.session_uid != self.armature_uid or not self._pose_reader.fits(armature_object):
             self.needs_recreation = True
             return False
         self._check_vertex_count(mesh_object.original)
-        binding = mesh_object.fdda
+        return True
+
+    def read_inputs(
+        self,
+        mesh_object: bpy.types.Object,
+        armature_object: bpy.types.Object,
+        owners: Sequence[bpy.types.ID | None],
+    ) -> ModelInputs | None:
+        """Read the pose of evaluated objects; return None if one has a scale of zero, which hides a character.
+
+        Args:
+            owners: the datablocks that own `control_sources`, in their order.
+
+        Raises:
+            RigError: a control was removed.
+        """
         try:
             pose_matrices = self._pose_reader.read(mesh_object, armature_object)
         except RigError:
-            # Animators hide a character with a scale of zero.
-            return False
+            return None
         controls = self._control_reader.values(owners)
+        return ModelInputs(pose_matrices, controls, self._control_reader.warning)
+
+    def shares_pose(self, other: "Player", mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
+        """Return whether evaluated objects have the pose that another player of the model has read.
+
+        They have unless one of the mesh objects has moved against the other since the recording.
+        """
+        matrix, other_matrix = (
+            self._pose_reader.read_transform(mesh_object, armature_object),
+            other._pose_reader.transform,
+        )
+        if matrix == other_matrix:
+            return True
+        linear, other_linear = (np.array(m.to_3x3(), np.float64) for m in (matrix, other_matrix))
+        to_mesh = mesh_object.matrix_world.inverted_safe()
+        # Far from the world origin, locations are rounded more.
+        distance = (to_mesh.to_3x3() @ mesh_object.matrix_world.translation).length
+        tolerance = POSE_TOLERANCE * self._model_size + FLOAT32_ROUNDING_RATIO * distance
+        return (
+            np.abs(linear - other_linear).max() <= POSE_TOLERANCE * np.abs(linear).max()
+            and (matrix.translation - other_matrix.translation).length <= tolerance
+        )
+
+    def is_outdated(self, inputs: ModelInputs, mesh_object: bpy.types.Object) -> bool:
+        """Return whether the positions are of other inputs or of another strength than the evaluated object has."""
+        binding = mesh_object.fdda
         # In mode RIG the modifiers are about to be switched, so the strength does not matter.
-        strength = 0.0 if (session.overriding_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
-        inputs = pose_matrices.tobytes(), controls.tobytes(), strength, self._control_reader.warning
-        if inputs != self._shown_inputs and not (session.skips_models and self._positions is not None):
-            self.warning = self._control_reader.warning
-            if not np.isfinite(pose_matrices).all():
-                pose_matrices, first_name = repair_pose(pose_matrices, self.network.info)
-                self.warning = (
-                    f"The pose of the joint '{first_name}' of '{armature_object.name}' is not a number; what it moves "
-                    "follows the joint above."
-                )
-            if self._blend is None and (strength < 1 or self.mask is not None):
-                self._blend = self._create_blend(SceneRig(mesh_object.original, armature_object.original))
-            self._shown_inputs = inputs
-            self.new_inputs = ModelInputs(pose_matrices, controls, strength)
-            self.has_moved = True
-        return True
+        mode = session.overriding_mode(self.object_uid) or binding.mode
+        self.strength = 0.0 if mode == "LINEAR" else binding.strength
+        if self._shown is None:
+            return True
+        shown_inputs, shown_strength = self._shown
+        is_shown = shown_inputs is inputs and shown_strength == self.strength
+        return not (is_shown or (session.skips_models and self._positions is not None))
 
-    def run_model(self) -> None:
-        """Run the model for `new_inputs` alone."""
-        # After an exception no inputs count as shown, so the next evaluation tries again.
-        self._shown_inputs, shown_inputs = None, self._shown_inputs
-        if self.new_inputs.strength > 0:
-            self._execution.poses[0] = self.new_inputs.pose_matrices
-            self._execution.controls[0] = self.new_inputs.controls
-            self._execution.run()
-        self.set_positions(self._execution.positions[0])
-        self._shown_inputs = shown_inputs
+    def set_positions(self, inputs: ModelInputs, positions: np.ndarray, mesh_object: bpy.types.Object) -> None:
+        """Use positions of the model.
 
-    def set_positions(self, positions: np.ndarray) -> None:
-        """Use positions of an execution, (V, 3) float32, as those of `new_inputs`. They are not copied."""
-        self._positions = positions
-        self._check_finite(positions)
-        strength = self.new_inputs.strength
-        if strength < 1 or self.mask is not None:
-            pose_matrices, strengths = self.new_inputs.pose_matrices[None], np.array([strength], np.float32)
-            self._positions = self._blend.apply(positions[None], pose_matrices, strengths)[0]
+        Args:
+            inputs: the inputs for which the model was run.
+            positions: (V, 3) float32, of all meshes, in the space of the model. They are not copied.
+            mesh_object: the evaluated object.
+        """
+        # After an exception nothing counts as shown, so the next evaluation tries again.
+        self._shown, self.warning = None, inputs.warning
+        positions = positions[self.network.vertices]
+        if not np.isfinite(positions).all():
+            self.warning = f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
+        if self.strength < 1 or self.mask is not None:
+            if self._blend is None:
+                self._blend = self._create_blend(self.scene_rig(mesh_object.original))
+            strengths = np.array([self.strength], np.float32)
+            # The blend may overwrite its argument, which is the output of the model.
+            positions = self._blend.apply(positions[None].copy(), inputs.pose_matrices[None], strengths)[0]
+        self._positions = self.network.to_mesh_space(positions)
+        self._shown = inputs, self.strength
 
     def write_positions(self, buffer: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
         """Write the positions to an evaluated position buffer, even unchanged: an evaluation may have reset them."""
@@ -265,17 +258,21 @@ class Player:
                 evaluated_copies.mute_shape_keys(mesh_object)
 
     def _create_blend(self, scene_rig: SceneRig) -> SkinningBlend:
-        """Create the blend of the model with linear skinning."""
+        """Create the blend of the model with linear skinning, in the space of the model."""
         rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
+        positions, matrices = self._rest_positions(scene_rig.mesh_object), self.network.model.info.rest_matrices
         # The objects may have moved since training; pose matrices refer to the rest pose of the model.
-        return SkinningBlend(replace(rig, rest_matrices=self.network.info.rest_matrices), self.mask)
+        return SkinningBlend(replace(rig, rest_positions=positions, rest_matrices=matrices), self.mask)
 
-    def _check_finite(self, positions: np.ndarray) -> None:
-        if not np.isfinite(positions).all():
-            self.warning = f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
+    def _rest_positions(self, mesh_object: bpy.types.Object) -> np.ndarray:
+        """Read the rest positions of the mesh, (V, 3) float32, in the space of the model."""
+        positions, matrix = rest_positions(mesh_object.data), self.network.mesh_to_model
+        if matrix is None:
+            return positions
+        return (positions @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
 
     def _check_vertex_count(self, mesh_object: bpy.types.Object) -> None:
-        count, expected = len(mesh_object.data.vertices), self.network.info.vertex_count
+        count, expected = len(mesh_object.data.vertices), self._vertex_count
         if count != expected and mesh_object.mode != "EDIT":
             raise ModelError(
                 f"'{mesh_object.name}' has {count} vertices and its model was trained for {expected}; "
@@ -304,4 +301,6 @@ class Player:
                 f"The armature '{armature_object.name}' lacks the joint '{missing[0]}' of the model "
                 f"'{self.network.path.name}'; name it as before, or bind a model of this rig."
             )
-        return PoseReader(scene_rig, info.joint_names, info.rest_matrices)
+        return PoseReader(
+            scene_rig, info.joint_names, self.network.model.info.rest_matrices, self.network.mesh_to_model
+        )

@@ -59,9 +59,9 @@ class PlaybackSession:
 
     Attributes:
         characters: the bound objects, by their session ids.
-        players: the players, by the session ids of their position buffers. Threads that evaluate read this table.
-        batches: batches of players, by the session ids of their batch drivers (`player_batch`).
-        moved_buffers: by model: the position buffers of the players that moved in the last frame.
+        batches: batches of players, by the session ids of the position buffers that have their drivers
+            (`player_batch`). Threads that evaluate read this table.
+        moved_groups: by model: the groups of players that moved in the last frame.
         passed_checks: by the session id of a mesh object: its mesh, the rig that its model requires, and the signature
             of the rig that passed (`rig_signature`).
         read_bones: the bones that a check has read, by the session id of the armature and whether envelopes were read;
@@ -82,9 +82,8 @@ class PlaybackSession:
 
     def __init__(self) -> None:
         self.characters: dict[int, Character] = {}
-        self.players: dict[int, Any] = {}
         self.batches: dict[int, Any] = {}
-        self.moved_buffers: dict[Any, set[int]] = {}
+        self.moved_groups: dict[Any, set[Any]] = {}
         self.passed_checks: dict[int, tuple] = {}
         self.modes: dict[int, list[str]] = {}
         self.networks: dict[Path | int, tuple[tuple, Any]] = {}
@@ -118,7 +117,7 @@ class PlaybackSession:
             keep_checks: keep the passed checks, because names still refer to the same datablocks.
         """
         self.suspension_count = 0
-        for table in (self.characters, self.players, self.batches, self.moved_buffers):
+        for table in (self.characters, self.batches, self.moved_groups):
             table.clear()
         self.needs_scan, self._count_without_bound = True, None
         if not keep_checks:

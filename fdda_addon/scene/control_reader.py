@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import bpy
 import numpy as np
 
-from ..core.controls import SHAPE_KEY_PATH, Control
+from ..core.controls import MESH_OWNER, SHAPE_KEY_PATH, Control
 from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT
 from .armature import PoseMatrixReader, rest_matrices
@@ -100,7 +100,8 @@ class ControlReader:
         values, self.warning = np.zeros(len(self._controls), np.float32), ""
         bone_count, source_count = len(self._bone_names), len(owners) - len(self._key_readers)
         for (key_controls, reader), shape_keys in zip(self._key_readers, owners[source_count:], strict=True):
-            values[key_controls] = reader.read(shape_keys)
+            if shape_keys is not None or not self._is_absent_mesh(key_controls[0]):
+                values[key_controls] = reader.read(shape_keys)
         remaining = set(range(bone_count))
         for bone_indices, bones in self._constrained_bones:
             owner = owners[bone_indices[0]]
@@ -125,6 +126,8 @@ class ControlReader:
         for index, owner in zip(self._single_controls, owners[bone_count:source_count], strict=True):
             control = self._controls[index]
             value = None if owner is None else number_at(owner, control.path)
+            if owner is None and self._is_absent_mesh(index):
+                value = 0.0
             values[index] = np.nan if value is None else value
         if not (is_finite := np.isfinite(values)).all():
             raise RigError(
@@ -132,6 +135,10 @@ class ControlReader:
                 "a number; name it as before, or record and train this rig."
             )
         return values
+
+    def _is_absent_mesh(self, index: int) -> bool:
+        """Return whether a control without an owner belongs to another mesh: without that mesh, its value is 0."""
+        return MESH_OWNER.fullmatch(self._controls[index].owner) is not None
 
 
 class KeyReader:

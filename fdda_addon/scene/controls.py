@@ -22,7 +22,7 @@ from ..core.controls import (
 )
 from ..core.errors import RigError
 from .bone_transform import MATRIX_ELEMENT_RANGE, bone_transform
-from .scene_rig import SceneRig
+from .scene_rig import SceneRig, armature_of, name_without_number
 from .temporary_state import animation_state, restore_animation
 
 MAX_RANGE_WIDTH = 1e4
@@ -41,7 +41,8 @@ def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
     if owner.startswith(OTHER_OBJECT):
         return bpy.data.objects.get(owner.removeprefix(OTHER_OBJECT))
     if match := MESH_OWNER.fullmatch(owner):
-        mesh_object, owner = dict(scene_rig.other_meshes).get(match["mesh"]), match["owner"]
+        mesh_object = dict(scene_rig.other_meshes).get(match["mesh"]) or _find_other_mesh(scene_rig, match["mesh"])
+        owner = match["owner"]
         if mesh_object is None:
             return None
     return {
@@ -50,6 +51,22 @@ def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
         MESH_OBJECT: mesh_object,
         SHAPE_KEYS: mesh_object.data.shape_keys,
     }.get(owner)
+
+
+def _find_other_mesh(scene_rig: SceneRig, name: str) -> bpy.types.Object | None:
+    """Find the mesh object on the armature of a rig that is a mesh of its recording or model; return None without one.
+
+    An object that plays a model has the name of its mesh in the model; others are found by their own names.
+    """
+    named_object = bpy.data.objects.get(name)
+    for mesh_object in (*([named_object] if named_object else []), *bpy.data.objects):
+        if (
+            mesh_object.type == "MESH"
+            and name == (mesh_object.fdda.model_mesh or name_without_number(mesh_object))
+            and armature_of(mesh_object) == scene_rig.armature_object
+        ):
+            return mesh_object
+    return None
 
 
 def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID | None) -> str:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the rigs of a scene, without evaluating anything."""
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -42,6 +43,11 @@ class SceneRig:
         """Return a rig for each mesh, after the mesh's name in owners of controls: empty for the first mesh."""
         meshes = (("", self.mesh_object), *self.other_meshes)
         return [(name, SceneRig(mesh_object, self.armature_object)) for name, mesh_object in meshes]
+
+
+def name_without_number(mesh_object: bpy.types.Object) -> str:
+    """Return the name of an object without the number that Blender appends to the name of a copy."""
+    return re.sub(r"\.\d{3,}$", "", mesh_object.name)
 
 
 def find_rig(name: str = "") -> SceneRig:
@@ -214,7 +220,7 @@ def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
 
     It is the armature of the first Armature modifier. Without such a modifier, the search follows the objects that the
     modifiers read, such as a cage with an Armature modifier or an empty that is the child of a bone. It returns the
-    first armature on which these objects depend.
+    first armature on which these objects depend, else that of the bound model.
     """
     modifier = armature_modifier(mesh_object)
     if modifier is not None:
@@ -230,7 +236,7 @@ def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
             targets = [getattr(c, "target", None) for c in candidate.constraints if not c.mute]
             inputs = (*objects_read_by_modifiers(candidate), candidate.parent, *targets)
             queue += [scene_object for scene_object in inputs if scene_object is not None]
-    return None
+    return mesh_object.fdda.armature
 
 
 def objects_read_by_modifiers(owner: bpy.types.Object) -> Iterator[bpy.types.Object]:

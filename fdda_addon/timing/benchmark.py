@@ -319,6 +319,8 @@ def benchmark(
                 # More rounds than the smallest number are rare, and a total that grows would look like a fault.
                 yield Progress("benchmark", min(index * len(show) + number, ROUNDS * len(show) - 1), ROUNDS * len(show))
             index += 1
+        # Meshes may share a model, which runs once.
+        networks = list(dict.fromkeys(network.model for network in networks))
         start, processor_start = time.perf_counter(), time.process_time()
         times[INFERENCE] = list(np.sum([_inference_times(network, frames) for network in networks], axis=0))
         processor_share = (time.process_time() - processor_start) / (time.perf_counter() - start)
@@ -334,7 +336,7 @@ def benchmark(
     return Benchmark(
         armature_object.name,
         tuple(sorted(described, key=lambda mesh: -mesh.vertices)),
-        len(networks),
+        len(played),
         frames_per_round * index,
         times,
         rounds,

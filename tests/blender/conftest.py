@@ -253,7 +253,7 @@ def evaluated_positions(mesh_object: bpy.types.Object) -> np.ndarray:
 
 def predicted_positions(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
     """Return the model's positions (V, 3) for the evaluated pose, computed without the code for playback."""
-    network = Network(model)
+    network = Network(model).of_mesh(mesh_object.fdda.model_mesh)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     armature_object = armature_of(mesh_object)
     names = tuple(joint.name for joint in network.info.joints)

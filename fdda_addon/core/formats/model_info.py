@@ -2,16 +2,16 @@
 """The metadata of a model: what it was trained for, on what, and how accurate it is."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from ..controls import Control, read_controls
+from ..controls import Control, owners_from_mesh, read_controls
 from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import Partition, make_partitions
-from ..mathematics.poses import Channel
+from ..mathematics.poses import CONTROL, Channel
 from ..mathematics.skin_fit import SkinFit
-from ..rig import Joint, MeshPart, Rig, read_joints, read_meshes
+from ..rig import IDENTITY, STATIC_JOINT, Joint, MeshPart, Rig, read_joints, read_meshes
 from ..unit import read_unit, unit_to_json
 
 VERSION = 1
@@ -119,6 +119,33 @@ class ModelInfo:
     def has_key_joints(self) -> bool:
         """Whether the model reads fewer joints than those with skin weights."""
         return any(mesh.fingerprint.has_key_joints for mesh in self.meshes)
+
+    def of_mesh(self, mesh: MeshPart) -> "ModelInfo":
+        """Return the metadata for one of the meshes alone, in the space and the unit of its object.
+
+        All joints, partitions and controls stay.
+        """
+        if len(self.meshes) == 1:
+            return self
+        mesh_matrices = np.linalg.inv(mesh.matrix) @ self.rest_matrices.astype(np.float64)
+        is_static = np.array([name == STATIC_JOINT for name in self.joint_names])
+        mesh_matrices[is_static] = np.eye(4)
+        owners, training = owners_from_mesh(self.meshes[0].name, mesh.name), dict(self.training)
+        if LIMITS_KEY in training:
+            channels = []
+            for channel in self.limits:
+                owner, slash, path = channel.name.partition("/")
+                name = f"{owners.get(owner, owner)}{slash}{path}" if channel.kind == CONTROL else channel.name
+                channels.append(replace(channel, name=name).to_json())
+            training[LIMITS_KEY] = channels
+        return replace(
+            self,
+            training=training,
+            rest_matrices=mesh_matrices.astype(np.float32),
+            meshes=(replace(mesh, transform=IDENTITY),),
+            controls=tuple(replace(c, owner=owners.get(c.owner, c.owner)) for c in self.controls),
+            metres_per_unit=self.metres_per_unit * abs(np.linalg.det(mesh.matrix[:3, :3])) ** (1 / 3),
+        )
 
     def to_json(self) -> str:
         """Return the text of the metadata property."""

@@ -190,12 +190,12 @@ def test_a_bone_driven_by_another_object_is_played(bound_elbow, elbow_files):
 
 
 def test_an_unchanged_character_is_not_evaluated(bound_elbow, monkeypatch):
-    from fdda_addon.runtime.player import Player
+    from fdda_addon.runtime.player_batch import PlayerBatch
 
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     bpy.context.view_layer.update()
-    calls, play = [], Player.play
-    monkeypatch.setattr(Player, "play", lambda self, buffer: calls.append(buffer) or play(self, buffer))
+    calls, play = [], PlayerBatch.play
+    monkeypatch.setattr(PlayerBatch, "play", lambda self, buffer: calls.append(buffer) or play(self, buffer))
     bpy.context.scene.frame_set(7)
     assert calls == []
     pose(angle=0.7)
@@ -241,6 +241,6 @@ def test_depsgraphs_are_identified_by_mode_scene_and_view_layer(bound_elbow, tmp
             still(tmp_path / "still.png")
             bpy.context.scene.frame_set(frame)
     assert set(seen_graphs) == {("RENDER", False), ("VIEWPORT", True)}
-    (player,) = session.players.values()
+    (player,) = (character.player for character in session.characters.values())
     uid, name = bpy.context.scene.session_uid, bpy.context.view_layer.name
     assert player.depsgraph_keys == {("RENDER", uid, name), ("VIEWPORT", uid, name)}

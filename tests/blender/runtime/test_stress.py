@@ -14,7 +14,7 @@ def test_random_operations_leave_correct_playback_and_no_memory(bound_elbow, elb
     bpy.context.scene.frame_set(1)
     outcome = PlaybackStress(bound_elbow, elbow_files.model, 6, tmp_path, seed).run(250)
     assert outcome.largest_difference < MAX_DIFFERENCE_M, outcome.worst_case
-    assert outcome.compared_count > 750 and len(outcome.operations) == len(OPERATION_WEIGHTS)
+    assert outcome.compared_count > 600 and len(outcome.operations) == len(OPERATION_WEIGHTS)
     # What was allocated once stays; a character more or less is below a megabyte.
     half = len(outcome.memory_mb) // 2
     # Only Linux says what a process holds.

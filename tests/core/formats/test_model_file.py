@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper
 
+from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import check_rig, read_model, read_model_info
-from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
-from fdda_addon.core.mathematics.poses import Channel
+from fdda_addon.core.formats.model_info import LIMITS_KEY, ModelInfo, ModelPartition
+from fdda_addon.core.mathematics.poses import CONTROL, Channel
+from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, MeshPart
 
 from ... import systems
 from ..limb import make_rig
@@ -236,3 +238,27 @@ def test_invalid_limits_are_refused(tmp_path, limits):
     assert_refused(
         save_model(tmp_path, tiny_model(changed_metadata(training=training))), "cannot be used: ", "train it again"
     )
+
+
+@pytest.mark.parametrize("name", ["body", "shirt"])
+def test_metadata_for_one_mesh_have_its_space_unit_and_controls(name):
+    """The shirt is twice as large as the body, which comes first."""
+    transform = tuple(np.diag([2.0, 2.0, 2.0, 1.0]).ravel().tolist())
+    prints = Fingerprint("a", "b", "c"), Fingerprint("d", "e", "f")
+    meshes = MeshPart("body", 3, prints[0]), MeshPart("shirt", 1, prints[1], transform)
+    names = {"body": ("shape_keys", "shape_keys:shirt"), "shirt": ("shape_keys:body", "shape_keys")}
+    paths = [f'{owner}/key_blocks["puff"].value' for owner in names["body"]]
+    info = tiny_info(
+        joints=(Joint("root", -1), Joint("arm", 0), Joint(STATIC_JOINT, -1)),
+        rest_matrices=np.array([np.eye(4)] * 3, np.float32),
+        meshes=meshes,
+        controls=tuple(Control(*path.split("/"), 0.0, 1.0) for path in paths),
+        training={LIMITS_KEY: [Channel(path, CONTROL, 0, 0.0, 1.0).to_json() for path in paths]},
+    )
+    own = info.of_mesh(meshes[name == "shirt"])
+    scale = 2.0 if name == "shirt" else 1.0
+    assert own.meshes == (MeshPart(name, meshes[name == "shirt"].vertices, prints[name == "shirt"]),)
+    assert own.rest_matrices[:, 0, 0].tolist() == [1 / scale, 1 / scale, 1.0], "the static joint is the identity"
+    assert own.metres_per_unit == pytest.approx(scale)
+    assert tuple(control.owner for control in own.controls) == names[name]
+    assert tuple(channel.name.split("/")[0] for channel in own.limits) == names[name]
