@@ -62,7 +62,8 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
                 meshes = zip(rig.meshes, rig.mesh_slices, strict=True)
                 names = [mesh.name for mesh, part in meshes if part.start in unweighted]
                 subject = format_with_noun(names, "mesh", "meshes")
-                sink.send(MessageType.LOG, text=f"Skin weights are fitted for the {subject}, which have none.")
+                verb = "has" if len(names) == 1 else "have"
+                sink.send(MessageType.LOG, text=f"Skin weights are fitted for {subject}, which {verb} none.")
                 poses = poses.of_vertices(unweighted) if vertices is None else poses
             kind, weighted = config.base_skinning or DEFAULT_KIND, choice.weighted_joints if removes_joints else joints
             training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
