@@ -99,8 +99,11 @@ def export_skinning(
     for index, (mesh_object, part) in enumerate(zip(scene_rig.mesh_objects, recording.rig.mesh_slices, strict=True)):
         arrays = recording.rig.joint_names, fit["joints"][part], fit["weights"][part]
         bones = _write_skin(mesh_object, scene_rig.armature_object, *arrays)
+        has_weights = part.start not in recording.rig.unweighted_vertices
         mesh_errors = {
-            poses_name: {name: statistics[index] for name, statistics in by_name.items()}
+            poses_name: {
+                name: statistics[index] for name, statistics in by_name.items() if has_weights or name != OWN_WEIGHTS
+            }
             for poses_name, by_name in errors.items()
         }
         skins.append(ExportedSkin(mesh_object.name, bones, influences, mesh_errors))

@@ -106,11 +106,14 @@ def write_models(mesh_objects: list[bpy.types.Object], folder: Path) -> Path:
         ModelError: a model cannot be read.
         OSError: a file cannot be written.
     """
+    # Meshes of one character share a model.
+    files: dict[bytes, Path] = {}
     for index, mesh_object in enumerate(mesh_objects):
         binding = mesh_object.fdda
         data = packed_model.read(binding.packed) if binding.packed else read_model(model_path(mesh_object))[1]
-        # Clean names of different objects may be equal.
-        file = folder / str(index) / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
-        file.parent.mkdir()
-        file.write_bytes(data)
-    return file if len(mesh_objects) == 1 else folder
+        if data not in files:
+            # Clean names of different objects may be equal.
+            file = files[data] = folder / str(index) / f"{bpy.path.clean_name(mesh_object.name)}.onnx"
+            file.parent.mkdir()
+            file.write_bytes(data)
+    return folder if len(files) > 1 else next(iter(files.values()))
