@@ -9,7 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import WrongUsageError
+import bpy
+
+from ..core.errors import OutputError, WrongUsageError
 from ..core.files import file_kind
 from ..core.files.output import atomic_write_all, check_outputs
 from ..core.progress import Job
@@ -58,11 +60,22 @@ def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> t
 
     Raises:
         WrongUsageError: the extension, the frames or the samples are invalid.
-        OutputError: a file cannot be written, is an input, or exists as another kind of file.
+        OutputError: a file cannot be written, is an input, or exists as another kind of file; or this Blender lacks
+            the exporter.
     """
     suffix = out.suffix.lower()
     if suffix not in KINDS:
         raise WrongUsageError(f"'{out}' ends in neither .abc, .usd nor .blend; give it the extension of what to write.")
+    format_name, is_built_in = (
+        ("USD", bpy.app.build_options.usd)
+        if KINDS[suffix] is file_kind.USD
+        else ("Alembic", bpy.app.build_options.alembic)
+    )
+    if not is_built_in:
+        raise OutputError(
+            f"This Blender was built without {format_name}; use Blender from blender.org, or "
+            f"{'an .abc file' if format_name == 'USD' else 'a .usdc file'}."
+        )
     if settings.samples < 1:
         raise WrongUsageError(f"A frame cannot have {settings.samples} samples; give 1 or more.")
     if KINDS[suffix] is file_kind.USD and settings.samples > 1:

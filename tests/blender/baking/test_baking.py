@@ -4,13 +4,16 @@
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 
+from fdda_addon.baking import run as bake_run
 from fdda_addon.baking.export import write_bake
 from fdda_addon.baking.run import BakeSettings, bake_file
+from fdda_addon.core.errors import OutputError
 from fdda_addon.core.progress import Progress
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig
@@ -200,3 +203,12 @@ def test_a_canceled_bake_leaves_no_files(elbow_files, tmp_path):
     assert len(file_contents(tmp_path)) == 2
     job.close()
     assert file_contents(tmp_path) == {}
+
+
+@pytest.mark.one_blender_version
+@pytest.mark.parametrize(("name", "option"), [("a.blend", "alembic"), ("a.usd", "usd")])
+def test_a_blender_without_the_exporter_is_named(elbow_files, tmp_path, monkeypatch, name, option):
+    options = SimpleNamespace(**({"alembic": True, "usd": True} | {option: False}))
+    monkeypatch.setattr(bake_run, "bpy", SimpleNamespace(app=SimpleNamespace(build_options=options)))
+    with pytest.raises(OutputError, match=f"This Blender was built without {'USD' if option == 'usd' else 'Alembic'};"):
+        bake_run.output_files(tmp_path / name, BakeSettings(), ())
