@@ -106,8 +106,8 @@ def assess_training(report: Mapping) -> Assessment:
         problems.append((overfit, "the model needs more poses. Raise Random Poses or check more actions, and record"))
     warnings = _describe_problems(problems, report.get("warnings", ()))
     next_step = "" if warnings else "Next: bind the model, then compare it with the rig on an action."
-    subject = f"{report['object']}, unseen poses" if report["object"] else "Unseen poses"
-    return Assessment(f"{subject}: {describe_errors(model, skinning)}", warnings, next_step)
+    names = ", ".join(mesh["name"] for mesh in report["meshes"])
+    return Assessment(f"{names}, unseen poses: {describe_errors(model, skinning)}", warnings, next_step)
 
 
 def assess_evaluation(

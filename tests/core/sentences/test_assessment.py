@@ -26,7 +26,7 @@ REPORTS = Path(__file__).parents[1] / "reports"
 
 def read(name: str) -> dict:
     """Read a report; all its body parts have the errors of the whole mesh."""
-    report = json.loads((REPORTS / f"{name}.json").read_text(encoding="utf-8")) | {"object": "arm"}
+    report = json.loads((REPORTS / f"{name}.json").read_text(encoding="utf-8")) | {"meshes": [{"name": "arm"}]}
     for partition in report["partitions"]:
         partition |= {"held_out": report["fdda"]["held_out"], "linear": report["linear"]["held_out"]}
         partition["largest_errors"] = {"cause": "poses"}
