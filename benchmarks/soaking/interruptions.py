@@ -94,7 +94,8 @@ def _kill_record(folder: Path, random: np.random.Generator) -> None:
         command = _verb_command("record", folder / "elbow.blend", recording, "--poses", POSES, *resume)
         if not _run_and_kill(command, float(random.uniform(0.5, 2.5))):
             break
-    if not (recording / "recording.json").exists() or read_index(recording)["complete"] < POSES:
+    index = read_index(recording) if (recording / "recording.json").exists() else {"complete": 0, "poses": POSES}
+    if index["complete"] < index["poses"]:
         resume = ("--resume",) if recording.exists() else ()
         command = _verb_command("record", folder / "elbow.blend", recording, "--poses", POSES, *resume)
         if _run_and_kill(command, 60):
