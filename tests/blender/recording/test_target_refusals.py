@@ -206,5 +206,5 @@ def test_settling_and_pre_roll_without_a_simulation_are_refused(refusal, tmp_pat
 def test_a_target_for_several_meshes_is_refused(refusal, tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
     assert refusal("record", rig, tmp_path / "out", "--all", "--learn-from", "flesh").startswith(
-        "A target belongs to one mesh; record the meshes one by one"
+        "A target belongs to one mesh; record each mesh by itself"
     )
