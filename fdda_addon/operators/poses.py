@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Collection
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import bpy
 
@@ -71,9 +71,11 @@ class FDDA_OT_poses_to_action(JobOperator, bpy.types.Operator):
     changes_file = True
 
     def steps(self, context: bpy.types.Context) -> Job[tuple[bpy.types.Action, list[str]]]:
-        rig = self.rig(context)
-        with model_disabled(rig.mesh_object):
-            return (yield from make_posed_action(rig, recording_settings(rig)))
+        character = self.character(context)
+        with ExitStack() as stack:
+            for mesh_object in character.mesh_objects:
+                stack.enter_context(model_disabled(mesh_object))
+            return (yield from make_posed_action(character, recording_settings(self.rig(context))))
 
     def finish(self, context: bpy.types.Context, result: tuple[bpy.types.Action, list[str]]) -> str:
         action, driven = result

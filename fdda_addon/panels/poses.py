@@ -6,7 +6,7 @@ import bpy
 from ..properties.recording_options import actions_of_rig
 from ..scene.scene_rig import SceneRig
 from . import limits, sampling
-from .section import Section, draw_advanced, draw_wrapped, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_wrapped, panel_rig
 
 
 class FDDA_UL_actions(bpy.types.UIList):
@@ -54,7 +54,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         row = layout.row(align=True)
         row.prop(context.window_manager.fdda, "preview_pose")
         row.operator("fdda.rest_pose", text="Rest Pose", icon="LOOP_BACK")
-        layout.operator("fdda.poses_to_action", icon="ACTION")
+        draw_button(layout, context, "fdda.poses_to_action", "Poses to Action", "ACTION")
         # Draw the sentences that come and go, below the buttons, so that these do not move under the mouse.
         if not _has_poses(rig):
             draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
