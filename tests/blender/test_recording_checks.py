@@ -14,7 +14,6 @@ from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import skin_recording
-from fdda_addon.core.settings import MIN_VERTICES_PER_PART
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW, ELBOW_RIG, run, train
@@ -156,7 +155,3 @@ class TestSmallPartitions:
             "tip": ["nail"],
         }
         assert evaluation["fdda"]["mean"] < 0.5 * evaluation["linear"]["mean"]
-
-    def test_the_sidebar_has_the_same_default(self, rig):
-        bpy.ops.wm.open_mainfile(filepath=str(rig))
-        assert bpy.data.objects[ELBOW].fdda.settings.min_vertices_per_part == MIN_VERTICES_PER_PART

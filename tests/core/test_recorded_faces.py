@@ -50,13 +50,3 @@ def test_invalid_faces_are_refused(recording, name, index, value):
     array[index] = value
     np.save(recording / f"{name}.npy", array)
     assert_refused(recording, f"The faces of '{recording}' are damaged; record again.")
-
-
-@pytest.mark.parametrize("name", ["face_starts", "face_vertices"])
-@pytest.mark.parametrize("dtype", [np.int64, np.uint32, ">i4", np.float32])
-def test_faces_of_another_dtype_are_refused(recording, name, dtype):
-    array = np.load(recording / f"{name}.npy")
-    np.save(recording / f"{name}.npy", array.astype(dtype))
-    assert_refused(
-        recording, f"{name}.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not {array.shape} int32"
-    )

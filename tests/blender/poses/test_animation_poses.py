@@ -292,16 +292,3 @@ def test_evaluation_of_an_action_needs_no_range_of_motion(trained_folder):
     assert evaluation.held_out is evaluation.actions[0] and evaluation.held_out.name == WAVE
     with pytest.raises(RigError, match="nothing to evaluate: 0 poses and no action; give --poses or --action"):
         drain(evaluate(rig, trained_folder / "figure.onnx", EvaluationSettings(0)))
-
-
-def test_sidebar_records_mirrored_frames(figure, tmp_path):
-    bpy.context.view_layer.objects.active = figure.mesh_object
-    settings = figure.mesh_object.fdda.settings
-    settings.poses, settings.mirror = 3, True
-    settings.recording = str(tmp_path / "without")
-    assert bpy.ops.fdda.record() == {"FINISHED"}, "nothing is ticked, so there is nothing to mirror"
-    bpy.data.actions[WAVE].fdda.record = True
-    settings.recording = str(tmp_path / "with")
-    assert bpy.ops.fdda.record() == {"FINISHED"}
-    kinds = [s.kind for s in read_recording(tmp_path / "with").info.sampling.sources[:-1]]
-    assert kinds == ["random", "action", "mirrored"]
