@@ -188,7 +188,7 @@ def test_fitting_to_too_few_poses_is_refused(refusal, tmp_path):
     assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 9) == 0
     text = refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--base-skinning", "hard")
     assert text.startswith(
-        "Skin weights are fitted to at least 10 poses, and the recording has 9; record more, or leave --fit"
+        "Skin weights are fitted to at least 10 poses, and the recording has 9; record more, or leave --base"
     )
 
 

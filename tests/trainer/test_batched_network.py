@@ -68,7 +68,7 @@ def test_the_training_returns_the_weights_of_the_best_epoch():
     prepared, trained = train_partitions(
         [replace(smooth_partition, read_residuals=lambda: smooth_partition.read_residuals() + noise)]
     )
-    assert trained[0].curves.best_epoch < CONFIG.epochs
+    assert trained[0].curves.best_epoch < CONFIG.passes
     split = split_poses(np.arange(40), CONFIG.validation_fraction, CONFIG.seed)
     coefficients = trained[0].network.evaluate(prepared[0].inputs[split.validation])
     squared = ((coefficients - prepared[0].coefficients[split.validation]) ** 2).sum(axis=1) / 10
@@ -112,7 +112,7 @@ def test_the_progress_shows_what_a_constant_partition_misses_in_unseen_poses_alo
     progress = []
     _, trained = train_partitions([learned, constant], on_epoch=lambda *errors: progress.append(errors))
     (epoch, training_mm, validation_mm), curve = progress[-1], trained[0].curves
-    assert epoch == CONFIG.epochs and training_mm == pytest.approx(curve.training_mm[-1] / 2)
+    assert epoch == CONFIG.passes and training_mm == pytest.approx(curve.training_mm[-1] / 2)
     # Each coordinate of half of the vertices is off by 10 mm.
     assert validation_mm == pytest.approx(curve.validation_mm[-1] / 2 + 10 * 3**0.5 / 2)
 

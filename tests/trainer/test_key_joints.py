@@ -316,7 +316,7 @@ def test_without_removable_joints_the_weights_are_the_own_or_fitted_ones(base_sk
 
 def test_too_few_random_poses_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="at least 40 random poses, and the recording has 30"):
-        split(tmp_path / "r", chain_poses(), 30, joints="auto")
+        split(tmp_path / "r", chain_poses(), 30, bones_to_read="auto")
 
 
 def test_a_rig_without_weights_needs_a_fit(tmp_path):
