@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -23,12 +24,11 @@ from fdda_addon.core.progress import run_job
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.rig.reading import PoseReader, read_rig
+from fdda_addon.rig.reading import PoseEvaluator, read_model_rig, read_rig
 from fdda_addon.runtime import model_files
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.armature import Poser, clear_pose
-from fdda_addon.scene.mesh import evaluated_positions
-from fdda_addon.scene.scene_rig import SceneRig, armature_modifier, find_rig
+from fdda_addon.scene.scene_rig import SceneRig, armature_modifier, armature_of, find_rig
 from fdda_addon.scene.temporary_state import temporary_pose
 from fdda_addon.timing.animation import key_random_poses
 from fdda_addon.timing.benchmark import benchmark
@@ -164,17 +164,10 @@ def cold_start(bound: str) -> dict:
 
 def _is_model_shown() -> bool:
     mesh_object = next(o for o in bpy.data.objects if o.fdda.is_bound)
-    armature_object = armature_modifier(mesh_object).object
-    network = Network(model_files.model_path(mesh_object))
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    reader = PoseReader(
-        SceneRig(mesh_object, armature_object),
-        tuple(joint.name for joint in network.info.joints),
-        network.info.rest_matrices,
-    )
-    pose = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))
-    shown_positions = evaluated_positions(mesh_object, depsgraph)
-    return bool(abs(shown_positions - network.positions(pose[None])[0]).max() < 1e-5)
+    scene_rig = SceneRig(mesh_object, armature_of(mesh_object))
+    network = model_files.network_of(mesh_object)
+    pose, shown_positions, controls = PoseEvaluator(scene_rig, read_model_rig(scene_rig, network.info)).evaluate()
+    return bool(abs(shown_positions - network.positions(pose[None], controls[None])[0]).max() < 1e-5)
 
 
 def inference(model: str) -> dict:
@@ -183,7 +176,10 @@ def inference(model: str) -> dict:
     result = {}
     for pose_count in (1, CROWD_SIZE):
         poses = network.info.rest_matrices[None].repeat(pose_count, axis=0)
-        times = [_time_call(lambda poses=poses: network.positions(poses)) for _ in range(200)]
+        controls = np.zeros((pose_count, len(network.info.controls)), np.float32)
+        times = [
+            _time_call(lambda poses=poses, controls=controls: network.positions(poses, controls)) for _ in range(200)
+        ]
         result[f"ms_at_{pose_count}"] = statistics.median(times[20:]) * 1000 / pose_count
     return result
 
