@@ -4,6 +4,7 @@
 from pathlib import Path
 
 import numpy as np
+import onnx
 
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
@@ -115,3 +116,12 @@ def chain_info(pose_count: int, seed: int = 0) -> RecordingInfo:
     limits = (Channel("bone_1", "rotation", 0, -MAX_ANGLE, MAX_ANGLE),)
     sampling = Sampling(seed, 1.0, limits, (Source("random", pose_count),))
     return RecordingInfo(pose_count, 0, "chain.blend", "5.2.0", sampling)
+
+
+def constant_names(graph: onnx.GraphProto) -> set[str]:
+    """Return the names of all values that depend on constants alone, which ONNX Runtime computes while it loads."""
+    names = {tensor.name for tensor in graph.initializer}
+    for node in graph.node:
+        if names.issuperset(node.input):
+            names.update(node.output)
+    return names

@@ -2,6 +2,7 @@
 """Builds the ONNX model, checks it against the trained networks, and measures its errors."""
 
 import hashlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -265,7 +266,11 @@ def build_model(
     session = open_session(model.SerializeToString())
     held_out = measure(session, recording, held_out_poses, trained_model)
     check_parity(recording, held_out)
-    constant_bytes = sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer)
+    # ONNX Runtime converts compact constants to float32.
+    constant_bytes = sum(
+        math.prod(tensor.dims) * max(4, onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize)
+        for tensor in model.graph.initializer
+    )
     info = _model_info(recording, trained_model, held_out, training_info, constant_bytes)
     # The checksum comes first, so that a truncated file still has it.
     model.metadata_props.add(key=CHECKSUM_KEY, value=hashlib.sha256(model.graph.SerializeToString()).hexdigest())

@@ -59,7 +59,7 @@ def add_networks(
     values = _add_first_layer(graph, clamped, first_layers)
     values = _add_activation(graph, values, activation, "hidden_0")
     for layer in range(1, len(networks[0].weights) - 1):
-        weights = graph.floats(f"weights_{layer}", np.stack([network.weights[layer] for network in networks]))
+        weights = graph.compact_floats(f"weights_{layer}", np.stack([network.weights[layer] for network in networks]))
         values = graph.add("MatMul", [values, weights], f"product_{layer}")
         biases = graph.floats(f"biases_{layer}", np.stack([network.biases[layer][None] for network in networks]))
         values = graph.add("Add", [values, biases], f"layer_{layer}")
@@ -106,7 +106,7 @@ def _add_first_layer(graph: GraphBuilder, clamped: str, layers: list[tuple[np.nd
         vectors, chunk_weights = (array[layer_slice] for array in layers[network])
         chunk_vectors[index, : len(vectors)], weights[index, : len(vectors)] = vectors, chunk_weights
         summation_matrix[network, index] = 1
-    weights = graph.floats("weights_0", weights.reshape(len(chunks), -1, units))
+    weights = graph.compact_floats("weights_0", weights.reshape(len(chunks), -1, units))
     values = graph.add("Gather", [clamped, graph.integers("chunk_vectors", chunk_vectors)], "chunk_features", axis=1)
     values = graph.reshape(values, [0, len(chunks), VECTOR_SIZE * chunk_size], "chunk_rows")
     values = graph.add("Transpose", [values], "inputs", perm=[1, 0, 2])
@@ -137,7 +137,7 @@ def _add_last_layer(
         weights[index, :, : chunk_weights.shape[1]] = chunk_weights
     if len(chunks) > len(layers):
         values = graph.add("Gather", [values, graph.integers("chunk_owners", chunk_networks)], "chunk_hidden", axis=0)
-    values = graph.add("MatMul", [values, graph.floats("output_weights", weights)], "coefficients_by_chunk")
+    values = graph.add("MatMul", [values, graph.compact_floats("output_weights", weights)], "coefficients_by_chunk")
     values = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
     partitions = np.array([[partition_indices[parts[network]]] for network in chunk_networks])
     confidence = graph.integers("chunk_partitions", partitions)

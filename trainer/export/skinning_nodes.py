@@ -32,6 +32,7 @@ class _PartitionRows:
         half_rotation_joints: joints with half-rotation matrices in the partition's fit, as in `JointFit`.
         joints: the joints of the partition's skin weights, followed by the joints of its fit.
         padding: number of zero rows at the end, which fill the last slice of three translations.
+        linear_only_count: number of the first rows, those of components, shape keys and half rotations.
         row_count: number of rows.
     """
 
@@ -48,8 +49,8 @@ class _PartitionRows:
         self.half_rotation_joints = self.prepared.fit.joints[is_half_rotation]
         self.joints = np.append(self.skin.joints, self.prepared.fit.joints[~is_half_rotation])
         self.padding = -len(self.joints) % 3
-        self._linear_only_count = 3 * (self.component_count + len(self.controls) + len(self.half_rotation_joints))
-        self.row_count = self._linear_only_count + MATRIX_COLUMNS * len(self.joints) + self.padding
+        self.linear_only_count = 3 * (self.component_count + len(self.controls) + len(self.half_rotation_joints))
+        self.row_count = self.linear_only_count + MATRIX_COLUMNS * len(self.joints) + self.padding
 
     def matrix(self) -> np.ndarray:
         """Compute the (row_count, Vp) float64 constant matrix."""
@@ -78,15 +79,15 @@ class _PartitionRows:
         """Return two factors of the constant matrix; the first leaves the rows of the skin joints unchanged."""
         is_skin_joint = np.arange(len(self.joints)) < len(self.skin.joints)
         is_skin = np.zeros(self.row_count, bool)
-        is_skin[self._linear_only_count : self.row_count - self.padding] = np.append(
+        is_skin[self.linear_only_count : self.row_count - self.padding] = np.append(
             np.repeat(is_skin_joint, 3), is_skin_joint
         )
         matrix, skin_row_count = self.matrix(), is_skin.sum()
         vertex_factors = self.prepared.vertex_factors.astype(np.float64)
         left_factor = np.zeros((self.row_count, skin_row_count + len(vertex_factors)))
-        left_factor[is_skin, :skin_row_count] = np.eye(skin_row_count)
-        left_factor[~is_skin, skin_row_count:] = matrix[~is_skin] @ vertex_factors.T
-        return left_factor, np.concatenate([matrix[is_skin], vertex_factors])
+        left_factor[is_skin, len(vertex_factors) :] = np.eye(skin_row_count)
+        left_factor[~is_skin, : len(vertex_factors)] = matrix[~is_skin] @ vertex_factors.T
+        return left_factor, np.concatenate([vertex_factors, matrix[is_skin]])
 
 
 def add_skinning(
@@ -142,15 +143,28 @@ def _add_product(graph: GraphBuilder, rows: str, partition: _PartitionRows, colu
     """
     suffix = partition.index
     if partition.prepared.vertex_factors is None:
-        matrix = partition.matrix()
+        matrix, compact_count = partition.matrix(), partition.linear_only_count
     else:
         left_factor, matrix = partition.factorized_matrix()
-        rows = graph.add("MatMul", [rows, graph.floats(f"left_factor_{suffix}", left_factor)], f"low_rank_{suffix}")
+        left_factor = _add_matrix(graph, f"left_factor_{suffix}", left_factor, partition.linear_only_count)
+        rows = graph.add("MatMul", [rows, left_factor], f"low_rank_{suffix}")
+        compact_count = len(partition.prepared.vertex_factors)
     # Each of the partition's vertices has a column of the matrix.
     vertices = partition.vertices
     indices = np.searchsorted(vertices, np.maximum(columns, vertices[0]))
-    matrix = graph.floats(f"matrix_{suffix}", np.where(columns >= 0, matrix[:, indices], 0))
-    return graph.add("MatMul", [rows, matrix], f"block_{suffix}")
+    matrix = np.where(columns >= 0, matrix[:, indices], 0)
+    return graph.add("MatMul", [rows, _add_matrix(graph, f"matrix_{suffix}", matrix, compact_count)], f"block_{suffix}")
+
+
+def _add_matrix(graph: GraphBuilder, name: str, matrix: np.ndarray, compact_count: int) -> str:
+    """Add a constant matrix whose first rows are stored as 16-bit integers.
+
+    The rows of joints that have a translation are exact: an error would grow with the distance from the origin.
+    """
+    parts = [graph.compact_floats(f"{name}_compact", matrix[:compact_count])] if compact_count else []
+    if compact_count < len(matrix):
+        parts.append(graph.floats(f"{name}_exact", matrix[compact_count:]))
+    return graph.join(parts, name, axis=0)
 
 
 def _add_rows(
