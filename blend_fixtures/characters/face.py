@@ -42,7 +42,7 @@ def _direction(part_angles: tuple[float, float]) -> np.ndarray:
     return np.array((math.sin(left) * math.cos(up), -math.cos(left) * math.cos(up), math.sin(up)))
 
 
-def _surface() -> tuple[np.ndarray, list[tuple[int, ...]]]:
+def head_surface() -> tuple[np.ndarray, list[tuple[int, ...]]]:
     """Return the points (5186, 3) and the faces of the head: rings around Z and two poles."""
     elevations = (np.arange(RINGS) + 0.5) / RINGS * np.pi - np.pi / 2
     azimuths = np.arange(RING_VERTICES) / RING_VERTICES * 2 * np.pi
@@ -74,7 +74,7 @@ def _angle_from_part(points: np.ndarray, name: str) -> np.ndarray:
     return np.arccos(np.clip(directions @ _direction(PART_ANGLES[name]), -1, 1))
 
 
-def _move_near(name: str, offset: tuple[float, float, float], size: float = 0.16) -> Callable[[np.ndarray], np.ndarray]:
+def move_near(name: str, offset: tuple[float, float, float], size: float = 0.16) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that moves the points near a part of the face; `offset` in millimeters, `size` in radians."""
 
     def move(points: np.ndarray) -> np.ndarray:
@@ -91,29 +91,29 @@ def _shape_key_moves() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
     """Return the 22 shape keys that an animator sets: functions that move points, by name."""
     found = {
         "pucker": _combine(
-            _move_near("corner.L", (-7, -4, 0)), _move_near("corner.R", (7, -4, 0)), _move_near("lip_top", (0, -5, 0))
+            move_near("corner.L", (-7, -4, 0)), move_near("corner.R", (7, -4, 0)), move_near("lip_top", (0, -5, 0))
         ),
-        "funnel": _combine(_move_near("lip_top", (0, -5, 3)), _move_near("lip_bottom", (0, -5, -3))),
-        "press": _combine(_move_near("lip_top", (0, 1, -3)), _move_near("lip_bottom", (0, 1, 3))),
-        "chin_up": _move_near("chin", (0, -2, 5)),
+        "funnel": _combine(move_near("lip_top", (0, -5, 3)), move_near("lip_bottom", (0, -5, -3))),
+        "press": _combine(move_near("lip_top", (0, 1, -3)), move_near("lip_bottom", (0, 1, 3))),
+        "chin_up": move_near("chin", (0, -2, 5)),
     }
     for side, sign in (("L", 1), ("R", -1)):
         found |= {
             f"smile.{side}": _combine(
-                _move_near(f"corner.{side}", (6 * sign, 3, 7)), _move_near(f"cheek.{side}", (0, -3, 4))
+                move_near(f"corner.{side}", (6 * sign, 3, 7)), move_near(f"cheek.{side}", (0, -3, 4))
             ),
-            f"frown.{side}": _move_near(f"corner.{side}", (2 * sign, 0, -7)),
-            f"wide.{side}": _move_near(f"corner.{side}", (7 * sign, 3, 0)),
+            f"frown.{side}": move_near(f"corner.{side}", (2 * sign, 0, -7)),
+            f"wide.{side}": move_near(f"corner.{side}", (7 * sign, 3, 0)),
             f"blink.{side}": _combine(
-                _move_near(f"lid_top.{side}", (0, -2, -8), 0.12), _move_near(f"lid_bottom.{side}", (0, 0, 2), 0.1)
+                move_near(f"lid_top.{side}", (0, -2, -8), 0.12), move_near(f"lid_bottom.{side}", (0, 0, 2), 0.1)
             ),
-            f"squint.{side}": _move_near(f"lid_bottom.{side}", (0, -2, 4), 0.12),
+            f"squint.{side}": move_near(f"lid_bottom.{side}", (0, -2, 4), 0.12),
             f"brow_up.{side}": _combine(
-                _move_near(f"brow_in.{side}", (0, 0, 6)), _move_near(f"brow_out.{side}", (0, 0, 7))
+                move_near(f"brow_in.{side}", (0, 0, 6)), move_near(f"brow_out.{side}", (0, 0, 7))
             ),
-            f"angry.{side}": _move_near(f"brow_in.{side}", (-4 * sign, -2, -6)),
-            f"sneer.{side}": _combine(_move_near(f"lip_top.{side}", (0, -2, 5)), _move_near("nose", (0, 0, 3), 0.1)),
-            f"puff.{side}": _move_near(f"cheek.{side}", (6 * sign, -5, 0), 0.2),
+            f"angry.{side}": move_near(f"brow_in.{side}", (-4 * sign, -2, -6)),
+            f"sneer.{side}": _combine(move_near(f"lip_top.{side}", (0, -2, 5)), move_near("nose", (0, 0, 3), 0.1)),
+            f"puff.{side}": move_near(f"cheek.{side}", (6 * sign, -5, 0), 0.2),
         }
     return found
 
@@ -121,23 +121,23 @@ def _shape_key_moves() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 def _corrective_moves() -> dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]]:
     """Return the correctives for two shape keys, or for a shape key and the open jaw: functions that move points."""
     found = {
-        ("pucker", "jaw"): _move_near("lip_bottom", (0, -4, 3)),
-        ("funnel", "press"): _move_near("lip_top", (0, 3, -2)),
+        ("pucker", "jaw"): move_near("lip_bottom", (0, -4, 3)),
+        ("funnel", "press"): move_near("lip_top", (0, 3, -2)),
     }
     for side, sign in (("L", 1), ("R", -1)):
         found |= {
-            (f"smile.{side}", "jaw"): _move_near(f"corner.{side}", (-5 * sign, 0, -4)),
-            (f"smile.{side}", "pucker"): _move_near(f"corner.{side}", (3 * sign, -4, 3)),
-            (f"blink.{side}", f"squint.{side}"): _move_near(f"lid_bottom.{side}", (0, 2, -4), 0.1),
-            (f"brow_up.{side}", f"angry.{side}"): _move_near(f"brow_in.{side}", (2 * sign, -4, 2)),
-            (f"sneer.{side}", f"smile.{side}"): _move_near(f"lip_top.{side}", (2 * sign, -3, -3)),
+            (f"smile.{side}", "jaw"): move_near(f"corner.{side}", (-5 * sign, 0, -4)),
+            (f"smile.{side}", "pucker"): move_near(f"corner.{side}", (3 * sign, -4, 3)),
+            (f"blink.{side}", f"squint.{side}"): move_near(f"lid_bottom.{side}", (0, 2, -4), 0.1),
+            (f"brow_up.{side}", f"angry.{side}"): move_near(f"brow_in.{side}", (2 * sign, -4, 2)),
+            (f"sneer.{side}", f"smile.{side}"): move_near(f"lip_top.{side}", (2 * sign, -3, -3)),
         }
     return found
 
 
 def face() -> None:
     """Build the mesh object `face` and the armature object `face_rig` in the current scene."""
-    points, faces = _surface()
+    points, faces = head_surface()
     mesh = bpy.data.meshes.new(MESH)
     mesh.from_pydata(points.tolist(), [], faces)
     mesh_object = link(bpy.data.objects.new(MESH, mesh))

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Build characters with as many shape keys as productions have: ARKit's 52, 300, and 60 that joints drive.
+
+`python -m blend_fixtures.characters.shape_keys arkit|many|correctives OUT.blend` saves one of them. The heads are that of
+`face` with two bones, and have an action; the correctives are on the sample arm, which has one.
+"""
+
+import math
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from fdda_addon.arm.rig import build_arm
+
+from .base import link
+from .bones import NewBone, add_bones, limit
+from .controls import add_key
+from .face import PART_ANGLES, RADII, head_surface, move_near
+
+ACTION, FRAMES = "performance", 80
+SIDES = ("Left", "Right")
+ARKIT_PARTS = {
+    **{f"{name}{side}": f"{part}.{side[0]}" for side in SIDES for name, part in (
+        ("browDown", "brow_in"), ("browOuterUp", "brow_out"), ("cheekSquint", "cheek"), ("eyeBlink", "lid_top"),
+        ("eyeLookDown", "lid_bottom"), ("eyeLookIn", "lid_top"), ("eyeLookOut", "lid_bottom"), ("eyeLookUp", "lid_top"),
+        ("eyeSquint", "lid_bottom"), ("eyeWide", "lid_top"), ("mouthDimple", "corner"), ("mouthFrown", "corner"),
+        ("mouthLowerDown", "lip_bottom"), ("mouthPress", "lip_bottom"), ("mouthSmile", "corner"),
+        ("mouthStretch", "corner"), ("mouthUpperUp", "lip_top"),
+    )},
+    "browInnerUp": "brow_in.L", "cheekPuff": "cheek.L", "jawForward": "chin", "jawLeft": "chin", "jawOpen": "jaw",
+    "jawRight": "chin", "mouthClose": "lip_bottom", "mouthFunnel": "lip_top", "mouthLeft": "corner.L",
+    "mouthPucker": "lip_top", "mouthRight": "corner.R", "mouthRollLower": "lip_bottom", "mouthRollUpper": "lip_top",
+    "mouthShrugLower": "chin", "mouthShrugUpper": "lip_top", "noseSneerLeft": "nose", "noseSneerRight": "nose",
+    "tongueOut": "lip_bottom",
+}  # fmt: skip
+"""The 52 blend shapes of ARKit, and the part of the face near which each one moves the vertices."""
+
+
+def arkit_face() -> None:
+    """Build the head with ARKit's 52 shape keys, which an animator or a capture sets."""
+    _build_head(ARKIT_PARTS)
+
+
+def many_keys(count: int = 300) -> None:
+    """Build the head with many shape keys, each near a part of the face."""
+    parts = list(PART_ANGLES)
+    _build_head({f"key.{index:03}": parts[index % len(parts)] for index in range(count)})
+
+
+def _build_head(parts: dict[str, str]) -> None:
+    """Build a head, skull and jaw as bones, with a shape key near a part of the face for each name."""
+    points, faces = head_surface()
+    mesh = bpy.data.meshes.new("face")
+    mesh.from_pydata(points.tolist(), [], faces)
+    mesh_object = link(bpy.data.objects.new("face", mesh))
+    armature_object = link(bpy.data.objects.new("face_rig", bpy.data.armatures.new("face_rig")))
+    add_bones(
+        armature_object,
+        NewBone("head", (0.0, 0.02, -0.12), (0.0, 0.02, 0.1)),
+        NewBone("jaw", (0.0, 0.03, 0.0), (0.0, -0.09, -0.06), "head"),
+    )
+    limit(armature_object.pose.bones["head"], "LIMIT_ROTATION", {0: (-20.0, 20.0), 1: (-30.0, 30.0)})
+    limit(armature_object.pose.bones["jaw"], "LIMIT_ROTATION", {0: (-25.0, 0.0)})
+    jaw_weights = 1 / (1 + np.exp((points[:, 2] / RADII[2] + 0.42) * 18)) / (1 + np.exp(points[:, 1] / RADII[1] * 12))
+    _add_group(mesh_object, "jaw", jaw_weights)
+    _add_group(mesh_object, "head", 1 - jaw_weights)
+    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    random = np.random.default_rng(0)
+    for name, part in parts.items():
+        add_key(mesh_object, name, move_near(part, tuple(random.uniform(-6, 6, 3)), random.uniform(0.08, 0.25)))
+    smooth = mesh_object.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
+    smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.5, 6
+    _add_performance(mesh_object, armature_object)
+
+
+def corrected_arm(count: int = 60) -> None:
+    """Build the sample arm with corrective shape keys that angles of joints drive, clamped to 0 and 1."""
+    mesh_object, armature_object = build_arm()
+    points = np.array([vertex.co for vertex in mesh_object.data.vertices])
+    axes = [(bone, axis) for axis in range(3) for bone in armature_object.pose.bones if not bone.lock_rotation[axis]]
+    random = np.random.default_rng(0)
+    for index in range(count):
+        bone, axis = axes[index % len(axes)]
+        center = points[np.argmin(np.linalg.norm(points - bone.bone.head_local, axis=1))]
+        offset, radius = random.uniform(-0.004, 0.004, 3), random.uniform(0.02, 0.06)
+
+        def bulge(at: np.ndarray, center=center, offset=offset, radius=radius) -> np.ndarray:
+            return at + np.exp(-(((at - center) / radius) ** 2).sum(axis=1))[:, None] * offset
+
+        driver = add_key(mesh_object, f"{bone.name}_{index:02}", bulge).driver_add("value").driver
+        variable = driver.variables.new()
+        variable.name, variable.type = "angle", "TRANSFORMS"
+        target = variable.targets[0]
+        target.id, target.bone_target = armature_object, bone.name
+        target.transform_type, target.transform_space = f"ROT_{'XYZ'[axis]}", "LOCAL_SPACE"
+        driver.expression = f"min(1, max(0, {random.choice([-1.5, 1.5])} * angle))"
+
+
+def _add_group(mesh_object: bpy.types.Object, name: str, weights: np.ndarray) -> None:
+    group = mesh_object.vertex_groups.new(name=name)
+    for index in np.flatnonzero(weights > 1e-3):
+        group.add([int(index)], float(weights[index]), "REPLACE")
+
+
+def _add_performance(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> None:
+    """Add an action in which bones and shape keys move at the same time, each at a different rate."""
+    action = bpy.data.actions.new(ACTION)
+    armature_object.animation_data_create().action = action
+    for frame in range(1, FRAMES + 1, 4):
+        for index, bone in enumerate(armature_object.pose.bones):
+            (constraint,) = bone.constraints
+            for axis, letter in enumerate("xyz"):
+                low, high = getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}")
+                fraction = 0.5 + 0.45 * math.sin(frame * (0.11 + 0.017 * index) + 2.1 * index + axis)
+                bone.rotation_euler[axis] = low + (high - low) * fraction
+            bone.keyframe_insert("rotation_euler", frame=frame)
+    keys = mesh_object.data.shape_keys
+    action.slots.new(id_type="KEY", name=keys.name)
+    keys.animation_data_create().action = action
+    for frame in range(1, FRAMES + 1, 4):
+        for index, block in enumerate(keys.key_blocks[1:]):
+            block.value = max(0.0, math.sin(frame * (0.09 + 0.013 * (index % 30)) + 1.7 * index))
+            keys.keyframe_insert(f'key_blocks["{block.name}"].value', frame=frame)
+    for block in keys.key_blocks[1:]:
+        block.value = 0.0
+    keys.animation_data.action = None
+
+
+def main(name: str, output_path: Path) -> None:
+    """Build a character, and save it."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    {"arkit": arkit_face, "many": many_keys, "correctives": corrected_arm}[name]()
+    bpy.ops.wm.save_as_mainfile(filepath=str(output_path.absolute()), copy=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))
