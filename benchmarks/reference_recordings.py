@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.settings import MAX_DETAIL_MM
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import split_poses
 from trainer.device import choose_device
@@ -167,7 +168,8 @@ def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bo
     else:
         measured, trained_on = np.arange(TRAINING_POSES, pose_count), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
-    prepared = [prepare_partition(partition.data, split, config.detail_mm, config.seed) for partition in partitions]
+    detail_mm = config.detail_mm or MAX_DETAIL_MM
+    prepared = [prepare_partition(partition.data, split, detail_mm, config.seed) for partition in partitions]
     rows = []
     for partition, trained in zip(partitions, train(prepared, split, config, choose_device().device), strict=True):
         mean, largest, linear = measure(partition, trained, measured)

@@ -5,7 +5,15 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+FLOAT = TensorProto.FLOAT
 MAX_SHORT = np.iinfo(np.int16).max
+
+
+def compact(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return floats as int16 integers, and the float32 scale of each row along the last axis."""
+    scales = np.abs(values).max(axis=-1, keepdims=True).astype(np.float32) / MAX_SHORT
+    scales[scales == 0] = 1
+    return np.rint(values / scales).astype(np.int16), scales
 
 
 class GraphBuilder:
@@ -28,10 +36,8 @@ class GraphBuilder:
 
         ONNX Runtime computes the float32 constant while it loads the model, so that a run takes no longer.
         """
-        scales = np.abs(value).max(axis=-1, keepdims=True).astype(np.float32) / MAX_SHORT
-        scales[scales == 0] = 1
-        integers = self._constant(f"{name}_integers", np.rint(value / scales).astype(np.int16))
-        integers = self.add("Cast", [integers], f"{name}_rounded", to=TensorProto.FLOAT)
+        integers, scales = compact(value)
+        integers = self.add("Cast", [self._constant(f"{name}_integers", integers)], f"{name}_rounded", to=FLOAT)
         return self.add("Mul", [integers, self.floats(f"{name}_scales", scales)], name)
 
     def integers(self, name: str, value: np.ndarray) -> str:

@@ -10,6 +10,7 @@ from fdda_addon.core.mathematics.features import MIN_FEATURE_SPREAD, float32_rou
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
+from fdda_addon.core.settings import MAX_DETAIL_MM
 
 from .blocks import block_slices
 from .config import TrainingConfig
@@ -20,6 +21,12 @@ from .fits.joint_fit import JointFit, JointRegression, joint_regression
 from .fits.parts import divide_partition
 from .inputs.network_inputs import NetworkInputs
 
+DETAIL_RATIO = 0.01
+"""A detail that is chosen automatically, as a part of the rms error of linear skinning."""
+MIN_DETAIL_MM = 0.005
+"""The smallest detail that is chosen automatically."""
+MAX_DETAIL_POSES = 100
+"""Maximum number of training poses that determine the detail."""
 MIN_DIVIDED_VERTICES = 500
 """Partitions with fewer vertices are not divided."""
 
@@ -87,6 +94,20 @@ class PreparedPartition:
         """(n,) rms distance over the vertices between validation residuals and their approximation, mesh units."""
         truncated = self.validation_residuals - self.basis.reconstruct(self.coefficients[self.validation])
         return np.sqrt((truncated**2).sum(axis=1) / self.vertex_count)
+
+
+def choose_detail(recording: SkinnedRecording, split: Split) -> float:
+    """Choose the detail of a training, mm, by the rms error of linear skinning on the training poses.
+
+    A face moves by millimeters where a body moves by centimeters, so its details are smaller.
+    """
+    squares = [
+        np.square(recording.compute_residuals(np.array([pose])), dtype=np.float64).sum(axis=2).mean()
+        for pose in split.training[:: -(-len(split.training) // MAX_DETAIL_POSES)]
+    ]
+    smallest, ratio = float32_rounding(recording.pose_matrices), DETAIL_RATIO * float(np.sqrt(np.mean(squares)))
+    detail_mm = 1000 * recording.rig.metres_per_unit * max(smallest, ratio)
+    return min(max(MIN_DETAIL_MM, detail_mm), MAX_DETAIL_MM)
 
 
 def make_parts(recording: SkinnedRecording, split: Split, tolerance: float) -> list[Partition]:

@@ -4,7 +4,7 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import onnxruntime
@@ -36,7 +36,7 @@ from .networks.loop import train
 from .networks.networks import TrainedPartition
 from .networks.warm_start import checkpoint_parts, initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import training_outputs
-from .preparation import PartitionData, make_parts, partition_data, prepare_partitions
+from .preparation import PartitionData, choose_detail, make_parts, partition_data, prepare_partitions
 from .progress import MessageSink
 from .report.contents import make_report
 from .report.error_analysis import analyze_errors
@@ -78,6 +78,8 @@ def train_model(
     with stoppable():
         recording = split_deformation(read_recording(recording_path), config, sink)
         split = split_recording(recording, config)
+        if not config.detail_mm:
+            config = replace(config, detail_mm=choose_detail(recording, split))
         holdout = holdout_fingerprint(recording, split)
         checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
         job = _Job(config, sink, recording, split, checkpoint)
@@ -151,6 +153,7 @@ class _Job:
             self.sink.send(MessageType.WARNING, **warning.to_json())
         if strict:
             raise_first_warning(warnings)
+        self.log(f"Detail: {self.config.detail_mm:.2g} mm.")
         return warnings
 
     def make_parts(self) -> list[Partition]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Build characters with as many shape keys as productions have: ARKit's 52, 300, and 60 that joints drive.
 
-`python -m blend_fixtures.characters.shape_keys arkit|many|correctives OUT.blend` saves one of them. The heads are that of
-`face` with two bones, and have an action; the correctives are on the sample arm, which has one.
+`python -m blend_fixtures.characters.shape_keys arkit|many|correctives OUT.blend` saves one of them. The heads are that
+of `face` with two bones, and have an action; the correctives are on the sample arm, which has one.
 """
 
 import math

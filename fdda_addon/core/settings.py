@@ -174,14 +174,16 @@ REFINEMENT_POSES = 250
 
 TRAINING_SEED = Setting("seed", 0, "Random seed of the training", "Seed", high=(1 << 63) - 1)
 """PyTorch takes no larger seeds."""
+MAX_DETAIL_MM = 0.04
+"""The largest detail that is chosen automatically."""
 DETAIL_MM = Setting(
     "detail_mm",
-    0.04,
+    0.0,
     "Smallest deformation worth learning, in mm; smaller is more accurate and slower. 0.05 is invisible in a close-up "
-    "of a face, 0.5 in a full figure",
+    f"of a face, 0.5 in a full figure. 0 chooses {MAX_DETAIL_MM} or 1 % of the error of skinning alone, whichever is "
+    "less",
     "Detail (mm)",
-    ABOVE_ZERO,
-    ui={"min": 0.001, "soft_max": 1.0, "precision": 3, "step": 1},
+    ui={"soft_max": 1.0, "precision": 3, "step": 1},
 )
 """Allowed rms error of the principal components alone, over training poses and all vertices, mm."""
 PASSES = Setting(

@@ -10,7 +10,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import check_model
 from fdda_addon.core.formats.onnx_file import FREE_ELEMENTS, infer_shapes, read_onnx
 from trainer.__main__ import main
-from trainer.config import ACTIVATIONS
+from trainer.config import ACTIVATION
 
 from .chain import constant_names, write_chain
 
@@ -21,7 +21,7 @@ def models(recording, tmp_path_factory) -> list[bytes]:
     folder = tmp_path_factory.mktemp("models")
     for joints in (1, 12):
         write_chain(folder / f"chain_{joints}", pose_count=60, joint_count=joints)
-    trainings = [(recording, "--activation", name, "--hidden", "24", "24") for name in ACTIVATIONS]
+    trainings = [(recording, "--activation", name, "--hidden", "24", "24") for name in ACTIVATION.choices]
     trainings += [(folder / f"chain_{joints}", "--hidden", "16") for joints in (1, 12)]
     trainings += [(recording, "--hidden", "300", "200", "100", "50"), (recording, "--detail-mm", "10000")]
     contents = []

@@ -14,7 +14,7 @@ from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.rig import Rig
 from trainer.__main__ import main
-from trainer.config import ACTIVATIONS, TrainingConfig
+from trainer.config import ACTIVATION, TrainingConfig
 from trainer.data.split import split_recording
 
 from ..recordings import read_skinned
@@ -162,7 +162,7 @@ def test_the_report_has_the_errors_of_the_model(report, trained, recording, sess
         assert len(p["curve"]["validation"]) == (40 if p["basis"] else 0)
 
 
-@pytest.mark.parametrize("activation", [name for name in ACTIVATIONS if name != TrainingConfig.activation])
+@pytest.mark.parametrize("activation", [name for name in ACTIVATION.choices if name != TrainingConfig.activation])
 def test_every_activation_and_any_depth_can_be_exported(tmp_path, recording, activation):
     model = tmp_path / "m.onnx"
     options = ["--passes", "2", "--activation", activation, "--hidden", *(["8"] if activation == "tanh" else ["8"] * 3)]

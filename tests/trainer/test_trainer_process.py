@@ -132,9 +132,10 @@ def test_a_diverging_training_fails_with_one_sentence(recording, tmp_path, capsy
     assert list(tmp_path.iterdir()) == []
 
 
-def test_wrong_usage_exits_with_two(capsys):
+@pytest.mark.parametrize("arguments", [["only-one"], ["recording", "m.onnx", "--learning-rate", "-1"]])
+def test_wrong_usage_exits_with_two(arguments):
     with pytest.raises(SystemExit) as exit_:
-        main(["only-one"])
+        main(arguments)
     assert exit_.value.code == 2
 
 

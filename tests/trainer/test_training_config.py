@@ -13,7 +13,7 @@ from trainer.config import TrainingConfig, add_options, config_from_arguments
     "name, value",
     [
         ("passes", 0),
-        ("detail_mm", 0.0),
+        ("detail_mm", -0.1),
         ("detail_mm", float("nan")),
         ("learning_rate", float("inf")),
         ("hidden", ()),

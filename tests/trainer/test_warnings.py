@@ -36,8 +36,9 @@ def test_warnings_are_sent_before_the_training_and_reported(suspicious_recording
         == 0
     )
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
-    first_message_types = [MessageType.STARTED, MessageType.LOG, *[MessageType.WARNING] * 2, MessageType.PREPARING]
-    assert [m.type for m in messages[:5]] == first_message_types
+    log = MessageType.LOG
+    first_message_types = [MessageType.STARTED, log, *[MessageType.WARNING] * 2, log, MessageType.PREPARING]
+    assert [m.type for m in messages[:6]] == first_message_types
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert [w["name"] for w in report["warnings"]] == WARNING_NAMES
     assert [m.values for m in messages[2:4]] == report["warnings"]

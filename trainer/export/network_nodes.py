@@ -14,7 +14,7 @@ import numpy as np
 
 from fdda_addon.core.formats.model import CONFIDENCE_OUTPUT
 
-from ..graph_builder import GraphBuilder
+from ..graph_builder import GraphBuilder, compact
 from ..inputs.block import VECTOR_SIZE
 from ..model import TrainedModel
 from ..networks.networks import TrainedPartition
@@ -152,14 +152,19 @@ def _first_layer(features: Features, prepared: TrainedPartition) -> tuple[np.nda
 
     Returns:
         (Bn,) int64 indices of the vectors that are its inputs, and their (Bn, 3, H) float64 weights. The last vector is
-        `Features.ones_vector`, and the weight of its last element is the bias.
+        `Features.ones_vector`, whose elements are 1. The weight of its last element is the bias.
     """
     network, position = prepared.network, features.position[prepared.columns]
     vectors, vector_slots = np.unique(position // VECTOR_SIZE, return_inverse=True)
-    unscaled_weights = network.weights[0].astype(np.float64) / prepared.feature_scale[:, None]
-    weights = np.zeros((len(vectors) + 1, VECTOR_SIZE, unscaled_weights.shape[1]))
-    weights[vector_slots, position % VECTOR_SIZE] = unscaled_weights
-    weights[-1, -1] = network.biases[0] - prepared.feature_mean.astype(np.float64) @ unscaled_weights
+    weights = np.zeros((len(vectors) + 1, VECTOR_SIZE, network.weights[0].shape[1]))
+    weights[vector_slots, position % VECTOR_SIZE] = (
+        network.weights[0].astype(np.float64) / prepared.feature_scale[:, None]
+    )
+    # A feature may be far from 0 and vary little. So the bias has what compact weights take from the mean, and another
+    # element what they take from the bias.
+    rounded = np.multiply(*compact(weights))[vector_slots, position % VECTOR_SIZE]
+    bias = network.biases[0] - prepared.feature_mean.astype(np.float64) @ rounded
+    weights[-1, -1], weights[-1, 0] = bias, bias - np.multiply(*compact(bias))
     return np.append(vectors, features.ones_vector), weights
 
 

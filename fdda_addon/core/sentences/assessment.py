@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ..mathematics.metrics import ErrorStatistics
-from ..settings import DETAIL_MM
+from ..settings import MAX_DETAIL_MM
 
 MAX_GOOD_RATIO = 0.7
 """Largest ratio of an error of the model to that of skinning alone at which the model clearly beats it."""
@@ -281,7 +281,7 @@ def _unimproved_tail(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorS
 
 def _is_farther(model_mm: float, skinning_mm: float) -> bool:
     """Return whether a model is farther from the rig than skinning alone, by more than its tolerance allows."""
-    return model_mm > (DETAIL_MM.default if skinning_mm < MIN_SKINNING_ERROR_MM else skinning_mm)
+    return model_mm > (MAX_DETAIL_MM if skinning_mm < MIN_SKINNING_ERROR_MM else skinning_mm)
 
 
 def _describe_no_gain(model_mm: float, skinning_mm: float) -> str:
