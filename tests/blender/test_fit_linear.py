@@ -163,18 +163,6 @@ def test_a_mesh_without_weights_is_recorded_and_needs_fitted_ones(refusal, tmp_p
     assert not (tmp_path / "other").exists()
 
 
-def test_all_meshes_are_those_with_an_armature_modifier_and_others_are_named(tmp_path, capfd):
-    build_cloth()
-    bpy.ops.mesh.primitive_cube_add()
-    save_copy(tmp_path / "cloth.blend")
-    assert run("record", tmp_path / "cloth.blend", tmp_path / "recordings", "--all", "--poses", 4) == 0
-    assert [path.name for path in (tmp_path / "recordings").iterdir()] == ["body"]
-    assert (
-        "Left out: the mesh 'elbow', because no Armature modifier deforms it. Other modifiers follow the armature; "
-        "record such a mesh by itself (--object 'elbow' --base-skinning smooth)."
-    ) in capfd.readouterr().out
-
-
 def test_the_times_of_a_mesh_without_armature_modifier_lack_linear_skinning(make_fitted_character, capfd, tmp_path):
     files = make_fitted_character(*KINDS_AND_BUILDERS[0])
     times = tmp_path / "times.json"

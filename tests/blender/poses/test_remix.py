@@ -92,7 +92,7 @@ def test_a_recording_remixes_its_actions(waving, tmp_path):
     options = ("--bones-to-pose", "remix", "--action", WAVE, "--poses", 30, "--seed", 4)
     assert run("record", tmp_path / "rig.blend", tmp_path / "recording", *options) == 0
     recording = read_recording(tmp_path / "recording")
-    random_source, action_source = recording.info.sampling.sources
+    random_source, action_source, _ = recording.info.sampling.sources
     assert (random_source.kind, random_source.name, random_source.poses) == ("random", "remix", 30)
     assert action_source.poses == 40
     settings = RecordingSettings(poses=30, seed=4, bones_to_pose=("remix",), actions=(WAVE,))
