@@ -149,7 +149,7 @@ class EnvironmentCreation:
         (packages / "fdda.pth").write_text(os.path.relpath(self.folder, packages) + "\n", encoding="ascii")
         command = [str(interpreter_path(self.folder)), "-I", str(RUN_PIP), "install"]
         command += ["--no-input", "--disable-pip-version-check", "--no-cache-dir"]
-        command += ["--learn-from", str(self.folder)]
+        command += ["--target", str(self.folder)]
         command += ["--only-binary=:all:", "--constraint", str(requirements_file(interpreter.version)), *PACKAGES]
         if self.wheels is not None:
             command += ["--no-index", "--find-links", str(self.wheels)]

@@ -134,11 +134,11 @@ def test_the_report_has_a_sentence_for_each_line_of_the_verb(name):
     assert FDDA_OT_fast_rig.finish(None, None, output) == expected
 
 
-def test_meshes_whose_clean_names_are_equal_keep_their_models(saved, tmp_path_factory):
+def test_meshes_of_one_model_share_its_file(saved, tmp_path_factory):
     mesh_object = bpy.data.objects[ELBOW]
     other = mesh_object.copy()
     bpy.context.scene.collection.objects.link(other)
-    mesh_object.name, other.name = "left arm", "left_arm"
+    mesh_object.name = "left arm"
     folder = tmp_path_factory.mktemp("models")
-    assert write_models([mesh_object, other], folder) == folder
-    assert len(list(folder.glob("*/*.onnx"))) == 2
+    assert write_models([mesh_object, other], folder) == folder / "0" / "left_arm.onnx"
+    assert len(list(folder.glob("*/*.onnx"))) == 1
