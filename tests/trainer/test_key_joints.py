@@ -113,7 +113,7 @@ def test_half_rotating_joints_follow_from_the_main_joints():
     poses = chain_poses(followers=("half",))
     choice = choose(poses)
     # The half of the last main joint and its main joint rotate about other points, so one of them could be enough.
-    assert len(choice.joints) == BONES and choice.report.unexplained_mm < choice.report.detail_mm
+    assert len(choice.joints) == BONES and choice.report.unexplained_mm < choice.report.tolerance_mm
     # The vertices around a removed joint need the joint from whose rotation its own follows.
     for joint in set(range(BONES, 2 * BONES)) - set(choice.joints.tolist()):
         rotated = (joint - BONES + 1) % BONES
@@ -141,7 +141,7 @@ def test_independent_joints_are_all_kept():
     assert len(choice.joints) == len(poses.rig.joints) and choice.report.independent == ()
     assert choice.report.sentence() == (
         f"Key joints: all {2 * BONES} joints are read, because each moves by more than "
-        f"{choice.report.detail_mm:.2f} mm in ways that the others do not explain."
+        f"{choice.report.tolerance_mm:.2f} mm in ways that the others do not explain."
     )
 
 

@@ -34,7 +34,7 @@ REFERENCE_POSES = 48
 
 
 def split_deformation(recording: Recording, config: TrainingConfig, sink: MessageSink) -> SkinnedRecording:
-    """Split the deformation of a recording, with the settings `base_skinning`, `joints` and those of partitions.
+    """Split the deformation of a recording, with the settings `base_skinning`, `bones_to_read` and those of partitions.
 
     Args:
         recording: the recording.

@@ -21,7 +21,7 @@ class KeyJointReport:
         joints, rig_joints: number of key joints, and of all joints.
         unexplained_mm: largest motion of another joint that key joints and controls do not explain, mm: rms over poses
             and over the vertices of the joint, times skin weights.
-        detail_mm: unexplained motion with which "auto" removes any joint.
+        tolerance_mm: unexplained motion with which "auto" removes any joint.
         independent: names of the removed joints that "auto" would not remove, the largest unexplained motion first.
         still: names of the removed joints that no pose moves relative to their parents.
     """
@@ -30,7 +30,7 @@ class KeyJointReport:
     joints: int
     rig_joints: int
     unexplained_mm: float
-    detail_mm: float
+    tolerance_mm: float
     independent: tuple[str, ...] = ()
     still: tuple[str, ...] = ()
 
@@ -51,7 +51,7 @@ class KeyJointReport:
         lost = [value[name] for name in ("independent", "still")]
         if not all(isinstance(names, list | tuple) and all(isinstance(name, str) for name in names) for names in lost):
             raise ValueError("the joints that are not read have no names")
-        distances = [float(value[name]) for name in ("unexplained_mm", "detail_mm")]
+        distances = [float(value[name]) for name in ("unexplained_mm", "tolerance_mm")]
         if not np.isfinite(distances).all() or not isinstance(value["requested"], str):
             raise ValueError("the errors of key joints are not numbers")
         return KeyJointReport(parse_joints(value["requested"]), *counts, *distances, *map(tuple, lost))
@@ -64,7 +64,7 @@ class KeyJointReport:
         if not removed:
             return (
                 f"Key joints: all {self.rig_joints} joints are read, because each moves by more than "
-                f"{self.detail_mm:.2f} mm in ways that the others do not explain."
+                f"{self.tolerance_mm:.2f} mm in ways that the others do not explain."
             )
         text = f"Key joints: the model reads {self.joints} of {self.rig_joints} joints"
         if self.independent:
