@@ -68,8 +68,9 @@ def read_faces(folder: Path, info: dict) -> list[np.ndarray]:
     """Read the vertices of each face from the recording that the model was trained on."""
     if not (folder / "face_starts.npy").is_file():
         sys.exit(f"{folder} is not a recording with faces; record the rig again, or leave out --recording.")
-    recorded_fingerprint = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["rig"]["fingerprint"]
-    if recorded_fingerprint["topology"] != info["fingerprint"]["topology"]:
+    index = json.loads((folder / "recording.json").read_text(encoding="utf-8"))
+    recorded, trained = ([mesh["fingerprint"]["topology"] for mesh in each["meshes"]] for each in (index, info))
+    if recorded != trained:
         sys.exit(f"{folder} is a recording of a different mesh; choose the one that the model was trained on.")
     starts, vertices = (np.load(folder / f"face_{name}.npy") for name in ("starts", "vertices"))
     return np.split(vertices, starts[1:])
@@ -93,7 +94,7 @@ def read_arguments() -> argparse.Namespace:
     arguments = parser.parse_args()
     try:
         arguments.turn = {name: tuple(map(float, angles)) for name, *angles in arguments.turn}
-        arguments.control = {name: float(value) for name, value in arguments.control}
+        arguments.extra_input = {name: float(value) for name, value in arguments.extra_input}
     except ValueError as error:
         parser.error(str(error))
     return arguments
@@ -106,14 +107,14 @@ def main() -> None:
     joints = [joint["name"] for joint in info["joints"] if joint["name"]]  # a joint without a name never moves
     for kind, requested_names, known_names in (
         ("joint", arguments.turn, joints),
-        ("control", arguments.control, [control_name(control) for control in controls]),
+        ("control", arguments.extra_input, [control_name(control) for control in controls]),
     ):
         if unknown := [name or "''" for name in requested_names if name not in known_names]:
             sys.exit(f"The model has no {kind} {', '.join(unknown)}; it has: {', '.join(known_names) or 'none'}.")
 
     inputs = {"pose_matrices": pose_matrices(info, arguments.turn)[None]}  # N = 1 pose
     if controls:
-        inputs["controls"] = control_values(controls, arguments.control)[None]
+        inputs["controls"] = control_values(controls, arguments.extra_input)[None]
     positions, confidence = session.run(["positions", "confidence"], inputs)
     if arguments.out.suffix == ".npy":
         np.save(arguments.out, positions[0])

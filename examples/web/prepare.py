@@ -42,8 +42,9 @@ def main(model: Path, recording: Path, folder: Path) -> None:
         sys.exit(f"{model} is not an FDDA model of version 1; choose one that 'train' has written.")
     if not (recording / "face_starts.npy").is_file():
         sys.exit(f"{recording} is not a recording with faces; record the rig again.")
-    recorded_fingerprint = json.loads((recording / "recording.json").read_text(encoding="utf-8"))["rig"]["fingerprint"]
-    if recorded_fingerprint["topology"] != info["fingerprint"]["topology"]:
+    index = json.loads((recording / "recording.json").read_text(encoding="utf-8"))
+    recorded, trained = ([mesh["fingerprint"]["topology"] for mesh in each["meshes"]] for each in (index, info))
+    if recorded != trained:
         sys.exit(f"{recording} is a recording of a different mesh; choose the one that the model was trained on.")
     triangles = triangulate(*(np.load(recording / f"face_{name}.npy") for name in ("starts", "vertices")))
     folder.mkdir(parents=True, exist_ok=True)

@@ -13,10 +13,10 @@ from mathutils import Euler, Matrix
 from fdda_addon.core.controls import Control
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
-from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import STATIC_JOINT, Joint
 from trainer.__main__ import main as train
 
+from ..recordings import write_recording
 from ..trainer.chain import chain_angles, chain_residuals, chain_rig, pose_chain, write_chain
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,8 +70,7 @@ def controlled_chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
     moving_joints = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for joint in range(JOINTS)}
     partitions = make_partitions(rig, moving_joints, {joint: (0,) for joint in range(JOINTS)})
     info = RecordingInfo(POSES, 0, "chain.blend", "5.2.0", Sampling(1, 1.0, (), (Source("random", POSES),)))
-    with RecordingWriter(recording, rig, partitions, info) as writer:
-        writer.append(poses, residuals, values)
+    write_recording(recording, rig, partitions, info, poses, residuals, values)
     return train_character(recording)
 
 

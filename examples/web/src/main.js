@@ -22,7 +22,7 @@ async function start() {
   setState("busy", "Loading …");
   const model = await Model.load(await fetchBytes("model.onnx"));
   const triangles = new Uint32Array((await fetchBytes("triangles.bin")).buffer);
-  if (triangles.some((vertex) => vertex >= model.info.vertices)) {
+  if (triangles.some((vertex) => vertex >= model.info.vertexCount)) {
     throw new Error("triangles.bin belongs to a different mesh; write both files with prepare.py.");
   }
   const pose = new Pose(model.info);

@@ -14,7 +14,7 @@ const VALUE = 2;
 export function readInfo(bytes) {
   const info = JSON.parse(readProperties(bytes).get("fdda") ?? "{}");
   if (info.version !== 1) throw new Error("model.onnx is not an FDDA model of version 1; run prepare.py with one.");
-  return info;
+  return { ...info, vertexCount: info.meshes.reduce((sum, { vertices }) => sum + vertices, 0) };
 }
 
 function readProperties(bytes) {

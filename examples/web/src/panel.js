@@ -54,7 +54,7 @@ export function fillPanel(info, pose, onChange) {
     refresh();
   });
   const count = (number, what) => `${number.toLocaleString("en")} ${what}`;
-  element("size").textContent = `${count(select.length, "joints")}, ${count(info.vertices, "vertices")}`;
+  element("size").textContent = `${count(select.length, "joints")}, ${count(info.vertexCount, "vertices")}`;
   refresh();
 }
 
