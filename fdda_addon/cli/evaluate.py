@@ -70,7 +70,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--heatmap",
         metavar="OUT.png",
         type=Path,
-        help="picture to write, with rig, linear skinning and model as heat maps",
+        help="picture to write, with rig, linear skinning and model as heat maps of the first mesh",
     )
     parser.add_argument(
         "--video",
@@ -97,11 +97,8 @@ def run(options: argparse.Namespace) -> None:
         check_outputs([*outputs, (options.video, VIDEO)], (options.rig, options.model), options.overwrite)
     check_outputs(outputs, (options.rig, options.model), options.overwrite)
     rigs = open_rigs(options)
-    for option in ("heatmap", "video"):
-        if getattr(options, option) and len(rigs) > 1:
-            raise WrongUsageError(
-                f"--{option} draws one mesh, and '{options.model}' holds models of several; give --object."
-            )
+    if options.video and len(rigs) > 1:
+        raise WrongUsageError(f"--video draws one mesh, and '{options.model}' deforms several; give --object.")
     settings = EvaluationSettings(
         options.poses,
         options.seed,
@@ -115,7 +112,7 @@ def run(options: argparse.Namespace) -> None:
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
     with atomic_write_all(*(path for path, _ in outputs)) as (errors, *pictures):
         for picture in pictures:
-            ((name, (scene_rig, model)),) = rigs.items()
+            name, (scene_rig, model) = next(iter(rigs.items()))
             reference_name = f"target '{options.learn_from}'" if options.learn_from else "true rig"
             poses = representative_poses(evaluations[name].held_out)
             draw_comparison(scene_rig, model, poses, picture, is_heat_map=True, reference_label=reference_name)

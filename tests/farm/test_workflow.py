@@ -60,8 +60,8 @@ def test_a_character_is_made_once_and_again_after_a_change(tmp_path):
     assert farm.new_calls() == ["bind", "evaluate", "record", "train"]
     output, work = tmp_path / "out/elbow", tmp_path / "farm/elbow"
     assert {path.name for path in output.rglob("*.*")} >= {"elbow.blend", "elbow.onnx", "report.html"}
-    errors = json.loads((work / "evaluate/elbow/errors.json").read_text())
-    assert errors["fdda"]["p999"] < 100 and (work / "evaluate/elbow/errors.png").is_file()
+    errors = json.loads((work / "evaluate/errors.json").read_text())
+    assert errors["fdda"]["p999"] < 100 and (work / "evaluate/errors.png").is_file()
 
     os.utime(tmp_path / "elbow.blend")
     assert farm.run("elbow").returncode == 0 and farm.new_calls() == [], "the rig has the same content"
@@ -76,9 +76,9 @@ def test_a_character_is_made_once_and_again_after_a_change(tmp_path):
 def test_a_training_with_a_goal_adds_poses(tmp_path):
     goal = {"goal-mm": 1e-6, "poses": 5}
     farm = Farm(tmp_path, one=character("one", objects=["elbow"], record={"poses": 40}, train=goal))
-    run = farm.run("farm/one/train/elbow/done")
+    run = farm.run("farm/one/train/done")
     assert run.returncode == 0, run.stdout
-    report = json.loads((tmp_path / "out/one/models/elbow/report.json").read_text())
+    report = json.loads((tmp_path / "out/one/models/report.json").read_text())
     index = json.loads((tmp_path / "farm/one/recording/recording.json").read_text())
     assert report["goal"]["verdict"] == "exhausted" and index["poses"] > 40
     assert farm.new_calls() == ["record", "train"]
@@ -95,9 +95,9 @@ def test_only_a_fault_of_the_machine_is_tried_again(tmp_path, status, records):
 
 
 def test_a_failure_is_reported_and_the_other_characters_are_made(tmp_path):
-    farm = Farm(tmp_path, bad=character("bad", record={"bones": 3}), good=character("good"))
+    farm = Farm(tmp_path, bad=character("bad", record={"nothing": 3}), good=character("good"))
     run = farm.run("farm/bad/record/done", "farm/good/record/done")
-    assert run.returncode == 1 and "unrecognized arguments: --bones=3" in run.stdout
+    assert run.returncode == 1 and "unrecognized arguments: --nothing=3" in run.stdout
     assert farm.new_calls() == ["record", "record"] and (tmp_path / "farm/good/record/done").exists()
 
 
@@ -156,8 +156,8 @@ def test_nothing_is_lost_or_trained_twice_when_processes_are_killed(tmp_path):
     assert "train again" not in farm.calls.read_text(), "a finished model was trained again"
     for name in characters:
         assert (tmp_path / "out" / name / f"{name}.blend").is_file()
-        assert (tmp_path / "farm" / name / "evaluate" / name / "errors.json").is_file()
-        assert json.loads((tmp_path / "farm" / name / "recording/recording.json").read_text())["complete"] == 600
+        assert (tmp_path / "farm" / name / "evaluate/errors.json").is_file()
+        assert json.loads((tmp_path / "farm" / name / "recording/recording.json").read_text())["complete"] >= 600
 
 
 def test_a_job_of_openjd_makes_a_character(tmp_path):

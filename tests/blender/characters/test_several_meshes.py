@@ -200,7 +200,7 @@ def test_an_incomplete_recording_of_several_is_refused_before_the_first_training
     [
         ("train", ("--goal-mm", 1, "--refine", "rig"), "--refine takes one recording"),
         ("record", ("--all", "--object", BODY), "give one of them"),
-        ("evaluate", ("--json", "e.json", "--heatmap", "h.png"), "--heatmap draws one mesh"),
+        ("evaluate", ("--json", "e.json", "--action", "a", "--video", "v.mp4"), "--video draws one mesh"),
     ],
 )
 def test_options_for_one_mesh_are_refused_for_several(two, tmp_path, monkeypatch, capfd, verb, options, text):
