@@ -321,8 +321,12 @@ class Rig:
 
 def rest_matrices_match(rest_matrices: np.ndarray, rig: Rig) -> bool:
     """Return whether (J, 4, 4) rest matrices equal those of a rig within `REST_MATRIX_TOLERANCE`."""
-    difference = np.abs(rest_matrices - rig.rest_matrices)
-    difference[:, :3, 3] *= rig.metres_per_unit
+    return _matrices_match(rest_matrices, rig.rest_matrices, rig.metres_per_unit)
+
+
+def _matrices_match(first: np.ndarray, second: np.ndarray, metres_per_unit: float) -> bool:
+    difference = np.abs(first - second)
+    difference[..., :3, 3] *= metres_per_unit
     return bool(difference.max(initial=0) <= REST_MATRIX_TOLERANCE)
 
 
@@ -361,12 +365,14 @@ def rig_differences(
     if not clauses:
         for index, (mesh, rig_mesh) in enumerate(zip(meshes, rig.meshes, strict=True)):
             controls = controls_of_mesh(rig.controls, mesh.name if index else "")
-            mesh_clauses = _mesh_differences(mesh, rig_mesh, controls)
+            mesh_clauses = _mesh_differences(mesh, rig_mesh, controls, rig.metres_per_unit)
             clauses += [f"{clause} ('{rig_mesh.name}')" for clause in mesh_clauses] if len(meshes) > 1 else mesh_clauses
     return clauses
 
 
-def _mesh_differences(mesh: MeshPart, rig_mesh: MeshPart, controls: Iterable[Control]) -> list[str]:
+def _mesh_differences(
+    mesh: MeshPart, rig_mesh: MeshPart, controls: Iterable[Control], metres_per_unit: float
+) -> list[str]:
     """List the differences between a mesh of a recording or model and the mesh of a rig with the given controls."""
     clauses, (fingerprint, rig_fingerprint) = [], (mesh.fingerprint, rig_mesh.fingerprint)
     for attribute, label in (
@@ -376,7 +382,7 @@ def _mesh_differences(mesh: MeshPart, rig_mesh: MeshPart, controls: Iterable[Con
     ):
         if getattr(fingerprint, attribute) != getattr(rig_fingerprint, attribute):
             clauses.append(f"{label} differ" + ("s" if attribute != "skin_weights" else ""))
-    if not np.allclose(mesh.matrix, rig_mesh.matrix, atol=REST_MATRIX_TOLERANCE):
+    if not _matrices_match(mesh.matrix, rig_mesh.matrix, metres_per_unit):
         clauses.append("the mesh has moved against the others")
     return clauses + deformation_differences(fingerprint.deformation, rig_fingerprint.deformation, controls)
 

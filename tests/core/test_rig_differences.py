@@ -84,6 +84,21 @@ def test_rest_poses_are_compared_in_meters(rig):
     ]
 
 
+def test_transforms_of_meshes_are_compared_in_meters(rig):
+    meshes = (rig.meshes[0], replace(rig.meshes[0], name="shirt"))
+
+    def moved(distance_mm: float) -> tuple[MeshPart, ...]:
+        matrix = np.eye(4)
+        matrix[0, 3] = distance_mm
+        return (meshes[0], replace(meshes[1], transform=tuple(matrix.ravel().tolist())))
+
+    # Blender's float32 matrices move by such distances where a character in mm is 100 m away.
+    assert differences(replace(rig, metres_per_unit=1e-3, meshes=moved(20)), meshes=moved(20.03)) == []
+    for metres_per_unit, distance in ((1e-3, 20.2), (1, 20.0002)):
+        character = replace(rig, metres_per_unit=metres_per_unit, meshes=moved(20))
+        assert differences(character, meshes=moved(distance)) == ["the mesh has moved against the others ('shirt')"]
+
+
 @pytest.mark.parametrize(
     ("part", "sentence"),
     [
