@@ -72,7 +72,7 @@ def test_positions_that_stop_being_finite_are_influenced(tmp_path):
     np.save(tmp_path / "r" / "positions.npy", positions)
     skinned = skin_recording(read_recording(tmp_path / "r"), min_vertices_per_part=0, note=notes.append)
     assert skinned.partitions[3].influencing == (0,) and len(skinned.rows) == 6
-    assert "are not finite in 1 tests of its influences, as when 'root' moves from the rest pose" in notes[0]
+    assert "are not finite in 1 test of its influences, as when 'root' moves from the rest pose" in notes[0]
 
 
 def test_a_recording_without_controls_has_an_empty_array(recording):

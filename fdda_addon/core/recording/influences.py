@@ -13,6 +13,7 @@ from ..mathematics.partition import Partition
 from ..mathematics.poses import CONTROL
 from ..mathematics.skinning import LinearSkinning
 from ..rig import STATIC_JOINT_LABEL, Rig
+from ..sentences.counts import format_count
 from .index import JOINT
 from .reader import Recording
 
@@ -75,10 +76,11 @@ def detect_influences(
     base_index, kind, indices = infinite_tests[0]
     base_text = f"random pose {base_index}" if base_index else "the rest pose"
     name = recording.rig.joint_names[indices[0]] if kind == JOINT else rig.controls[indices[0]].name
+    count_text = format_count(len(infinite_tests), "test")
     return influences, (
-        f"Some positions of '{rig.meshes[0].name}' are not finite in {len(infinite_tests)} tests of its "
-        f"influences, as when '{name or STATIC_JOINT_LABEL}' moves from {base_text}; "
-        "that counts as an influence. Look for a constraint, driver or modifier that fails in extreme poses."
+        f"Some positions of the rig are not finite in {count_text} of its influences, as when "
+        f"'{name or STATIC_JOINT_LABEL}' moves from {base_text}; that counts as an influence. Look for a constraint, "
+        "driver or modifier that fails in extreme poses."
     )
 
 
