@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.features import MIN_FEATURE_SPREAD, float32_rounding
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.settings import MAX_DETAIL_MM
 
-from .blocks import block_slices
 from .config import TrainingConfig
 from .data.split import Split
 from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis

@@ -45,7 +45,7 @@ TRAINER_LAYERS: tuple[tuple[str, ...], ...] = (
     ("fits",),
     ("data",),
     ("config", "device", "goal", "graph_builder", "outputs", "process"),
-    ("blocks", "progress"),
+    ("progress",),
 )
 """The folders and root files of trainer/ from the top down. Each imports from its own folder and lower layers."""
 

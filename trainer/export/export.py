@@ -28,6 +28,7 @@ from fdda_addon.core.formats.model_info import (
     ModelInfo,
     ModelPartition,
 )
+from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT, FLOAT32_ROUNDING_RATIO
 from fdda_addon.core.mathematics.metrics import distances, error_statistics
 from fdda_addon.core.mathematics.skin_fit import skin_to_text
@@ -35,7 +36,6 @@ from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.mathematics.surface import Surface, SurfaceComparison, surface_errors, surface_json
 from fdda_addon.core.recording.skinned import SkinnedRecording
 
-from ..blocks import block_slices
 from ..fits.half_rotations import regression_matrices
 from ..model import TrainedModel
 from .graph import build_graph

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..blocks import block_slices
+from fdda_addon.core.mathematics.blocks import block_slices
 
 MAX_POSES = 1000
 """Maximum number of poses from which components are computed. Coefficients are then computed for all poses."""

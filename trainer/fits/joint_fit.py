@@ -14,10 +14,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
-from ..blocks import block_slices
 from .least_squares import add_ridge, solve_ridge
 
 RIDGE = 1e-4

@@ -16,11 +16,11 @@ from typing import Self
 import numpy as np
 
 from fdda_addon.core.formats.model import POSE_INPUT
+from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
-from ..blocks import block_slices
 from ..config import TrainingConfig
 from ..data.split import Split
 from ..graph_builder import GraphBuilder

@@ -14,10 +14,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.skin_fit import INFLUENCES
 from fdda_addon.core.mathematics.skinning import skin_matrices
 
-from ..blocks import block_slices
 from .fit_poses import FitPoses
 
 RIG_CANDIDATES = 4

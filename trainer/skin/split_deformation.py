@@ -9,6 +9,7 @@ from fdda_addon.core.checks.warning import format_with_noun
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.messages import MessageType
 from fdda_addon.core.joint_option import ALL, KEY_JOINTS_STAGE
+from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.key_joints import find_unread_bones, joints_with_indices, select_joints
 from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.partition import Partition
@@ -19,7 +20,6 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from fdda_addon.core.rig import Rig
 
-from ..blocks import block_slices
 from ..config import TrainingConfig
 from ..progress import MessageSink
 from .choice import choose_key_joints

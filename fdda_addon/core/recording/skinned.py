@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..mathematics.blocks import block_slices
 from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import (
     INFLUENCE_TOLERANCE,
@@ -22,9 +23,6 @@ from ..settings import MIN_VERTICES_PER_PART
 from .index import ALONE, RecordingInfo
 from .influences import add_influences, detect_influences
 from .reader import Recording
-
-BLOCK_ELEMENTS = 1 << 22
-"""Maximum number of array elements of a block of poses."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +78,8 @@ class SkinnedRecording:
 
     def iterate_residuals(self, poses: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the (V, 3) float32 local residuals of each pose; a block of poses is in memory."""
-        size = max(1, BLOCK_ELEMENTS // (8 * self.rig.vertex_count))
-        for start in range(0, len(poses), size):
-            yield from self.compute_residuals(poses[start : start + size])
+        for block in block_slices(len(poses), 8 * self.rig.vertex_count):
+            yield from self.compute_residuals(poses[block])
 
     def compute_partition_residuals(
         self, partition: Partition, poses: np.ndarray | None = None, vertices: np.ndarray | None = None
@@ -101,9 +98,7 @@ class SkinnedRecording:
         vertices = partition.vertices if vertices is None else vertices
         block = SkinBlock(self.rig, partition.joint, vertices)
         residuals = np.empty((len(poses), len(vertices), 3), np.float32)
-        size = max(1, BLOCK_ELEMENTS // max(3 * len(vertices), 16 * len(self.rig.joints)))
-        for start in range(0, len(poses), size):
-            rows = slice(start, start + size)
+        for rows in block_slices(len(poses), max(3 * len(vertices), 16 * len(self.rig.joints))):
             residuals[rows] = self.recorded_positions[np.ix_(self.rows[poses[rows]], vertices)]
             skin = skin_matrices(self.pose_matrices[poses[rows]], self.rig.rest_matrices)[:, :, :3]
             block.subtract_from(residuals[rows], skin)
