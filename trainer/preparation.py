@@ -101,12 +101,10 @@ def choose_detail(recording: SkinnedRecording, split: Split) -> float:
 
     A face moves by millimeters where a body moves by centimeters, so its details are smaller.
     """
-    squares = [
-        np.square(recording.compute_residuals(np.array([pose])), dtype=np.float64).sum(axis=2).mean()
-        for pose in split.training[:: -(-len(split.training) // MAX_DETAIL_POSES)]
-    ]
-    smallest, ratio = float32_rounding(recording.pose_matrices), DETAIL_RATIO * float(np.sqrt(np.mean(squares)))
-    detail_mm = 1000 * recording.rig.metres_per_unit * max(smallest, ratio)
+    poses = split.training[:: -(-len(split.training) // MAX_DETAIL_POSES)]
+    squares = [np.einsum("vc,vc->v", r, r, dtype=np.float64).mean() for r in recording.iterate_residuals(poses)]
+    detail = max(float32_rounding(recording.pose_matrices), DETAIL_RATIO * float(np.sqrt(np.mean(squares))))
+    detail_mm = 1000 * recording.rig.metres_per_unit * detail
     return min(max(MIN_DETAIL_MM, detail_mm), MAX_DETAIL_MM)
 
 

@@ -2,11 +2,17 @@
 """Impossible values of training settings are refused, and every setting has an option."""
 
 import argparse
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from fdda_addon.core.errors import TrainingError
 from trainer.config import TrainingConfig, add_options, config_from_arguments
+from trainer.data.split import split_recording
+from trainer.preparation import choose_detail
+
+from ..recordings import read_skinned
 
 
 @pytest.mark.parametrize(
@@ -31,6 +37,19 @@ from trainer.config import TrainingConfig, add_options, config_from_arguments
 def test_an_impossible_value_is_refused(name, value):
     with pytest.raises(TrainingError, match=f"setting {name} cannot be"):
         TrainingConfig(**{name: value})
+
+
+@pytest.mark.parametrize("scale, detail_mm", [(0, 0.005), (0.5, None), (100, 0.04)])
+@pytest.mark.parametrize("metres_per_unit", [1, 0.01])
+def test_the_detail_is_a_part_of_the_error_of_skinning(recording, scale, detail_mm, metres_per_unit):
+    source = read_skinned(recording)
+    residuals = source.residuals * np.float32(scale / metres_per_unit)
+    source = replace(source, rig=replace(source.rig, metres_per_unit=metres_per_unit), residuals=residuals)
+    split = split_recording(source, TrainingConfig())
+    poses = split.training[:: -(-len(split.training) // 100)]
+    rms_mm = 1000 * metres_per_unit * np.sqrt((residuals[poses].astype(np.float64) ** 2).sum(axis=2).mean())
+    assert detail_mm or 0.005 < 0.01 * rms_mm < 0.04
+    assert choose_detail(source, split) == pytest.approx(detail_mm or 0.01 * rms_mm, rel=1e-5)
 
 
 def test_every_setting_is_an_option():
