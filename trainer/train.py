@@ -253,11 +253,12 @@ class _Job:
 def _training_size_sentence(recording: SkinnedRecording) -> str:
     """Describe the disk space of a recording and the memory that its training needs."""
     poses, rig = len(recording.rows), recording.rig
+    disk_space = format_size(recording_bytes(rig, len(recording.recorded_positions)))
     largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
     vertices = len(largest.vertices)
     return (
-        f"{poses:,} poses of {rig.vertex_count:,} vertices: {format_size(recording_bytes(rig, poses))} on the disk; "
-        f"residuals of the largest partition, '{rig.joints[largest.joint].name or STATIC_JOINT_LABEL}', of "
+        f"{poses:,} poses of {rig.vertex_count:,} vertices: {disk_space} on the disk; residuals "
+        f"of the largest partition, '{rig.joints[largest.joint].name or STATIC_JOINT_LABEL}', of "
         f"{vertices:,} vertices: {format_size(12 * poses * vertices)}, in memory two or three times."
     )
 
