@@ -102,10 +102,11 @@ def _check_large_residuals(recording: SkinnedRecording, scan: ResidualScan) -> l
     rig, bone_lengths = recording.rig, compute_bone_lengths(recording.rig)
     large_residuals = []
     # The skin weights of some meshes are fitted later.
-    largest = scan.largest.copy()
-    largest[rig.unweighted_vertices] = 0
+    largest, is_weighted = scan.largest.copy(), np.ones(rig.vertex_count, bool)
+    is_weighted[rig.unweighted_vertices] = False
+    largest[~is_weighted] = 0
     for partition in recording.partitions:
-        vertices = np.setdiff1d(partition.vertices, rig.unweighted_vertices)
+        vertices = partition.vertices[is_weighted[partition.vertices]]
         if not len(vertices):
             continue
         extent = float(np.linalg.norm(np.ptp(rig.rest_positions[vertices], axis=0)))
