@@ -18,8 +18,6 @@ from .solver import fit_skin
 
 MAX_PATCH_VERTICES = 16
 """Largest number of vertices that one fitted vertex represents."""
-MAX_REFERENCE_POSES = 48
-"""Number of poses by which reference joints are chosen."""
 
 
 def choose_key_joints(

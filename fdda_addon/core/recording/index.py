@@ -3,7 +3,7 @@
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -164,17 +164,12 @@ class RecordingInfo:
     @property
     def alone_poses(self) -> range:
         """Return the indices of the poses in which one input moves alone."""
-        return alone_poses(self.sampling.sources)
-
-
-def alone_poses(sources: Sequence[Source]) -> range:
-    """Return the indices of the poses in which one input moves alone."""
-    start = 0
-    for source in sources:
-        if source.kind == ALONE:
-            return range(start, start + source.poses)
-        start += source.poses
-    return range(0)
+        start = 0
+        for source in self.sampling.sources:
+            if source.kind == ALONE:
+                return range(start, start + source.poses)
+            start += source.poses
+        return range(0)
 
 
 def read_index(path: Path) -> dict:
