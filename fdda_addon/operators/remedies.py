@@ -4,7 +4,7 @@
 import bpy
 import numpy as np
 
-from ..core.checks.seams import POSITION_DIGITS
+from ..core.checks.seams import POSITION_DIGITS, split_vertex_groups
 from ..core.errors import RigError
 from ..core.sentences.counts import format_count
 from ..poses.motion_range import unlimited_bones
@@ -17,7 +17,8 @@ class FDDA_OT_merge_vertices(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.merge_vertices"
     bl_label = "Merge by Distance"
     bl_description = (
-        "Merge the vertices that lie on each other, as importers of game formats leave them. Normals and UV maps stay"
+        "Merge the vertices along cuts that lie on each other, as importers of game formats leave them. Normals and UV "
+        "maps stay, and cuts that skin weights or shape keys open"
     )
     bl_options = {"REGISTER", "UNDO"}
     waits_for_all_jobs = True
@@ -30,19 +31,39 @@ class FDDA_OT_merge_vertices(RigOperator, bpy.types.Operator):
         mesh = mesh_object.data
         if mesh_object.fdda.is_bound or mesh.library or mesh_object.library:
             raise RigError(f"'{mesh_object.name}' has a model or is linked; unbind it, or merge in its own file.")
-        count, normals = len(mesh.vertices), [tuple(corner.vector) for corner in mesh.corner_normals]
-        size = np.linalg.norm(np.ptp([vertex.co for vertex in mesh.vertices], axis=0))
+        rig = read_rig(self.rig(context))
+        normals = np.array([corner.vector for corner in mesh.corner_normals], np.float32)
+        # A layer keeps the normal of each corner, also where faces collapse.
+        layer = mesh.attributes.new("fdda_normals", "FLOAT_VECTOR", "CORNER")
+        layer.data.foreach_set("vector", normals.ravel())
+        layer_name, distance = layer.name, rig.size * 10.0**-POSITION_DIGITS
+        targets, apart_count = {}, 0
         edited = bmesh.new()
         try:
             edited.from_mesh(mesh)
-            bmesh.ops.remove_doubles(edited, verts=edited.verts, dist=size * 10.0**-POSITION_DIGITS)
+            edited.verts.ensure_lookup_table()
+            keys = edited.verts.layers.shape.values()
+            for group in split_vertex_groups(rig):
+                kept = []
+                for vertex in (edited.verts[i] for i in group):
+                    same = (v for v in kept if all((v[key] - vertex[key]).length <= distance for key in keys))
+                    if (target := next(same, None)) is not None:
+                        targets[vertex] = target
+                    else:
+                        kept.append(vertex)
+                apart_count += len(kept) - 1
+            bmesh.ops.weld_verts(edited, targetmap=targets)
             edited.to_mesh(mesh)
         finally:
             edited.free()
-        if len(mesh.loops) == len(normals):
-            mesh.normals_split_custom_set(normals)
+            layer = mesh.attributes[layer_name]
+            normals = np.zeros((len(mesh.loops), 3), np.float32)
+            layer.data.foreach_get("vector", normals.ravel())
+            mesh.attributes.remove(layer)
+        mesh.normals_split_custom_set(normals)
         mesh.update()
-        return f"Merged {format_count(count - len(mesh.vertices), 'vertex', 'vertices')} of '{mesh_object.name}'."
+        message = f"Merged {format_count(len(targets), 'vertex', 'vertices')} of '{mesh_object.name}'."
+        return f"{message} Shape keys move {apart_count:,} apart, which stay." if apart_count else message
 
 
 class FDDA_OT_fit_base_skinning(RigOperator, bpy.types.Operator):

@@ -40,6 +40,14 @@ def count_split_vertices(rig: Rig) -> int:
     return count if count > MAX_TORN_RATIO * rig.vertex_count else 0
 
 
+def split_vertex_groups(rig: Rig) -> list[np.ndarray]:
+    """Return the vertices along cuts of the mesh, those that lie on each other in one array."""
+    vertices = np.unique(_seam_pairs(rig))
+    groups = _coincident_groups(rig)[vertices]
+    order = np.argsort(groups, kind="stable")
+    return np.split(vertices[order], np.flatnonzero(np.diff(groups[order])) + 1)
+
+
 def find_open_seams(rig: Rig, residuals: Iterable[np.ndarray]) -> list[RecordingWarning]:
     """Return the warning "open-seams" if cuts open in the poses; none if the faces of the rig are unknown.
 

@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 import bpy
+import numpy as np
 import pytest
 
 from fdda_addon.evaluation import last_evaluation
@@ -270,3 +271,34 @@ def test_what_makes_a_good_model_unlikely_has_a_remedy(saved: SceneRig, change, 
         checks.unregister()
         checks.check_now(saved)
         assert not findings.find(saved) and len(saved.mesh_object.data.vertices) == vertex_count
+
+
+def test_merging_keeps_normals_and_the_cuts_that_weights_or_shape_keys_open(saved: SceneRig):
+    mesh_object, mesh = saved.mesh_object, saved.mesh_object.data
+    vertex_count = len(mesh.vertices)
+    split_vertices(mesh_object)
+    normals = np.random.default_rng(0).normal(size=(len(mesh.loops), 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    mesh.normals_split_custom_set(normals)
+
+    def corner_normals() -> dict[tuple, np.ndarray]:
+        return {
+            (tuple(face.center), tuple(mesh.vertices[mesh.loops[i].vertex_index].co)): mesh.corner_normals[i].vector[:]
+            for face in mesh.polygons
+            for i in face.loop_indices
+        }
+
+    before = corner_normals()
+    mesh_object.vertex_groups["lower"].add([0], 0.3, "REPLACE")
+    mesh_object.vertex_groups["upper"].add([0], 0.7, "REPLACE")
+    mesh_object.shape_key_add(name="Basis")
+    mesh_object.shape_key_add(name="open").data[len(mesh.vertices) - 1].co.z += 0.1
+    bpy.context.view_layer.objects.active = mesh_object
+    assert bpy.ops.fdda.merge_vertices() == {"FINISHED"}
+    assert len(mesh.vertices) == vertex_count + 2
+    after = corner_normals()
+    assert after.keys() == before.keys() and "fdda_normals" not in mesh.attributes
+    np.testing.assert_allclose([after[key] for key in before], list(before.values()), atol=1e-3)
+    basis, opened = mesh.shape_keys.key_blocks
+    heights = [opened.data[i].co.z - basis.data[i].co.z for i in range(len(mesh.vertices))]
+    assert sorted(heights)[-2:] == pytest.approx([0.0, 0.1])
