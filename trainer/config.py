@@ -98,11 +98,18 @@ def _is_joints_option(text: str) -> bool:
         return False
 
 
+def _parse_joints_option(text: str) -> str:
+    try:
+        return parse_joints(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add an option for each setting to a parser, for example `--batch-size` for `batch_size`."""
     group = parser.add_argument_group("training settings")
     for setting in settings_of(TrainingConfig):
-        setting.add_option(group, **({"type": parse_joints} if setting is BONES_TO_READ else {}))
+        setting.add_option(group, **({"type": _parse_joints_option} if setting is BONES_TO_READ else {}))
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainingConfig:

@@ -52,6 +52,14 @@ def test_the_detail_is_a_part_of_the_error_of_skinning(recording, scale, detail_
     assert choose_detail(source, split) == pytest.approx(detail_mm or 0.01 * rms_mm, rel=1e-5)
 
 
+def test_the_joints_of_a_wrong_option_are_explained(capsys):
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--bones-to-read", "0"])
+    assert "--bones-to-read: joints are auto, all, or a number from 1, and not '0'" in capsys.readouterr().err
+
+
 def test_every_setting_is_an_option():
     parser = argparse.ArgumentParser()
     add_options(parser)
