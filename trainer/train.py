@@ -13,7 +13,7 @@ import torch
 from fdda_addon.core.checks.recording import check_recording, merges_sentence
 from fdda_addon.core.checks.warning import RecordingWarning, raise_first_warning
 from fdda_addon.core.files.output import atomic_write_all
-from fdda_addon.core.formats.messages import MessageType
+from fdda_addon.core.formats.messages import PARTITIONS_STAGE, MessageType
 from fdda_addon.core.formats.report import report_text
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.recording.estimate import format_size, recording_bytes
@@ -42,9 +42,6 @@ from .report.contents import make_report
 from .report.error_analysis import analyze_errors
 from .report.page import render_html
 from .skin.split_deformation import split_deformation
-
-PARTITIONS_STAGE = "partitions"
-"""Stage of the message `PREPARING` in which principal components are computed."""
 
 
 def train_model(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RecordingError, TrainingError
-from fdda_addon.core.joint_option import KEY_JOINTS_STAGE
+from fdda_addon.core.formats.messages import KEY_JOINTS_STAGE
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.mathematics.skinning import LinearSkinning

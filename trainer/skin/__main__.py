@@ -17,7 +17,7 @@ if __name__ == "__main__":
 import numpy as np
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.formats.messages import MessageType
+from fdda_addon.core.formats.messages import FIT_STAGE, MessageType
 from fdda_addon.core.recording.index import ALONE, REFINED
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import STATIC_JOINT
@@ -25,8 +25,6 @@ from fdda_addon.core.rig import STATIC_JOINT
 from ..process import StopRequest, missing_package_error, run_with_messages
 from ..progress import JsonMessageSink
 from .fit_poses import choose_fit_poses, select_poses
-
-FIT_STAGE = "fit"
 
 
 def main() -> int:

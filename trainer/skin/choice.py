@@ -35,8 +35,7 @@ def choose_key_joints(
     Raises:
         RecordingError: a joint has a scale of zero in some random pose.
     """
-    random_count = all_poses.random_count
-    poses = all_poses.subset(slice(0, random_count))
+    poses = all_poses.subset(slice(0, all_poses.random_count))
     if not are_invertible(poses.pose_matrices).all():
         raise RecordingError(
             "A bone has a scale of zero in some pose, so key joints cannot be chosen; look for the key, constraint or "
@@ -44,7 +43,7 @@ def choose_key_joints(
         )
     moments, acts = _measure_vertices(poses)
     blocks = InputBlocks(poses)
-    unseen_motions = _measure_unseen_motions(all_poses, random_count, moments)
+    unseen_motions = _measure_unseen_motions(all_poses, moments)
     is_unseen = (blocks.widths[: len(moments)] == 0) & (unseen_motions > TOLERANCE_RATIO * poses.rig.size)
     is_static = np.array([name == STATIC_JOINT for name in poses.rig.joint_names])
     search = KeyJointSearch(poses, moments, blocks, is_static, is_unseen)
@@ -93,7 +92,7 @@ def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np
     return fit_skin(poses.of_vertices(vertices), "smooth")
 
 
-def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndarray) -> np.ndarray:
+def _measure_unseen_motions(poses: FitPoses, moments: np.ndarray) -> np.ndarray:
     """Measure how far frames of actions move joints from where random poses have them, relative to reference joints.
 
     Args:
@@ -104,7 +103,7 @@ def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndar
         (J,) largest distance of any pose from the mean of the random poses, rms over the vertices, mesh units.
     """
     is_usable = are_invertible(poses.pose_matrices).all(axis=1)
-    is_usable[:random_count] = True
+    is_usable[: poses.random_count] = True
     skin = skin_matrices(poses.pose_matrices[is_usable], poses.rig.rest_matrices).astype(np.float64)
     variances, axes = np.linalg.eigh(moments)
     moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
@@ -112,7 +111,7 @@ def _measure_unseen_motions(poses: FitPoses, random_count: int, moments: np.ndar
     for joint, reference in enumerate(poses.rig.references.tolist()):
         relative = np.linalg.solve(skin[:, reference], skin[:, joint]) if reference >= 0 else skin[:, joint]
         motion = (relative @ moment_roots[joint])[:, :3]
-        motion -= motion[:random_count].mean(axis=0)
+        motion -= motion[: poses.random_count].mean(axis=0)
         distances[joint] = np.sqrt((motion**2).sum(axis=(1, 2))).max()
     return distances
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from fdda_addon.core.checks.warning import format_with_noun
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.formats.messages import MessageType
-from fdda_addon.core.joint_option import ALL, KEY_JOINTS_STAGE
+from fdda_addon.core.formats.messages import FIT_STAGE, KEY_JOINTS_STAGE, MessageType
+from fdda_addon.core.joint_option import ALL
 from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.key_joints import find_unread_bones, joints_with_indices, select_joints
 from fdda_addon.core.mathematics.metrics import distances
@@ -27,8 +27,6 @@ from .fit_poses import FitPoses, read_fit_poses
 from .key_joints import KeyJoints
 from .solver import fit_skin
 
-FIT_STAGE = "fit"
-"""Stage of the message `PREPARING` in which skin weights are fitted to vertices."""
 REFERENCE_POSES = 48
 """Number of poses by which the reference joints of a rig with fitted weights are chosen."""
 

@@ -13,6 +13,8 @@ STOP_FILE_VARIABLE = "FDDA_STOP_FILE"
 """Environment variable of the trainer: path of a file that is created to stop the trainer."""
 WARNING_LINE = "Warning ({name}): {text}"
 """Text of a warning on the command line."""
+KEY_JOINTS_STAGE, FIT_STAGE, PARTITIONS_STAGE = "key joints", "fit", "partitions"
+"""Stages of the message `PREPARING`."""
 
 
 class MessageType(enum.Enum):
