@@ -16,6 +16,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from .programs import PYTHON
+
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = [sys.executable, str(Path(__file__).with_name("programs.py"))]
 DEFAULTS = {"record": {"poses": 20}, "train": {"passes": 2, "hidden": [8]}, "evaluate": {"poses": 4}}
@@ -82,6 +84,29 @@ def test_a_training_with_a_goal_adds_poses(tmp_path):
     index = json.loads((tmp_path / "farm/one/recording/recording.json").read_text())
     assert report["goal"]["verdict"] == "exhausted" and index["poses"] > 40
     assert farm.new_calls() == ["record", "train"]
+
+
+SAVE_TWO_MESHES = """
+import bpy, sys
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+copy = bpy.data.objects["elbow"].copy()
+copy.data, copy.name = copy.data.copy(), "second"
+bpy.context.scene.collection.objects.link(copy)
+bpy.ops.wm.save_mainfile()
+"""
+
+
+@pytest.mark.parametrize("objects", [["second"], ["elbow", "second"]])
+def test_the_objects_of_a_character_have_one_model(tmp_path, objects):
+    farm = Farm(tmp_path, one=character("one", objects=objects, train={"goal-mm": 100}))
+    subprocess.run([PYTHON, "-c", SAVE_TWO_MESHES, tmp_path / "elbow.blend"], check=True, **STREAMS)
+    run = farm.run()
+    assert run.returncode == 0, run.stdout
+    assert farm.new_calls() == ["bind", "evaluate", "record", "train"]
+    report = json.loads((tmp_path / "out/one/models/report.json").read_text())
+    errors = json.loads((tmp_path / "farm/one/evaluate/errors.json").read_text())
+    assert [mesh["name"] for mesh in report["meshes"]] == objects
+    assert list(errors.get("objects", [])) == (objects if len(objects) > 1 else [])
 
 
 @pytest.mark.parametrize(("status", "records"), [(75, 2), (2, 1)])
