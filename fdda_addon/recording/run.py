@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Records the meshes of a rig in the same poses."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -82,7 +82,6 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     target = pose_setter.target
     recorded = RecordedRig(scene_rig, rig, PoseEvaluator(scene_rig, rig, target))
-    check_disk_space(path, recording_bytes(rig, plan.total))
     with ExitStack() as exit_stack:
         if target:
             exit_stack.enter_context(target.prepared())
@@ -97,10 +96,12 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             notes += [check_seams(recorded, plan, player), check_saturation(recorded)]
         for note in filter(None, notes):
             yield Progress("poses", 0, plan.total, note)
-        rig = find_references(scene_rig, rig, find_fixed_joints(scene_rig), plan, player)
+        fixed_joints = find_fixed_joints(scene_rig)
+        rig = find_references(scene_rig, rig, fixed_joints, plan, player)
         if follows_pose:
             alone = plan_alone_poses(scene_rig, rig, channels, settings, clips, player, target is not None)
-        info = _make_info(scene_rig, rig, settings, plan, channels, alone)
+        info = _make_info(scene_rig, rig, fixed_joints, settings, plan, channels, alone)
+        check_disk_space(path, recording_bytes(rig, info.poses))
         writer = exit_stack.enter_context(RecordingWriter(path, rig, info, settings.resume, settings.overwrite))
         # The appender ends before the writer, so that an interrupted recording keeps the evaluated poses.
         appender = exit_stack.enter_context(PoseAppender(recorded.evaluator, writer, rig.vertex_count, pose_setter))
@@ -109,7 +110,11 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             yield Progress("poses", done, total, writer.note)
         seconds = pose_setter.seconds_per_pose or seconds_per_pose
         remaining = Estimate(
-            total - done, rig.vertex_count, recording_bytes(rig, total), seconds and seconds * (total - done)
+            total - done,
+            min(total - done, len(info.alone_poses)),
+            rig.vertex_count,
+            recording_bytes(rig, total),
+            seconds and seconds * (total - done),
         )
         yield Progress("poses", done, total, remaining.sentence() if done < total else "")
         with closing(plan.show_poses(player, range(done, plan.total))) as poses:
@@ -148,6 +153,7 @@ def _check_readers(scene_rig: SceneRig) -> None:
 def _make_info(
     scene_rig: SceneRig,
     rig: Rig,
+    fixed_joints: Collection[str],
     settings: RecordingSettings,
     plan: PosePlan,
     channels: tuple[Channel, ...],
@@ -167,7 +173,7 @@ def _make_info(
         Path(bpy.data.filepath).name,
         bpy.app.version_string,
         sampling,
-        describe_bones(scene_rig, rig, dependencies, find_fixed_joints(scene_rig)),
+        describe_bones(scene_rig, rig, dependencies, fixed_joints),
         plan.pose_setter.recorded_target,
         alone=alone_poses,
     )

@@ -13,6 +13,7 @@ from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.mathematics.poses import ROTATION, Channel, sample_pose
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.progress import Progress
+from fdda_addon.core.recording.estimate import recording_bytes
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.skinned import skin_recording
@@ -208,15 +209,21 @@ def test_the_index_describes_the_rig_and_its_sampling(fresh, elbow_files):
     assert index["joints"] == [{"name": "upper", "parent": -1}, {"name": "lower", "parent": 0}]
 
 
-def test_progress(fresh, tmp_path):
-    poses = BATCH_POSES + 5
+def test_progress(fresh, tmp_path, monkeypatch):
+    poses, checked_sizes = BATCH_POSES + 5, []
+    monkeypatch.setattr("fdda_addon.recording.run.check_disk_space", lambda _, size: checked_sizes.append(size))
     steps = list(record(fresh, tmp_path / "r", RecordingSettings(poses=poses, influence_poses=4)))
     # There are 4 base poses, and from each, one pose for each of the 2 joints.
     poses += 12
     first, *others = steps
     assert (first.stage, first.done, first.total) == ("poses", 0, poses)
-    assert re.fullmatch(r"267 poses of 300 vertices: about 1 MB on the disk, about (a|\d+) seconds?", first.note)
+    assert re.fullmatch(
+        r"267 poses \(12 to find what each joint and control moves\) of 300 vertices: about 1 MB on the disk, about "
+        r"(a|\d+) seconds?",
+        first.note,
+    )
     assert others == [Progress("poses", done, poses) for done in range(1, poses + 1)]
+    assert checked_sizes == [recording_bytes(read_recording(tmp_path / "r").rig, poses)]
 
 
 @pytest.mark.parametrize(("source", "actions"), [("channels", ()), ("overrides", ("elbow_wave",))])

@@ -25,12 +25,14 @@ class Estimate:
 
     Attributes:
         poses: number of remaining poses.
+        alone_poses: number of those in which one input moves alone.
         vertices: number of vertices of all meshes together.
         size_bytes: size of the complete recording.
         seconds: time for the remaining poses; None where unknown.
     """
 
     poses: int
+    alone_poses: int
     vertices: int
     size_bytes: int
     seconds: float | None
@@ -39,7 +41,9 @@ class Estimate:
         """Format the estimate: "2,000 poses of 200,612 vertices: about 4.8 GB on the disk, about 12 minutes"."""
         time_text = "" if self.seconds is None else f", {format_duration(self.seconds)}"
         size_text = f"{'about ' if self.size_bytes >= MIN_SHOWN_BYTES else ''}{format_size(self.size_bytes)}"
-        return f"{format_count(self.poses, 'pose')} of {self.vertices:,} vertices: {size_text} on the disk{time_text}"
+        alone_text = f" ({self.alone_poses:,} to find what each joint and control moves)" if self.alone_poses else ""
+        poses_text = f"{format_count(self.poses, 'pose')}{alone_text}"
+        return f"{poses_text} of {self.vertices:,} vertices: {size_text} on the disk{time_text}"
 
 
 def recording_bytes(rig: Rig, poses: int) -> int:
