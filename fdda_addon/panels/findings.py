@@ -26,6 +26,7 @@ def find(rig: SceneRig) -> tuple[Finding, ...]:
     settings = mesh_object.fdda.settings
     inputs = (
         check,
+        *((m.show_viewport, getattr(m, "use_deform_preserve_volume", False)) for m in mesh_object.modifiers),
         settings.base_skinning,
         settings.bones_to_read,
         settings.bones_to_pose,
@@ -47,7 +48,6 @@ def _find(rig: SceneRig, check: RigCheck) -> list[Finding]:
         [(m.type, getattr(m, "use_deform_preserve_volume", False)) for m in modifiers] == [("ARMATURE", False)]
         and not has_keys
         and not settings.learn_from
-        and not mesh_object.fdda.is_playing
         and all(bones[name].bone.bbone_segments == 1 for name in joint_names if name in bones)
     )
     if is_linear:

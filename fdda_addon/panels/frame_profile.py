@@ -40,8 +40,8 @@ def draw_times(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
         for mesh in times.meshes if len(times.meshes) > 1 else ():
             if mesh.reason:
                 draw_wrapped(layout, context, f"{mesh.name} has no model: {mesh.reason}", "ERROR")
-            elif mesh.name in times.times:
-                _draw_time(grid, f"   Only {mesh.name}", f"{times.median(mesh.name):.2f} ms")
+            elif mesh.variant in times.times:
+                _draw_time(grid, f"   Only {mesh.name}", f"{times.median(mesh.variant):.2f} ms")
         draw_wrapped(layout, context, times.sentence, "CHECKMARK" if times.is_worthwhile else "INFO")
     if state is None or not state.is_running:
         layout.operator("fdda.measure", text="Measure Speed", icon="TIME")

@@ -60,7 +60,7 @@ class MeshTimes:
     Attributes:
         name: name of the mesh object.
         vertices: its number of vertices.
-        has_model: whether a model of it was measured; its name is then the variant with this model alone.
+        has_model: whether a model of it was measured.
         reason: why no model can replace its rig; else empty.
     """
 
@@ -68,6 +68,11 @@ class MeshTimes:
     vertices: int
     has_model: bool = False
     reason: str = ""
+
+    @property
+    def variant(self) -> str:
+        """Return the variant with the model of this mesh alone; a mesh may have the name of another variant."""
+        return _only(self.name)
 
 
 @dataclass(frozen=True)
@@ -198,7 +203,7 @@ class Benchmark:
                 for variant, times in self.times.items()
                 if variant in LABELS
             },
-            "model_alone": {m.name: _round(self.median(m.name)) for m in self.meshes if m.name in self.times},
+            "model_alone": {m.name: _round(self.median(m.variant)) for m in self.meshes if m.variant in self.times},
             "ratio": _round(self.ratio),
             "ratio_quartiles": [_round(ratio) for ratio in self.quartiles],
             "is_faster": self.ratio > 1,
@@ -227,11 +232,15 @@ class Benchmark:
         lines = []
         for mesh in self.meshes if len(self.meshes) > 1 else ():
             text = mesh.reason or ("" if mesh.has_model else "no model")
-            if mesh.name in self.times:
-                ms = self.median(mesh.name)
+            if mesh.variant in self.times:
+                ms = self.median(mesh.variant)
                 text = f"its model alone {ms:.2f} ms, {self.median(RIG) / ms:.1f}x as fast"
             lines.append(f"{mesh.name} ({mesh.vertices:,} vertices): {text or 'the only model'}")
         return lines
+
+
+def _only(mesh_name: str) -> str:
+    return f"only {mesh_name}"
 
 
 def _round(value: float) -> float:
@@ -304,7 +313,7 @@ def benchmark(
         if all(armature_modifier(mesh_object) is None for mesh_object in meshes):
             del show[LINEAR]
         if len(rigs) > 1 and len(meshes) > 1:
-            show |= {mesh_object.name: partial(_models_shown, [mesh_object]) for mesh_object in meshes}
+            show |= {_only(mesh_object.name): partial(_models_shown, [mesh_object]) for mesh_object in meshes}
         times: dict[str, list[float]] = {variant: [] for variant in show}
         rounds: dict[str, list[float]] = {variant: [] for variant in show}
         frames_per_round = max(1, -(-frames // ROUNDS))
@@ -324,15 +333,7 @@ def benchmark(
         start, processor_start = time.perf_counter(), time.process_time()
         times[INFERENCE] = list(np.sum([_inference_times(network, frames) for network in networks], axis=0))
         processor_share = (time.process_time() - processor_start) / (time.perf_counter() - start)
-    described = [
-        MeshTimes(
-            o.name,
-            len(o.data.vertices),
-            o in meshes,
-            reasons.get(o, ""),
-        )
-        for o in mesh_objects
-    ]
+    described = [MeshTimes(o.name, len(o.data.vertices), o in meshes, reasons.get(o, "")) for o in mesh_objects]
     return Benchmark(
         armature_object.name,
         tuple(sorted(described, key=lambda mesh: -mesh.vertices)),

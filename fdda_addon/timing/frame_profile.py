@@ -131,8 +131,8 @@ class FrameProfile:
             for mesh in times.meshes if len(times.meshes) > 1 else ():
                 if mesh.reason:
                     sentences.append(f"{mesh.name} has no model: {mesh.reason}")
-                elif mesh.name in times.times:
-                    ms = frame_ms * times.median(mesh.name) / rig_ms
+                elif mesh.variant in times.times:
+                    ms = frame_ms * times.median(mesh.variant) / rig_ms
                     sentences.append(f"Only {mesh.name} with a model: {ms:.2f} ms.")
         if self.fast_rig is not None:
             sentences.append(self.fast_rig.describe(frame_ms))
