@@ -44,8 +44,8 @@ REFUSED_FIELD_LABELS = {
 }
 ITEM_BYTES = {1: 4, 5: 2, 6: 4, 7: 8}
 """Bytes per element, by the number of the ONNX data type: float, int16, int32, int64."""
-INT64 = 7
-"""Number of the ONNX data type int64."""
+FLOAT, INT64 = 1, 7
+"""Numbers of ONNX data types."""
 MAX_CONSTANT_INTEGERS = 1 << 16
 """Largest number of elements of a constant whose integers are read; the longest one has the sizes of all partitions."""
 SUPPORTED_OPSETS = range(13, 22)
@@ -279,7 +279,10 @@ def _output_shapes(node: OnnxNode, shapes: list[Shape], constants: list[OnnxCons
 
     attributes, shape = node.attributes, shapes[0]
     match node.operator:
-        case "Cast" | "Relu" | "Sigmoid" | "Tanh" | "Erf" | "Sqrt":
+        # Texts, for example, would take many times the memory of floats.
+        case "Cast" if attributes.get("to") == FLOAT:
+            return [shape]
+        case "Relu" | "Sigmoid" | "Tanh" | "Erf" | "Sqrt":
             return [shape]
         case "Add" | "Sub" | "Mul" | "Div" | "Max" | "Min":
             return [np.broadcast_shapes(*shapes)]

@@ -17,10 +17,9 @@ from ..mathematics.skinning import SkinBlock
 from ..rig import STATIC_JOINT, Rig
 from .model import CHECKSUM_KEY, CONFIDENCE_OUTPUT, CONTROLS_INPUT, METADATA_KEY, POSE_INPUT, POSITIONS_OUTPUT
 from .model_info import ModelInfo, ModelPartition
+from .onnx_file import FLOAT, INT64
 
 OPSET, IR_VERSION = 17, 8
-FLOAT, INT64 = 1, 7
-"""Numbers of ONNX data types."""
 HIDDEN_UNITS = 64
 COMPONENTS, FIT_JOINTS, INFLUENCING_JOINTS = 12, 8, 6
 """Typical numbers of a body part of a trained model: components, joints of its linear fit, joints that it reads."""

@@ -63,6 +63,11 @@ def test_a_forbidden_operator_is_refused(operator):
     assert_refused(model, f"it has the operator '{operator[:100]}", "which train does not write")
 
 
+@pytest.mark.parametrize("data_type", [TensorProto.STRING, TensorProto.DOUBLE])
+def test_a_cast_to_another_type_than_floats_is_refused(data_type):
+    assert_refused(tiny_model(nodes=[make_node("Cast", "shape", to=data_type)]), "it has the operator 'Cast'")
+
+
 def test_a_product_of_constants_is_refused():
     """Two constants of 400 kB, whose product would have 40 GB."""
     column, row = (np.zeros(shape, np.float32) for shape in ((100_000, 1), (1, 100_000)))
