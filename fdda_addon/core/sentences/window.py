@@ -10,6 +10,9 @@ PHRASES = (
     ("for --controls", "for"),
     ("give --poses or --action", "set Random Poses, or check an action"),
     ("give --action or --strip", "check an action or a strip"),
+    ("0 random poses (--action NAME --poses 0)", "Random Poses at 0"),
+    ("(--action NAME)", "in Training Poses"),
+    ("--settle-frames", "Settle"),
     ("--extra-input", "Extra Inputs"),
 )
 """Phrases with options, and the words of the window where these differ."""

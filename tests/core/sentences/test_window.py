@@ -22,7 +22,15 @@ from fdda_addon.core.sentences.window import for_window
             "continue it with --resume, or replace it with --overwrite.",
             "continue it with Resume, or replace it with Overwrite.",
         ),
-        ("more frames (--settle-frames) let them rest", "more frames (Settle Frames) let them rest"),
+        ("more frames (--settle-frames) let them rest", "more frames (Settle) let them rest"),
+        (
+            "or record actions alone, with 0 random poses (--action NAME --poses 0).",
+            "or record actions alone, with Random Poses at 0.",
+        ),
+        (
+            "Remixed poses combine actions; name some (--action NAME).",
+            "Remixed poses combine actions; name some in Training Poses.",
+        ),
         (
             "more bones (--bones-to-pose), or --min-vertices-per-part 8",
             "more bones (Bones to Pose), or Min Vertices per Part 8",
