@@ -38,7 +38,6 @@ from .index import (
     write_json,
 )
 from .lock import RecordingLock
-from .reader import check_resumable
 from .target import Repeatability
 
 MUTABLE_KEYS = ("complete", "unsettled", "repeatability")
@@ -128,7 +127,6 @@ class RecordingWriter:
                 f"Cannot resume '{self.path}': it was recorded differently ({', '.join(different_keys)}); "
                 "record with the same rig and options, or into another folder."
             )
-        check_resumable(self.path)
 
     def _open_arrays(self) -> None:
         rig = self.rig
