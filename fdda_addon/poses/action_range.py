@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, Control
+from ..core.controls import OTHER_OBJECT, Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import CONTROL, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, Channel
 from ..core.mathematics.rotations import euler_angles, rotation_vectors, total_range_width
 from ..scene.action_slots import curves_of_actions
 from ..scene.arrays import KEYFRAME_ELEMENTS, read
-from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_of
+from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_name, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_curves import CurvesByChannel, channel_values, curves_by_bone
 
@@ -200,9 +200,11 @@ def keyed_numbers(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> l
     curves_by_action = curves_of_actions(actions, *scene_rig.mesh_objects, scene_rig.armature_object)
     for action, curves in zip(actions, curves_by_action, strict=True):
         frames, numbers = action_frames(action), {}
-        for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
-            datablock = owner_of(scene_rig, owner)
-            for curve in curves.get(datablock, ()):
+        for datablock, datablock_curves in curves.items():
+            owner = owner_name(scene_rig, datablock)
+            if not owner or owner.startswith(OTHER_OBJECT):
+                continue
+            for curve in datablock_curves:
                 path = canonical_path(datablock, curve.data_path)
                 if _CONTROL_PATH.fullmatch(path):
                     numbers[owner, path] = np.array([curve.evaluate(frame) for frame in frames])

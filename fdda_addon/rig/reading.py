@@ -142,11 +142,14 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
         names = [name for name in info.joint_names if name in rig.joint_names]
         is_complete = len(names) == len(info.joints)
         selected = select_joints(rig, info.joints if is_complete else choose_joints(scene_rig, names, names))
-        unread_bones = info.meshes[0].fingerprint.deformation.get("unread_bones", {})
-        (mesh,) = selected.meshes
-        deformation = mesh.fingerprint.deformation | {"unread_bones": read_unread_bones(scene_rig, unread_bones)}
-        mesh = replace(mesh, fingerprint=replace(mesh.fingerprint, deformation=deformation))
-        rig = replace(selected, meshes=(mesh,))
+        names = info.meshes[0].fingerprint.deformation.get("unread_bones", {})
+        unread_bones = {"unread_bones": read_unread_bones(scene_rig, names)}
+        prints = [
+            replace(mesh.fingerprint, deformation=mesh.fingerprint.deformation | unread_bones)
+            for mesh in selected.meshes
+        ]
+        meshes = zip(selected.meshes, prints, strict=True)
+        rig = replace(selected, meshes=tuple(replace(mesh, fingerprint=each) for mesh, each in meshes))
     if scene_rig.mesh_object.fdda.is_fast_rig:
         (mesh,), recorded = rig.meshes, info.meshes[0].fingerprint
         fingerprint = replace(mesh.fingerprint, skin_weights=recorded.skin_weights, deformation=recorded.deformation)
@@ -285,10 +288,11 @@ class PoseEvaluator:
 
     def _check_transform(self, part: MeshPart, first: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
         """Raise a RigError if an evaluated mesh object has moved against the first."""
-        if (mesh_to_mesh_matrix(first, mesh_object) == part.matrix).all():
+        difference = mesh_to_mesh_matrix(first, mesh_object) - part.matrix
+        if not difference.any():
             return
         corners = np.array([[*corner, 1.0] for corner in mesh_object.bound_box])
-        moves = (corners @ (mesh_to_mesh_matrix(first, mesh_object) - part.matrix).T)[:, :3]
+        moves = (corners @ difference.T)[:, :3]
         if np.linalg.norm(moves, axis=1).max() > MAX_MESH_MOTION_RATIO * self._rig.size:
             raise RigError(
                 f"The object '{mesh_object.name}' moves against '{first.name}', and meshes of one recording move "

@@ -16,6 +16,7 @@ from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.formats.report import read_report
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.poses.action_range import measured_controls
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.blend_file import save_copy
@@ -101,6 +102,23 @@ def test_a_key_of_each_mesh_is_an_input_of_its_own(dressed):
     assert np.ptp(values, axis=0).min() > 0.5 and abs(np.corrcoef(values.T)[0, 1]) < 0.5
 
 
+def test_an_action_has_the_range_of_a_key_of_each_mesh(dressed):
+    bpy.ops.wm.open_mainfile(filepath=str(dressed.rig))
+    action = bpy.data.actions.new("puffs")
+    for name, value in ((BODY, 0.25), (SLEEVE, 0.75)):
+        shape_keys = bpy.data.objects[name].data.shape_keys
+        animation = shape_keys.animation_data_create()
+        animation.action, animation.action_slot = action, action.slots.new("KEY", name)
+        for frame, key_value in ((1, 0.0), (10, value)):
+            shape_keys.key_blocks["puff"].value = key_value
+            shape_keys.key_blocks["puff"].keyframe_insert("value", frame=frame)
+    controls = measured_controls(find_whole_character()[0], [action])
+    assert {(control.owner, control.low, control.high) for control in controls} == {
+        ("shape_keys", 0.0, 0.25),
+        ("shape_keys:sleeve", 0.0, 0.75),
+    }
+
+
 def test_an_interrupted_recording_resumes_with_the_same_bytes(dressed, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(dressed.rig))
     settings = RecordingSettings(poses=POSES, actions=("elbow_wave",))
@@ -125,11 +143,13 @@ def test_a_model_has_all_meshes_and_its_report_a_line_for_each(dressed):
     assert [line.partition(":")[0] for line in dressed.trained.err if line.startswith("'")] == [f"'{n}'" for n in NAMES]
 
 
-def test_poses_are_added_and_training_continues(dressed, tmp_path, capfd):
+@pytest.mark.parametrize("bones", ["auto", 1])
+def test_poses_are_added_and_training_continues(dressed, tmp_path, capfd, bones):
     recording, model = tmp_path / "r", tmp_path / "m.onnx"
-    options = ("--passes", 4, "--hidden", 16)
+    options = ("--passes", 4, "--hidden", 16, "--bones-to-read", bones)
     assert run("record", dressed.rig, recording, "--all", *OPTIONS) == 0
     assert run("train", recording, model, *options) == 0
+    assert read_model_info(model).has_key_joints is (bones == 1)
     assert run("record", dressed.rig, recording, "--refine", model, "--poses", 5) == 0
     assert read_recording(recording).info.sampling.sources[-1].poses == 5
     assert run("train", recording, model, *options, "--warm-start") == 0
