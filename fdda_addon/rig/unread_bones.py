@@ -14,6 +14,7 @@ from operator import attrgetter
 import bpy
 import numpy as np
 
+from ..core.mathematics.key_joints import with_sources
 from ..core.recording.bones import RecordedBones
 from ..core.rig import Fingerprint, Rig
 from ..scene.bone_transform import controls_by_bone
@@ -41,14 +42,14 @@ def describe_bones(
     """
     sources, controlled = _sources_of_bones(scene_rig.armature_object), set(controls_by_bone(rig.controls))
     weighted = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
-    described = sorted(_with_sources(sources, {*rig.joint_names, *controlled}))
+    described = sorted(with_sources(sources, {*rig.joint_names, *controlled}))
     indices = {name: index for index, name in enumerate(rig.joint_names)}
     return RecordedBones(
         tuple(sorted(indices[name] for name in dependencies if name in indices)),
         tuple(sorted(indices[name] for name in fixed_joints if name in indices)),
         tuple(sorted(controlled)),
         {name: sorted(sources[name] & sources.keys()) for name in described},
-        read_unread_bones(scene_rig, sorted(_with_sources(sources, weighted))),
+        read_unread_bones(scene_rig, sorted(with_sources(sources, weighted))),
     )
 
 
@@ -145,14 +146,3 @@ def _sources_of_bones(armature_object: bpy.types.Object) -> dict[str, set[str]]:
             pending += [node for node in new_nodes if node.driven_path]
         sources[bone.name] = {node.bone for node in needed if node.datablock == armature_object} - {"", bone.name}
     return sources
-
-
-def _with_sources(sources: dict[str, set[str]], names: Iterable[str]) -> set[str]:
-    """Return bones and all bones on which they depend."""
-    found, queue = set(), [name for name in names if name in sources]
-    while queue:
-        name = queue.pop()
-        if name not in found:
-            found.add(name)
-            queue += [source for source in sources[name] if source in sources]
-    return found

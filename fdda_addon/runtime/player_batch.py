@@ -11,6 +11,7 @@ The driver of a batch belongs to the position buffer of its first player. The ot
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from weakref import WeakKeyDictionary
 
 import bpy
 import numpy as np
@@ -86,7 +87,7 @@ class PlayerGroup:
         self.members: dict[int, Player] = {}
         self.pose = PlayedPose(self.network)
         # The poses of the players whose objects have moved against that of the first player.
-        self._moved_poses: dict[Player, PlayedPose] = {}
+        self._moved_poses: WeakKeyDictionary[Player, PlayedPose] = WeakKeyDictionary()
         self.has_moved = False
 
     def driver_inputs(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Key joints: a rig whose model reads fewer joints than those with skin weights."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -157,21 +157,22 @@ def find_unread_bones(
     Returns:
         Names in alphabetical order.
     """
-
-    def with_sources(names: Iterable[str]) -> set[str]:
-        found, queue = set(), [name for name in names if name in sources]
-        while queue:
-            name = queue.pop()
-            if name not in found:
-                found.add(name)
-                queue += [source for source in sources[name] if source in sources]
-        return found
-
     weighted = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
     joints = set(joint_names)
     followers = weighted - joints - {STATIC_JOINT}
-    visible = with_sources({*joints, *controlled})
-    return sorted(followers | (with_sources(followers) - visible))
+    visible = with_sources(sources, {*joints, *controlled})
+    return sorted(followers | (with_sources(sources, followers) - visible))
+
+
+def with_sources(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> set[str]:
+    """Return bones and all bones on which they depend, given the bones that each bone reads."""
+    found, queue = set(), [name for name in names if name in sources]
+    while queue:
+        name = queue.pop()
+        if name not in found:
+            found.add(name)
+            queue += [source for source in sources[name] if source in sources]
+    return found
 
 
 def _digest_weights(joint_names: Sequence[str], skin_joints: np.ndarray, skin_weights: np.ndarray) -> str:
