@@ -142,13 +142,13 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
         names = [name for name in info.joint_names if name in rig.joint_names]
         is_complete = len(names) == len(info.joints)
         selected = select_joints(rig, info.joints if is_complete else choose_joints(scene_rig, names, names))
-        names = info.meshes[0].fingerprint.deformation.get("unread_bones", {})
-        unread_bones = {"unread_bones": read_unread_bones(scene_rig, names)}
-        prints = [
+        recorded_bones = info.meshes[0].fingerprint.deformation.get("unread_bones", {})
+        unread_bones = {"unread_bones": read_unread_bones(scene_rig, recorded_bones)}
+        fingerprints = [
             replace(mesh.fingerprint, deformation=mesh.fingerprint.deformation | unread_bones)
             for mesh in selected.meshes
         ]
-        meshes = zip(selected.meshes, prints, strict=True)
+        meshes = zip(selected.meshes, fingerprints, strict=True)
         rig = replace(selected, meshes=tuple(replace(mesh, fingerprint=each) for mesh, each in meshes))
     if scene_rig.mesh_object.fdda.is_fast_rig:
         (mesh,), recorded = rig.meshes, info.meshes[0].fingerprint
