@@ -2,13 +2,13 @@
 """Operators that mend what the section "Rig" finds before a recording."""
 
 import bpy
-import numpy as np
 
 from ..core.checks.seams import POSITION_DIGITS, split_vertex_groups
 from ..core.errors import RigError
 from ..core.sentences.counts import format_count
 from ..poses.motion_range import unlimited_bones
 from ..rig.reading import read_rig
+from ..scene.arrays import VECTOR_ELEMENT, read, write
 from .poses import select_bones
 from .rig_operator import RigOperator
 
@@ -32,11 +32,11 @@ class FDDA_OT_merge_vertices(RigOperator, bpy.types.Operator):
         if mesh_object.fdda.is_bound or mesh.library or mesh_object.library:
             raise RigError(f"'{mesh_object.name}' has a model or is linked; unbind it, or merge in its own file.")
         rig = read_rig(self.rig(context))
-        normals = np.array([corner.vector for corner in mesh.corner_normals], np.float32)
         # A layer keeps the normal of each corner, also where faces collapse.
         layer = mesh.attributes.new("fdda_normals", "FLOAT_VECTOR", "CORNER")
-        layer.data.foreach_set("vector", normals.ravel())
-        layer_name, distance = layer.name, rig.size * 10.0**-POSITION_DIGITS
+        write(layer.data, VECTOR_ELEMENT, read(mesh.corner_normals, VECTOR_ELEMENT))
+        # Equal rounded positions may differ by the diagonal of a cube.
+        layer_name, distance = layer.name, 2 * rig.size * 10.0**-POSITION_DIGITS
         targets, apart_count = {}, 0
         edited = bmesh.new()
         try:
@@ -57,8 +57,7 @@ class FDDA_OT_merge_vertices(RigOperator, bpy.types.Operator):
         finally:
             edited.free()
             layer = mesh.attributes[layer_name]
-            normals = np.zeros((len(mesh.loops), 3), np.float32)
-            layer.data.foreach_get("vector", normals.ravel())
+            normals = read(layer.data, VECTOR_ELEMENT)
             mesh.attributes.remove(layer)
         mesh.normals_split_custom_set(normals)
         mesh.update()

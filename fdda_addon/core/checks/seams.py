@@ -45,7 +45,7 @@ def split_vertex_groups(rig: Rig) -> list[np.ndarray]:
     vertices = np.unique(_seam_pairs(rig))
     groups = _coincident_groups(rig)[vertices]
     order = np.argsort(groups, kind="stable")
-    return np.split(vertices[order], np.flatnonzero(np.diff(groups[order])) + 1)
+    return np.split(vertices[order], np.flatnonzero(np.diff(groups[order])) + 1) if len(vertices) else []
 
 
 def find_open_seams(rig: Rig, residuals: Iterable[np.ndarray]) -> list[RecordingWarning]:
