@@ -63,15 +63,6 @@ def test_a_missing_python_is_reported_with_its_packages(tmp_path: Path):
 
 
 @posix_only
-def test_a_missing_venv_module_is_reported_with_its_package(tmp_path: Path):
-    write_shell_script(tmp_path / "bin/python3.99", "exit 3")
-    result = run_setup(tmp_path, "3.99")
-    assert result.returncode == 3
-    assert result.stderr.count("\n") == 1
-    assert "apt-get install python3.99-venv libx11-6" in result.stderr
-
-
-@posix_only
 def test_a_python_on_path_that_does_not_start_is_skipped(tmp_path: Path):
     write_shell_script(tmp_path / "bin/python3.99", "echo 'this version is not selected' >&2; exit 127")
     working_python = write_shell_script(tmp_path / "real/python", 'echo "set up by the real one: $*"')

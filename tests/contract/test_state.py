@@ -86,30 +86,6 @@ def state_of(source: str) -> set[str]:
     return changed | objects | cached
 
 
-def test_state_is_found():
-    source = """
-import functools
-from x import imported
-_count, _table, CONSTANT, _object = 0, {}, {1: 2}, Session()
-_draw_handles: list = []
-def count():
-    global _count
-    _count += 1
-    _table["a"].b = 1
-    imported.attribute = 2
-    CONSTANT.get(1)
-def add():
-    local = []
-    local.append(1)
-    _draw_handles.append(1)
-@functools.lru_cache
-def cached():
-    return CONSTANT[1]
-"""
-    assert state_of(source) == {"_count", "_table", "_draw_handles", "cached"}
-    assert state_of("session = Session()\n") == {"session"}
-
-
 def test_no_module_has_state_that_is_not_listed():
     for path in sorted(ADD_ON.rglob("*.py")):
         name = path.relative_to(ADD_ON).as_posix()
@@ -120,9 +96,3 @@ def test_no_module_has_state_that_is_not_listed():
 def test_all_listed_state_exists():
     for name, state in STATE.items():
         assert state.keys() <= state_of((ADD_ON / name).read_text(encoding="utf-8")), name
-
-
-def test_the_only_state_of_playback_is_the_session():
-    runtime_state = [(path, *names) for path, names in STATE.items() if path.startswith("runtime/")]
-    assert runtime_state == [("runtime/session.py", "session")]
-    assert sum(map(len, STATE.values())) <= 20

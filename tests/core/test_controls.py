@@ -75,11 +75,6 @@ def test_positions_that_stop_being_finite_are_influenced(tmp_path):
     assert "are not finite in 1 test of its influences, as when 'root' moves from the rest pose" in notes[0]
 
 
-def test_a_recording_without_controls_has_an_empty_array(recording):
-    assert read_recording(recording).controls.shape == (12, 0)
-    assert not (recording / "controls.npy").exists()
-
-
 def test_an_extension_appends_controls(controlled_recording):
     with RecordingExtension(read_recording(controlled_recording), 2, "model.onnx") as extension:
         extension.append(random_poses(2), random_positions(2), control_values(2))

@@ -28,15 +28,6 @@ def test_nodes_that_need_each_other_are_kept_together():
     assert graph.kept([bone("b")]) == {bone("a"), bone("b")}
 
 
-def test_a_root_without_edges_is_kept():
-    assert DependencyGraph().kept([bone("root")]) == {bone("root")}
-
-
-def test_bones_datablocks_and_driven_properties_of_one_name_are_different_nodes():
-    nodes = {Node(RIG), Node(RIG, bone="x"), Node(RIG, driven_path="x")}
-    assert len(nodes) == 3
-
-
 @pytest.mark.parametrize("member", ["foot", "shin", "thigh"])
 def test_each_bone_of_a_chain_keeps_the_owner_and_its_target(member):
     """A bone in an IK chain depends on the bone below it that has the constraint."""
@@ -48,9 +39,3 @@ def test_each_bone_of_a_chain_keeps_the_owner_and_its_target(member):
     kept = graph.kept([bone(member)])
     assert kept == {bone(name) for name in ("foot", "shin", "thigh", "hips", "ik_target")}
     assert bone("ik_target") not in graph.kept([bone("hips")])
-
-
-def test_a_chain_of_one_bone_needs_nothing_new():
-    graph = DependencyGraph()
-    graph.add_chain([bone("hips")])
-    assert graph.kept([bone("hips")]) == {bone("hips")}

@@ -172,7 +172,7 @@ FINGERPRINT_HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c
         (("limits", [{"bone": "upper"}]), "is damaged"),
         (("limits", [[]]), "is damaged"),
         (("seed", -1), "its seed is -1"),
-        (("seed", True), "its seed is True"),
+        *[(("seed", seed), f"its seed is {seed!r}") for seed in (True, 1.5, "one", None)],
         (("spread", 0), "its spread is 0"),
         (("spread", float("inf")), "its spread is inf"),
         *[(("sources", [{**POSE_SOURCE, key: value}]), words) for key, value, words in (
@@ -253,10 +253,3 @@ def test_a_huge_sparse_recording_is_refused_without_reading_it(recording):
         path.write_bytes(npy_bytes(header))
         os.truncate(path, path.stat().st_size + 4 * int(np.prod(shape, dtype=object)))
     assert_refused(recording, "The rest pose or skin weights of")
-
-
-def test_a_valid_recording_is_accepted(recording):
-    check_resumable(recording)
-    check_recordable(recording, resume=True)
-    with pytest.raises(RecordingError, match="holds a recording already"):
-        check_recordable(recording, resume=False)

@@ -108,12 +108,6 @@ def test_damaged_reports_are_refused(key, value):
         KeyJointReport.from_json({**REPORT.to_json(), key: value})
 
 
-def test_a_fit_with_key_joints_is_read_back():
-    fit = SkinFit("smooth", 100, ERRORS, ERRORS, REPORT)
-    assert SkinFit.from_json(fit.to_json()) == fit
-    assert fit.sentence().startswith(f"{REPORT.sentence()} Linear skinning with fitted weights (smooth), mm: 1.00 rms")
-
-
 @pytest.mark.parametrize(
     ("fit", "options", "matches"),
     [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.checks import residual_scan
-from fdda_addon.core.checks.recording import WARNING_NAMES, check_recording, compute_bone_lengths, merges_sentence
+from fdda_addon.core.checks.recording import check_recording, merges_sentence
 from fdda_addon.core.checks.warning import RecordingWarning, format_length, format_list, format_with_noun
 from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.recording.index import Source
@@ -206,10 +206,6 @@ def test_sentence_about_merged_partitions(clean_recording):
     assert sentence(tuple(range(4, 20)), 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
 
 
-def test_bone_lengths_of_the_tube(clean_recording):
-    assert compute_bone_lengths(clean_recording.rig) == pytest.approx([BONE_LENGTH] * 4)
-
-
 def test_the_scan_reads_a_limited_number_of_poses_and_vertices(clean_recording, monkeypatch):
     monkeypatch.setattr(residual_scan, "MAX_SCANNED_POSES", 50)
     monkeypatch.setattr(residual_scan, "MAX_KEPT_VERTICES", 40)
@@ -247,8 +243,3 @@ def test_lengths_are_formatted_in_meters_for_any_unit(clean_recording):
     for meters in (1.0, 0.01):
         rig = with_rig(clean_recording, metres_per_unit=meters).rig
         assert [format_length(rig, m / meters) for m in (0.00004, 0.0871, 0.25, 1.234)] == texts
-
-
-def test_every_warning_is_documented():
-    headings = re.findall(r"^#### `(.+)`$", FORMATS_PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    assert headings == list(WARNING_NAMES)

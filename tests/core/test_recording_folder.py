@@ -11,7 +11,6 @@ from fdda_addon.core.errors import OutputError, RecordingError
 from fdda_addon.core.recording.arrays import ARRAY_NAMES
 from fdda_addon.core.recording.folder import FolderContent, FolderState, read_folder, remove_recording
 from fdda_addon.core.recording.lock import LOCK_NAME, RecordingLock
-from fdda_addon.core.recording.target import STATISTIC_NAMES, Repeatability
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .good_recording import good_recording
@@ -49,15 +48,6 @@ def test_state_of_a_complete_recording(tmp_path):
     content = read_limb_folder(tmp_path / "r", limits=[], spread=0.5)
     assert content.state is FolderState.COMPLETE
     assert content.sentence == "It was recorded with other settings than those above: range of motion, spread."
-
-
-def test_measurements_of_a_recording_are_reported(tmp_path):
-    record_limb(tmp_path / "r", POSE_COUNT)
-    repeatability = Repeatability((1, 2), dict.fromkeys(STATISTIC_NAMES, 0.25))
-    index = json.loads((tmp_path / "r" / "recording.json").read_text())
-    (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "repeatability": repeatability.to_json()}))
-    assert read_limb_folder(tmp_path / "r").measured_sentence == repeatability.sentence()
-    assert "0.25 mm apart on average" in repeatability.sentence()
 
 
 def test_state_of_an_interrupted_recording(tmp_path):

@@ -52,15 +52,6 @@ def test_poses_are_near_the_largest_error_and_the_largest_distance():
     assert np.array_equal(poses[:, 2], draw_values(400, 9)[:, 2])
 
 
-def test_a_partition_without_channels_changes_nothing():
-    values = draw_values(20)
-    errors = np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))
-    poses = choose_poses(
-        Probes(values, errors, errors), CHANNELS, [np.array([], int)] * 4, draw_values(5, 9), np.random.default_rng(0)
-    )
-    assert np.array_equal(poses, draw_values(5, 9))
-
-
 def test_nearest_distances_are_relative_to_standard_deviations():
     recorded = np.array([[0.0, 0, 5], [2, 0, 5], [2, 20, 5], [0, 20, 5]])
     distances = nearest_recorded_distances(np.array([[1.0, 0, 5], [2, 20, 5], [0, -10, 9]]), recorded)

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.formats.model_info import ModelInfo
-from fdda_addon.core.mathematics.metrics import distances, error_statistics
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
-from .damage import assert_refused, edit_index
 from .limb import make_rig, random_poses, random_positions, record_limb, recording_info
 from .tiny_model import tiny_info
 
@@ -50,12 +48,6 @@ def test_a_recording_in_meters_stores_no_unit(tmp_path, metres_per_unit):
     assert "metres_per_unit" not in index.read_text()
 
 
-@pytest.mark.parametrize("metres_per_unit", INVALID_LENGTHS)
-def test_a_recording_with_an_invalid_unit_is_refused(recording, metres_per_unit):
-    edit_index(recording, metres_per_unit=metres_per_unit)
-    assert_refused(recording, "recording.json' is damaged: 'metres_per_unit' is ", "; record again.")
-
-
 @pytest.mark.parametrize(("first_unit", "resumed_unit"), [(0.01, 1.0), (1.0, 0.01), (0.01, 0.02)])
 def test_a_resumed_recording_keeps_its_unit(tmp_path, first_unit, resumed_unit):
     """The unit may differ when a recording is resumed, because the scale of an object may be animated."""
@@ -83,10 +75,3 @@ def test_model_metadata_with_an_invalid_unit_is_refused(metres_per_unit):
     text = json.dumps({**json.loads(tiny_info().to_json()), "metres_per_unit": metres_per_unit})
     with pytest.raises(ValueError, match=r"'metres_per_unit' is .*, and must be a number above 0"):
         ModelInfo.from_json(text)
-
-
-def test_distances_are_in_meters_for_any_unit():
-    positions, other_positions = np.zeros((1, 2, 3), np.float32), np.float32([[[0, 0, 0], [0, 30, 40]]])
-    errors = distances(positions, other_positions, 0.01)
-    assert errors.dtype == np.float32
-    assert error_statistics(errors).max == pytest.approx(500)

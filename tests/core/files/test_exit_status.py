@@ -16,7 +16,6 @@ from fdda_addon.core.errors import (
     exit_status,
     os_error_text,
 )
-from fdda_addon.core.files.output import atomic_write
 
 
 def error_caused_by(cause: BaseException) -> OutputError:
@@ -57,9 +56,3 @@ def test_exit_status_of_error_classes():
     assert [exit_status(kind("text")) for kind in (BusyError, DiskFullError, TrainingDiedError)] == [TRY_AGAIN] * 3
     assert exit_status(RigError("text")) == 1 and exit_status(WrongUsageError("text")) == 2
     assert exit_status(error_caused_by(MemoryError())) == TRY_AGAIN
-
-
-def test_full_disk_in_atomic_write_may_be_tried_again(tmp_path):
-    with pytest.raises(OutputError) as failed, atomic_write(tmp_path / "a.json"):
-        raise OSError(errno.ENOSPC, "No space left on device")
-    assert exit_status(failed.value) == TRY_AGAIN and list(tmp_path.iterdir()) == []

@@ -96,12 +96,6 @@ def test_a_file_whose_temporary_path_exceeds_the_limit_is_refused(tmp_path):
         check_writable(folder / "a.jsons")
 
 
-def test_long_paths_are_accepted_if_windows_supports_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(path_limits, "is_windows", lambda: True)
-    monkeypatch.setattr(path_limits, "supports_long_windows_paths", lambda: True)
-    check_recordable(folder_with_length(300, tmp_path), resume=False)
-
-
 def test_a_path_that_blender_would_truncate_is_refused_on_every_system(tmp_path):
     """Blender truncates a path that has too many bytes and writes to another file."""
     folder = folder_with_length(1023 - len("/" + INDEX_NAME), tmp_path)

@@ -31,11 +31,6 @@ def test_every_type_has_a_sample_message():
     assert [message.type for message in SAMPLE_MESSAGES] == list(MessageType)
 
 
-def test_types_that_end_a_training():
-    last_types = {MessageType.FINISHED, MessageType.CANCELLED, MessageType.FAILED}
-    assert {kind for kind in MessageType if kind.is_last} == last_types
-
-
 @pytest.mark.parametrize(
     "line", ["", "hello", "{", "[]", "3", "null", "{}", '{"type": "lunch"}', '{"type": null}', '{"type": ["log"]}']
 )

@@ -34,10 +34,6 @@ def test_linear_skinning_is_the_weighted_sum_of_the_joints(rig):
         np.testing.assert_allclose(result, reference_skinning(rig, pose), atol=2e-6)
 
 
-def test_linear_skinning_of_the_rest_pose_gives_the_rest_positions(rig):
-    np.testing.assert_allclose(LinearSkinning(rig).positions(rig.rest_matrices[None])[0], rig.rest_positions, atol=1e-6)
-
-
 def test_skin_matrices_of_the_rest_pose_are_the_identity(rig):
     skin = skin_matrices(rig.rest_matrices[None], rig.rest_matrices)
     assert skin.dtype == np.float32
