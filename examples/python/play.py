@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pose a model and write the deformed mesh, with only numpy and ONNX Runtime. Copy this code into other programs.
+"""Pose a model and write the deformed meshes, with only numpy and ONNX Runtime. Copy this code into other programs.
 
 python play.py character.onnx posed.obj --turn elbow 80 0 0 --recording recording
 """
@@ -76,14 +76,20 @@ def read_faces(folder: Path, info: dict) -> list[np.ndarray]:
     return np.split(vertices, starts[1:])
 
 
-def write_obj(path: Path, positions: np.ndarray, faces: list[np.ndarray]) -> None:
-    lines = [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in positions.tolist()]
-    lines += ["f " + " ".join(str(vertex + 1) for vertex in face) for face in faces]
+def write_obj(path: Path, info: dict, positions: np.ndarray, faces: list[np.ndarray]) -> None:
+    """Write the meshes as objects of one file, in the space of the first."""
+    lines, start = [], 0
+    for mesh in info["meshes"]:
+        end = start + mesh["vertices"]
+        lines.append(f"o {mesh['name']}")
+        lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in positions[start:end].tolist()]
+        lines += ["f " + " ".join(str(vertex + 1) for vertex in face) for face in faces if start <= face[0] < end]
+        start = end
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Pose a model and write the mesh.")
+    parser = argparse.ArgumentParser(description="Pose a model and write the meshes.")
     parser.add_argument("model", help=".onnx file")
     parser.add_argument("out", type=Path, help=".obj file, or .npy file of an array (V, 3); mesh-object space")
     turn_options = {"nargs": 4, "metavar": ("JOINT", "X", "Y", "Z"), "help": "rotate a joint; degrees"}
@@ -119,7 +125,9 @@ def main() -> None:
     if arguments.out.suffix == ".npy":
         np.save(arguments.out, positions[0])
     else:
-        write_obj(arguments.out, positions[0], read_faces(arguments.recording, info) if arguments.recording else [])
+        write_obj(
+            arguments.out, info, positions[0], read_faces(arguments.recording, info) if arguments.recording else []
+        )
     print(f"{arguments.out}: {len(positions[0])} vertices, confidence {confidence.min():.2f}")
 
 

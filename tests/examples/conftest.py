@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fixtures: two small models for the examples, trained once; one has a control and a joint that never moves."""
+"""Fixtures: two small models, trained once: of one mesh, and of two with a shape key and a static joint."""
 
 import json
 from dataclasses import dataclass, replace
@@ -21,7 +21,9 @@ from ..trainer.chain import chain_angles, chain_residuals, chain_rig, pose_chain
 
 ROOT = Path(__file__).resolve().parents[2]
 JOINTS, POSES = 4, 100
-CONTROL = Control("mesh_object", '["bulge"]', 0.25, 1.0)
+PIPE_VERTICES = 40
+"""Number of vertices of the lower of two meshes."""
+CONTROL = Control("shape_keys:hose", 'key_blocks["bulge"].value', 0.25, 1.0)
 Rotations = dict[str, tuple[float, float, float]]
 """Rotations by name of the joint: degrees about its X, Y and Z axes."""
 
@@ -50,12 +52,20 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
 
 @pytest.fixture(scope="session")
 def controlled_chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    """Return a model of a tube with a control that makes it thicker; its lowest vertices have no bone."""
+    """Return a model of a pipe, whose lowest vertices have no bone, and of a hose on it with a shape key."""
     recording = tmp_path_factory.mktemp("controlled") / "recording"
     rig, angles = chain_rig(JOINTS), chain_angles(POSES, JOINTS, seed=1)
+    order = np.argsort(rig.rest_positions[:, 2])
+    names = ("rest_positions", "skin_joints", "skin_weights")
+    rig = replace(rig, **{name: getattr(rig, name)[order] for name in names})
+    faces = np.argsort(order)[rig.face_vertices].reshape(-1, 3)
+    faces = faces[(faces < PIPE_VERTICES).all(axis=1) | (faces >= PIPE_VERTICES).all(axis=1)].astype(np.int32)
+    (mesh,) = rig.meshes
+    hose_vertices = mesh.vertices - PIPE_VERTICES
+    raised = (1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1)
     values = np.random.default_rng(2).uniform(CONTROL.low, CONTROL.high, (POSES, 1)).astype(np.float32)
     poses, residuals = pose_chain(rig, angles), chain_residuals(rig, angles)
-    residuals[:, :, 1] += 0.05 * values
+    residuals[:, PIPE_VERTICES:, 1] += 0.05 * values
     is_static = rig.rest_positions[:, 2] < 0.15
     residuals[:, is_static] = 0
     rig = replace(
@@ -65,6 +75,12 @@ def controlled_chain(tmp_path_factory: pytest.TempPathFactory) -> Character:
         skin_joints=np.where(is_static[:, None], [JOINTS, 0], rig.skin_joints).astype(np.int32),
         skin_weights=np.where(is_static[:, None], [1, 0], rig.skin_weights).astype(np.float32),
         controls=(CONTROL,),
+        meshes=(
+            replace(mesh, name="pipe", vertices=PIPE_VERTICES),
+            replace(mesh, name="hose", vertices=hose_vertices, transform=raised),
+        ),
+        face_starts=np.arange(0, faces.size, 3, dtype=np.int32),
+        face_vertices=faces.ravel(),
     )
     poses = np.concatenate([poses, np.broadcast_to(np.eye(4, dtype=np.float32), (POSES, 1, 4, 4))], axis=1)
     moving_joints = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for joint in range(JOINTS)}

@@ -3,9 +3,9 @@
 //
 // usage: node drive_page.mjs CHROMIUM URL PICTURE [SELECTOR=VALUE …]
 //
-// Each selector names a select, a slider, or a button (without a value); they are used in the given order. Writes a
-// screenshot of the page. Prints JSON: state and status of the page, vertex positions, names of the joints, number of
-// sliders, addresses of the requests, and errors.
+// Each selector names a select, a slider, or, without a value, a button or a box to uncheck; in the given order. Writes a
+// screenshot of the page. Prints JSON: state and status of the page, vertex positions, names of the joints and controls,
+// addresses of the requests, and errors.
 
 import { createRequire } from "node:module";
 
@@ -44,6 +44,7 @@ try {
     const kind = await element.evaluate(({ localName }) => localName);
     if (kind === "select") await element.selectOption(value);
     else if (kind === "button") await element.click();
+    else if (!value) await element.setChecked(false);
     else await element.fill(value);
   }
   await waitForResult();
@@ -55,7 +56,7 @@ try {
       status: document.getElementById("status").textContent,
       positions: Array.from(globalThis.positions ?? []),
       joints: Array.from(document.getElementById("joint").options, (option) => option.text),
-      sliders: document.querySelectorAll("input").length,
+      controls: Array.from(document.querySelectorAll("#controls .slider span"), (span) => span.textContent),
     };
   });
   await page.screenshot({ path: picture });

@@ -12,7 +12,7 @@ import pytest
 
 from fdda_addon.core.formats.model import read_model_info
 
-from .conftest import CONTROL, ROOT, Character, expected_positions
+from .conftest import CONTROL, PIPE_VERTICES, ROOT, Character, expected_positions
 
 EXAMPLE = ROOT / "examples" / "python" / "play.py"
 ROTATIONS = {"bone_0": (10.0, -70.0, 5.0), "bone_1": (40.0, 25.0, -30.0), "bone_3": (0.0, 0.0, 50.0)}
@@ -56,6 +56,26 @@ def test_the_obj_file_has_the_faces_of_the_recording(chain: Character, tmp_path:
     assert np.abs(vertices - expected_positions(chain.model, ROTATIONS)).max() < 1e-5
     recorded_faces = np.load(chain.recording / "face_vertices.npy").reshape(-1, 3)
     assert faces == recorded_faces.tolist()
+
+
+def test_several_meshes_are_objects_of_the_obj_file(controlled_chain: Character, tmp_path: Path):
+    recording = controlled_chain.recording
+    assert run_example(tmp_path, controlled_chain.model, "a.obj", "--recording", recording).returncode == 0
+    pipe, hose = (tmp_path / "a.obj").read_text().removeprefix("o pipe\n").split("o hose\n")
+    assert (pipe.count("v "), hose.count("v ")) == (PIPE_VERTICES, 90 - PIPE_VERTICES)
+    corners = [{int(corner) for line in re.findall("f (.*)", text) for corner in line.split()} for text in (pipe, hose)]
+    assert 0 < min(corners[0]) < max(corners[0]) <= PIPE_VERTICES < min(corners[1]) < max(corners[1]) <= 90
+
+
+def test_the_code_of_the_page_divides_the_meshes(controlled_chain: Character, tmp_path: Path):
+    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8").partition("### Running a model\n")[2]
+    (tmp_path / "model.onnx").symlink_to(controlled_chain.model)
+    code = page.partition("```python\n")[2].partition("```")[0]
+    command = [sys.executable, "-I", "-c", code + "\nprint(*own[0, 0], *positions[0, 40])"]
+    lines = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert [line.partition(") ")[0] for line in lines[1:3]] == ["pipe (2, 40, 3", "hose (2, 50, 3"]
+    x, y, z, *first = map(float, lines[3].split())
+    assert (x, y, z + 0.5) == pytest.approx(first, abs=1e-6)
 
 
 def test_the_confidence_is_printed_and_falls_outside_the_trained_range(chain: Character, tmp_path: Path):

@@ -40,7 +40,7 @@ class PageState:
         status: the sentence in the panel.
         positions: (V, 3) float32 vertex positions, meters; empty if the model has not run.
         joints: names in the list of joints.
-        sliders: number of sliders.
+        controls: labels of the sliders of controls.
         requests: addresses that were fetched.
         errors: errors in the browser's console.
         view: (H, W, 3) float32 pixels of the screenshot beside the panel, 0 to 1.
@@ -50,7 +50,7 @@ class PageState:
     status: str
     positions: np.ndarray
     joints: list[str]
-    sliders: int
+    controls: list[str]
     requests: list[str]
     errors: list[str]
     view: np.ndarray
@@ -173,15 +173,23 @@ def test_the_button_resets_to_the_rest_pose(
     assert np.array_equal(mesh_mask(reset_page.view), mesh_mask(rest_page.view))
 
 
-def test_controls_have_sliders_and_static_joints_have_none(
+def test_shape_keys_have_sliders_and_static_joints_have_none(
     open_page: Callable[..., PageState], controlled_chain: Character
 ):
     low = read_model_info(controlled_chain.model).controls[0].low
     for steps, value in ([], low), (["#control-0=0.9"], 0.9):
         page = open_page(controlled_chain, *slider_steps(ROTATIONS), *steps)
-        assert (page.state, page.errors, page.sliders) == ("ready", [], 4)
+        assert (page.state, page.errors, page.controls) == ("ready", [], ["bulge"])
         assert page.joints == ["bone_0", "bone_1", "bone_2", "bone_3"]
         assert np.abs(page.positions - expected_positions(controlled_chain.model, ROTATIONS, (value,))).max() < 1e-5
+
+
+def test_meshes_can_be_hidden(open_page: Callable[..., PageState], controlled_chain: Character):
+    both, hose, pipe, none = (
+        mesh_mask(open_page(controlled_chain, *steps).view).mean()
+        for steps in ([], ["#mesh-0"], ["#mesh-1"], ["#mesh-0", "#mesh-1"])
+    )
+    assert none == 0 < min(hose, pipe) < both and both == pytest.approx(hose + pipe, rel=0.2)
 
 
 def test_a_page_without_a_model_shows_an_error(open_page: Callable[..., PageState]):

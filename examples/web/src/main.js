@@ -27,7 +27,7 @@ async function start() {
   }
   const pose = new Pose(model.info);
   const rest = await model.run(pose);
-  const stage = new Stage(document.getElementById("view"), triangles, rest.positions);
+  const stage = new Stage(document.getElementById("view"), triangles, rest.positions, model.info.meshes);
   const up = document.getElementById("up");
   up.addEventListener("change", () => stage.frame(up.value));
   stage.resize();
@@ -54,11 +54,12 @@ async function start() {
       running = false;
     }
   }
-  fillPanel(model.info, pose, (chosenJoint) => {
+  const onChange = (chosenJoint) => {
     joint = chosenJoint;
     document.body.dataset.state = "busy";
     play().catch(fail);
-  });
+  };
+  fillPanel(model.info, pose, onChange, (mesh, isShown) => stage.showMesh(mesh, isShown));
 }
 
 function fail(error) {

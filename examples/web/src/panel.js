@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The panel beside the mesh: a list of joints, three angle sliders, and a slider for each control.
+// The panel beside the meshes: a list of joints, three angle sliders, a slider for each control, and a box for each mesh.
 
 import { MathUtils } from "three";
 
@@ -12,8 +12,9 @@ const element = (id) => document.getElementById(id);
  * @param info the metadata of the model
  * @param {Pose} pose the pose that the sliders change
  * @param {(joint: number) => void} onChange called after each change with the index of the chosen joint
+ * @param {(mesh: number, isShown: boolean) => void} onShow called when a mesh is shown or hidden
  */
-export function fillPanel(info, pose, onChange) {
+export function fillPanel(info, pose, onChange, onShow) {
   const select = element("joint");
   info.joints.forEach(({ name }, joint) => {
     if (name) select.append(new Option(name, joint)); // a joint without a name never moves
@@ -27,15 +28,24 @@ export function fillPanel(info, pose, onChange) {
     element("angles").append(slider.row);
     return slider;
   });
-  const controls = pose.controls.map(({ path, low, high }, number) => {
-    const slider = new Slider(path, `control-${number}`, low, high, "any", "", (value) => {
+  const controls = pose.controls.map(({ owner, path, low, high }, number) => {
+    const slider = new Slider(shortName(path), `control-${number}`, low, high, "any", "", (value) => {
       pose.values[number] = value;
       onChange(chosenJoint());
     });
+    slider.row.title = `${owner}/${path}`;
     element("controls").append(slider.row);
     return slider;
   });
   element("controls").hidden = !controls.length;
+  info.meshes.forEach(({ name }, mesh) => {
+    const row = element("mesh").content.firstElementChild.cloneNode(true);
+    const [box, label] = row.children;
+    [box.id, label.textContent] = [`mesh-${mesh}`, name];
+    box.addEventListener("change", () => onShow(mesh, box.checked));
+    element("meshes").append(row);
+  });
+  element("meshes").hidden = info.meshes.length < 2;
 
   const refresh = () => {
     const trainedLimits = (info.training?.limits ?? []).filter(
@@ -58,13 +68,18 @@ export function fillPanel(info, pose, onChange) {
   refresh();
 }
 
+/** Return the name of a shape key or custom property: "smile" for key_blocks["smile"].value; else the path. */
+function shortName(path) {
+  const name = path.match(/^(?:key_blocks)?\[("(?:[^"\\]|\\.)*")\](?:\.value)?$/);
+  return name ? JSON.parse(name[1]) : path;
+}
+
 /** A labeled slider; `row` is its HTML element. */
 class Slider {
   constructor(label, id, low, high, step, unit, onChange) {
     this.unit = unit;
     this.row = element("slider").content.firstElementChild.cloneNode(true);
     this.row.firstElementChild.textContent = label;
-    this.row.title = label;
     [this.input, this.output] = this.row.querySelectorAll("input, output");
     Object.assign(this.input, { id, min: low, max: high, step });
     this.input.addEventListener("input", () => {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The 3D view: the mesh, a floor, the axes of the chosen joint, and a camera that orbits around them.
+// The 3D view: the meshes, a floor, the axes of the chosen joint, and a camera that orbits around them.
 
 import {
   AxesHelper,
@@ -25,6 +25,7 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const BACKGROUND = 0x24272c;
 const AXIS_COLORS = [0xff7a6b, 0x7ed77e, 0x7fb0ff]; // the colors of the panel
+const SHADES = [1, 0.7, 0.85]; // of the meshes, in turns
 const LIGHTS = [
   [2.4, -0.8, 1, 0.5], // strength and direction in camera space: from the left and above
   [0.8, 1, 0.2, -0.6], // rim light from the right
@@ -36,8 +37,9 @@ export class Stage {
    * @param {HTMLCanvasElement} canvas fills its parent
    * @param {Uint32Array} triangles three vertices each
    * @param {Float32Array} positions vertex positions in the rest pose, meters
+   * @param meshes the meshes of the metadata; the triangles and positions of each follow those of the one before
    */
-  constructor(canvas, triangles, positions) {
+  constructor(canvas, triangles, positions, meshes) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true });
     this.renderer.setPixelRatio(devicePixelRatio);
     this.scene = new Scene();
@@ -54,8 +56,19 @@ export class Stage {
     this.geometry.setIndex(new BufferAttribute(triangles, 1));
     this.geometry.setAttribute("position", new BufferAttribute(positions.slice(), 3).setUsage(DynamicDrawUsage));
     this.geometry.computeVertexNormals();
-    const gray = new MeshStandardMaterial({ color: 0xc4c4c4, roughness: 0.55, side: DoubleSide });
-    const mesh = new Mesh(this.geometry, gray);
+    this.materials = meshes.map((_, mesh) => {
+      const color = new Color(0xc4c4c4).multiplyScalar(SHADES[mesh % SHADES.length]);
+      return new MeshStandardMaterial({ color, roughness: 0.55, side: DoubleSide });
+    });
+    let [start, vertices] = [0, 0]; // of the next mesh: its first corner and its first vertex
+    meshes.forEach((mesh, number) => {
+      vertices += mesh.vertices;
+      const next = triangles.findIndex((vertex, corner) => corner >= start && vertex >= vertices);
+      const end = next < 0 ? triangles.length : next;
+      this.geometry.addGroup(start, end - start, number);
+      start = end;
+    });
+    const mesh = new Mesh(this.geometry, this.materials);
     mesh.frustumCulled = false; // frustum culling would need new bounds for each pose
     this.box = new Box3().setFromBufferAttribute(this.geometry.getAttribute("position"));
     this.sphere = this.box.getBoundingSphere(new Sphere());
@@ -73,7 +86,13 @@ export class Stage {
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
   }
 
-  /** Show the mesh, and axes at the pose matrix of a joint. */
+  /** Show or hide a mesh. */
+  showMesh(mesh, isShown) {
+    this.materials[mesh].visible = isShown;
+    this.draw();
+  }
+
+  /** Show the meshes, and axes at the pose matrix of a joint. */
   show(positions, joint) {
     const attribute = this.geometry.getAttribute("position");
     attribute.array.set(positions);
