@@ -3,7 +3,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -29,14 +28,6 @@ def start_trainer(*arguments: str | Path, **options) -> subprocess.Popen:
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
         **options,
     )
-
-
-def run_page_code(chapter: str, folder: Path) -> str:
-    """Run the code block of a chapter of docs/formats.md in a folder, and return its output."""
-    page = (REPOSITORY / "docs" / "formats.md").read_text("utf-8")
-    text = page.partition(f"\n## {chapter}\n")[2].partition("\n## ")[0]
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    return subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 @pytest.fixture(scope="session")

@@ -53,13 +53,6 @@ def test_components_are_orthonormal_so_coefficients_measure_distance():
     assert np.linalg.norm(coefficients[3] - coefficients[4]) == pytest.approx(distance, rel=1e-3)
 
 
-def test_a_constant_residual_needs_no_component():
-    values = np.tile(np.float32([[0.01, 0.02, 0.03]]), (20, 5))
-    basis = make_basis(values, 1e-5, np.random.default_rng(0))
-    assert basis.components.shape == (0, 15)
-    np.testing.assert_allclose(basis.reconstruct(basis.project(values)), values, atol=1e-8)
-
-
 def test_a_sample_of_the_poses_gives_the_same_components(monkeypatch):
     monkeypatch.setattr(basis_module, "MAX_POSES", 50)
     monkeypatch.setattr(basis_module, "NEGLIGIBLE_RMS_RATIO", 0)
@@ -96,13 +89,6 @@ def test_shared_allocation_meets_the_tolerance_with_fewer_parameters():
 
     assert count_parameters(counts) < count_parameters(separate_counts)
     assert all(error_by_count[count] <= 2 * 0.06 for error_by_count, count in zip(errors, counts, strict=True))
-
-
-def test_a_single_partition_gets_just_enough_components():
-    errors, vertex_counts = example_errors()
-    for error_by_count, vertex_count in zip(errors, vertex_counts, strict=True):
-        (count,) = allocate_components([error_by_count], [vertex_count], 0.06, parameters_per_component=65)
-        assert error_by_count[count] <= 0.06 < error_by_count[count - 1]
 
 
 def test_an_unreachable_tolerance_takes_all_components():

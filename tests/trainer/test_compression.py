@@ -121,14 +121,6 @@ def test_a_component_for_extreme_poses_stays(kind):
     assert error < 1.1 * mean_error(data, prepared[0], extremes) < 0.2 * np.abs(residuals[extremes]).mean()
 
 
-def test_a_dropped_component_that_is_small_needs_no_remedy():
-    prepared, split = train_partitions(make_data(noise=0.001))
-    remaining = drop_components(prepared, split)
-    assert remaining[0].dropped_count == 1
-    sentence = dropped_components_sentence(prepared, remaining)
-    assert "record" not in sentence and sentence.endswith("of what the linear fit leaves.")
-
-
 @pytest.fixture(scope="module")
 def noisy_chain(tmp_path_factory):
     """Folder with a recording of the chain whose vertices also move at random, and a model trained on it."""

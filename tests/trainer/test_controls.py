@@ -26,7 +26,7 @@ from trainer.networks.confidence import measure_training_range
 
 from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
-from .conftest import QUICK_OPTIONS, run_page_code
+from .conftest import QUICK_OPTIONS
 
 POSES = 150
 BULGE = Control("shape_keys", 'key_blocks["Bulge"].value', 0, 1)
@@ -221,17 +221,6 @@ def test_each_pose_of_a_batch_has_its_own_control_values(network):
         single_positions = network.positions(poses[index : index + 1], values[index : index + 1])
         np.testing.assert_allclose(single_positions[0], batch_positions[index], atol=2e-6)
     assert np.abs(network.positions(poses, values[::-1]) - batch_positions).max() > 1e-3
-
-
-def test_the_code_in_the_model_format_page_runs(model):
-    assert run_page_code("Model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
-
-
-def test_a_model_without_controls_ignores_controls(trained):
-    network = Network(trained / "model.onnx")
-    rest = network.info.rest_matrices[None]
-    expected_positions = network.positions(rest).copy()
-    np.testing.assert_array_equal(network.positions(rest, np.zeros((1, 0), np.float32)), expected_positions)
 
 
 def test_a_warm_start_requires_the_same_controls(controlled_recording, model, tmp_path, capsys):

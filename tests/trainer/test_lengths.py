@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.formats.report import report_path
 from fdda_addon.core.mathematics.features import FEATURES_PER_JOINT
@@ -131,11 +130,3 @@ def test_training_ranges_agree_in_meters(results_by_unit, name):
         bounds = bounds.copy()
         bounds[:, 3::4] /= units_per_metre
         assert np.abs(bounds - reference_bounds)[1:].max() < 2e-4
-
-
-@pytest.mark.parametrize("name", UNITS_AND_DISTANCES)
-def test_recording_checks_give_the_same_warnings(results_by_unit, name):
-    warnings, reference_warnings = (
-        {warning.name for warning in check_recording(results_by_unit[n][0])} for n in (name, METER)
-    )
-    assert warnings == reference_warnings

@@ -19,7 +19,7 @@ from trainer.fits.joint_fit import joint_regression, joints_on_path
 
 from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
-from .conftest import QUICK_OPTIONS, run_page_code
+from .conftest import QUICK_OPTIONS
 
 POSES, JOINTS = 120, 4
 STATIC_JOINT_INDEX = JOINTS
@@ -101,18 +101,6 @@ def test_model_and_report_name_merged_joints(model):
     assert all(p["held_out"]["mean"] < 0.1 * p["linear"]["mean"] for p in report["partitions"])
     page = model.with_name("report.html").read_text()
     assert '<td title="with bone_3">bone_2</td>' in page and ">no bone</td>" in page
-
-
-def test_the_code_in_the_recording_format_page_runs(model):
-    rig = odd_rig()
-    pose = odd_poses(rig, POSES, 0)[:1]
-    expected = distances(smoothed(rig, pose), LinearSkinning(rig).positions(pose)).mean() * 1000
-    shape, residual = run_page_code("Recording", model.parent).split(" mean distance from linear skinning ")
-    assert shape == "(90, 3)" and float(residual.removesuffix(" mm\n")) == pytest.approx(expected, rel=1e-4)
-
-
-def test_confidence_is_one_where_only_recorded_joints_move(model):
-    assert (Network(model).confidence(odd_poses(odd_rig(), 10, 0)) == 1).all()
 
 
 def test_vertices_without_a_bone_are_fitted_to_influencing_joints():

@@ -14,8 +14,6 @@ from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.rig import Rig
 from trainer.__main__ import main
-from trainer.config import ACTIVATION, TrainingConfig
-from trainer.data.split import split_recording
 
 from ..recordings import read_skinned
 from .chain import MAX_ANGLE, chain_angles, chain_residuals, pose_chain, write_chain
@@ -58,15 +56,6 @@ def test_the_poses_of_a_batch_of_any_size_are_independent(session, rig):
 
 def partitions_in_metadata(session) -> list:
     return json.loads(session.get_modelmeta().custom_metadata_map["fdda"])["partitions"]
-
-
-def test_linear_skinning_moves_with_the_character(session, rig):
-    poses = pose_chain(rig, chain_angles(4, 3, seed=6))
-    shift = np.float32([0.5, -2, 1])
-    moved_poses = poses.copy()
-    moved_poses[:, :, :3, 3] += shift
-    skinning = LinearSkinning(rig)
-    np.testing.assert_allclose(skinning.positions(moved_poses), skinning.positions(poses) + shift, atol=1e-5)
 
 
 def test_confidence_is_one_in_recorded_poses(session, recording):
@@ -160,14 +149,9 @@ def test_the_report_has_the_errors_of_the_model(report, trained, recording, sess
     assert sum(report["histogram"]["fdda"]) == source_recording.rig.vertex_count * report["training"]["held_out_poses"]
     for p in report["partitions"]:
         assert len(p["curve"]["validation"]) == (40 if p["basis"] else 0)
-
-
-@pytest.mark.parametrize("activation", [name for name in ACTIVATION.choices if name != TrainingConfig.activation])
-def test_every_activation_and_any_depth_can_be_exported(tmp_path, recording, activation):
-    model = tmp_path / "m.onnx"
-    options = ["--passes", "2", "--activation", activation, "--hidden", *(["8"] if activation == "tanh" else ["8"] * 3)]
-    assert main([str(recording), str(model), *options]) == 0
-    assert read_model_info(model).parity_mm < 1e-2
+    normals, edges = report["normals"], report["edges"]
+    assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
+    assert edges["fdda"]["across"] < edges["linear"]["across"]
 
 
 def test_a_rig_of_one_joint_is_exported(tmp_path):
@@ -178,27 +162,3 @@ def test_a_rig_of_one_joint_is_exported(tmp_path):
     positions, confidence = run_model(session, rig.rest_matrices[None])
     np.testing.assert_allclose(positions[0], rig.rest_positions, atol=1e-5)
     assert confidence.tolist() == [[1.0]]
-
-
-def test_the_report_has_the_surface_errors(report, recording, session, trained):
-    source_recording = read_skinned(recording)
-    normals, edges = report["normals"], report["edges"]
-    assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
-    assert edges["fdda"]["across"] < edges["linear"]["across"]
-    skinning, split = LinearSkinning(source_recording.rig), split_recording(source_recording, TrainingConfig())
-    triangles = source_recording.rig.face_vertices.reshape(-1, 3)
-    edge_vertices = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    partition_of_vertex = np.empty(source_recording.rig.vertex_count, np.int64)
-    for index, partition in enumerate(read_model_info(trained / "model.onnx").partitions_of(source_recording.rig)):
-        partition_of_vertex[partition.vertices] = index
-    is_across = partition_of_vertex[edge_vertices[:, 0]] != partition_of_vertex[edge_vertices[:, 1]]
-    rest_lengths = np.linalg.norm(np.subtract(*source_recording.rig.rest_positions[edge_vertices.T]), axis=1)
-    errors = []
-    for pose in split.held_out:
-        matrices = np.array(source_recording.pose_matrices[pose : pose + 1])
-        truth = skinning.complex_positions(matrices, np.array(source_recording.residuals[pose : pose + 1]))[0]
-        predicted = run_model(session, matrices)[0][0]
-        lengths = [np.linalg.norm(np.subtract(*positions[edge_vertices.T]), axis=1) for positions in (predicted, truth)]
-        errors.append(np.abs(lengths[0] - lengths[1]) / rest_lengths)
-    assert edges["fdda"]["across"] == pytest.approx(np.mean(errors, axis=0)[is_across].mean(), rel=1e-3)
-    assert edges["fdda"]["inside"] == pytest.approx(np.mean(errors, axis=0)[~is_across].mean(), rel=1e-3)

@@ -60,10 +60,3 @@ def test_a_strict_training_fails_before_it_starts(suspicious_recording, tmp_path
     )
     assert expected_warning in output.out
     assert ("epoch" in output.out, list(tmp_path.iterdir())) == (False, [])
-
-
-def test_the_text_output_has_the_warnings(report, suspicious_recording, tmp_path, capsys):
-    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), *QUICK_OPTIONS[2:], "--passes", "1"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines[2:4]] == [f"Warning ({name})" for name in WARNING_NAMES]
-    assert report["warnings"] == []
