@@ -9,7 +9,7 @@ import numpy as np
 from ..scene.arrays import COORDINATE_ELEMENT, MATERIAL_INDEX_ELEMENT, write
 from .action import assign_drive_action
 from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED_RANGE, RIG_OBJECT, ROTATION_MODE
-from .surface import Surface, sculpt_arm
+from .surface import Surface, read_surface
 
 # Iterations and factor of Corrective Smooth, by density. On finer quads, each iteration smooths a smaller distance.
 SMOOTHING_SETTINGS = {1: (10, 0.5), 2: (20, 0.8), 3: (30, 1.0)}
@@ -24,7 +24,7 @@ def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
     The arm has three deformers: an Armature modifier with hard skinning, a biceps shape key with a driver, and
     Corrective Smooth. The action `arm_drive` is assigned, and the scene gets its frame range.
     """
-    surface = sculpt_arm(density)
+    surface = read_surface(density)
     armature_object = _create_armature_object()
     # Set the range of motion as IK limits and locks, which do not clamp posing, so an action may exceed it.
     for joint in JOINTS:
@@ -51,7 +51,7 @@ def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
     basis = mesh_object.shape_key_add(name="Basis", from_mix=False)
     key = mesh_object.shape_key_add(name=BICEPS_KEY, from_mix=False)
     key.relative_key = basis
-    write(key.data, COORDINATE_ELEMENT, (surface.points + surface.biceps).astype(np.float32))
+    write(key.data, COORDINATE_ELEMENT, surface.contracted)
     driver = key.driver_add("value").driver
     driver.type = "SCRIPTED"
     variable = driver.variables.new()
