@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import MACHINE_WINERRORS, TRY_AGAIN, ModelError
-from ..core.files.native_library import loader_winerror, runtime_advice
-from ..core.files.windows_library import check_cpp_library
+from ..core.files.native_library import check_cpp_library, loader_winerror, runtime_advice
 from ..core.formats.model import (
     CONFIDENCE_OUTPUT,
     CONTROLS_INPUT,
@@ -53,8 +52,7 @@ class Network:
         self.info, data = read_model(path) if data is None else (check_model(data, path), data)
         self._skin = read_skin(data, self.info, path)
         try:
-            # Another extension may have brought a newer version than Blender can load.
-            check_cpp_library("onnxruntime")
+            check_cpp_library()
             # Imported here so that Blender starts without ONNX Runtime.
             import onnxruntime
         except (ImportError, OSError) as error:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import setuptools
 
-from fdda_addon.core.files import windows_library
-from fdda_addon.core.files.windows_library import check_cpp_library, loaded_cpp_library_version, read_imports
+from fdda_addon.core.files import native_library
+from fdda_addon.core.files.native_library import check_cpp_library, loaded_cpp_library_version
 
 from ..systems import WINDOWS
 from .test_setup import package
@@ -49,7 +49,7 @@ def make_dll(
 
 
 def test_imports_of_a_real_program_are_read():
-    linker, imports = read_imports(Path(setuptools.__file__).with_name("cli-64.exe").read_bytes())
+    linker, imports = package.read_imports(Path(setuptools.__file__).with_name("cli-64.exe").read_bytes())
     assert linker >= (9, 0) and {"CreateProcessA", "WaitForSingleObject"} <= imports["kernel32.dll"]
 
 
@@ -97,21 +97,23 @@ def test_a_damaged_dll_is_refused(tmp_path: Path, data: bytes):
         package.check_wheel(tmp_path / "x.whl", "windows-x64", "3.11")
 
 
-@pytest.mark.parametrize(("loaded", "is_refused"), [((14, 29), True), ((14, 40), False), (None, False)])
-def test_a_package_that_would_end_the_process_is_not_imported(tmp_path: Path, monkeypatch, loaded, is_refused):
-    (tmp_path / "fragile/capi").mkdir(parents=True)
-    (tmp_path / "fragile/__init__.py").write_text("")
-    (tmp_path / "fragile/capi/state.pyd").write_bytes(make_dll(CONSTANT_MUTEX))
-    (tmp_path / "fragile/capi/damaged.dll").write_bytes(b"")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(windows_library, "loaded_cpp_library_version", lambda: loaded)
+@pytest.mark.parametrize(
+    ("loaded", "version", "is_refused"),
+    [
+        ((14, 29), "1.21.0", True),
+        ((14, 29), "1.20.1", False),
+        ((14, 40), "1.31.1", False),
+        (None, "1.31.1", False),
+    ],
+)
+def test_a_runtime_that_would_end_the_process_is_not_imported(monkeypatch, loaded, version, is_refused):
+    monkeypatch.setattr(native_library, "loaded_cpp_library_version", lambda: loaded)
+    monkeypatch.setattr(native_library.metadata, "version", lambda _: version)
     if not is_refused:
-        check_cpp_library("fragile")
+        check_cpp_library()
         return
-    with pytest.raises(
-        ImportError, match=r"state\.pyd' needs msvcp140\.dll 14\.40 or later, and Blender has loaded 14\.29"
-    ):
-        check_cpp_library("fragile")
+    with pytest.raises(ImportError, match=r"1\.21\.0 needs msvcp140\.dll 14\.40, and Blender has loaded 14\.29"):
+        check_cpp_library()
 
 
 @pytest.mark.skipif(not WINDOWS, reason="Only Windows has this library.")

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Advice on libraries of Python packages that the operating system cannot load, by what its loader reports."""
+"""Libraries of Python packages that the operating system cannot load: advice by what its loader reports."""
 
 import ctypes
 import platform
 import re
 import sys
+from importlib import metadata
 from typing import NamedTuple
 
-_REINSTALL_TRAINER = "install the training environment again"
-_REINSTALL_EXTENSION = "install the extension's zip for this platform again"
-_ALLOW = "the security settings of this system block the file: allow it there, or ask your administrator"
-_MEMORY = "enlarge the paging file of Windows, or end other programs"
-_OTHER_FILE = "the file is damaged or made for another processor: "
-_OTHER_PROGRAM = (
-    "a DLL of another program is loaded in its place: remove that program's folder from the variable PATH, or "
-)
-_NO_PROGRAMS = "its drive is mounted with the option noexec: mount it without"
+OLD_CPP_LIBRARY, LAST_OLD_RUNTIME = (14, 40), (1, 20)
+"""Newer versions of ONNX Runtime than the second end the process with an older C++ library than the first.
+`setup/package.py` refuses wheels that need more than Blender brings, but another extension may have brought one."""
+_REINSTALL = "install the training environment again", "install the extension's zip for this platform again"
+"""Replaces {again} in advice for the trainer's Python, and for Blender."""
+_INSTALL_RUNTIME = "install Microsoft's Visual C++ runtime from {runtime}"
+_OTHER_FILE = "the file is damaged or made for another processor: {again}"
 
 
 class _Cause(NamedTuple):
@@ -24,70 +23,65 @@ class _Cause(NamedTuple):
     Attributes:
         pattern: regular expression for the text of the error. Its group is {0} in the advice.
         winerrors: error numbers of Windows.
-        for_trainer: advice for a library of the trainer's Python; {runtime} is the URL of Microsoft's runtime.
-        for_blender: advice for a library of the extension. Blender brings Microsoft's runtime itself.
+        advice: {runtime} is the URL of Microsoft's runtime.
+        blender_advice: advice for a library of the extension, if it differs. Blender brings Microsoft's runtime itself.
     """
 
     pattern: str
     winerrors: tuple[int, ...]
-    for_trainer: str
-    for_blender: str
+    advice: str
+    blender_advice: str | None = None
 
 
 _CAUSES = (
-    _Cause(
-        r"",
-        (126, 1157, 14001),
-        "install Microsoft's Visual C++ runtime from {runtime}",
-        f"a virus scanner may have removed a file: {_REINSTALL_EXTENSION}",
-    ),
+    _Cause("", (126, 1157, 14001), _INSTALL_RUNTIME, "a virus scanner may have removed a file: {again}"),
     _Cause(
         r"needs msvcp140\.dll",
         (127, 998, 1114),
-        "install Microsoft's Visual C++ runtime from {runtime}",
+        _INSTALL_RUNTIME,
         "another extension may have brought a newer ONNX Runtime: remove that extension, or use a newer Blender",
     ),
-    _Cause(r"", (182,), _OTHER_PROGRAM + _REINSTALL_TRAINER, _OTHER_PROGRAM + _REINSTALL_EXTENSION),
-    _Cause(r"shared object.*: Cannot allocate memory", (8, 14, 1455), _MEMORY, _MEMORY),
-    _Cause(r"code signature|disallowed by system policy", (225, 577, 1260, 4551), _ALLOW, _ALLOW),
+    _Cause(
+        "",
+        (182,),
+        "a DLL of another program is loaded in its place: remove that program's folder from the variable PATH, or "
+        "{again}",
+    ),
+    _Cause(
+        r"shared object.*: Cannot allocate memory",
+        (8, 14, 1455),
+        "enlarge the paging file of Windows, or end other programs",
+    ),
+    _Cause(
+        r"code signature|disallowed by system policy",
+        (225, 577, 1260, 4551),
+        "the security settings of this system block the file: allow it there, or ask your administrator",
+    ),
     _Cause(
         r"ELF (?:class|header|load)|file too short|cannot read file data|/[^\s:]+: cannot open shared object|mach-o",
         (193, 216),
-        f"{_OTHER_FILE}{_REINSTALL_TRAINER}, with a Python for this processor",
-        _OTHER_FILE + _REINSTALL_EXTENSION,
+        f"{_OTHER_FILE}, with a Python for this processor",
+        _OTHER_FILE,
     ),
-    _Cause(
-        r"(GLIBC_[\d.]+)' not found",
-        (),
-        "this Linux is too old: use one whose C library has {0}",
-        "this Linux is too old: use one whose C library has {0}",
-    ),
+    _Cause(r"(GLIBC_[\d.]+)' not found", (), "this Linux is too old: use one whose C library has {0}"),
     _Cause(
         r"((?:GLIBCXX|CXXABI)_[\d.]+)' not found",
         (),
         "an older C++ library is loaded: unset LD_LIBRARY_PATH, or use a Linux whose libstdc++ has {0}",
-        "an older C++ library is loaded: unset LD_LIBRARY_PATH, or use a Linux whose libstdc++ has {0}",
     ),
-    _Cause(
-        r"built for macOS ([\d.]+)",
-        (),
-        "update macOS to version {0} or later",
-        "update macOS to version {0} or later",
-    ),
-    _Cause(
-        r"(?s)Symbol not found.*Expected in: \S*/(?:usr/lib|System)/",
-        (),
-        "update macOS to version 14 or later",
-        "update macOS to version 14 or later",
-    ),
+    _Cause(r"built for macOS ([\d.]+)", (), "update macOS to version {0} or later"),
+    _Cause(r"(?s)Symbol not found.*Expected in: \S*/(?:usr/lib|System)/", (), "update macOS to version 14 or later"),
     _Cause(
         r"([^\s:('\"/]+): cannot open shared object file",
         (),
-        f"install the package of this Linux that has '{{0}}', or {_REINSTALL_TRAINER}",
-        f"install the package of this Linux that has '{{0}}', or {_REINSTALL_EXTENSION}",
+        "install the package of this Linux that has '{0}', or {again}",
     ),
-    _Cause(r"failed to map segment from shared object", (), _NO_PROGRAMS, _NO_PROGRAMS),
-    _Cause(r'Error loading "|DLL load failed|dlopen\(|shared object|undefined symbol', (), _REINSTALL_TRAINER, ""),
+    _Cause(
+        r"failed to map segment from shared object",
+        (),
+        "its drive is mounted with the option noexec: mount it without",
+    ),
+    _Cause(r'Error loading "|DLL load failed|dlopen\(|shared object|undefined symbol', (), "{again}", ""),
 )
 _ENGLISH_TEXTS = {
     8: "Not enough memory resources",
@@ -117,8 +111,8 @@ def runtime_advice(error_text: str, in_blender: bool = False) -> str:
     for cause in _CAUSES:
         match = re.search(cause.pattern, error_text) if cause.pattern else None
         if match or winerror in cause.winerrors:
-            advice = cause.for_blender if in_blender else cause.for_trainer
-            return advice.format(*match.groups() if match else (), runtime=runtime_url())
+            advice = cause.advice if cause.blender_advice is None or not in_blender else cause.blender_advice
+            return advice.format(*match.groups() if match else (), runtime=runtime_url(), again=_REINSTALL[in_blender])
     return ""
 
 
@@ -137,3 +131,38 @@ def runtime_url() -> str:
     """Return Microsoft's permanent URL of the Visual C++ runtime for this processor."""
     processor = "arm64" if platform.machine().lower() in ("arm64", "aarch64") else "x64"
     return f"https://aka.ms/vs/17/release/vc_redist.{processor}.exe"
+
+
+def check_cpp_library() -> None:
+    """Check that ONNX Runtime can be imported with the C++ library, MSVCP140.dll, that this process has loaded.
+
+    Blender brings a copy, which all DLLs of the process get. If it is too old, the import ends the process.
+
+    Raises:
+        ImportError: ONNX Runtime needs a newer one, or is not installed.
+    """
+    loaded = loaded_cpp_library_version()
+    if loaded is None or loaded >= OLD_CPP_LIBRARY:
+        return
+    version = metadata.version("onnxruntime")
+    if tuple(map(int, version.split(".")[:2])) > LAST_OLD_RUNTIME:
+        needed_text, loaded_text = ("{}.{}".format(*pair) for pair in (OLD_CPP_LIBRARY, loaded))
+        raise ImportError(f"version {version} needs msvcp140.dll {needed_text}, and Blender has loaded {loaded_text}")
+
+
+def loaded_cpp_library_version() -> tuple[int, int] | None:
+    """Return the version of the C++ library in this process; None if none is loaded, or on another system."""
+    if sys.platform != "win32":
+        return None
+    kernel, versions = ctypes.WinDLL("kernel32"), ctypes.WinDLL("version")
+    kernel.GetModuleHandleW.restype = ctypes.c_void_p
+    handle, path = kernel.GetModuleHandleW("msvcp140.dll"), ctypes.create_unicode_buffer(32768)
+    if not handle or not kernel.GetModuleFileNameW(ctypes.c_void_p(handle), path, len(path)):
+        return None
+    information = ctypes.create_string_buffer(versions.GetFileVersionInfoSizeW(path, None))
+    fields, size = ctypes.POINTER(ctypes.c_uint32)(), ctypes.c_uint()
+    if not versions.GetFileVersionInfoW(path, 0, len(information), information) or not versions.VerQueryValueW(
+        information, "\\", ctypes.byref(fields), ctypes.byref(size)
+    ):
+        return None
+    return fields[2] >> 16, fields[2] & 0xFFFF
