@@ -26,6 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from ..core.checks.target import unsettled_sentence
+    from ..core.recording.estimate import format_poses
     from ..core.recording.index import read_index, read_info
     from ..runtime.binding import model_disabled
     from .files import open_file
@@ -53,11 +54,12 @@ def run(options: argparse.Namespace) -> None:
         print(f"{options.recording}: {format_count(step.total, 'pose')} added in {seconds:.1f} s")
         return
     index = read_index(options.recording)
-    repeatability = read_info(index).repeatability
-    for sentence in filter(None, (unsettled_sentence(index), repeatability and repeatability.sentence())):
+    info = read_info(index)
+    for sentence in filter(None, (unsettled_sentence(index), info.repeatability and info.repeatability.sentence())):
         print(sentence)
-    meshes = f" of {len(index['meshes'])} meshes" if len(index["meshes"]) > 1 else ""
-    print(f"{options.recording}: {format_count(index['poses'], 'pose')}{meshes} in {seconds:.1f} s")
+    meshes = f", of {len(index['meshes'])} meshes" if len(index["meshes"]) > 1 else ""
+    poses = format_poses(info.poses, len(info.alone_poses))
+    print(f"{options.recording}: {poses}{meshes}, in {seconds:.1f} s")
 
 
 def _find_rig(options: argparse.Namespace) -> "SceneRig":

@@ -81,7 +81,7 @@ class JobPlan:
 def recording_steps(pose_count: int, has_target: bool = False) -> list[JobStep]:
     """Return the steps of a recording."""
     check = [JobStep("checking the object", ("target",), None, 1)] if has_target else []
-    return [*check, JobStep("recording", ("poses", "repeatability"), None, pose_count)]
+    return [*check, JobStep("recording", ("poses", "influences", "repeatability"), None, pose_count)]
 
 
 def training_steps(

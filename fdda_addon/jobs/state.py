@@ -11,6 +11,7 @@ CHARACTER, ENVIRONMENT = "character", "environment"
 """Kinds of jobs. A job on a character ends when another file is opened. A job on the training environment uses no data
 of Blender and continues."""
 STAGE_UNITS = {
+    "influences": "bones and inputs moved alone",
     "fit": "vertices fitted",
     "key joints": "bones compared with others",
     "probes": "poses compared with the rig",
@@ -26,7 +27,7 @@ STAGE_UNITS = {
 }
 """Labels of the steps of a stage, where they differ from the name of the stage."""
 PREPARING_STAGES = {
-    *("influences", "starting", "partitions prepared", "poses to fit", "key joints", "fit", "target", "probes"),
+    *("starting", "partitions prepared", "poses to fit", "key joints", "fit", "target", "probes"),
     *("full rig", "repeated poses", "fast rig"),
 }
 """Stages that are always followed by another stage of the same job."""
@@ -124,7 +125,8 @@ class JobState:
     def detail(self) -> str:
         """Return the progress of the stage: "Training: 50 of 200", "Poses compared: 3 of 10", "Starting…"."""
         stage, separator, mesh_part = self.stage.partition(" of '")
-        label = self.plan.current.label if self.plan is not None else STAGE_UNITS.get(stage, stage)
+        is_step = self.plan is not None and stage in ("", self.plan.current.stages[0])
+        label = self.plan.current.label if is_step else STAGE_UNITS.get(stage, stage)
         if not self.stage:
             return f"{label[:1].upper()}{label[1:]}…" if label else "Starting…"
         count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"

@@ -8,8 +8,9 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
+from ..core.recording.estimate import format_poses
 from ..core.recording.folder import remove_recording
-from ..core.recording.index import read_index
+from ..core.recording.index import read_index, read_info
 from ..core.sentences.counts import format_count
 from ..core.settings import REFINEMENT_POSES
 from ..jobs.plan import JobPlan, JobStep, recording_steps
@@ -86,14 +87,14 @@ class FDDA_OT_record(JobOperator, bpy.types.Operator):
         yield from record_character(character, shown.mesh_object, self._path, self.resume)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
-        return f"Recorded {format_count(self.state.total, 'pose')} into '{self._path.name}'."
+        info = read_info(read_index(self._path))
+        return f"Recorded {format_poses(info.poses, len(info.alone_poses))}, into '{self._path.name}'."
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
-        if self.state.stage != "poses" or not self.state.done:
+        if self.state.stage not in ("poses", "influences", "repeatability") or not self.state.done:
             return "Recording canceled before the first pose; nothing was kept."
-        return (
-            f"Recording canceled. {self.state.done:,} of {self.state.total:,} poses are kept; press Resume to continue."
-        )
+        kept_text = f"{self.state.done:,} of {self.state.total:,}" if self.state.stage == "poses" else "All"
+        return f"Recording canceled. {kept_text} poses are kept; press Resume to continue."
 
 
 class FDDA_OT_refine(JobOperator, bpy.types.Operator):

@@ -10,6 +10,7 @@ import bpy
 
 from ..core.errors import FDDAError, RecordingError, RigError
 from ..core.mathematics.poses import Channel
+from ..core.recording.estimate import format_poses
 from ..core.recording.folder import FolderContent, FolderState, read_folder
 from ..core.recording.index import INDEX_NAME
 from ..core.sentences.counts import format_count
@@ -114,7 +115,8 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         row = layout.row()
         row.scale_y = 1.3
         draw_button(row, context, "fdda.train", "Train", "PLAY")
-        draw_wrapped(layout, context, f"{format_count(content.poses, 'pose')} recorded. Next: Train", "CHECKMARK")
+        text = f"{format_poses(content.poses, content.alone_poses)}. Next: Train"
+        draw_wrapped(layout, context, f"Recorded: {text}", "CHECKMARK")
     elif content.state is FolderState.INCOMPLETE:
         _draw_record(layout, context, "Resume", can_record, resume=True)
         text = f"{content.complete:,} of {content.poses:,} poses recorded. Press Resume to continue."

@@ -51,8 +51,8 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         settings: settings of the recording.
 
     Yields:
-        Progress of the stage "poses", with a target also of "target" before and "repeatability" after it. The first
-        progress of "poses" has a note with the estimated time and disk space.
+        Progress of the stages "poses" and "influences", with a target also of "target" before and "repeatability" after
+        these. The first progress of "poses" has a note with the estimated time and disk space.
 
     Raises:
         RigError: the rig cannot be recorded.
@@ -105,34 +105,33 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         writer = exit_stack.enter_context(RecordingWriter(path, rig, info, settings.resume, settings.overwrite))
         # The appender ends before the writer, so that an interrupted recording keeps the evaluated poses.
         appender = exit_stack.enter_context(PoseAppender(recorded.evaluator, writer, rig.vertex_count, pose_setter))
-        done, total = appender.pose_count, info.poses
+        start, alone_count = min(appender.pose_count, plan.total), len(info.alone_poses)
         if writer.note:
-            yield Progress("poses", done, total, writer.note)
-        seconds = pose_setter.seconds_per_pose or seconds_per_pose
-        remaining = Estimate(
-            total - done,
-            min(total - done, len(info.alone_poses)),
+            yield Progress("poses", start, plan.total, writer.note)
+        seconds, remaining = pose_setter.seconds_per_pose or seconds_per_pose, info.poses - appender.pose_count
+        estimate = Estimate(
+            remaining,
+            min(remaining, alone_count),
             rig.vertex_count,
-            recording_bytes(rig, total),
-            seconds and seconds * (total - done),
+            recording_bytes(rig, info.poses),
+            seconds and seconds * remaining,
         )
-        yield Progress("poses", done, total, remaining.sentence() if done < total else "")
-        with closing(plan.show_poses(player, range(done, plan.total))) as poses:
+        yield Progress("poses", start, plan.total, estimate.sentence() if remaining else "")
+        with closing(plan.show_poses(player, range(start, plan.total))) as poses:
             for _ in poses:
                 appender.append_current_pose()
-                yield Progress("poses", appender.pose_count, total, detail=pose_setter.rest_description)
+                yield Progress("poses", appender.pose_count, plan.total, detail=pose_setter.rest_description)
         player.stop()
         if alone:
             player.restore_numbers()
             with closing(alone.show_poses(appender.pose_count - plan.total)) as poses:
                 for _ in poses:
                     appender.append_current_pose()
-                    yield Progress("poses", appender.pose_count, total)
+                    yield Progress("influences", appender.pose_count - plan.total, alone_count)
         if plan.repeatable_poses and settings.target.repeatability_poses:
             appender.flush()
             count = settings.target.repeatability_poses
             yield from measure_repeatability(recorded.evaluator, plan, player, writer, count)
-            yield Progress("poses", total, total)
 
 
 def _check_readers(scene_rig: SceneRig) -> None:

@@ -44,7 +44,10 @@ def test_a_recording_follows_the_settings_and_is_stored_beside_the_file(saved, t
         ("action", 30, "elbow_wave"),
         ("alone", 12, ""),
     ]
-    assert job.state_of("record").outcome == "Recorded 62 poses into 'elbow_recording'."
+    assert (
+        job.state_of("record").outcome
+        == "Recorded 50 poses, and 12 to find what each bone and input moves, into 'elbow_recording'."
+    )
 
 
 def test_an_unsaved_file_is_refused_without_a_folder():
@@ -78,7 +81,7 @@ def test_a_canceled_recording_keeps_its_poses_and_is_resumed(saved, tmp_path, mo
     assert_same_state(before, scene_state(saved))
     outcome = job.state_of("record").outcome
     complete = read_index(recorded_folder(tmp_path))["complete"]
-    assert complete >= 8 and f"{complete} of 32 poses are kept" in outcome
+    assert complete >= 8 and f"{complete} of 20 poses are kept" in outcome
     with pytest.raises(RuntimeError, match="holds a recording already"):
         record(saved)
     assert record(saved, resume=True) == {"FINISHED"}

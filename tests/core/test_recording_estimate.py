@@ -18,16 +18,19 @@ from .limb import make_rig, record_limb
     [
         (
             Estimate(2000, 0, 200_612, 4_830_000_000, 12 * 60.0),
-            "2,000 poses of 200,612 vertices: about 4.8 GB on the disk, about 12 minutes",
+            "2,000 poses, each of 200,612 vertices: about 4.8 GB on the disk, about 12 minutes",
         ),
-        (Estimate(1, 0, 300, 3600, 0.001), "1 pose of 300 vertices: less than 1 MB on the disk, about a second"),
+        (Estimate(1, 0, 300, 3600, 0.001), "1 pose, each of 300 vertices: less than 1 MB on the disk, about a second"),
         (
             Estimate(90, 60, 9960, 12_400_000, 80.0),
-            "90 poses (60 to find what each joint and control moves) of 9,960 vertices: about 12 MB on the disk, "
+            "30 poses, and 60 to find what each bone and input moves, each of 9,960 vertices: about 12 MB on the disk, "
             "about 80 seconds",
         ),
-        (Estimate(9, 0, 9, 10**9, 3 * 3600.0), "9 poses of 9 vertices: about 1.0 GB on the disk, about 3.0 hours"),
-        (Estimate(9, 0, 9, 10**9, None), "9 poses of 9 vertices: about 1.0 GB on the disk"),
+        (
+            Estimate(9, 0, 9, 10**9, 3 * 3600.0),
+            "9 poses, each of 9 vertices: about 1.0 GB on the disk, about 3.0 hours",
+        ),
+        (Estimate(9, 0, 9, 10**9, None), "9 poses, each of 9 vertices: about 1.0 GB on the disk"),
     ],
 )
 def test_sentence_about_an_estimate(estimate, sentence):

@@ -38,12 +38,22 @@ class Estimate:
     seconds: float | None
 
     def sentence(self) -> str:
-        """Format the estimate: "2,000 poses of 200,612 vertices: about 4.8 GB on the disk, about 12 minutes"."""
+        """Format the estimate: "2,000 poses, each of 200,612 vertices: about 4.8 GB on the disk, about 12 minutes"."""
         time_text = "" if self.seconds is None else f", {format_duration(self.seconds)}"
         size_text = f"{'about ' if self.size_bytes >= MIN_SHOWN_BYTES else ''}{format_size(self.size_bytes)}"
-        alone_text = f" ({self.alone_poses:,} to find what each joint and control moves)" if self.alone_poses else ""
-        poses_text = f"{format_count(self.poses, 'pose')}{alone_text}"
-        return f"{poses_text} of {self.vertices:,} vertices: {size_text} on the disk{time_text}"
+        poses_text = format_poses(self.poses, self.alone_poses)
+        return f"{poses_text}, each of {self.vertices:,} vertices: {size_text} on the disk{time_text}"
+
+
+def format_poses(poses: int, alone_poses: int) -> str:
+    """Format a number of poses: "4 poses, and 12 to find what each bone and input moves".
+
+    Args:
+        poses: number of all poses.
+        alone_poses: number of those in which one input moves alone.
+    """
+    alone_text = f"{alone_poses:,} to find what each bone and input moves" if alone_poses else ""
+    return ", and ".join(filter(None, (format_count(poses - alone_poses, "pose"), alone_text)))
 
 
 def recording_bytes(rig: Rig, poses: int) -> int:

@@ -39,6 +39,7 @@ class FolderContent:
     Attributes:
         state: state of the folder.
         complete, poses: number of complete poses and of all poses of the recording.
+        alone_poses: number of the poses of a complete recording in which one input moves alone.
         sentence: a sentence that describes a problem; may be empty.
         measured_sentence: sentence about the repeatability of the target; may be empty.
         is_recording: whether the folder has a recording, possibly damaged, that can be removed.
@@ -50,6 +51,7 @@ class FolderContent:
     sentence: str = ""
     measured_sentence: str = ""
     is_recording: bool = False
+    alone_poses: int = 0
 
 
 def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None) -> FolderContent:
@@ -85,9 +87,11 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None) -> FolderC
     setting_names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in different_keys}))
     if pose_counts[0] == pose_counts[1]:
         sentence = f"It was recorded with other settings than those above: {setting_names}." if different_keys else ""
-        repeatability = read_info(index).repeatability
-        measured_sentence = repeatability.sentence() if repeatability else ""
-        return FolderContent(FolderState.COMPLETE, *pose_counts, sentence, measured_sentence)
+        info = read_info(index)
+        measured_sentence = info.repeatability.sentence() if info.repeatability else ""
+        return FolderContent(
+            FolderState.COMPLETE, *pose_counts, sentence, measured_sentence, alone_poses=len(info.alone_poses)
+        )
     if different_keys:
         return FolderContent(
             FolderState.OTHER,

@@ -76,7 +76,8 @@ def test_one_recording_has_all_meshes_with_weights_first(dressed):
     assert [np.array_equal(mesh.matrix, np.eye(4)) for mesh in recording.rig.meshes] == [True, True, False]
     assert recording.rig.face_vertices.max() == 899 and recording.rig.unweighted_vertices.tolist() == [*range(600, 900)]
     assert (
-        dressed.recorded.out[-1].startswith(f"{dressed.recording}: ") and " of 3 meshes in " in dressed.recorded.out[-1]
+        dressed.recorded.out[-1].startswith(f"{dressed.recording}: ")
+        and ", of 3 meshes, in " in dressed.recorded.out[-1]
     )
 
 

@@ -108,11 +108,13 @@ def test_record_prints_plain_lines_without_a_terminal(elbow_files, tmp_path, cap
     hint, estimate, summary = captured.out.splitlines()
     assert hint.startswith("Hint: ")
     assert estimate.startswith(
-        "62 poses (12 to find what each joint and control moves) of 300 vertices: less than 1 MB on the disk, about "
+        "50 poses, and 12 to find what each bone and input moves, each of 300 vertices: less than 1 MB on the disk, "
+        "about "
     )
-    assert summary.startswith(f"{tmp_path / 'r'}: 62 poses in ")
+    assert summary.startswith(f"{tmp_path / 'r'}: 50 poses, and 12 to find what each bone and input moves, in ")
     lines = captured.err.splitlines()
-    assert lines[0].startswith("poses: 0 of 62, ") and lines[-1].startswith("poses: 62 of 62, ")
+    assert lines[0].startswith("poses: 0 of 50, ") and lines[-1].startswith("influences: 12 of 12, ")
+    assert any(line.startswith("poses: 50 of 50, ") for line in lines)
     assert "\r" not in captured.err and "\x1b" not in captured.err
     recording = read_recording(tmp_path / "r")
     assert recording.info.sampling.seed == 4

@@ -69,11 +69,10 @@ def test_a_successful_verb(elbow_files, tmp_path):
     status, out, err = run_to_end("record", elbow_files.rig, tmp_path / "r", "--poses", 4)
     assert status == 0, err
     estimate, recorded = out.splitlines()
-    assert estimate.startswith("16 poses (12 to find what each joint and control moves) of 300 vertices: "), (
-        "Blender's output is hidden"
-    )
-    assert recorded.startswith(f"{tmp_path / 'r'}: 16 poses in ")
-    assert err.splitlines()[-1].startswith("poses: 16 of 16, ")
+    poses = "4 poses, and 12 to find what each bone and input moves"
+    assert estimate.startswith(f"{poses}, each of 300 vertices: "), "Blender's output is hidden"
+    assert recorded.startswith(f"{tmp_path / 'r'}: {poses}, in ")
+    assert err.splitlines()[-1].startswith("influences: 12 of 12, ")
 
 
 def test_a_failed_verb(tmp_path):

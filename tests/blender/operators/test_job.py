@@ -251,7 +251,7 @@ def test_a_job_is_finishing_when_its_last_stage_is_complete(stage):
     assert state.is_finishing
 
 
-@pytest.mark.parametrize("stage", ["probes", "poses to fit", "key joints", "fit", "target", "influences of 'arm'"])
+@pytest.mark.parametrize("stage", ["probes", "poses to fit", "key joints", "fit", "target of 'arm'"])
 def test_a_job_is_not_finishing_when_a_preparing_stage_is_complete(stage):
     state = JobState("record", "Recording")
     state.show(Progress(stage, 10, 10))
