@@ -3,6 +3,7 @@
 
 import io
 import math
+import mmap
 import os
 import tokenize
 from collections.abc import Sequence
@@ -102,6 +103,13 @@ def open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:
         raise RecordingError(f"'{path}' cannot be used: {error}; record again.") from error
     except NPY_HEADER_ERRORS as error:
         raise RecordingError(f"'{path}' cannot be used: its header is damaged; record again.") from error
+
+
+def release_pages(array: np.ndarray) -> None:
+    """Release the memory of the parts of a memory-mapped array that were read; they can be read again."""
+    # Windows has no such call.
+    if isinstance(array.base, mmap.mmap) and hasattr(array.base, "madvise"):
+        array.base.madvise(mmap.MADV_DONTNEED)
 
 
 def read_array_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:

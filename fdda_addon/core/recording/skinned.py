@@ -20,6 +20,7 @@ from ..mathematics.skin_fit import SkinFit
 from ..mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
 from ..rig import Fingerprint, Rig
 from ..settings import MIN_VERTICES_PER_PART
+from .arrays import release_pages
 from .index import ALONE, RecordingInfo
 from .influences import add_influences, detect_influences
 from .reader import Recording
@@ -139,6 +140,8 @@ def skin_recording(
         influences, text = detect_influences(recording, rig, joints, partitions, influence_tolerance)
         if text:
             note(text)
+    # The poses that move one input alone are not read again.
+    release_pages(recording.positions)
     info, rows = recording.info, np.delete(np.arange(recording.info.poses), recording.info.alone_poses)
     sources = tuple(source for source in info.sampling.sources if source.kind != ALONE)
     return SkinnedRecording(
