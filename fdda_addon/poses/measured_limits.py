@@ -87,7 +87,7 @@ def set_limits_from_actions(
     held_rotations = {
         key: bounds
         for key, bounds in keyed_channel_ranges.items()
-        if key[1] == ROTATION and _is_constant_rotation(bounds)
+        if key[1] == ROTATION and (not has_width(bounds) and abs(bounds[0]) > RANGE_TOLERANCE)
     }
     if not moving_channel_ranges:
         names = ", ".join(f"'{action.name}'" for action in actions) or "none"
@@ -126,16 +126,16 @@ def _set_limits(bone: bpy.types.PoseBone, limits: list[MeasuredLimit], has_ik: b
     for kind in (ROTATION, LOCATION, SCALE):
         settable_limits = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
         has_constraint = find_local_limit(bone, LIMIT_CONSTRAINT_TYPES[kind]) is not None
-        if kind == ROTATION and not has_ik and not has_constraint and _can_be_ik_limits(settable_limits):
+        if (
+            kind == ROTATION
+            and not has_ik
+            and not has_constraint
+            and all(-math.pi <= limit.low <= 0 <= limit.high <= math.pi for limit in settable_limits)
+        ):
             for limit in settable_limits:
                 set_rotation_range(bone, limit.axis, limit.low, limit.high)
         elif settable_limits:
             _set_range_constraint(bone, kind, settable_limits)
-
-
-def _is_constant_rotation(bounds: tuple[float, float]) -> bool:
-    """Return whether a rotation is constant and differs from the rest pose."""
-    return not has_width(bounds) and abs(bounds[0]) > RANGE_TOLERANCE
 
 
 def _measured_limit(
@@ -164,11 +164,6 @@ def _measured_limit(
     if not low < high:
         return MeasuredLimit(bone.name, kind, axis, *bounds, "held by its limit, left so")
     return MeasuredLimit(bone.name, kind, axis, low, high)
-
-
-def _can_be_ik_limits(limits: list[MeasuredLimit]) -> bool:
-    """Return whether IK limits can express ranges, which must include the rest pose and lie within ±180 degrees."""
-    return all(-math.pi <= limit.low <= 0 <= limit.high <= math.pi for limit in limits)
 
 
 def _set_range_constraint(bone: bpy.types.PoseBone, kind: str, limits: list[MeasuredLimit]) -> None:

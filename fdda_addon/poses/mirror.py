@@ -112,7 +112,10 @@ def _check_symmetric(armature_object: bpy.types.Object, partner_indices: np.ndar
         elif axis_distances[index] > AXIS_TOLERANCE:
             angle = np.degrees(2 * np.arcsin(min(1.0, axis_distances[index] / 2)))
             difference = f"in roll or direction, by {angle:.1f}°"
-        elif armature_object.pose.bones[bone.name].rotation_mode != _rotation_mode(armature_object, partner.name):
+        elif (
+            armature_object.pose.bones[bone.name].rotation_mode
+            != armature_object.pose.bones[partner.name].rotation_mode
+        ):
             difference = "in rotation mode"
         else:
             continue
@@ -124,10 +127,6 @@ def _check_symmetric(armature_object: bpy.types.Object, partner_indices: np.ndar
         else:
             problem = f"the bone '{name}' differs from its mirror image {difference}; bring it into the middle"
         raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
-
-
-def _rotation_mode(armature_object: bpy.types.Object, name: str) -> str:
-    return armature_object.pose.bones[name].rotation_mode
 
 
 def _custom_property_paths(armature_object: bpy.types.Object) -> list[str]:

@@ -95,7 +95,25 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         )
         partitions = network.info.partitions_of(opened.linear_rig)
         probe_matrices, errors = yield from _evaluate_probes(probe_poses, poser, evaluator, network, partitions)
-        distances_to_recording = _distances_to_recording(recording, recorded_count, probe_matrices, rig, partitions)
+        columns = [recording.rig.joint_names.index(name) for name in rig.joint_names]
+        poses = np.delete(np.arange(recorded_count), recording.info.alone_poses)
+        recorded_matrices = np.array(recording.pose_matrices[poses][:, columns])
+        probe_features, recorded_features = (
+            joint_features(matrices, rig.rest_matrices, rig.references)
+            for matrices in (probe_matrices, recorded_matrices)
+        )
+        distances_to_recording = np.stack(
+            [
+                nearest_recorded_distances(
+                    *(
+                        features[:, list(partition.influencing)].reshape(len(features), -1)
+                        for features in (probe_features, recorded_features)
+                    )
+                )
+                for partition in partitions
+            ],
+            axis=1,
+        )
         probes = Probes(probe_poses, errors, distances_to_recording)
         base_poses = np.stack(
             [sample_pose(channels, settings.seed, BASE_INDEX + recorded_count + i) for i in range(settings.poses)]
@@ -185,45 +203,6 @@ def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> in
     raise RecordingError(
         f"Cannot resume: '{model}' was trained on {info.trained_poses} poses, and the other "
         f"{added_count} of '{recording.path}' were not chosen for it; refine without --resume, or with the last model."
-    )
-
-
-def _distances_to_recording(
-    recording: Recording,
-    recorded_count: int,
-    pose_matrices: np.ndarray,
-    rig: Rig,
-    partitions: Sequence[Partition],
-) -> np.ndarray:
-    """Compute the distance of each pose to the nearest recorded pose, in the inputs of each partition.
-
-    Args:
-        recording: the recording.
-        recorded_count: number of recorded poses to consider, from the first.
-        pose_matrices: (M, J, 4, 4), the poses.
-        rig: the rig with the J joints of the model.
-        partitions: the P partitions of the model.
-
-    Returns:
-        (M, P) distances.
-    """
-    columns = [recording.rig.joint_names.index(name) for name in rig.joint_names]
-    poses = np.delete(np.arange(recorded_count), recording.info.alone_poses)
-    recorded_matrices = np.array(recording.pose_matrices[poses][:, columns])
-    probe_features, recorded_features = (
-        joint_features(matrices, rig.rest_matrices, rig.references) for matrices in (pose_matrices, recorded_matrices)
-    )
-    return np.stack(
-        [
-            nearest_recorded_distances(
-                *(
-                    features[:, list(partition.influencing)].reshape(len(features), -1)
-                    for features in (probe_features, recorded_features)
-                )
-            )
-            for partition in partitions
-        ],
-        axis=1,
     )
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Records the meshes of a rig in the same poses."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -9,14 +9,12 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import RecordingError, RigError
-from ..core.mathematics.poses import Channel
 from ..core.progress import Progress
 from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
 from ..core.recording.folder_check import check_recordable
 from ..core.recording.index import ALONE, RecordingInfo, Source
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
-from ..core.rig import Rig
 from ..poses.clip import find_clips
 from ..rig.dependencies import deforming_mesh_objects, read_dependencies
 from ..rig.modifier_stack import check_evaluable, read_stack
@@ -26,7 +24,7 @@ from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
 from ..rig.unread_bones import describe_bones
 from ..scene.scene_rig import SceneRig, check_full_rig
-from .alone_poses import AlonePosePlan, plan_alone_poses
+from .alone_poses import plan_alone_poses
 from .appender import PoseAppender
 from .first_checks import check_follows_pose, check_saturation, check_seams, check_target_moves
 from .plan import RecordedRig, RecordingSettings, find_actions, make_sampling, read_sampled_rig
@@ -68,7 +66,16 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     for _, part in scene_rig.parts:
         check_full_rig(part.mesh_object)
         stacks.append(check_evaluable(part))
-    _check_readers(scene_rig)
+    # Raise a RigError if a mesh is deformed by another one that has downstream modifiers, which a recording disables.
+    # An example is a shirt with a Surface Deform modifier on a body that a later modifier subdivides.
+    for mesh_object in scene_rig.mesh_objects if scene_rig.other_meshes else ():
+        for read_object in deforming_mesh_objects(scene_rig, mesh_object):
+            if read_object in scene_rig.mesh_objects and (names := read_stack(read_object).downstream):
+                raise RigError(
+                    f"'{mesh_object.name}' follows the surface of '{read_object.name}' with its modifier '{names[0]}', "
+                    f"which is off while '{read_object.name}' is recorded; switch it off in the viewport, or record "
+                    f"'{mesh_object.name}' by itself."
+                )
     rig, channels = read_sampled_rig(scene_rig, settings)
     notes = [] if rig.has_weights else [MISSING_WEIGHTS.format(scene_rig.mesh_object.name)]
     if not settings.target.name:
@@ -100,7 +107,23 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         rig = find_references(scene_rig, rig, fixed_joints, plan, player)
         if follows_pose:
             alone = plan_alone_poses(scene_rig, rig, channels, settings, clips, player, target is not None)
-        info = _make_info(scene_rig, rig, fixed_joints, settings, plan, channels, alone)
+        sampling, alone_poses = make_sampling(scene_rig, settings, channels), alone.description if alone else None
+        if alone_poses:
+            sampling = replace(sampling, sources=(*sampling.sources, Source(ALONE, alone_poses.poses)))
+        # Any joint may move a target.
+        dependencies = (
+            rig.joint_names if settings.target.name else read_dependencies(scene_rig, find_actions(settings)).bones
+        )
+        info = RecordingInfo(
+            sum(source.poses for source in sampling.sources),
+            0,
+            Path(bpy.data.filepath).name,
+            bpy.app.version_string,
+            sampling,
+            describe_bones(scene_rig, rig, dependencies, fixed_joints),
+            plan.pose_setter.recorded_target,
+            alone=alone_poses,
+        )
         check_disk_space(path, recording_bytes(rig, info.poses))
         writer = exit_stack.enter_context(RecordingWriter(path, rig, info, settings.resume, settings.overwrite))
         # The appender ends before the writer, so that an interrupted recording keeps the evaluated poses.
@@ -132,47 +155,3 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             appender.flush()
             count = settings.target.repeatability_poses
             yield from measure_repeatability(recorded.evaluator, plan, player, writer, count)
-
-
-def _check_readers(scene_rig: SceneRig) -> None:
-    """Raise a RigError if a mesh is deformed by another one that has downstream modifiers, which a recording disables.
-
-    An example is a shirt with a Surface Deform modifier on a body that a later modifier subdivides.
-    """
-    for mesh_object in scene_rig.mesh_objects if scene_rig.other_meshes else ():
-        for read_object in deforming_mesh_objects(scene_rig, mesh_object):
-            if read_object in scene_rig.mesh_objects and (names := read_stack(read_object).downstream):
-                raise RigError(
-                    f"'{mesh_object.name}' follows the surface of '{read_object.name}' with its modifier '{names[0]}', "
-                    f"which is off while '{read_object.name}' is recorded; switch it off in the viewport, or record "
-                    f"'{mesh_object.name}' by itself."
-                )
-
-
-def _make_info(
-    scene_rig: SceneRig,
-    rig: Rig,
-    fixed_joints: Collection[str],
-    settings: RecordingSettings,
-    plan: PosePlan,
-    channels: tuple[Channel, ...],
-    alone: AlonePosePlan | None,
-) -> RecordingInfo:
-    """Make the info of the recording of a rig."""
-    sampling, alone_poses = make_sampling(scene_rig, settings, channels), alone.description if alone else None
-    if alone_poses:
-        sampling = replace(sampling, sources=(*sampling.sources, Source(ALONE, alone_poses.poses)))
-    # Any joint may move a target.
-    dependencies = (
-        rig.joint_names if settings.target.name else read_dependencies(scene_rig, find_actions(settings)).bones
-    )
-    return RecordingInfo(
-        sum(source.poses for source in sampling.sources),
-        0,
-        Path(bpy.data.filepath).name,
-        bpy.app.version_string,
-        sampling,
-        describe_bones(scene_rig, rig, dependencies, fixed_joints),
-        plan.pose_setter.recorded_target,
-        alone=alone_poses,
-    )

@@ -73,7 +73,10 @@ def read_rig(
     names = tuple(joint.name for joint in joints)
     rest_matrices = armature_io.rest_matrices(armature_object.data, names)
     is_bone = np.array([name != STATIC_JOINT for name in names], bool)
-    rest_matrices[is_bone] = armature_to_mesh_matrix(scene_rig.mesh_object, armature_object) @ rest_matrices[is_bone]
+    rest_matrices[is_bone] = (
+        np.array(_armature_to_mesh_transform(scene_rig.mesh_object, armature_object), np.float64)
+        @ rest_matrices[is_bone]
+    )
     # Raise a RigError if a rest matrix, (J, 4, 4), has no inverse.
     for name, matrix in zip(names, rest_matrices, strict=True):
         if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < MIN_VOLUME:
@@ -155,11 +158,6 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
         fingerprint = replace(mesh.fingerprint, skin_weights=recorded.skin_weights, deformation=recorded.deformation)
         rig = replace(rig, meshes=(replace(mesh, fingerprint=fingerprint),))
     return replace(rig, controls=info.controls, metres_per_unit=info.metres_per_unit)
-
-
-def armature_to_mesh_matrix(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
-    """Return the matrix from armature space to mesh-object space, (4, 4) float64, of original or evaluated objects."""
-    return np.array(_armature_to_mesh_transform(mesh_object, armature_object), np.float64)
 
 
 def _armature_to_mesh_transform(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:

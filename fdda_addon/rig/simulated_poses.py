@@ -209,29 +209,26 @@ class SimulatedPoseSetter(PoseSetter):
         needs_range = self._pre_roll or extra_frames
         with temporary_frame_range(self.target, first_frame, last_frame) if needs_range else nullcontext():
             if self._pre_roll:
-                self._play_pre_roll(player, clip, first_frame)
+                # Move from the rest pose towards the first pose of the clip, up to the frame before the clip.
+                player.show(clip, clip.frames[0])
+                end_channels = player.current_clip_frame.channels
+                player.stop()
+                rest_channels = player.current_clip_frame.channels
+                self.target.restart_simulations()
+                for frame in range(first_frame, clip.frames[0]):
+                    fraction = (frame - first_frame) / (clip.frames[0] - first_frame)
+                    for armature_object in player.armature_objects:
+                        ends = rest_channels[armature_object], end_channels[armature_object]
+                        for channel, start, end in zip(POSE_CHANNELS, *ends, strict=True):
+                            values = _interpolate_channel(channel.name, start, end, np.float32(fraction))
+                            write(armature_object.pose.bones, channel, values)
+                        armature_object.update_tag(refresh={"DATA"})
+                    bpy.context.scene.frame_set(frame)
             else:
                 self.target.restart_simulations()
                 for frame in range(self.target.first_frame, clip.frames[0]):
                     player.show(clip, frame)
             yield
-
-    def _play_pre_roll(self, player: ClipPlayer, clip: Clip, first_frame: int) -> None:
-        """Move from the rest pose at a frame towards the first pose of a clip, up to the frame before the clip."""
-        player.show(clip, clip.frames[0])
-        end_channels = player.current_clip_frame.channels
-        player.stop()
-        rest_channels = player.current_clip_frame.channels
-        self.target.restart_simulations()
-        for frame in range(first_frame, clip.frames[0]):
-            fraction = (frame - first_frame) / (clip.frames[0] - first_frame)
-            for armature_object in player.armature_objects:
-                ends = rest_channels[armature_object], end_channels[armature_object]
-                for channel, start, end in zip(POSE_CHANNELS, *ends, strict=True):
-                    values = _interpolate_channel(channel.name, start, end, np.float32(fraction))
-                    write(armature_object.pose.bones, channel, values)
-                armature_object.update_tag(refresh={"DATA"})
-            bpy.context.scene.frame_set(frame)
 
 
 def _interpolate_channel(name: str, start: np.ndarray, end: np.ndarray, fraction: np.float32) -> np.ndarray:

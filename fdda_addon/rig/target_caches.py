@@ -53,33 +53,30 @@ def _object_caches(scene_object: bpy.types.Object) -> Iterator[Cache]:
     object_name = scene_object.name
     for modifier in scene_object.modifiers:
         if modifier.show_viewport:
-            yield from _modifier_caches(modifier, f"the modifier '{modifier.name}' of '{object_name}'")
+            description = f"the modifier '{modifier.name}' of '{object_name}'"
+            scene = bpy.context.scene
+            if modifier.type in {"CLOTH", "SOFT_BODY"}:
+                point_cache = modifier.point_cache
+                is_simulation = not point_cache.is_baked
+                yield Cache(description, point_cache.frame_start, point_cache.frame_end, is_simulation, point_cache)
+            elif modifier.type == "NODES":
+                node = find_time_node(modifier.node_group)
+                if node is not None and node.bl_idname in SIMULATION_NODES:
+                    yield Cache(description, scene.frame_start, scene.frame_end, True, scene)
+                elif node is not None:
+                    yield Cache(description)
+            elif modifier.type == "MESH_CACHE":
+                yield _mesh_cache(modifier, description)
+            elif modifier.type == "MESH_SEQUENCE_CACHE":
+                if modifier.cache_file is None:
+                    raise RigError(f"{_capitalize(description)} has no cache file; choose one, or another target.")
+                yield _file_cache(modifier.cache_file, description)
+            elif modifier.type in TIME_DEPENDENT_TYPES:
+                is_simulation = TIME_DEPENDENT_TYPES[modifier.type] == "is a simulation"
+                yield Cache(description, scene.frame_start if is_simulation else None, None, is_simulation)
     for constraint in scene_object.constraints:
         if constraint.type == "TRANSFORM_CACHE" and constraint.cache_file and not constraint.mute:
             yield _file_cache(constraint.cache_file, f"the constraint '{constraint.name}' of '{object_name}'")
-
-
-def _modifier_caches(modifier: bpy.types.Modifier, description: str) -> Iterator[Cache]:
-    scene = bpy.context.scene
-    if modifier.type in {"CLOTH", "SOFT_BODY"}:
-        point_cache = modifier.point_cache
-        is_simulation = not point_cache.is_baked
-        yield Cache(description, point_cache.frame_start, point_cache.frame_end, is_simulation, point_cache)
-    elif modifier.type == "NODES":
-        node = find_time_node(modifier.node_group)
-        if node is not None and node.bl_idname in SIMULATION_NODES:
-            yield Cache(description, scene.frame_start, scene.frame_end, True, scene)
-        elif node is not None:
-            yield Cache(description)
-    elif modifier.type == "MESH_CACHE":
-        yield _mesh_cache(modifier, description)
-    elif modifier.type == "MESH_SEQUENCE_CACHE":
-        if modifier.cache_file is None:
-            raise RigError(f"{_capitalize(description)} has no cache file; choose one, or another target.")
-        yield _file_cache(modifier.cache_file, description)
-    elif modifier.type in TIME_DEPENDENT_TYPES:
-        is_simulation = TIME_DEPENDENT_TYPES[modifier.type] == "is a simulation"
-        yield Cache(description, scene.frame_start if is_simulation else None, None, is_simulation)
 
 
 def _mesh_cache(modifier: bpy.types.MeshCacheModifier, description: str) -> Cache:

@@ -43,7 +43,18 @@ def choose_key_joints(
         )
     moments, acts = _measure_vertices(poses)
     blocks = InputBlocks(poses)
-    unseen_motions = _measure_unseen_motions(all_poses, moments)
+    # Measure how far frames of actions move joints from where random poses have them, relative to reference joints.
+    is_usable = are_invertible(all_poses.pose_matrices).all(axis=1)
+    is_usable[: all_poses.random_count] = True
+    skin = skin_matrices(all_poses.pose_matrices[is_usable], all_poses.rig.rest_matrices).astype(np.float64)
+    variances, axes = np.linalg.eigh(moments)
+    moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
+    unseen_motions = np.zeros(len(moments))
+    for joint, reference in enumerate(all_poses.rig.references.tolist()):
+        relative = np.linalg.solve(skin[:, reference], skin[:, joint]) if reference >= 0 else skin[:, joint]
+        motion = (relative @ moment_roots[joint])[:, :3]
+        motion -= motion[: all_poses.random_count].mean(axis=0)
+        unseen_motions[joint] = np.sqrt((motion**2).sum(axis=(1, 2))).max()
     is_unseen = (blocks.widths[: len(moments)] == 0) & (unseen_motions > TOLERANCE_RATIO * poses.rig.size)
     is_static = np.array([name == STATIC_JOINT for name in poses.rig.joint_names])
     search = KeyJointSearch(poses, moments, blocks, is_static, is_unseen)
@@ -90,30 +101,6 @@ def _cut(rest_positions: np.ndarray, vertices: np.ndarray) -> list[np.ndarray]:
 def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit the weights of (n,) vertices to poses; returns (n, 4) joints and (n, 4) weights."""
     return fit_skin(poses.of_vertices(vertices), "smooth")
-
-
-def _measure_unseen_motions(poses: FitPoses, moments: np.ndarray) -> np.ndarray:
-    """Measure how far frames of actions move joints from where random poses have them, relative to reference joints.
-
-    Args:
-        poses: poses of J joints, the random ones first.
-        moments: as for `KeyJointSearch`.
-
-    Returns:
-        (J,) largest distance of any pose from the mean of the random poses, rms over the vertices, mesh units.
-    """
-    is_usable = are_invertible(poses.pose_matrices).all(axis=1)
-    is_usable[: poses.random_count] = True
-    skin = skin_matrices(poses.pose_matrices[is_usable], poses.rig.rest_matrices).astype(np.float64)
-    variances, axes = np.linalg.eigh(moments)
-    moment_roots = axes * np.sqrt(np.maximum(variances, 0))[:, None]
-    distances = np.zeros(len(moments))
-    for joint, reference in enumerate(poses.rig.references.tolist()):
-        relative = np.linalg.solve(skin[:, reference], skin[:, joint]) if reference >= 0 else skin[:, joint]
-        motion = (relative @ moment_roots[joint])[:, :3]
-        motion -= motion[: poses.random_count].mean(axis=0)
-        distances[joint] = np.sqrt((motion**2).sum(axis=(1, 2))).max()
-    return distances
 
 
 def _moments_at_heads(rig: Rig) -> np.ndarray:

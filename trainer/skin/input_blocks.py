@@ -49,7 +49,13 @@ class InputBlocks:
         self._is_usable = self.widths > 0
 
     def _set(self, block: int, features: np.ndarray) -> None:
-        components = _principal_components(features)
+        # Principal components, with variance 1 in the training poses.
+        centered = features - features[::2].mean(axis=0)
+        covariance = centered[::2].T @ centered[::2] / len(centered[::2])
+        variances, axes = np.linalg.eigh(covariance)
+        order = np.argsort(-variances)[:BLOCK_COLUMNS]
+        order = order[variances[order] > MIN_SPREAD**2]
+        components = centered @ axes[:, order] / np.sqrt(variances[order])
         self.widths[block] = components.shape[1]
         self._columns[block] = 0
         self._columns[block, : components.shape[1]] = components.T
@@ -127,13 +133,3 @@ def _standardize(columns: np.ndarray) -> np.ndarray:
     training = columns[::2]
     spread = training.std(axis=0)
     return np.where(spread > 1e-9, (columns - training.mean(axis=0)) / np.maximum(spread, 1e-9), 0)
-
-
-def _principal_components(features: np.ndarray) -> np.ndarray:
-    """Return (n, c) principal components of (n, f) features, with variance 1 in the training poses."""
-    centered = features - features[::2].mean(axis=0)
-    covariance = centered[::2].T @ centered[::2] / len(centered[::2])
-    variances, axes = np.linalg.eigh(covariance)
-    order = np.argsort(-variances)[:BLOCK_COLUMNS]
-    order = order[variances[order] > MIN_SPREAD**2]
-    return centered @ axes[:, order] / np.sqrt(variances[order])

@@ -172,7 +172,13 @@ class KeyJointSearch:
                 continue
             self._is_kept[joint] = False
             children = self._blocks.remove(joint)
-            explanations = self._explain_without(joint, children)
+            changed = {joint, *children}
+            dependents = [
+                removed
+                for removed, known in self._explanations.items()
+                if known.anchor == joint or not changed.isdisjoint(known.inputs)
+            ]
+            explanations = {removed: self._explain(removed) for removed in (joint, *dependents)}
             cost = max(explanation.cost for explanation in explanations.values())
             is_removable = count is not None or cost <= 1
             entry = self._queue_entry(joint, cost)
@@ -208,16 +214,6 @@ class KeyJointSearch:
         """
         step = int(cost / COST_STEP)
         return cost > 1, bool(self._is_sampled[joint]), step, -len(self._ancestors[joint]), joint
-
-    def _explain_without(self, joint: int, children: list[int]) -> dict[int, _Explanation]:
-        """Explain a removed joint, and the removed joints that it explained, or its children."""
-        changed = {joint, *children}
-        dependents = [
-            removed
-            for removed, known in self._explanations.items()
-            if known.anchor == joint or not changed.isdisjoint(known.inputs)
-        ]
-        return {removed: self._explain(removed) for removed in (joint, *dependents)}
 
     def _explain(self, joint: int) -> _Explanation:
         """Explain the motion of a joint by kept joints and controls.

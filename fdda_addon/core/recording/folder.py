@@ -76,7 +76,12 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None) -> FolderC
     except RecordingError as error:
         return FolderContent(FolderState.FOREIGN, sentence=str(error))
     pose_counts = index["complete"], index["poses"]
-    if rig is not None and (rig_clauses := _rig_differences(index, rig)):
+    # The rest matrices are in an array; they are compared when the recording is used.
+    if rig is not None and (
+        rig_clauses := rig_differences(
+            read_joints(index["joints"]), rig.rest_matrices, read_meshes(index["meshes"]), rig
+        )
+    ):
         return FolderContent(
             FolderState.OTHER,
             *pose_counts,
@@ -113,11 +118,6 @@ def _planned_sampling(sampling: dict) -> dict:
     """Return the JSON of a sampling without the poses that do not follow from the settings alone."""
     sources = [source for source in sampling["sources"] if source["kind"] not in (ALONE, REFINED)]
     return {**sampling, "sources": sources}
-
-
-def _rig_differences(index: dict, rig: Rig) -> list[str]:
-    # The rest matrices are in an array; they are compared when the recording is used.
-    return rig_differences(read_joints(index["joints"]), rig.rest_matrices, read_meshes(index["meshes"]), rig)
 
 
 def remove_recording(path: Path) -> None:

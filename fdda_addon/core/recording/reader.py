@@ -78,7 +78,16 @@ def open_recording(path: Path) -> Recording:
         for name, shape_and_dtype in _index_array_shapes(index).items()
     }
     joints = read_joints(index["joints"])
-    _check_rest(path, arrays, len(joints))
+    rest_matrices, rest_positions = arrays["rest_matrices"], arrays["rest_positions"]
+    is_valid = bool((np.abs(rest_matrices) <= MAX_VALUE).all()) and bool(are_invertible(rest_matrices).all())
+    for start in range(0, len(rest_positions), CHECK_BLOCK_VERTICES):
+        block = slice(start, start + CHECK_BLOCK_VERTICES)
+        is_valid = is_valid and bool((np.abs(rest_positions[block]) <= MAX_VALUE).all())
+        is_valid = is_valid and are_skin_weights(
+            arrays["skin_joints"][block], arrays["skin_weights"][block], len(joints)
+        )
+    if not is_valid:
+        raise RecordingError(f"The rest pose or skin weights of '{path}' are damaged; record again.")
     rig = Rig(
         joints,
         *(np.array(arrays[name]) for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
@@ -134,17 +143,3 @@ def _index_array_shapes(index: dict) -> dict[str, tuple[tuple, type]]:
         *(index.get(key, 0) for key in ("faces", "corners")),
         len(index["controls"]),
     )
-
-
-def _check_rest(path: Path, arrays: dict[str, np.ndarray], joint_count: int) -> None:
-    """Raise RecordingError where rest pose or skin weights are invalid."""
-    rest_matrices, rest_positions = arrays["rest_matrices"], arrays["rest_positions"]
-    is_valid = bool((np.abs(rest_matrices) <= MAX_VALUE).all()) and bool(are_invertible(rest_matrices).all())
-    for start in range(0, len(rest_positions), CHECK_BLOCK_VERTICES):
-        block = slice(start, start + CHECK_BLOCK_VERTICES)
-        is_valid = is_valid and bool((np.abs(rest_positions[block]) <= MAX_VALUE).all())
-        is_valid = is_valid and are_skin_weights(
-            arrays["skin_joints"][block], arrays["skin_weights"][block], joint_count
-        )
-    if not is_valid:
-        raise RecordingError(f"The rest pose or skin weights of '{path}' are damaged; record again.")
