@@ -9,7 +9,7 @@ from ..core.errors import WrongUsageError
 from ..core.files.file_kind import BLEND
 from ..core.files.output import check_outputs
 from ..core.recording.index import read_index
-from ..recording.recorded_character import find_recorded_character
+from ..recording.plan import find_recorded_character
 from ..scene.blend_file import save_copy
 from .files import add_rig_options, open_file
 from .outputs import add_overwrite_option

@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _find_rig(options: argparse.Namespace) -> "SceneRig":
     """Return the rig of the meshes to record, or of those of the recording that `--refine` extends."""
-    from ..recording.recorded_character import find_recorded_character
+    from ..recording.plan import find_recorded_character
     from ..scene.scene_rig import find_character, find_whole_character
 
     if options.refine:

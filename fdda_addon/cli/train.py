@@ -125,7 +125,7 @@ def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
 
 
 def _open_rig(recording: Path, options: argparse.Namespace) -> "SceneRig":
-    from ..recording.recorded_character import find_recorded_character
+    from ..recording.plan import find_recorded_character
     from .files import open_file
 
     open_file(options.refine)

@@ -24,10 +24,10 @@ from ..rig.pose_setter import (
     PoseSetter,
     TargetSettings,
     blend_from_rest,
+    make_pose_setter,
 )
 from ..rig.reading import PoseEvaluator
 from ..rig.shape_keys import set_keys_undriven
-from ..rig.target_poses import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
 from ..runtime.network import Network

@@ -5,8 +5,16 @@ from collections.abc import Iterable, Iterator
 
 import bpy
 
-from ..rig.dependency_graph import DependencyGraph, Node
-from ..rig.references import add_bones, add_drivers, bones_of_modifier, deforming_bones, is_armature, references
+from ..rig.references import (
+    DependencyGraph,
+    Node,
+    add_bones,
+    add_drivers,
+    bones_of_modifier,
+    deforming_bones,
+    is_armature,
+    references,
+)
 from ..rig.sources import Sources
 from ..scene.compatibility import accepts_slot, curves_of_slot, node_input
 from ..scene.node_groups import read_bone_names

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 import bpy
 
 from ..core.errors import RigError
-from ..rig.dependency_graph import Node
 from ..rig.references import (
+    Node,
     driven_node,
     driver_references,
     drivers_of,

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import bpy
 
 from ..core.errors import RigError
-from ..rig.dependency_graph import Node
 from ..rig.modifier_stack import deforming_modifiers, recorded_modifiers
-from ..rig.references import bones_of_modifier, deforming_bones, drivers_of, is_armature
+from ..rig.references import Node, bones_of_modifier, deforming_bones, drivers_of, is_armature
 from ..scene.action_slots import curves_of_actions
 from ..scene.controls import canonical_path
 from ..scene.scene_rig import SceneRig

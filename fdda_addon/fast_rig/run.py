@@ -11,9 +11,8 @@ from ..core.formats.model import read_model
 from ..core.progress import Job
 from ..core.rig import STATIC_JOINT
 from ..core.sentences.counts import format_count
-from ..rig.dependency_graph import Node
 from ..rig.modifier_stack import check_evaluable
-from ..rig.references import driven_node, split_bone_path
+from ..rig.references import Node, driven_node, split_bone_path
 from ..runtime import packed_model
 from ..runtime.binding import bind, unbind
 from ..runtime.model_files import network_of

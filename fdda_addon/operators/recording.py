@@ -17,7 +17,7 @@ from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import copy_settings, planned_pose_count, recording_settings
-from ..recording.recorded_character import find_recorded_character
+from ..recording.plan import find_recorded_character
 from ..recording.refinement import RefinementSettings, refine
 from ..recording.run import record
 from ..runtime.binding import model_disabled

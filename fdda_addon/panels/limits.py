@@ -8,8 +8,15 @@ import bpy
 
 from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from ..operators.poses import FDDA_OT_set_limit
-from ..poses.bone_channels import is_moved_by_constraints
-from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, find_local_limit, location_ranges, rotation_ranges
+from ..poses.motion_range import (
+    CONSTRAINT,
+    DEFAULT,
+    IK,
+    find_local_limit,
+    is_moved_by_constraints,
+    location_ranges,
+    rotation_ranges,
+)
 from ..properties.recording_options import recorded_actions
 from ..scene.compatibility import is_selected, selection_owner
 from ..scene.draw_cache import computed_once, draw_cached

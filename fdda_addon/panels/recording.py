@@ -18,8 +18,7 @@ from ..jobs import job
 from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder
 from ..properties.recording_options import recorded_actions, recording_settings
-from ..recording.plan import RecordingSettings, make_sampling, read_sampled_rig
-from ..recording.recorded_character import find_recorded_character
+from ..recording.plan import RecordingSettings, find_recorded_character, make_sampling, read_sampled_rig
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks

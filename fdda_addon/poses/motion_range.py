@@ -4,14 +4,20 @@
 The range is stored in Limit constraints in local space, or else in the bone's IK limits. Without these the bone
 has the default range. Locked axes do not move. A Limit constraint with an influence of 0 stores a range without
 enforcing it.
+
+While a pose exceeds Limit constraints, they are muted.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Self
 
 import bpy
+import numpy as np
 
+from ..core.controls import ARMATURE_OBJECT
 from ..core.errors import RigError
-from ..core.mathematics.poses import DEFAULT_RANGE, LOCATION, ROTATION, SCALE
+from ..core.mathematics.poses import DEFAULT_RANGE, LOCATION, ROTATION, SCALE, Channel
 from ..core.rig import Rig
 
 AXES = "xyz"
@@ -210,3 +216,92 @@ def enforced_range(bone: bpy.types.PoseBone, constraint_type: str, axis: int) ->
         if getattr(constraint, use_limit_name if hasattr(constraint, use_limit_name) else f"use_max_{letter}"):
             high = min(high, getattr(constraint, f"max_{letter}"))
     return low, high
+
+
+LIMIT_CONSTRAINTS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
+_PROPERTY_NAMES = {ROTATION: "rotation_euler", LOCATION: "location", SCALE: "scale"}
+
+
+def control_name(armature_object: bpy.types.Object, channel: Channel) -> str:
+    """Return the name of the control (`Control.name`) for the number that a channel sets; empty if there is none."""
+    bone = armature_object.pose.bones.get(channel.name)
+    if channel.kind not in _PROPERTY_NAMES or bone is None:
+        return ""
+    if channel.kind == ROTATION and bone.rotation_mode in {"QUATERNION", "AXIS_ANGLE"}:
+        return ""
+    escaped_name = bpy.utils.escape_identifier(channel.name)
+    return f'{ARMATURE_OBJECT}/pose.bones["{escaped_name}"].{_PROPERTY_NAMES[channel.kind]}[{channel.axis}]'
+
+
+def ranges_by_control(armature_object: bpy.types.Object, channels: Iterable[Channel]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of bone channels, by the names of the controls that set the same numbers."""
+    ranges = {control_name(armature_object, channel): (channel.low, channel.high) for channel in channels}
+    ranges.pop("", None)
+    return ranges
+
+
+def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
+    """Return whether a constraint other than a limit moves a bone."""
+    return any(c.type not in LIMIT_CONSTRAINTS and not c.mute and c.influence > 0 for c in bone.constraints)
+
+
+class SuspendedLimits:
+    """Mutes Limit constraints in local space that a pose exceeds. As a context manager, it unmutes them at the end."""
+
+    def __init__(self, armature_object: bpy.types.Object, channels: tuple[Channel, ...]):
+        """Find the constraints that limit channels.
+
+        Args:
+            armature_object: the armature object with the bones.
+            channels: C channels of the poses.
+        """
+        channel_indices: dict[tuple[str, str], list[int]] = {}
+        """Indices of channels by the name of the bone and the type of the constraint."""
+        for index, channel in enumerate(channels):
+            if channel.kind in LIMIT_CONSTRAINT_TYPES:
+                channel_indices.setdefault((channel.name, LIMIT_CONSTRAINT_TYPES[channel.kind]), []).append(index)
+        self._limits = [
+            (
+                constraint,
+                limited_channels,
+                *_limits_of_axes(constraint, [channels[index].axis for index in limited_channels]),
+            )
+            for (name, constraint_type), limited_channels in channel_indices.items()
+            for constraint in armature_object.pose.bones[name].constraints
+            if constraint.type == constraint_type
+            and constraint.owner_space == "LOCAL"
+            and constraint.influence > 0
+            and not constraint.mute
+        ]
+
+    def suspend(self, values: np.ndarray) -> None:
+        """Mute the constraints that the (C,) channel values exceed, and unmute the others."""
+        for constraint, limited_channels, low, high in self._limits:
+            limited_values = values[limited_channels]
+            is_exceeded = bool(((limited_values < low) | (limited_values > high)).any())
+            if constraint.mute != is_exceeded:
+                constraint.mute = is_exceeded
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for constraint, *_ in self._limits:
+            constraint.mute = False
+
+
+def _limits_of_axes(constraint: bpy.types.Constraint, axes: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper limits of a constraint for n axes, (n,) each; infinite where it has none."""
+    bounds = []
+    for side, infinite_value in (("min", -np.inf), ("max", np.inf)):
+        limits = []
+        for letter in (AXES[axis] for axis in axes):
+            # Limit Rotation has one switch for both sides of an axis.
+            switch_name = (
+                f"use_limit_{letter}" if hasattr(constraint, f"use_limit_{letter}") else f"use_{side}_{letter}"
+            )
+            limits.append(
+                getattr(constraint, f"{side}_{letter}") if getattr(constraint, switch_name) else infinite_value
+            )
+        bounds.append(np.array(limits))
+    return bounds[0], bounds[1]

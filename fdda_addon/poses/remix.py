@@ -14,8 +14,15 @@ from ..core.mathematics.rotations import rotation_vectors
 from ..scene.action_slots import curves_of_actions
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
-from .action_curves import CurvesByChannel, axis_angle_to_quaternion, curves_by_bone, evaluate_curves
-from .action_range import action_frames, has_width, keyed_numbers
+from .action_range import (
+    CurvesByChannel,
+    action_frames,
+    axis_angle_to_quaternion,
+    curves_by_bone,
+    evaluate_curves,
+    has_width,
+    keyed_numbers,
+)
 
 _REST_VALUES = {ROTATION_VECTOR: 0.0, LOCATION: 0.0, SCALE: 1.0}
 

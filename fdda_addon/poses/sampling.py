@@ -24,9 +24,17 @@ from ..core.rig import Rig
 from ..scene.controls import can_be_set, driven_numbers, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_range import ChannelRanges, has_width
-from .bone_channels import control_name, is_moved_by_constraints, ranges_by_control
 from .control_bones import bone_controls
-from .motion_range import DEFAULT, RotationRange, location_ranges, rotation_ranges, scale_ranges
+from .motion_range import (
+    DEFAULT,
+    RotationRange,
+    control_name,
+    is_moved_by_constraints,
+    location_ranges,
+    ranges_by_control,
+    rotation_ranges,
+    scale_ranges,
+)
 from .sample_selection import DEFAULT_SELECTION, SampleSelection, select_bones
 
 ControlRanges = dict[str, tuple[float, float]]

@@ -14,7 +14,7 @@ from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
 from ..core.mathematics.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE
 from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
-from ..core.recording.target import SIMULATION
+from ..core.recording.index import SIMULATION
 from ..poses.clip_player import ClipPlayer
 from ..scene.armature import clear_pose
 from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control

@@ -3,14 +3,14 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import bpy
 
 from ..core.controls import Control
 from ..core.mathematics.poses import CONTROL, Channel, Overshoot, make_overshoot
 from ..core.mathematics.remix import PoseSampler
-from ..core.recording.index import RANDOM, Sampling, Source
-from ..core.recording.target import POSE
+from ..core.recording.index import POSE, RANDOM, Sampling, Source, read_index
 from ..core.rig import Rig
 from ..core.settings import MIRROR, OVERSHOOT, POSES, SEED, SPREAD
 from ..poses.clip import find_clips
@@ -32,7 +32,7 @@ from ..rig.reading import PoseEvaluator, read_rig
 from ..rig.shape_keys import find_unposed_keys, key_distances
 from ..rig.target import find_target
 from ..scene.controls import owner_name, parse_controls
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, find_character, find_rig
 
 INFLUENCE_POSES = 4
 """Number of base poses from which each input is moved alone."""
@@ -208,3 +208,14 @@ def make_recording_overshoot(
     """Make the overshoot of the random poses; `channels` are sampled within the range of motion."""
     fixed_channels = locked_channels(scene_rig.armature_object, channels)
     return make_overshoot(channels, fixed_channels, settings.overshoot, settings.poses if channels else 0)
+
+
+def find_recorded_character(path: Path, object_name: str = "") -> SceneRig:
+    """Find the rig of the meshes of a recording.
+
+    Args:
+        path: folder of the recording.
+        object_name: name of the mesh object of a recording of one mesh; several meshes have their recorded names.
+    """
+    names = [mesh["name"] for mesh in read_index(path)["meshes"]]
+    return find_character(names) if len(names) > 1 else find_rig(object_name)

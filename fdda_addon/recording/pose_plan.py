@@ -10,10 +10,9 @@ import numpy as np
 from ..core.mathematics.poses import Channel
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
-from ..poses.suspended_limits import SuspendedLimits
-from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest
+from ..poses.motion_range import SuspendedLimits
+from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest, reversible_frames
 from ..rig.shape_keys import set_keys_undriven
-from ..rig.simulated_poses import reversible_frames
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, make_pose_sampler, make_recording_overshoot

@@ -15,9 +15,9 @@ from ..core.mathematics.partition import Partition
 from ..core.mathematics.poses import Channel, sample_pose
 from ..core.mathematics.refinement import Probes, choose_poses, nearest_recorded_distances
 from ..core.progress import Progress
-from ..core.recording.extension import RecordingExtension
 from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
+from ..core.recording.writer import RecordingExtension
 from ..core.rig import Rig, rig_differences
 from ..core.settings import REFINEMENT_POSES, SPREAD
 from ..poses.sampling import model_channels, rig_allows_ranges

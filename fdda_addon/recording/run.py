@@ -7,22 +7,26 @@ from dataclasses import replace
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from ..core.errors import RecordingError, RigError
+from ..core.mathematics.metrics import distances, error_statistics
+from ..core.mathematics.partition import GOLDEN_RATIO
 from ..core.progress import Progress
+from ..core.recording.arrays import open_array
 from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
-from ..core.recording.folder_check import check_recordable
-from ..core.recording.index import ALONE, RecordingInfo, Source
-from ..core.recording.target import POSE
+from ..core.recording.folder import check_recordable
+from ..core.recording.index import ALONE, POSE, RecordingInfo, Repeatability, Source
 from ..core.recording.writer import RecordingWriter
 from ..poses.clip import find_clips
+from ..poses.clip_player import ClipPlayer
+from ..rig.deformation import describe_bones
 from ..rig.dependencies import deforming_mesh_objects, read_dependencies
 from ..rig.modifier_stack import check_evaluable, read_stack
+from ..rig.pose_setter import make_pose_setter
 from ..rig.reading import PoseEvaluator
-from ..rig.target_poses import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
-from ..rig.unread_bones import describe_bones
 from ..scene.scene_rig import SceneRig, check_full_rig
 from .alone_poses import plan_alone_poses
 from .appender import PoseAppender
@@ -30,7 +34,6 @@ from .first_checks import check_follows_pose, check_saturation, check_seams, che
 from .plan import RecordedRig, RecordingSettings, find_actions, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
 from .reference_joints import find_fixed_joints, find_references
-from .repeatability import measure_repeatability
 
 MISSING_WEIGHTS = (
     "'{}' has no skin weights on deforming bones, so its training needs fitted ones: --base-skinning smooth, or Base "
@@ -155,3 +158,44 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             appender.flush()
             count = settings.target.repeatability_poses
             yield from measure_repeatability(recorded.evaluator, plan, player, writer, count)
+
+
+def measure_repeatability(
+    evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, max_poses: int
+) -> Iterator[Progress]:
+    """Reach some poses from another direction, and write the distance from the recorded target to the index.
+
+    Does nothing if the repeatability was measured before. Poses that did not come to rest are left out.
+
+    Args:
+        evaluator: evaluates the target.
+        plan: plan of the poses.
+        player: player of the clips; None without clips.
+        writer: writer of the complete recording.
+        max_poses: largest number of poses.
+
+    Yields:
+        Progress of the stage "repeatability".
+    """
+    repeatable_indices = [index for index in plan.repeatable_poses if index not in writer.unsettled]
+    if writer.repeatability or not repeatable_indices:
+        return
+    pose_indices = sorted(
+        {
+            repeatable_indices[int(number * GOLDEN_RATIO * len(repeatable_indices)) % len(repeatable_indices)]
+            for number in range(max_poses)
+        }
+    )
+    shape = writer.complete, writer.rig.vertex_count, 3
+    recorded, pose_distances = open_array(writer.path / "positions.npy", shape, np.float32), []
+    # Closing the generator stops playback.
+    with closing(plan.show_poses_again(player, pose_indices)) as shown_poses:
+        for compared_count, pose_index in enumerate(shown_poses, 1):
+            positions = evaluator.evaluate()[1]
+            pose_distances.append(distances(positions, recorded[pose_index], writer.rig.metres_per_unit))
+            detail = plan.pose_setter.rest_description
+            yield Progress("repeatability", compared_count, len(pose_indices), detail=detail)
+    statistics = error_statistics(np.stack(pose_distances)).to_json()
+    writer.set_repeatability(
+        Repeatability(tuple(pose_indices), {name: round(value, 6) for name, value in statistics.items()})
+    )

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.controls import SHAPE_KEY_PATH
 from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
-from ..poses.bone_channels import is_moved_by_constraints
+from ..poses.motion_range import is_moved_by_constraints
 from ..scene.arrays import COORDINATE_ELEMENT, KEY_VALUE_ELEMENT, read, write
 from ..scene.controls import canonical_path, owner_name
 from ..scene.scene_rig import SceneRig

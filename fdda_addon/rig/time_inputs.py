@@ -14,9 +14,8 @@ from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.animation import changes_value, curves_with_actions, value_range
 from ..scene.controls import canonical_path, fcurve_target, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
-from .modifier_effects import time_dependence
-from .modifier_stack import ModifierStack, is_fdda_modifier
-from .other_armatures import check_other_armatures
+from .dependencies import check_other_armatures
+from .modifier_stack import ModifierStack, is_fdda_modifier, time_dependence
 from .sources import TRANSFORM_PREFIXES, OwnedCurve, Sources, followed_objects
 
 

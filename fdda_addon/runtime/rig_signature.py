@@ -13,10 +13,9 @@ import numpy as np
 
 from ..core.errors import ModelError
 from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
-from ..rig.deformation import b_bone_values, read_modifiers_and_drivers
+from ..rig.deformation import b_bone_values, read_modifiers_and_drivers, read_unread_bones
 from ..rig.modifier_stack import find_shape_readers, replaced_range
 from ..rig.reading import read_model_rig
-from ..rig.unread_bones import read_unread_bones
 from ..scene.arrays import ElementProperty, read
 from ..scene.mesh import rest_positions
 from ..scene.scene_rig import SceneRig, armature_modifier
@@ -53,7 +52,7 @@ def read_signature(
     """Read the signature of a rig: what is quick to read. If it and the mesh are unchanged, the whole rig is unchanged.
 
     Args:
-        unread_bones: names of the bones whose effect the model learned from others (`rig.unread_bones`).
+        unread_bones: names of the bones whose effect the model learned from others (`rig.deformation`).
         parts: which parts to read.
 
     Returns:

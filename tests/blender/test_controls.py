@@ -6,8 +6,7 @@ import pytest
 
 from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.core.errors import RigError
-from fdda_addon.poses.action_curves import curves_by_bone
-from fdda_addon.poses.action_range import keyed_numbers
+from fdda_addon.poses.action_range import curves_by_bone, keyed_numbers
 from fdda_addon.rig.dependencies import read_dependencies
 from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.control_names import control_default

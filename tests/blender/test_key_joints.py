@@ -25,8 +25,8 @@ from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
+from fdda_addon.rig.deformation import describe_bones
 from fdda_addon.rig.reading import read_rig
-from fdda_addon.rig.unread_bones import describe_bones
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.session import session
 from fdda_addon.scene.blend_file import save_copy

@@ -10,10 +10,9 @@ from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
 from fdda_addon.core.mathematics.partition import make_partitions
-from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
 
 from ..recordings import read_skinned, write_recording
 from .limb import CHANNELS, make_rig, partitions_of, random_poses, random_positions, recording_info

@@ -3,7 +3,7 @@
 
 import pytest
 
-from fdda_addon.rig.dependency_graph import DependencyGraph, Node
+from fdda_addon.rig.references import DependencyGraph, Node
 
 RIG = "rig"
 PARENTS = {"hips": "", "thigh": "hips", "shin": "thigh", "foot": "shin", "toe": "foot"}

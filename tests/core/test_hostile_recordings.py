@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import FDDAError, RecordingError
-from fdda_addon.core.recording.extension import RecordingExtension
-from fdda_addon.core.recording.folder_check import check_recordable
+from fdda_addon.core.recording.folder import check_recordable
 from fdda_addon.core.recording.reader import check_resumable, read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
 
 from .. import systems
 from .damage import assert_refused, edit_index, npy_bytes

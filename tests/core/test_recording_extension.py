@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.index import INDEX_NAME, REFINED, Source
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
 
 from .limb import make_rig, random_poses, random_positions, recording_info
 

@@ -12,7 +12,7 @@ import pytest
 
 from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
 from fdda_addon.core.recording.arrays import array_header
-from fdda_addon.core.recording.folder_check import check_recordable
+from fdda_addon.core.recording.folder import check_recordable
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter

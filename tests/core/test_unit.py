@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.formats.model_info import ModelInfo
-from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
 
 from .limb import make_rig, random_poses, random_positions, record_limb, recording_info
 from .tiny_model import tiny_info

@@ -11,8 +11,8 @@ import pytest
 
 from fdda_addon.core.formats.report import checkpoint_path
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingExtension
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording

@@ -12,8 +12,7 @@ from fdda_addon.core.mathematics.skinning import are_invertible, skin_matrices
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
 from .fit_poses import FitPoses
-from .input_blocks import LENGTH_RATIO, InputBlocks
-from .key_joints import TOLERANCE_RATIO, KeyJoints, KeyJointSearch, joint_moments
+from .key_joints import LENGTH_RATIO, TOLERANCE_RATIO, InputBlocks, KeyJoints, KeyJointSearch, joint_moments
 from .solver import fit_skin
 
 MAX_PATCH_VERTICES = 16

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writing of a recording (docs/formats.md). It can be interrupted at any moment and resumed later."""
+"""Writing of a recording (docs/formats.md), which can be interrupted at any moment and resumed or extended later."""
 
 import contextlib
 import io
@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import OutputError, RecordingError, os_error_text
+from ..errors import BusyError, OutputError, RecordingError, os_error_text
 from ..files.input_file import open_input
 from ..files.open_files import remove_file
 from ..rig import Rig, rest_matrices_match
+from ..sentences.counts import format_count
 from ..unit import read_unit, unit_to_json
 from .arrays import (
     STREAMED_ARRAY_NAMES,
@@ -25,20 +26,23 @@ from .arrays import (
     open_array,
     streamed_arrays,
 )
-from .folder_check import RECORDING_FILES, check_folder, remove_recording_files, remove_temporary_files
+from .folder import RECORDING_FILES, check_folder, remove_recording_files, remove_temporary_files
 from .index import (
     BONES_NAME,
     FORMAT,
     INDEX_NAME,
+    REFINED,
     VERSION,
     RecordingInfo,
+    Repeatability,
+    Source,
     find_different_keys,
     read_index,
     write_index,
     write_json,
 )
 from .lock import RecordingLock
-from .target import Repeatability
+from .reader import Recording
 
 MUTABLE_KEYS = ("complete", "unsettled", "repeatability")
 """Keys of the index that change while poses are appended."""
@@ -281,3 +285,47 @@ class RecordingWriter:
         for folder in self._new_folders:
             with contextlib.suppress(OSError):
                 folder.rmdir()
+
+
+class RecordingExtension(RecordingWriter):
+    """Writer of further poses, which its index counts when they are complete.
+
+    The arrays have the rows of all planned poses from the start. An interruption therefore leaves a complete recording,
+    which has the poses of all calls of `append` that returned.
+    """
+
+    def __init__(self, recording: Recording, poses: int, model_name: str, added_count: int = 0):
+        """Open the files of a recording.
+
+        Args:
+            recording: a complete recording.
+            poses: number of poses to append.
+            model_name: file name of the model that the poses refine.
+            added_count: number of poses at the end of the recording that were already added for this model.
+        """
+        self._recorded_count, self._added_count, self._model_name = recording.info.poses, added_count, model_name
+        super().__init__(
+            recording.path, recording.rig, replace(recording.info, poses=recording.info.poses + poses), resume=True
+        )
+
+    def _read_previous(self, previous: dict) -> None:
+        """Check that no other process has changed the recording since it was read."""
+        self.complete, self.unsettled = self._recorded_count, list(self.info.unsettled)
+        if previous["poses"] != self.complete:
+            raise BusyError(
+                f"The recording '{self.path}' had {format_count(self.complete, 'pose')} when it was read and has "
+                f"{previous['poses']} now: another process added to it; try again."
+            )
+
+    def _index(self) -> dict:
+        sampling, count = self.info.sampling, self.complete - self._recorded_count + self._added_count
+        sources = sampling.sources[:-1] if self._added_count else sampling.sources
+        added_sources = (Source(REFINED, count, self._model_name),) if count else ()
+        sampling = replace(sampling, sources=(*sources, *added_sources))
+        return super()._index() | {"poses": self.complete, "sampling": json.loads(json.dumps(sampling.to_json()))}
+
+    def _write_error(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"Cannot add poses to the recording '{self.path}': {os_error_text(error)}; it holds {self.complete} "
+            "poses and can be trained on as it is."
+        )

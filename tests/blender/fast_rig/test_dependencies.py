@@ -15,7 +15,7 @@ from fdda_addon.fast_rig.graph_reader import read_graph
 from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
 from fdda_addon.fast_rig.removal import remove_unneeded
 from fdda_addon.rig.dependencies import read_dependencies
-from fdda_addon.rig.dependency_graph import Node
+from fdda_addon.rig.references import Node
 from fdda_addon.scene.node_groups import BONE_NODE
 from fdda_addon.scene.scene_rig import SceneRig
 

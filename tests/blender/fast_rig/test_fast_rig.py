@@ -13,7 +13,7 @@ from fdda_addon.fast_rig import frame_times
 from fdda_addon.fast_rig import removal as fast_rig_removal
 from fdda_addon.fast_rig.compared_poses import ComparedPoses, differing_bones, infinite_bones
 from fdda_addon.fast_rig.graph_reader import read_graph
-from fdda_addon.rig.dependency_graph import Node
+from fdda_addon.rig.references import Node
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rig

@@ -14,7 +14,7 @@ from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.mathematics.skinning import skin_matrices
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.poses.suspended_limits import SuspendedLimits
+from fdda_addon.poses.motion_range import SuspendedLimits
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.blend_file import save_copy

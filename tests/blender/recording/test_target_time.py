@@ -16,8 +16,7 @@ from blend_fixtures.elbow import ACTION, FRAMES
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.rig.pose_setter import TargetSettings
-from fdda_addon.rig.simulated_poses import APPROACH_FRAMES
+from fdda_addon.rig.pose_setter import APPROACH_FRAMES, TargetSettings
 from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import find_rig
 

@@ -8,9 +8,8 @@ import pytest
 
 from fdda_addon.core.checks.target import check_target, unsettled_sentence
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.index import ACTION, Source
+from fdda_addon.core.recording.index import ACTION, RecordedTarget, Repeatability, Source
 from fdda_addon.core.recording.skinned import SkinnedRecording
-from fdda_addon.core.recording.target import RecordedTarget, Repeatability
 
 from ..good_recording import good_recording, with_positions
 

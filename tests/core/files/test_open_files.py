@@ -12,8 +12,7 @@ import pytest
 from fdda_addon.core.errors import TRY_AGAIN, OutputError, exit_status
 from fdda_addon.core.files import open_files
 from fdda_addon.core.files.output import atomic_write_all, write_text
-from fdda_addon.core.recording.folder import remove_recording
-from fdda_addon.core.recording.folder_check import check_recordable
+from fdda_addon.core.recording.folder import check_recordable, remove_recording
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 

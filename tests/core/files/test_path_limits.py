@@ -10,7 +10,7 @@ from fdda_addon.core.files import path_limits
 from fdda_addon.core.files.file_kind import EVALUATION, PICTURE
 from fdda_addon.core.files.output import check_folder_writable, check_outputs, check_writable
 from fdda_addon.core.files.path_limits import windows_name_problem
-from fdda_addon.core.recording.folder_check import check_recordable
+from fdda_addon.core.recording.folder import check_recordable
 from fdda_addon.core.recording.index import INDEX_NAME
 
 DEVICE_ERROR, TRAILING_CHARACTER_ERROR = (
