@@ -33,11 +33,7 @@ def replace_file(source: Path, target: Path) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file where it exists.
-
-    Raises:
-        OSError: `os.unlink` raised it; EBUSY where another program has the file open for longer than `RETRY_SECONDS`.
-    """
+    """Remove a file where it exists; raises errors as `replace_file` does."""
     _change(path, lambda: path.unlink(missing_ok=True))
 
 

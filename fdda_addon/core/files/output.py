@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Atomic writing of files: a reader finds the old file, the new file or no file, but never an incomplete file."""
 
+import errno
 import json
 import os
 import re
 import secrets
-import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -50,13 +50,7 @@ def check_outputs(
             continue
         if any(os.path.exists(input_path) and os.path.samefile(path, input_path) for input_path in inputs):
             raise OutputError(f"Cannot write '{path}': it is read for this; give another name, or --overwrite.")
-        try:
-            has_kind = kind.matches(path)
-        except OSError as error:
-            raise OutputError(
-                f"Cannot write '{path}': another file is there, {os_error_text(error)}; give another name."
-            ) from error
-        if not has_kind:
+        if not kind.matches(path):
             raise OutputError(
                 f"Cannot write '{path}': another file is there, which is not {kind.name}; give another name, or "
                 "--overwrite."
@@ -149,11 +143,7 @@ def atomic_write(path: Path, keep_on_failure: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write_all(*paths: Path, keep_on_failure: bool = True) -> Iterator[tuple[Path, ...]]:
-    """Write several files as `atomic_write` does. When one file cannot be written or renamed, no file is changed.
-
-    Raises:
-        OutputError: a file cannot be written or renamed.
-    """
+    """Write several files as `atomic_write` does. When one file cannot be written or replaced, no file is changed."""
     temporaries: list[Path] = []
     try:
         for path in paths:
@@ -179,56 +169,37 @@ def atomic_write_all(*paths: Path, keep_on_failure: bool = True) -> Iterator[tup
 
 
 def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failure: bool) -> None:
-    """Rename the temporary files to their paths: all files or none."""
-    backups: dict[Path, Path] = {}
-    renamed: list[tuple[Path, Path]] = []
+    """Rename the temporary files to their paths, after a check that no other program keeps one from being replaced."""
+    renamed: list[Path] = []
     try:
-        for path in filter(os.path.lexists, paths[:-1]):
-            backups[path] = path.with_name(_temporary_name(path))
-            try:
-                os.link(path, backups[path])
-            except OSError:
-                # Not every file system has hard links.
-                shutil.copy2(path, backups[path])
+        for path in filter(os.path.lexists, paths):
+            if os.path.isdir(path):
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            replace_file(path, path)
         for temporary, path in zip(temporaries, paths, strict=True):
             replace_file(temporary, path)
-            renamed.append((temporary, path))
-    except BaseException as error:
-        failed_path, changed_paths = paths[len(renamed) % len(paths)], []
-        for temporary, path in reversed(renamed):
-            try:
-                replace_file(path, temporary)
-                if path in backups:
-                    replace_file(backups[path], path)
-            except OSError:
-                changed_paths.append(path)
-        if not isinstance(error, OSError):
-            raise
-        text = f"{_format_names(changed_paths)} was replaced, and no other" if changed_paths else "nothing was changed"
-        if keep_on_failure and not changed_paths and (kept_paths := _keep_beside(temporaries, paths)):
+            renamed.append(path)
+    except OSError as error:
+        text = f"{_format_names(renamed)} was replaced, and no other" if renamed else "nothing was changed"
+        if keep_on_failure:
+            kept_paths = _keep_beside(temporaries[len(renamed) :], paths[len(renamed) :])
             text += (
-                f", and the new content is in {_format_names(kept_paths)}; rename it when no program has "
-                f"'{failed_path.name}' open"
+                f", and the new content is in {_format_names(kept_paths)}; rename it when no program has '{path.name}' "
+                "open"
             )
-        raise OutputError(f"Cannot write '{failed_path}': {os_error_text(error)}; {text}.") from error
-    finally:
-        for path, backup in backups.items():
-            if os.path.lexists(path):
-                with suppress(OSError):
-                    remove_file(backup)
+        raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; {text}.") from error
 
 
 def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
     """Rename temporary files that could not replace `paths` to new names beside these paths; return the new paths."""
-    prefixes = (f"new-{'' if attempt == 1 else f'{attempt}-'}" for attempt in count(1))
-    all_new_paths = ([path.with_name(prefix + path.name) for path in paths] for prefix in prefixes)
-    new_paths = next(new_paths for new_paths in all_new_paths if not any(map(os.path.lexists, new_paths)))
-    kept_paths = []
+    for attempt in count(1):
+        prefix = "new-" if attempt == 1 else f"new-{attempt}-"
+        new_paths = [path.with_name(prefix + path.name) for path in paths]
+        if not any(map(os.path.lexists, new_paths)):
+            break
     for temporary, new_path in zip(temporaries, new_paths, strict=True):
-        with suppress(OSError):
-            replace_file(temporary, new_path)
-            kept_paths.append(new_path)
-    return kept_paths
+        os.replace(temporary, new_path)
+    return new_paths
 
 
 def _format_names(paths: Iterable[Path]) -> str:
@@ -246,21 +217,13 @@ def is_temporary_name(name: str) -> bool:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically as UTF-8; invalid characters of file names are escaped.
-
-    Raises:
-        OutputError: as `atomic_write`.
-    """
+    """Write a text file as UTF-8 by `atomic_write`; invalid characters of file names are escaped."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: Path, value: object) -> None:
-    """Write a JSON file atomically; NaN and infinity raise ValueError.
-
-    Raises:
-        OutputError: as `atomic_write`.
-    """
+    """Write a JSON file by `atomic_write`; NaN and infinity raise ValueError."""
     write_text(path, to_json_text(value))
 
 
