@@ -179,8 +179,8 @@ class ShiftedSession:
         return positions + np.float32(1e-4), *others
 
 
-def test_a_difference_from_pytorch_is_refused_unless_the_error_is_far_larger(trained_model, recording):
-    """A rig that bursts has errors of meters, and float32 rounds its residuals by millimeters."""
+def test_a_difference_from_pytorch_is_refused_unless_errors_or_residuals_are_far_larger(trained_model, recording):
+    """A rig that bursts has errors of meters, and 16-bit integers round its residuals by tenths of a millimeter."""
     session = ShiftedSession(open_session(build_graph(trained_model).SerializeToString()))
     source = read_skinned(recording)
     held_out = measure(session, source, np.arange(5), trained_model)
@@ -188,3 +188,4 @@ def test_a_difference_from_pytorch_is_refused_unless_the_error_is_far_larger(tra
     with pytest.raises(TrainingError, match=r"differs from PyTorch by 0\.17\d mm, more than the allowed .* bursts"):
         check_parity(source, replace(held_out, fdda=np.full((5, 1), 0.001)))
     check_parity(source, replace(held_out, fdda=np.full((5, 1), 0.1)))
+    check_parity(source, replace(held_out, fdda=np.full((5, 1), 0.001), linear=np.full((5, 1), 0.5)))

@@ -46,6 +46,8 @@ and the rounding error of float32 far from the origin is added."""
 MAX_DIFFERENCE_RATIO = 0.01
 """Relative to the rms error in held-out poses, a difference that does not matter. Rigs that burst into pieces have
 errors of meters, and residuals that float32 rounds by millimeters."""
+MAX_ROUNDING_RATIO = 4e-4
+"""Relative to the largest residual, a difference that the 16-bit integers of the constants explain."""
 MAX_CONFIDENCE_DIFFERENCE = 1e-3
 MAX_SURFACE_POSES = 50
 """Maximum number of poses in which normals are compared. At 50,000 vertices a pose takes a tenth of a second."""
@@ -187,7 +189,8 @@ def check_parity(recording: SkinnedRecording, held_out: Measurement) -> None:
     max_coordinate = float(np.abs(rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max())
     rounding = 2 * FLOAT32_ROUNDING_RATIO * max_coordinate * rig.metres_per_unit
     allowed = MAX_DIFFERENCE_METRES * max(1.0, rig.size * rig.metres_per_unit) + rounding
-    allowed = max(allowed, MAX_DIFFERENCE_RATIO * float(np.sqrt(np.square(held_out.fdda).mean())))
+    error_rms, residual = float(np.sqrt(np.square(held_out.fdda).mean())), float(held_out.linear.max(initial=0))
+    allowed = max(allowed, MAX_DIFFERENCE_RATIO * error_rms, MAX_ROUNDING_RATIO * residual)
     if held_out.difference > allowed:
         raise TrainingError(
             f"The exported model differs from PyTorch by {held_out.difference * 1000:.3g} mm, more than the allowed "
