@@ -22,6 +22,8 @@ import tomllib
 import zipfile
 from pathlib import Path
 
+from manual_page import make_page
+
 ROOT = Path(__file__).resolve().parent.parent
 DIST_FOLDER = ROOT / "dist"
 STAGE_FOLDER = DIST_FOLDER / "stage"
@@ -250,10 +252,12 @@ def check_wheel(wheel: Path, name: str, python: str) -> None:
 
 
 def stage_manual(folder: Path) -> None:
-    """Copy the manual into a folder, with the pictures and pages that it refers to."""
+    """Write the manual as an HTML page into a folder, and copy the pictures and pages that it refers to."""
     text = (ROOT / "docs" / "manual.md").read_text(encoding="utf-8")
+    folder.mkdir(parents=True)
+    (folder / "manual.html").write_text(make_page(text), encoding="utf-8")
     references = re.findall(r"\]\(([\w./-]+)(?:#[^)]*)?\)|<img src=\"([^\"]+)\"", text)
-    for name in {"manual.md", *map("".join, references)}:
+    for name in set(map("".join, references)):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / "docs" / name, folder / name)
 

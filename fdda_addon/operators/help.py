@@ -1,16 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operator that opens the manual in the web browser. The manual is part of the add-on."""
 
-import tempfile
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import OutputError
-from ..core.files.output import write_text
-from ..core.sentences import manual_page
-
-MANUAL = Path(__file__).resolve().parents[2] / "docs" / "manual.md"
+_DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 class FDDA_OT_help(bpy.types.Operator):
@@ -24,12 +19,8 @@ class FDDA_OT_help(bpy.types.Operator):
     )
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        try:
-            path = manual_file()
-        except (OSError, OutputError) as error:
-            self.report({"ERROR"}, f"The manual cannot be opened ({error}).")
-            return {"CANCELLED"}
-        url = path.as_uri() + (f"#{manual_page.heading_anchor(self.section)}" if self.section else "")
+        path = manual_path()
+        url = path.as_uri() + (f"#{self.section.lower().replace(' ', '-')}" if self.section else "")
         try:
             bpy.ops.wm.url_open(url=url)
         except RuntimeError:
@@ -39,13 +30,10 @@ class FDDA_OT_help(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def manual_file() -> Path:
-    """Write the manual as an HTML page and return its path. The pictures stay in the add-on."""
-    text = MANUAL.read_text(encoding="utf-8")
-    folder = Path(bpy.app.tempdir or tempfile.gettempdir())
-    path = folder / "fdda_manual.html"
-    write_text(path, manual_page.make_page(text, MANUAL.parent.as_uri()))
-    return path
+def manual_path() -> Path:
+    """Return the path of the manual: the page that the zip has, or its source in a checkout."""
+    page = _DOCS / "manual.html"
+    return page if page.is_file() else _DOCS / "manual.md"
 
 
 CLASSES = (FDDA_OT_help,)

@@ -18,7 +18,7 @@ from ..jobs.job import JobRunner, current, request_cancel
 from ..jobs.state import ENVIRONMENT, JobState
 from ..properties.preferences import wheels_folder
 from ..training.environment import choice, folder, session
-from ..training.environment.check_result import CheckResult
+from ..training.environment.check import CheckResult
 from ..training.environment.creation import EnvironmentCreation
 
 WAIT_SECONDS = 0.05

@@ -12,7 +12,7 @@ from ..jobs.job import current
 from ..jobs.state import ENVIRONMENT, JobState
 from ..scene import folder_trust
 from ..training.environment import choice, session
-from ..training.environment.check_result import CheckResult
+from ..training.environment.check import CheckResult
 from ..training.environment.folder import EXTENSION, FolderState, creation_obstacle, environment_folder
 
 MODULE = EXTENSION or __package__.partition(".")[0]

@@ -3,12 +3,12 @@
 
 import json
 import subprocess
+from typing import NamedTuple
 
 from ...core.errors import os_error_text
 from ...core.files.child_process import child_options
 from ...core.files.native_library import runtime_advice
 from ..process_exit import explain_exit_status
-from .check_result import CheckResult
 from .folder import PACKAGES, ROOT
 
 MIN_VERSION = (3, 11)
@@ -35,6 +35,20 @@ if answer["packages"].get("torch"):
 print()
 print(json.dumps(answer))
 """
+
+
+class CheckResult(NamedTuple):
+    """Result of a check, or of an operation on the environment.
+
+    Attributes:
+        level: 'INFO', 'WARNING' (works, but needs attention) or 'ERROR' (does not work), as in operator reports.
+        message: one sentence; for a problem, with what to do.
+        details: further lines.
+    """
+
+    level: str
+    message: str
+    details: tuple[str, ...] = ()
 
 
 def check(python: str, advice: str) -> CheckResult:

@@ -9,8 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from .check import check
-from .check_result import CheckResult
+from .check import CheckResult, check
 from .folder import environment_python, interpreter_path
 
 PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"

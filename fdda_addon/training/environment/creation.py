@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
@@ -16,8 +17,7 @@ from typing import IO
 from ...core.errors import TrainerEnvironmentError, os_error_text
 from ...core.files.child_process import child_options
 from ...core.progress import Job, Progress
-from .check import check
-from .check_result import CheckResult
+from .check import CheckResult, check
 from .folder import (
     PACKAGES,
     creation_lock,
@@ -28,11 +28,12 @@ from .folder import (
     write_completion_marker,
 )
 from .interpreters import Interpreter, find_interpreters, query_interpreter
-from .source_checks import TEMPORARY_FOLDER_NAME, check_source, check_wheels
 
 RUN_PIP = Path(__file__).with_name("run_pip.py")
 UNREADABLE_SETTINGS_STATUS = 78
 """Exit status of `RUN_PIP` if pip's settings cannot be read: EX_CONFIG of sysexits.h."""
+MIN_FREE_GB = 9 if sys.platform.startswith("linux") else 2
+"""Free disk space that the packages and downloads need. On Linux they include CUDA."""
 
 
 class EnvironmentCreation:
@@ -69,7 +70,7 @@ class EnvironmentCreation:
 
     def _steps(self) -> Job[CheckResult]:
         with creation_lock(self.folder), _open_log(self.log) as log:
-            check_source(self.folder, self.wheels)
+            _check_source(self.folder, self.wheels)
             yield Progress("looking for a Python", 0, 0)
             if self.base:
                 queried = query_interpreter([self.base])
@@ -86,7 +87,7 @@ class EnvironmentCreation:
             if not interpreters:
                 raise self._no_python_error(f"{candidates[0]} {candidates[0].problem}" if candidates else "none runs")
             if self.wheels is not None:
-                check_wheels(self.wheels, interpreters[0], log, self.log)
+                _check_wheels(self.wheels, interpreters[0], log, self.log)
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
@@ -133,7 +134,7 @@ class EnvironmentCreation:
     def _temporary(self) -> Iterator[Path]:
         """Create a temporary folder on the disk, because /tmp may be in memory; on Windows with a short path."""
         if os.name == "nt":
-            path = Path(tempfile.mkdtemp(prefix=TEMPORARY_FOLDER_NAME[:-8]))
+            path = Path(tempfile.mkdtemp(prefix="fdda-"))
         else:
             path = self.folder / "temporary"
             path.mkdir()
@@ -230,6 +231,49 @@ class EnvironmentCreation:
         if self._cancelled:
             state = "nothing was kept" if self._has_changed_folder else "the previous environment was kept"
             raise TrainerEnvironmentError(f"The installation of the training environment was canceled; {state}.")
+
+
+def _check_source(folder: Path, wheels: Path | None) -> None:
+    """Raise a TrainerEnvironmentError if the disk is too full for downloads, or the folder of wheels is not there."""
+    if wheels is None:
+        free_gb = shutil.disk_usage(folder.parent).free / 1e9
+        if free_gb < MIN_FREE_GB:
+            raise TrainerEnvironmentError(
+                f"The training environment needs {MIN_FREE_GB} GB and '{folder.parent}' has {free_gb:.1f} GB "
+                "left; make room, or choose an existing Python that has torch."
+            )
+    elif not wheels.is_dir():
+        raise TrainerEnvironmentError(f"'{wheels}' is no folder; choose the folder that holds the packages.")
+
+
+def _check_wheels(wheels: Path, interpreter: Interpreter, log: IO[str], log_path: Path) -> None:
+    """Check that no wheel is missing. pip would report one late, and as a version conflict.
+
+    Raises:
+        TrainerEnvironmentError: wheels are missing; the log has the command that downloads them.
+    """
+    pinned = [
+        line for line in requirements_file(interpreter.version).read_text(encoding="utf-8").splitlines() if "==" in line
+    ]
+    pinned_versions = [line.split("==") for line in pinned if line.partition("==")[0] in PACKAGES]
+    missing = [
+        f"{name} {version}" for name, version in pinned_versions if not any(wheels.glob(f"{name}-{version}[-+]*.whl"))
+    ]
+    if missing:
+        version = f"{interpreter.version[0]}.{interpreter.version[1]}"
+        download = [
+            "pip",
+            "download",
+            "--only-binary=:all:",
+            f"--constraint={requirements_file(interpreter.version)}",
+            "--dest=wheels",
+        ]
+        log.write(f"With Python {version} on such a machine as this, but online:\n")
+        log.write(f"$ {subprocess.list2cmdline([f'python{version}', '-m', *download, *PACKAGES])}\n")
+        raise TrainerEnvironmentError(
+            f"The folder '{wheels}' lacks the packages {', '.join(missing)} for Python {version}; download "
+            f"them on a machine that is online, '{log_path}' has the command."
+        )
 
 
 @contextmanager

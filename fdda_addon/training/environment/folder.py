@@ -16,21 +16,12 @@ from pathlib import Path
 
 from ...core.errors import TrainerEnvironmentError, os_error_text
 from ...core.files.file_lock import NoLocksError, try_lock
-from ...core.files.path_limits import MAX_WINDOWS_PATH_LENGTH
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """Module name of the installed extension, "bl_ext.REPOSITORY.fdda"; empty if the add-on is not installed."""
 PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "jinja2")
 """Packages that the trainer imports."""
 COMPLETION_MARKER = "fdda-complete"
-MAX_WHEEL_PATH_LENGTH = 126
-"""Length of the longest path in the wheels for Windows, a license file of torch 2.15.0.
-
-To measure it in the folder of the installed packages:
-`find . -printf '%P\\n' | awk '{print length}' | sort -n | tail -1`.
-"""
-PIP_TARGET = "/pip-target-12345678/lib/python"
-"""Subfolder of the temporary folder, into which pip installs packages before it moves them."""
 ROOT = Path(__file__).parents[3]
 """Folder with the packages `fdda_addon` and `trainer`: the checkout, or the installed extension."""
 REQUIREMENTS = ROOT / "requirements"
@@ -67,33 +58,10 @@ def user_folder() -> Path:
 def environment_folder() -> Path:
     """Return the folder of the environment, in the folder that Blender removes with the extension.
 
-    On Windows the path has 91 characters besides the user name, which may have up to 33 (see `MAX_WHEEL_PATH_LENGTH`).
+    On Windows the path has 91 characters besides the user name. The longest path in the wheels has 126, a license file
+    of torch 2.15.0, so that user names of up to 33 characters fit into the 259 that Windows allows.
     """
     return user_folder() / "trainer"
-
-
-def excess_path_length(folder: Path, temporary: Path) -> int:
-    """Return by how many characters the longest path of an environment exceeds the limit of Windows; 0 if it fits.
-
-    Args:
-        folder: folder of the environment.
-        temporary: folder for temporary files during the installation.
-    """
-    longest_path = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + MAX_WHEEL_PATH_LENGTH
-    return max(0, longest_path - MAX_WINDOWS_PATH_LENGTH)
-
-
-def has_path_limit() -> bool:
-    """Return whether this system rejects paths of more than `MAX_WINDOWS_PATH_LENGTH` characters."""
-    if os.name != "nt":
-        return False
-    import winreg
-
-    try:
-        with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, r"SYSTEM\CurrentControlSet\Control\FileSystem") as key:
-            return winreg.QueryValueEx(key, "LongPathsEnabled")[0] != 1
-    except OSError:
-        return True
 
 
 def log_path() -> Path:

@@ -4,10 +4,8 @@
 Every candidate is run, because it may be a shim of a version manager, or lack the module venv.
 """
 
-import contextlib
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -116,73 +114,21 @@ def _unix_candidates() -> Iterator[list[str]]:
 
 
 def _windows_candidates() -> Iterator[list[str]]:
-    """Yield interpreters of the registry, python.org, uv, pyenv-win and the launcher, then those on PATH."""
-    home = Path.home()
-    local = Path(os.environ.get("LOCALAPPDATA") or home / "AppData/Local")
-    roaming = Path(os.environ.get("APPDATA") or home / "AppData/Roaming")
-    programs = dict.fromkeys(
-        Path(folder) for name in ("ProgramFiles", "ProgramW6432") if (folder := os.environ.get(name))
-    )
-    drive = Path(os.environ.get("SYSTEMDRIVE", "C:") + "/")
-    pyenv = Path(os.environ.get("PYENV_ROOT") or os.environ.get("PYENV") or home / ".pyenv/pyenv-win")
-    uv = [roaming / "uv/python", roaming / "uv/data/python"]
-    if folder := os.environ.get("UV_PYTHON_INSTALL_DIR"):
-        uv.insert(0, Path(folder))
-    for version in PREFERRED_VERSIONS:
-        digits = version.replace(".", "")
-        for path in (
-            *_registry_interpreters(version),
-            *(folder / f"Python{digits}/python.exe" for folder in (local / "Programs/Python", *programs, drive)),
-            local / f"Python/pythoncore-{version}-64/python.exe",
-            *(path for folder in uv for path in sorted(folder.glob(f"cpython-{version}.*/python.exe"))),
-            *sorted(pyenv.glob(f"versions/{version}.*/python.exe")),
-        ):
-            if path.is_file() and not _is_store_app(path):
-                yield [str(path)]
-        if launcher := _find_on_path("py.exe"):
-            yield [launcher, f"-{version}"]
+    """Yield the launcher with each version, then the interpreters on PATH."""
+    if launcher := _find_on_path("py.exe"):
+        yield from ([launcher, f"-{version}"] for version in PREFERRED_VERSIONS)
     for name in (*(f"python{version}.exe" for version in PREFERRED_VERSIONS), "python3.exe", "python.exe"):
         if program := _find_on_path(name):
             yield [program]
 
 
-def _registry_interpreters(version: str) -> Iterator[Path]:
-    """Yield interpreters of a version in the registry (PEP 514)."""
-    import winreg
-
-    for root in (winreg.HKEY_CURRENT_USER, winreg.HKEY_LOCAL_MACHINE):
-        for company in _subkeys(root, r"Software\Python"):
-            for tag in _subkeys(root, rf"Software\Python\{company}"):
-                if not re.match(rf"\D*{re.escape(version)}(?!\d)", tag):
-                    continue
-                with contextlib.suppress(OSError):
-                    folder = winreg.QueryValue(root, rf"Software\Python\{company}\{tag}\InstallPath")
-                    yield Path(folder) / "python.exe"
-
-
-def _subkeys(root: int, key: str) -> list[str]:
-    import winreg
-
-    try:
-        with winreg.OpenKey(root, key) as opened:
-            return [winreg.EnumKey(opened, index) for index in range(winreg.QueryInfoKey(opened)[0])]
-    except OSError:
-        return []
-
-
 def _find_on_path(name: str) -> str:
-    """Return the path of a program on PATH; empty if there is none. The current folder is not searched."""
-    for folder in map(Path, filter(None, os.environ.get("PATH", "").split(os.pathsep))):
-        path = folder / name
-        if folder.is_absolute() and path.is_file() and not _is_store_app(path):
-            return str(path)
-    return ""
+    """Return the path of a program on PATH; empty if there is none. The current folder is not searched.
 
-
-def _is_store_app(path: Path) -> bool:
-    """Return whether a program comes from the Microsoft Store.
-
-    Its python.exe may only open the store. If Python is installed from the store, Windows redirects what it writes to
-    AppData, and so the environment.
+    Programs of the Microsoft Store are left out. Its python.exe may only open the store. If Python is installed from
+    the store, Windows redirects what it writes to AppData, and so the environment.
     """
-    return "windowsapps" in (part.lower() for part in path.parts)
+    for folder in map(Path, filter(None, os.environ.get("PATH", "").split(os.pathsep))):
+        if folder.is_absolute() and (folder / name).is_file() and "windowsapps" not in map(str.lower, folder.parts):
+            return str(folder / name)
+    return ""

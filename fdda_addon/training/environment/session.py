@@ -2,7 +2,7 @@
 """Results of the last check of the trainer's Python in this session, which panels draw without running a check."""
 
 from ...scene import draw_cache
-from .check_result import CheckResult
+from .check import CheckResult
 from .folder import FolderState, environment_folder, folder_state
 
 check_result: CheckResult | None = None

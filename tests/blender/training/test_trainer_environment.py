@@ -17,7 +17,7 @@ from fdda_addon.core.progress import run_job
 from fdda_addon.jobs.job import JobRunner, current, state_of, stop
 from fdda_addon.jobs.state import ENVIRONMENT
 from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, _check, start_job
-from fdda_addon.training.environment import choice, folder, session, source_checks
+from fdda_addon.training.environment import choice, creation, folder, session
 from fdda_addon.training.environment.choice import Origin
 from fdda_addon.training.environment.creation import EnvironmentCreation
 from fdda_addon.training.environment.folder import FolderState
@@ -183,7 +183,7 @@ def test_without_online_access_wheels_are_required(user: Path, preferences, tmp_
 def test_too_little_disk_space_is_refused_before_the_installation(
     user: Path, own: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(source_checks, "MIN_FREE_GB", 10**9)
+    monkeypatch.setattr(creation, "MIN_FREE_GB", 10**9)
     with pytest.raises(TrainerEnvironmentError, match=r"needs 1000000000 GB and '.*' has [\d.]+ GB left; make room"):
         list(EnvironmentCreation(own, folder.log_path()).steps())
     assert session.environment_state() is FolderState.READY

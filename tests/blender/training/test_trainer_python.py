@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.errors import TrainerEnvironmentError
-from fdda_addon.training.environment import check, creation, folder, interpreters, source_checks
-from fdda_addon.training.environment.check_result import CheckResult
+from fdda_addon.training.environment import check, folder, interpreters
+from fdda_addon.training.environment.check import CheckResult
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
-from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, excess_path_length, interpreter_path
+from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, interpreter_path
 from fdda_addon.training.environment.interpreters import find_interpreters, query_interpreter
 
 from ..conftest import run
@@ -195,76 +194,17 @@ def test_the_advice_on_a_library_that_cannot_be_loaded_is_shown(packages: Path, 
     assert f"); {advice}" in asked(sys.executable).message
 
 
-@pytest.fixture
-def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Folders as Windows has them, with Pythons of every kind."""
-    names = {
-        "LOCALAPPDATA": "Local",
-        "APPDATA": "Roaming",
-        "ProgramFiles": "Program Files",
-        "ProgramW6432": "Program Files",
-        "SYSTEMDRIVE": "C",
-        "PYENV_ROOT": "pyenv-win",
-    }
-    for variable, name in names.items():
-        monkeypatch.setenv(variable, str(tmp_path / name))
-    monkeypatch.delenv("UV_PYTHON_INSTALL_DIR", raising=False)
-    monkeypatch.setattr(
-        interpreters, "_registry_interpreters", lambda version: iter([tmp_path / f"of_registry/{version}/python.exe"])
-    )
-    monkeypatch.setenv(
-        "PATH", os.pathsep.join(str(tmp_path / name) for name in ("Local/Microsoft/WindowsApps", "path"))
-    )
-    for name in (
-        "of_registry/3.13/python.exe",
-        "Local/Programs/Python/Python313/python.exe",
-        "Program Files/Python311/python.exe",
-        "Roaming/uv/python/cpython-3.12.9-windows-x86_64-none/python.exe",
-        "pyenv-win/versions/3.11.9/python.exe",
-        "Local/Microsoft/WindowsApps/python.exe",
-        "Local/Microsoft/WindowsApps/python3.13.exe",
-        "path/python.exe",
-        "path/py.exe",
-    ):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-    return tmp_path
-
-
 @pytest.mark.one_blender_version
-def test_pythons_are_searched_in_the_folders_of_windows(windows_folders: Path):
-    """Python.org, the launcher, uv and pyenv-win are searched; the alias of the Microsoft Store is skipped."""
-    found = [
-        (Path(path).relative_to(windows_folders).as_posix(), *rest)
-        for path, *rest in interpreters._windows_candidates()
-    ]
-    assert found == [
-        ("of_registry/3.13/python.exe",),
-        ("Local/Programs/Python/Python313/python.exe",),
-        ("path/py.exe", "-3.13"),
-        ("Program Files/Python311/python.exe",),
-        ("pyenv-win/versions/3.11.9/python.exe",),
-        ("path/py.exe", "-3.11"),
-        ("Roaming/uv/python/cpython-3.12.9-windows-x86_64-none/python.exe",),
-        ("path/py.exe", "-3.12"),
-        ("path/python.exe",),
-    ]
-
-
-@pytest.mark.one_blender_version
-def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    extension = r"AppData\Roaming\Blender Foundation\Blender\5.2\extensions\.user\user_default\fdda\trainer"
-    temporary = r"AppData\Local\Temp\fdda-12345678"
-
-    def missing(name: str) -> int:
-        return excess_path_length(*(Path(rf"C:\Users\{name}\{rest}") for rest in (extension, temporary)))
-
-    assert [missing(letters * "x") for letters in (15, 33, 34, 60)] == [0, 0, 1, 27]
-    monkeypatch.setattr(source_checks, "has_path_limit", lambda: True)
-    monkeypatch.setattr(source_checks, "excess_path_length", lambda *_: 7)
-    with pytest.raises(TrainerEnvironmentError, match=r"would be 7 letters too long for Windows; allow long paths \("):
-        list(creation.EnvironmentCreation(tmp_path / "trainer", tmp_path / "log").steps())
-    assert not (tmp_path / "trainer").exists()
+def test_pythons_are_searched_on_the_path_of_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The launcher comes first; the alias of the Microsoft Store is skipped."""
+    names = ("WindowsApps/python.exe", "WindowsApps/python3.13.exe", "path/python.exe", "path/py.exe")
+    for path in map(tmp_path.joinpath, names):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    monkeypatch.setenv("PATH", os.pathsep.join(str(tmp_path / name) for name in ("WindowsApps", "path")))
+    launcher, python = (str(tmp_path / "path" / name) for name in ("py.exe", "python.exe"))
+    expected = [*([launcher, f"-{version}"] for version in ("3.13", "3.11", "3.12")), [python]]
+    assert list(interpreters._windows_candidates()) == expected
 
 
 @pytest.mark.one_blender_version

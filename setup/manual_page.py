@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Conversion of the manual to an HTML page, for the subset of Markdown that it uses.
-
-Blender brings no Markdown library. A wheel for this one page would be larger than this module, and part of each update.
-"""
+"""Conversion of the manual to an HTML page, for the subset of Markdown that it uses."""
 
 import html
 import re
@@ -20,9 +17,9 @@ def heading_anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def make_page(text: str, folder: str) -> str:
-    """Convert Markdown text to an HTML page; relative links and images are resolved against the URL `folder`."""
-    body = "\n".join(_block_html(block, folder) for block in _split_blocks(text))
+def make_page(text: str) -> str:
+    """Convert Markdown text to an HTML page with the same links and images."""
+    body = "\n".join(map(_block_html, _split_blocks(text)))
     return f'<!doctype html><meta charset="utf-8"><title>FDDA</title><style>{STYLE}</style>\n{body}\n'
 
 
@@ -47,16 +44,16 @@ def _split_blocks(text: str) -> list[list[str]]:
     return [block for block in blocks if block]
 
 
-def _block_html(lines: list[str], folder: str) -> str:
+def _block_html(lines: list[str]) -> str:
     first = lines[0]
     if heading := re.match(r"(#{1,6}) (.*)", first):
         level = len(heading[1])
-        text = _inline_html(" ".join([heading[2], *lines[1:]]), folder)
+        text = _inline_html(" ".join([heading[2], *lines[1:]]))
         return f'<h{level} id="{heading_anchor(heading[2])}">{text}</h{level}>'
     if first.startswith("|"):
         rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
         rows = [row for row in rows if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
-        cells = ["".join(f"<td>{_inline_html(cell, folder)}</td>" for cell in row) for row in rows]
+        cells = ["".join(f"<td>{_inline_html(cell)}</td>" for cell in row) for row in rows]
         return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
     if first.startswith("    "):
         return f"<pre>{html.escape(chr(10).join(line[4:] for line in lines), quote=False)}</pre>"
@@ -68,11 +65,11 @@ def _block_html(lines: list[str], folder: str) -> str:
             else:
                 items[-1] += f" {line.strip()}"
         tag = "ul" if lines[0].startswith("- ") else "ol"
-        return f"<{tag}>" + "".join(f"<li>{_inline_html(item, folder)}</li>" for item in items) + f"</{tag}>"
-    return f"<p>{_inline_html(' '.join(lines), folder)}</p>"
+        return f"<{tag}>" + "".join(f"<li>{_inline_html(item)}</li>" for item in items) + f"</{tag}>"
+    return f"<p>{_inline_html(' '.join(lines))}</p>"
 
 
-def _inline_html(text: str, folder: str) -> str:
+def _inline_html(text: str) -> str:
     """Convert code, bold text, italic text, links and images inside a block to HTML."""
     fragments: list[str] = []
 
@@ -81,11 +78,10 @@ def _inline_html(text: str, folder: str) -> str:
         return f"\0{len(fragments) - 1}\0"
 
     def convert_image(match: re.Match) -> str:
-        return protect(f'<img src="{folder}/{html.escape(match[1])}" alt="{html.escape(match[2])}">')
+        return protect(f'<img src="{html.escape(match[1])}" alt="{html.escape(match[2])}">')
 
     def convert_link(match: re.Match) -> str:
-        target = match[2] if match[2].startswith("#") or "://" in match[2] else f"{folder}/{match[2]}"
-        return protect(f'<a href="{html.escape(target)}">') + match[1] + protect("</a>")
+        return protect(f'<a href="{html.escape(match[2])}">') + match[1] + protect("</a>")
 
     text = re.sub(r'<img src="([^"]+)"[^>]*alt="([^"]*)"[^>]*>', convert_image, text)
     text = re.sub(r"`([^`]+)`", lambda match: protect(f"<code>{html.escape(match[1], quote=False)}</code>"), text)

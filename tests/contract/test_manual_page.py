@@ -2,22 +2,22 @@
 """The manual as an HTML page: every heading has an anchor, and no Markdown remains."""
 
 import re
-from pathlib import Path
 
-from fdda_addon.core.sentences.manual_page import heading_anchor, make_page
+from .test_setup import ROOT, load_script
 
-ROOT = Path(__file__).resolve().parents[3]
+manual_page = load_script("manual_page")
+heading_anchor, make_page = manual_page.heading_anchor, manual_page.make_page
 MANUAL = (ROOT / "docs" / "manual.md").read_text(encoding="utf-8")
 
 
 def test_the_manual_is_converted_completely():
-    html_page = make_page(MANUAL, "file:///docs")
+    html_page = make_page(MANUAL)
     headings = re.findall(r"^#{1,6} (.+)$", MANUAL, re.MULTILINE)
     assert len(headings) > 60
     assert [heading for heading in headings if f'id="{heading_anchor(heading)}"' not in html_page] == []
     text = re.sub(r"<pre>.*?</pre>|<code>.*?</code>", "", html_page, flags=re.DOTALL)
     assert [line for line in text.splitlines() if "**" in line or "](" in line or line.startswith(("|", "- "))] == []
-    assert html_page.count("<table>") >= 4 and "file:///docs/pictures/" in html_page
+    assert html_page.count("<table>") >= 4 and 'src="pictures/' in html_page
     for name in re.findall(r'href="#([^"]+)"', html_page):
         assert f'id="{name}"' in html_page, name
 
@@ -25,7 +25,7 @@ def test_the_manual_is_converted_completely():
 def test_headings_paragraphs_lists_code_and_tables_are_converted():
     lists = "- i\n  more\n- j\n\n1. k"
     table = "| a | b |\n|---|---|\n| 1 | 2 |"
-    html_page = make_page(f"# A <b>\n\none\ntwo `**x**` & **b**\n{lists}\n\n    code **x**\n\n{table}", "f")
+    html_page = make_page(f"# A <b>\n\none\ntwo `**x**` & **b**\n{lists}\n\n    code **x**\n\n{table}")
     assert '<h1 id="a-b">A &lt;b&gt;</h1>' in html_page
     assert "<p>one two <code>**x**</code> &amp; <b>b</b></p>" in html_page
     assert "<ul><li>i more</li><li>j</li></ul>" in html_page and "<ol><li>k</li></ol>" in html_page
