@@ -7,7 +7,7 @@ from pathlib import Path
 from ..baking.export import write_bake
 from ..baking.run import BakeSettings, bake_file
 from ..core.files.stop_signals import exit_on_stop_signal
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from .files import add_rig_options
 from .folders import open_rigs
 from .outputs import add_overwrite_option

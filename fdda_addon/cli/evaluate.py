@@ -10,8 +10,8 @@ from ..core.errors import WrongUsageError
 from ..core.files.file_kind import EVALUATION, PICTURE, VIDEO
 from ..core.files.output import atomic_write_all, check_outputs, to_json_text
 from ..core.sentences.assessment import farther_than_skinning_sentence
-from ..core.sentences.counts import format_count
 from ..core.settings import EVALUATION_POSES, EVALUATION_SEED, FILM_TIMED_FRAMES
+from ..core.wording import format_count
 from ..evaluation.film import FDDA, LABELS, LINEAR, RIG, FilmSettings, film
 from ..evaluation.pictures import draw_comparison, representative_poses
 from ..evaluation.results import Evaluation

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..core.errors import OutputError, WrongUsageError
 from ..core.files.file_kind import BLEND
 from ..core.files.output import check_outputs
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count, format_list
 from ..fast_rig.controls import check_choices
 from ..fast_rig.frame_times import measure_frames
 from ..fast_rig.run import FastRig, make_fast_rig
@@ -68,7 +68,7 @@ def _summary(fast_rig: FastRig) -> str:
         f"'{fast_rig.armature_name}' has {fast_rig.bones_after:,} of {fast_rig.bones_before:,} bones; the model reads "
         f"{fast_rig.joints:,}, animators pose {len(fast_rig.controls):,}",
         f"  removed {_count(fast_rig.removed_objects, 'object')}, {_count(fast_rig.removed_modifiers, 'modifier')} "
-        f"and {fast_rig.removed_drivers:,} driver{'s' * (fast_rig.removed_drivers != 1)}",
+        f"and {format_count(fast_rig.removed_drivers, 'driver')}",
     ]
     if fast_rig.moving_joints:
         lines.append(
@@ -84,22 +84,15 @@ def _summary(fast_rig: FastRig) -> str:
     if counts := fast_rig.infinite_bones:
         lines.append(
             f"  in up to {max(counts.values())} of these, both rigs give no finite transform to "
-            f"{_names(tuple(counts))}; there they were not compared"
+            f"{format_list(list(counts), MAX_LISTED)}; there they were not compared"
         )
     if fast_rig.unrepeated:
         lines.append(f"  not compared, because the full rig does not repeat it: {', '.join(fast_rig.unrepeated)}")
     for action, counts in fast_rig.lost_channels.items():
-        lines.append(
-            f"  '{action}': {sum(counts.values()):,} keyed channels have no bone any more: {_names(tuple(counts))}"
-        )
+        count, names = sum(counts.values()), format_list(list(counts), MAX_LISTED)
+        lines.append(f"  '{action}': {count:,} keyed channels have no bone any more: {names}")
     return "\n".join(lines)
 
 
 def _count(names: tuple[str, ...], noun: str) -> str:
-    plural = "s" if len(names) != 1 else ""
-    return f"{len(names):,} {noun}{plural}" + (f" ({_names(names)})" if names else "")
-
-
-def _names(names: tuple[str, ...]) -> str:
-    more = f" and {len(names) - MAX_LISTED:,} more" if len(names) > MAX_LISTED else ""
-    return ", ".join(f"'{name}'" for name in names[:MAX_LISTED]) + more
+    return format_count(len(names), noun) + (f" ({format_list(names, MAX_LISTED)})" if names else "")

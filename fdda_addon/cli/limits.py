@@ -8,7 +8,7 @@ from pathlib import Path
 from ..core.errors import WrongUsageError
 from ..core.files.file_kind import BLEND
 from ..core.files.output import check_outputs
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..poses.action_range import measured_ranges
 from ..poses.clip import find_action
 from ..poses.measured_limits import DEFAULT_MARGIN, describe_limits, set_limits_from_actions

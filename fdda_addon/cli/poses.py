@@ -9,7 +9,7 @@ from ..core.errors import WrongUsageError
 from ..core.files.file_kind import BLEND
 from ..core.files.output import check_outputs
 from ..core.recording.index import read_index, read_info
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..recording.plan import RecordingSettings
 from ..recording.posed_action import make_posed_action, recorded_settings
 from ..runtime.binding import model_disabled

@@ -9,7 +9,7 @@ import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,8 +16,8 @@ from ..core.files.stop_signals import INTERRUPTED
 from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.formats.report import Verdict
 from ..core.recording.folder import recordings_in
-from ..core.sentences.counts import format_count
 from ..core.settings import REFINEMENT_POSES
+from ..core.wording import format_count
 from ..training.process import Training, trainer_command
 from .progress import ProgressPrinter
 

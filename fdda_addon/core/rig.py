@@ -9,6 +9,7 @@ import numpy as np
 
 from .controls import Control, controls_of_mesh
 from .deformation import check_deformation, deformation_differences
+from .wording import format_with_noun
 
 STATIC_JOINT = ""
 """Name of the static joint, which moves vertices without a bone; no bone has this name.
@@ -353,11 +354,11 @@ def rig_differences(
     file_joints, rig_joints = {j.name for j in joints}, set(rig.joint_names)
     if file_joints != rig_joints:
         if missing := sorted(file_joints - rig_joints):
-            clauses.append(f"the armature lacks {_format_joints(missing)}")
+            clauses.append(f"the armature lacks {format_with_noun(missing, 'joint')}")
         if STATIC_JOINT in rig_joints - file_joints:
             clauses.append("some vertices follow no bone")
         if extra := sorted(rig_joints - file_joints - {STATIC_JOINT}):
-            clauses.append(f"it does not know {_format_joints(extra)}")
+            clauses.append(f"it does not know {format_with_noun(extra, 'joint')}")
     elif joints != rig.joints:
         clauses.append("its joints have other parents")
     elif rest_matrices.shape != rig.rest_matrices.shape or (not rest_matrices_match(rest_matrices, rig)):
@@ -385,10 +386,3 @@ def _mesh_differences(
     if not _matrices_match(mesh.matrix, rig_mesh.matrix, metres_per_unit):
         clauses.append("the mesh has moved against the others")
     return clauses + deformation_differences(fingerprint.deformation, rig_fingerprint.deformation, controls)
-
-
-def _format_joints(names: list[str], max_names: int = 3) -> str:
-    shown_names = ", ".join(f"'{name}'" for name in names[:max_names])
-    return f"the {'joint' if len(names) == 1 else 'joints'} {shown_names}" + (
-        f" and {len(names) - max_names} more" if len(names) > max_names else ""
-    )

@@ -14,8 +14,8 @@ import numpy as np
 from ..core.errors import ModelError
 from ..core.mathematics.metrics import viewport_colors
 from ..core.mathematics.partition import make_merged_partitions, partition_colors
-from ..core.sentences.counts import format_count
 from ..core.settings import MIN_VERTICES_PER_PART
+from ..core.wording import format_count
 from ..rig.reading import read_rig
 from ..runtime.model_files import network_of
 from ..runtime.opened_model import open_model

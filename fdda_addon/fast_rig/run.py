@@ -10,7 +10,7 @@ from ..core.errors import ModelError, RigError
 from ..core.formats.model import read_model
 from ..core.progress import Job
 from ..core.rig import STATIC_JOINT
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..rig.modifier_stack import check_evaluable
 from ..rig.references import Node, driven_node, split_bone_path
 from ..runtime import packed_model

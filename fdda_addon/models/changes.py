@@ -8,13 +8,11 @@ import bpy
 from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.poses import ROTATION_VECTOR, Channel, bones_with_changed_range
 from ..core.rig import Rig, rig_differences
+from ..core.wording import format_list
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_model_rig
 from ..scene.scene_rig import SceneRig
 from .model_list import entry_info_of_mesh
-
-MAX_LISTED_BONES = 3
-"""Number of bones that `RigChanges.sentence` names."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +46,8 @@ class RigChanges:
         names = self.bones_with_changed_range
         if not names:
             return ""
-        quoted_names = ", ".join(f"'{name}'" for name in names[:MAX_LISTED_BONES])
-        more = f" and {len(names) - MAX_LISTED_BONES} more" if len(names) > MAX_LISTED_BONES else ""
         return (
-            f"The range of motion of {quoted_names}{more} has changed since {self.model_name} was trained: it plays, "
+            f"The range of motion of {format_list(names)} has changed since {self.model_name} was trained: it plays, "
             "but may be less exact there. Record and train again."
         )
 

@@ -9,8 +9,8 @@ from ..core.errors import RigError
 from ..core.files.file_kind import VIDEO
 from ..core.files.output import check_outputs
 from ..core.progress import Job
-from ..core.sentences.counts import format_count
 from ..core.settings import FILM_TIMED_FRAMES
+from ..core.wording import format_count
 from ..evaluation.film import FDDA, LINEAR, RIG, Film, FilmSettings, film
 from ..evaluation.picture import View
 from ..evaluation.run import evaluate_action

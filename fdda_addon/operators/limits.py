@@ -6,7 +6,7 @@ import math
 import bpy
 
 from ..core.errors import RigError
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..poses.human_ranges import human_ranges
 from ..poses.mirror import flipped_name
 from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range

@@ -6,7 +6,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import ModelError
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..models import model_list
 from ..models.changes import find_changes
 from ..models.entries import format_file_size

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import bpy
 
-from ..core.checks.warning import format_list
 from ..core.errors import FDDAError, ModelError
+from ..core.wording import format_list
 from ..evaluation import side_by_side
 from ..models import model_list
 from ..models.entries import active_entry, bound_model_name, format_file_size

@@ -9,7 +9,7 @@ import bpy
 
 from ..core.errors import FDDAError, RigError
 from ..core.progress import Job
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..poses.measured_limits import set_limits_from_actions
 from ..poses.motion_range import clear_rotation_range, set_rotation_range
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings

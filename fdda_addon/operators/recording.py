@@ -11,8 +11,8 @@ from ..core.errors import FDDAError
 from ..core.recording.estimate import format_poses
 from ..core.recording.folder import remove_recording
 from ..core.recording.index import read_index, read_info
-from ..core.sentences.counts import format_count
 from ..core.settings import REFINEMENT_POSES
+from ..core.wording import format_count
 from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder

@@ -5,7 +5,7 @@ import bpy
 
 from ..core.checks.seams import POSITION_DIGITS, split_vertex_groups
 from ..core.errors import RigError
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..poses.motion_range import unlimited_bones
 from ..rig.reading import read_rig
 from ..scene.arrays import VECTOR_ELEMENT, read, write

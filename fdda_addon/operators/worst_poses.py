@@ -6,8 +6,8 @@ import math
 import bpy
 
 from ..core.errors import ModelError
-from ..core.sentences.counts import format_count
 from ..core.settings import MARKERS
+from ..core.wording import format_count
 from ..evaluation import markers
 from ..evaluation.run import set_held_out_pose
 from ..scene.viewport import center_views

@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.sentences.assessment import Assessment, PartErrors, assess_evaluation
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..evaluation import heat_map, last_evaluation, markers, side_by_side
 from ..jobs import job
 from ..models.entries import bound_model_name

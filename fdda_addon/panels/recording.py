@@ -13,7 +13,7 @@ from ..core.mathematics.poses import Channel
 from ..core.recording.estimate import format_poses
 from ..core.recording.folder import FolderContent, FolderState, read_folder
 from ..core.recording.index import INDEX_NAME
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..jobs import job
 from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder

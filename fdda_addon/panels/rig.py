@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.recording.folder import FolderState
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..jobs import job
 from ..properties.character import file_problem
 from ..scene.active_rig import cached_rigs_of_active_armature

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import bpy
 
-from ..core.checks.warning import format_with_noun
 from ..core.controls import Control
 from ..core.errors import RigError
+from ..core.wording import format_with_noun
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.animation import changes_value, curves_with_actions, value_range
 from ..scene.controls import canonical_path, fcurve_target, is_driven, is_number, owner_of

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import bpy
 
-from ..core.checks.warning import format_with_noun
 from ..core.errors import ModelError
 from ..core.formats.model_info import ModelInfo
 from ..core.rig import Fingerprint, MeshPart
+from ..core.wording import format_with_noun
 from ..scene.comparison import is_comparison
 from ..scene.mesh import rest_positions, topology
 from ..scene.scene_rig import SceneRig, armature_of, name_without_number

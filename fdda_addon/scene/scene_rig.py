@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import bpy
 
-from ..core.checks.warning import format_with_noun
 from ..core.errors import RigError
+from ..core.wording import format_with_noun
 from .comparison import is_comparison
 from .temporary_state import animated_paths
 

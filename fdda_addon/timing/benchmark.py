@@ -18,7 +18,7 @@ import numpy as np
 
 from ..core.errors import FDDAError, RigError
 from ..core.progress import Job, Progress
-from ..core.sentences.counts import format_count
+from ..core.wording import format_count
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..runtime import model_files, playback

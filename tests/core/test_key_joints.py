@@ -85,8 +85,8 @@ def test_the_report_is_read_back_and_says_what_is_lost():
         "Key joints: all 500 joints are read, because 600 were asked for."
     )
     assert replace(REPORT, independent=("x", "y"), still=()).sentence() == (
-        "Key joints: the model reads 60 of 500 joints, but 2 of the others ('x', 'y') move independently of these, by "
-        "up to 0.40 mm (rms), and the model cannot learn that; read more joints, add their controls as inputs, or "
+        "Key joints: the model reads 60 of 500 joints, but 2 of the others ('x' and 'y') move independently of these, "
+        "by up to 0.40 mm (rms), and the model cannot learn that; read more joints, add their controls as inputs, or "
         "leave the choice to auto."
     )
 

@@ -49,11 +49,11 @@ def joints_with_names(*names: str) -> tuple[Joint, ...]:
         (joints_with_names("root", "upper", "lower"), ["the armature lacks the joint 'thumb'"]),
         (
             joints_with_names("root", "a", "b", "thumb"),
-            ["the armature lacks the joints 'lower', 'upper'", "it does not know the joints 'a', 'b'"],
+            ["the armature lacks the 2 joints 'lower' and 'upper'", "it does not know the 2 joints 'a' and 'b'"],
         ),
         (joints_with_names("a", "b", "c", "d"), [
-            "the armature lacks the joints 'lower', 'root', 'thumb' and 1 more",
-            "it does not know the joints 'a', 'b', 'c' and 1 more",
+            "the armature lacks the 4 joints 'lower', 'root', 'thumb' and 1 more",
+            "it does not know the 4 joints 'a', 'b', 'c' and 1 more",
         ]),
         ((*JOINTS, Joint("tail", 0)), ["it does not know the joint 'tail'"]),
         ((*JOINTS[:3], Joint("thumb", 2)), ["its joints have other parents"]),

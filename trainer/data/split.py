@@ -9,7 +9,7 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording.index import RANDOM, REFINED, Source
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Fingerprint
-from fdda_addon.core.sentences.counts import format_count
+from fdda_addon.core.wording import format_count
 
 from ..config import TrainingConfig
 

@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from fdda_addon.core.files.input_file import read_input
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
-from fdda_addon.core.sentences.counts import format_count
+from fdda_addon.core.wording import format_count
 
 from .charts import HistogramChart, LogAxis, curve_points
 from .error_analysis import REMEDY_BY_CAUSE

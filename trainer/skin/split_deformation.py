@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdda_addon.core.checks.warning import format_with_noun
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.messages import FIT_STAGE, KEY_JOINTS_STAGE, MessageType
 from fdda_addon.core.joint_option import ALL
@@ -19,6 +18,7 @@ from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from fdda_addon.core.rig import Rig
+from fdda_addon.core.wording import format_with_noun
 
 from ..config import TrainingConfig
 from ..progress import MessageSink

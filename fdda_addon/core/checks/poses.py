@@ -8,7 +8,8 @@ import numpy as np
 from ..mathematics.skinning import skin_matrices
 from ..recording.index import ACTION, MIRRORED, STRIP
 from ..recording.skinned import SkinnedRecording
-from .warning import RecordingWarning, format_length, format_with_noun
+from ..wording import format_with_noun
+from .warning import RecordingWarning, format_length
 
 _SOURCE_LABELS = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}
 """Labels of the sources of frames in messages."""
@@ -118,4 +119,4 @@ def _check_collapsed(recording: SkinnedRecording) -> list[RecordingWarning]:
         f"negative in {format_with_noun(collapsed_poses, 'pose')}, volumes by a factor of "
         f"{worst_factors[joints[0]]:.2g}: look for a constraint or driver that sets it, limit it and record again."
     )
-    return [RecordingWarning("degenerate-poses", text[0].upper() + text[1:])]
+    return [RecordingWarning("degenerate-poses", text)]

@@ -7,15 +7,15 @@ from ..controls import SHAPE_KEY_PATH
 from ..mathematics.features import float32_rounding, joint_features_in_metres
 from ..recording.skinned import SkinnedRecording
 from ..rig import Rig
-from ..sentences.counts import format_count
 from ..settings import MIN_VERTICES_PER_PART
+from ..wording import format_count, format_list, format_with_noun
 from .flips import check_flips
 from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
 from .rest import check_rest
 from .seams import check_seams
 from .target import check_target
-from .warning import RecordingWarning, format_length, format_list, format_with_noun, joint_name
+from .warning import RecordingWarning, format_length, joint_name
 
 WARNING_NAMES = (
     *("units", "axes", "large-residuals", "duplicate-poses", "hidden-inputs", "degenerate-poses", "flips"),
@@ -163,7 +163,7 @@ def _check_controls(recording: SkinnedRecording) -> list[RecordingWarning]:
             f"a model cannot learn {it}: record an action that moves {it}, or bones that drive {it} (--bones-to-pose), "
             f"or mute {it}."
         )
-        warnings.append(RecordingWarning("dead-controls", text[0].upper() + text[1:]))
+        warnings.append(RecordingWarning("dead-controls", text))
     if not dead_controls:
         return warnings
     constant_names = [controls[control].name for control in dead_controls if control in constant_controls]
@@ -173,7 +173,7 @@ def _check_controls(recording: SkinnedRecording) -> list[RecordingWarning]:
         f"{'changes' if len(dead_controls) == 1 else 'change'} nothing in this recording{constant_text}: leave "
         f"{'it' if len(dead_controls) == 1 else 'them'} out, or give a wider range, and record again."
     )
-    return [*warnings, RecordingWarning("dead-controls", text[0].upper() + text[1:])]
+    return [*warnings, RecordingWarning("dead-controls", text)]
 
 
 def _check_joints(recording: SkinnedRecording) -> list[RecordingWarning]:
@@ -207,7 +207,7 @@ def _check_joints(recording: SkinnedRecording) -> list[RecordingWarning]:
         f"{'is sampled but moves' if len(dead_names) == 1 else 'are sampled but move'} no vertex: lock the axes that "
         "have a range, or leave the bones out, so that poses are spent on what deforms the mesh."
     )
-    return [RecordingWarning("dead-joints", text[0].upper() + text[1:])]
+    return [RecordingWarning("dead-joints", text)]
 
 
 def _bone_path(name: str) -> str:
@@ -276,4 +276,4 @@ def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarnin
         f"{MIN_VERTICES_PER_PART.default} vertices (the smallest {min_vertex_count}), and a network each: train with "
         f"--min-vertices-per-part {MIN_VERTICES_PER_PART.default} to merge them into others."
     )
-    return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]
+    return [RecordingWarning("small-partitions", text)]

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks of units and axes in the rest pose: whether the joints of a rig lie inside of its mesh."""
 
-import itertools
-
 import numpy as np
 
 from ..mathematics.partition import main_joints
@@ -38,14 +36,15 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
     joint_positions = rig.rest_matrices[joints, :3, 3].astype(np.float64)
     vertices_by_joint = [rig.rest_positions[main_joint_of_vertex == joint].astype(np.float64) for joint in joints]
     vertex_centers = np.stack([vertices.mean(axis=0) for vertices in vertices_by_joint])
-    rotation, correlation, unrotated_correlation = _best_rotation(joint_positions, vertex_centers)
+    centered = [points - points.mean(axis=0) for points in (joint_positions, vertex_centers)]
+    correlation = np.vdot(*centered) / max(np.prod([np.linalg.norm(points) for points in centered]), 1e-12)
     extents = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (joint_positions, vertex_centers)]
     ratio = extents[1] / max(extents[0], 1e-9)
     if len(joints) > 2 and correlation > MIN_CORRELATION and not 1 / MAX_SCALE_RATIO < ratio < MAX_SCALE_RATIO:
         joint_extent, vertex_extent = (format_length(rig, extent) for extent in extents)
         text = (
             f"The {len(joints)} joints that skin the mesh lie {joint_extent} apart and their vertices "
-            f"{vertex_extent}, {_ratio_label(ratio)}: the scale of mesh or armature is not applied, or one was "
+            f"{vertex_extent}, {ratio:.3g} times as far: the scale of mesh or armature is not applied, or one was "
             "imported in another unit; give both one size in the rest pose and record again."
         )
         return [RecordingWarning("units", text)]
@@ -60,67 +59,12 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
         return []
     lower_bounds, upper_bounds = rig.rest_positions.min(axis=0), rig.rest_positions.max(axis=0)
     outside_count = int(((joint_positions < lower_bounds) | (joint_positions > upper_bounds)).any(axis=1).sum())
-    hint = (
-        f"their positions match after {rotation}"
-        if rotation and len(joints) > 2 and correlation > max(MIN_CORRELATION, unrotated_correlation + 0.2)
-        else f"most of it along {_axis_label(np.median(vertex_centers - joint_positions, axis=0))}"
-    )
+    offset = np.median(vertex_centers - joint_positions, axis=0)
+    axis = int(np.abs(offset).argmax())
     text = (
         f"{outside_count} of the {len(joints)} joints that skin the mesh lie outside its bounds, and joints lie "
         f"{format_length(rig, float(np.median(distances)))} from the nearest vertex that follows them (median), "
-        f"{hint}: mesh and armature do not match in the rest pose; bring them together, apply their transforms and "
-        "record again."
+        f"most of it along {'-' if offset[axis] < 0 else '+'}{'XYZ'[axis]}: mesh and armature do not match in the rest "
+        "pose; bring them together, apply their transforms and record again."
     )
     return [RecordingWarning("axes", text)]
-
-
-def _best_rotation(joint_positions: np.ndarray, vertex_centers: np.ndarray) -> tuple[str, float, float]:
-    """Find the rotation, among the 24 rotations of a cube, that best maps joints to their vertices.
-
-    Args:
-        joint_positions, vertex_centers: (n, 3) positions of joints and mean positions of their vertices, mesh units.
-
-    Returns:
-        A label of the best rotation, empty for the identity; the correlation with this rotation, and without rotation.
-    """
-    centered_joints, centered_vertices = (
-        joint_positions - joint_positions.mean(axis=0),
-        vertex_centers - vertex_centers.mean(axis=0),
-    )
-    scale = max(float(np.linalg.norm(centered_joints) * np.linalg.norm(centered_vertices)), 1e-12)
-    unrotated_correlation = float((centered_joints * centered_vertices).sum()) / scale
-    rotations = [
-        rotation
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1, -1), repeat=3)
-        if np.linalg.det(rotation := np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
-    ]
-    correlations = [
-        round(float(((centered_joints @ rotation.T) * centered_vertices).sum()) / scale, 2) for rotation in rotations
-    ]
-    # Joints in a row match after several rotations: prefer the rotation that keeps most axes.
-    best_index = max(range(len(rotations)), key=lambda i: (correlations[i], np.trace(rotations[i])))
-    return _rotation_label(rotations[best_index]), correlations[best_index], unrotated_correlation
-
-
-def _rotation_label(rotation: np.ndarray) -> str:
-    angle = round(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
-    fixed_axes = np.flatnonzero(np.diagonal(rotation) == 1)
-    if len(fixed_axes) == 3:
-        return ""
-    if len(fixed_axes) != 1:
-        return "an exchange of the axes"
-    x, y = (i for i in range(3) if i != fixed_axes[0])
-    # A counter-clockwise rotation about Y moves Z towards X.
-    positive = rotation[y, x] > 0 if fixed_axes[0] != 1 else rotation[x, y] > 0
-    sign = "" if angle == 180 or positive else "-"
-    return f"a rotation of {sign}{angle} degrees about {'XYZ'[fixed_axes[0]]}"
-
-
-def _axis_label(offset: np.ndarray) -> str:
-    axis = int(np.abs(offset).argmax())
-    return f"{'-' if offset[axis] < 0 else '+'}{'XYZ'[axis]}"
-
-
-def _ratio_label(ratio: float) -> str:
-    return f"{ratio:.3g} times as far" if ratio > 1 else f"only 1/{1 / ratio:.3g} of it"

@@ -8,8 +8,8 @@ import numpy as np
 from ..mathematics.metrics import distances
 from ..recording.index import ACTION, STRIP, Source
 from ..recording.skinned import SkinnedRecording
-from ..sentences.counts import format_count
-from .warning import RecordingWarning, format_length, format_list
+from ..wording import format_count, format_list
+from .warning import RecordingWarning, format_length
 
 MAX_DISTANCE_RATIO = 0.2
 """Largest distance between the shapes of a target in a pose that is reached from two directions, as a ratio of the

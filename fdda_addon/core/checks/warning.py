@@ -8,9 +8,6 @@ from ..errors import RecordingError
 from ..formats.messages import WARNING_LINE
 from ..rig import STATIC_JOINT_LABEL, Rig
 
-MAX_LISTED = 3
-"""Largest number of names that a message lists."""
-
 
 @dataclass(frozen=True)
 class RecordingWarning:
@@ -23,6 +20,9 @@ class RecordingWarning:
 
     name: str
     text: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", self.text[0].upper() + self.text[1:])
 
     def __str__(self) -> str:
         return WARNING_LINE.format(name=self.name, text=self.text)
@@ -42,21 +42,6 @@ def raise_first_warning(warnings: Sequence[RecordingWarning]) -> None:
     other_names = [warning.name for warning in warnings[1:]]
     others_text = f"; {len(other_names)} more: {', '.join(other_names)}" if other_names else ""
     raise RecordingError(f"{warnings[0].text.removesuffix('.')} ({warnings[0].name}{others_text}).")
-
-
-def format_list(names: Sequence[object], max_names: int = MAX_LISTED) -> str:
-    """Format the first names or numbers of a list: "'a', 'b', 'c' and 4 more"; strings are quoted."""
-    shown_names = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:max_names]]
-    if len(names) > max_names:
-        return f"{', '.join(shown_names)} and {len(names) - max_names} more"
-    return f"{', '.join(shown_names[:-1])} and {shown_names[-1]}" if len(shown_names) > 1 else "".join(shown_names)
-
-
-def format_with_noun(names: Sequence[object], noun: str, plural: str = "") -> str:
-    """Format names with a noun: "the joint 'a'", "the 7 joints 'a', 'b', 'c' and 4 more"."""
-    if len(names) == 1:
-        return f"the {noun} {format_list(names)}"
-    return f"the {len(names)} {plural or noun + 's'} {format_list(names)}"
 
 
 def joint_name(rig: Rig, joint: int) -> str:

@@ -8,8 +8,7 @@ import numpy as np
 
 from ..joint_option import AUTO, parse_joints
 from ..rig import KEY_JOINTS_PREFIX, STATIC_JOINT, Fingerprint, Joint, Rig
-
-MAX_NAMED_JOINTS = 3
+from ..wording import format_list
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class KeyJointReport:
         text = f"Key joints: the model reads {self.joints} of {self.rig_joints} joints"
         if self.independent:
             text += (
-                f", but {len(self.independent)} of the others ({_first_names(self.independent)}) move independently of "
+                f", but {len(self.independent)} of the others ({format_list(self.independent)}) move independently of "
                 f"these, by up to {self.unexplained_mm:.2f} mm (rms), and the model cannot learn that; read more "
                 "joints, add their controls as inputs, or leave the choice to auto."
             )
@@ -77,15 +76,10 @@ class KeyJointReport:
             text += f"; in random poses the others follow from these within {self.unexplained_mm:.2f} mm (rms)."
         if self.still:
             text += (
-                f" No random pose moves {len(self.still)} of the others ({_first_names(self.still)}) relative to their "
+                f" No random pose moves {len(self.still)} of the others ({format_list(self.still)}) relative to their "
                 "parents, so the model does not show their own motion."
             )
         return text
-
-
-def _first_names(names: tuple[str, ...]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:MAX_NAMED_JOINTS])
-    return shown + (f" and {len(names) - MAX_NAMED_JOINTS} more" if len(names) > MAX_NAMED_JOINTS else "")
 
 
 def select_joints(rig: Rig, joints: tuple[Joint, ...]) -> Rig:

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import DiskFullError
 from ..files.output import nearest_existing_folder
 from ..rig import Rig
-from ..sentences.counts import format_count
+from ..wording import format_count
 from .arrays import array_shapes
 
 MIN_SHOWN_BYTES = 10**6

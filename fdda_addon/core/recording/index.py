@@ -14,8 +14,8 @@ from ..files.output import atomic_write, to_json_text
 from ..mathematics.poses import CONTROL, Channel, Overshoot
 from ..mathematics.surface import MIN_CORNERS
 from ..rig import read_joints, read_meshes, read_name
-from ..sentences.counts import format_count
 from ..unit import read_unit
+from ..wording import format_count
 
 FORMAT = "fdda-recording"
 VERSION = 2

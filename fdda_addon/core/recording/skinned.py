@@ -25,8 +25,8 @@ from ..mathematics.poses import CONTROL
 from ..mathematics.skin_fit import SkinFit
 from ..mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
 from ..rig import STATIC_JOINT_LABEL, Fingerprint, Rig
-from ..sentences.counts import format_count
 from ..settings import MIN_VERTICES_PER_PART
+from ..wording import format_count
 from .arrays import release_pages
 from .index import ALONE, JOINT, RecordingInfo
 from .reader import Recording

@@ -16,8 +16,8 @@ from ..errors import BusyError, OutputError, RecordingError, os_error_text
 from ..files.input_file import open_input
 from ..files.open_files import remove_file
 from ..rig import Rig, rest_matrices_match
-from ..sentences.counts import format_count
 from ..unit import read_unit, unit_to_json
+from ..wording import format_count
 from .arrays import (
     STREAMED_ARRAY_NAMES,
     array_header,
