@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Characters with various transforms, parents and units are recorded, trained and bound, and play their model."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
-import fdda_addon
 from blend_fixtures.characters.transforms import CENTIMETRES, TRANSFORMS
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import armature_modifier, find_rig
 
-from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, predicted_positions, run, train
+from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, predicted_positions, run
 
 POSES = ((0.3, -0.2, 0.1), (1.2, 0.5, -0.4), (1.9, 0.1, 0.6))
 """Radians: the bend of the lower bone, two turns of the upper one."""
@@ -23,37 +21,15 @@ BEST_PART = 0.3
 """What the model's error may be of linear skinning's, after so short a training."""
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
-    """Rig file and model of each character, by its name."""
-    folder, files = tmp_path_factory.mktemp("transforms"), {}
-    fdda_addon.register()
-    try:
-        for build in TRANSFORMS:
-            own = folder / build.__name__
-            own.mkdir()
-            bpy.ops.wm.read_factory_settings(use_empty=True)
-            build()
-            save_copy(own / "rig.blend")
-            assert run("record", own / "rig.blend", own / "recording", "--poses", 120) == 0
-            files[build.__name__] = (own / "rig.blend", own / "elbow.onnx")
-    finally:
-        fdda_addon.unregister()
-    for _, model in files.values():
-        train(model.with_name("recording"), model, "--passes", 40)
-    return files
-
-
 @pytest.fixture(params=TRANSFORMS, ids=lambda build: build.__name__)
-def character(request, trained) -> tuple[bpy.types.Object, Path, float]:
+def character(request, trained_elbow) -> tuple[bpy.types.Object, Path, float]:
     """The mesh object with its model bound, the model, and how many units of the mesh make a meter."""
-    build: Callable[[], None] = request.param
-    rig, model = trained[build.__name__]
-    bpy.ops.wm.open_mainfile(filepath=str(rig))
-    bind(find_rig(), model)
+    files = trained_elbow(request.param)
+    bpy.ops.wm.open_mainfile(filepath=str(files.rig))
+    bind(find_rig(), files.model)
     mesh_object = bpy.data.objects[ELBOW]
     size = CENTIMETRES if max(mesh_object.dimensions) / min(mesh_object.matrix_world.to_scale()) > 10 else 1.0
-    return mesh_object, model, size
+    return mesh_object, files.model, size
 
 
 def show(mesh_object: bpy.types.Object, mode: str) -> np.ndarray:
@@ -72,40 +48,14 @@ def errors(mesh_object: bpy.types.Object) -> np.ndarray:
     return np.array([np.linalg.norm(positions - true, axis=1).mean() for positions in (playing, linear)])
 
 
-def assert_better_than_linear(found: list[np.ndarray]) -> None:
-    model, linear = np.mean(found, axis=0)
-    assert model < BEST_PART * linear
-
-
-def test_random_poses(character):
-    mesh_object, model, size = character
-    armature_object = bpy.data.objects[ELBOW_RIG]
-    armature_object.animation_data_clear()
-    found = []
-    for bend, turn, twist in POSES:
-        armature_object.pose.bones["lower"].rotation_euler[0] = bend
-        armature_object.pose.bones["upper"].rotation_euler = (turn, twist, 0.0)
-        bpy.context.view_layer.update()
-        assert_equal(mesh_object, model, size)
-        found.append(errors(mesh_object))
-    assert_better_than_linear(found)
-
-
-def test_frames_of_an_action(character):
+def test_frames_of_an_action_and_other_poses(character):
     """The elbow's own action, and that of the empty where there is one."""
     mesh_object, model, size = character
-    found = []
+    in_frames, in_poses = [], []
     for frame in (4, 15, 26):
         bpy.context.scene.frame_set(frame)
         assert_equal(mesh_object, model, size)
-        found.append(errors(mesh_object))
-    assert_better_than_linear(found)
-
-
-def test_linear_skinning_is_blenders_skinning(character):
-    mesh_object, _, size = character
-    for frame in (4, 15, 26):
-        bpy.context.scene.frame_set(frame)
+        in_frames.append(errors(mesh_object))
         linear = show(mesh_object, "LINEAR")
         mesh_object.fdda.mode = "RIG"
         mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
@@ -113,6 +63,17 @@ def test_linear_skinning_is_blenders_skinning(character):
         mesh_object.modifiers["CorrectiveSmooth"].show_viewport = True
         # Blender itself computes in single precision here.
         assert largest < 1e-5 * size + 1e-6 * np.abs(mesh_object.matrix_world.translation).max()
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    armature_object.animation_data_clear()
+    for bend, turn, twist in POSES:
+        armature_object.pose.bones["lower"].rotation_euler[0] = bend
+        armature_object.pose.bones["upper"].rotation_euler = (turn, twist, 0.0)
+        bpy.context.view_layer.update()
+        assert_equal(mesh_object, model, size)
+        in_poses.append(errors(mesh_object))
+    for found in (in_frames, in_poses):
+        model_error, linear_error = np.mean(found, axis=0)
+        assert model_error < BEST_PART * linear_error
 
 
 def test_a_character_survives_an_animated_scale_of_zero(bound_elbow, elbow_files, capsys):
