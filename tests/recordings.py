@@ -87,18 +87,22 @@ def with_influences(info: RecordingInfo, rig: Rig) -> RecordingInfo:
     """Return an index with the poses of `alone_arrays` after all poses but the refined ones."""
     inputs = [(JOINT, (joint,)) for joint in range(len(rig.joints))]
     inputs += [(CONTROL, (control,)) for control in range(len(rig.controls))]
-    alone = AloneMoves(1, tuple(inputs))
+    alone = AloneMoves(2, tuple(inputs))
     sources = sorted([*info.sampling.sources, Source(ALONE, alone.poses)], key=lambda source: source.kind == REFINED)
     sampling = replace(info.sampling, sources=tuple(sources))
     return replace(info, poses=info.poses + alone.poses, sampling=sampling, alone=alone)
 
 
 def alone_arrays(rig: Rig, partitions: tuple[Partition, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return pose matrices, positions and controls of poses in which each input changes what it influences."""
+    """Return pose matrices, positions and controls of poses in which each input moves alone, from two base poses.
+
+    An input changes what it influences in the moves from the second base pose, and nothing in those from the first.
+    """
     joint_count, control_count = len(rig.joints), len(rig.controls)
-    matrices = np.repeat(rig.rest_matrices[None], 1 + joint_count + control_count, axis=0)
+    stride = 1 + joint_count + control_count
+    matrices = np.repeat(rig.rest_matrices[None], 2 * stride, axis=0)
     positions = LinearSkinning(rig, partitions).positions(matrices)
     for partition in partitions:
         inputs = [*partition.influencing, *(joint_count + control for control in partition.controls)]
-        positions[np.ix_([1 + number for number in inputs], partition.vertices)] += rig.size
+        positions[np.ix_([stride + 1 + number for number in inputs], partition.vertices)] += rig.size
     return matrices, positions, np.zeros((len(matrices), control_count), np.float32) if control_count else None
