@@ -28,7 +28,6 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import ELBOW, assert_plays, evaluated_positions, pose, run, train
-from .refusals import save_elbow
 from .scene_state import drain
 from .stand_ins import import_from
 
@@ -170,14 +169,6 @@ def test_the_times_of_a_mesh_without_armature_modifier_lack_linear_skinning(make
     assert "linear" not in json.loads(times.read_text())
     printed = capfd.readouterr().out
     assert "Armature modifier alone" not in printed and "FDDA" in printed
-
-
-def test_fitting_to_too_few_poses_is_refused(refusal, tmp_path):
-    assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 9) == 0
-    text = refusal("train", tmp_path / "recording", tmp_path / "m.onnx", "--base-skinning", "hard")
-    assert text.startswith(
-        "Skin weights are fitted to at least 10 poses, and the recording has 9; record more, or leave --base"
-    )
 
 
 def test_a_python_without_scipy_is_named(refusal, elbow_files, tmp_path, monkeypatch):

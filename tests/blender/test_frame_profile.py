@@ -273,13 +273,6 @@ def test_a_full_temporary_disk_is_refused_before_the_measurement(elbow_files, tm
     assert capfd.readouterr().err.startswith("Error: No temporary file can be written (No usable temporary directory")
 
 
-def test_the_button_keeps_the_profile_without_a_temporary_folder(slow_rig, monkeypatch):
-    monkeypatch.setattr(tempfile, "TemporaryDirectory", fail_to_write)
-    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile = measurements.last(measurements.PROFILE, slow_rig.armature_object)
-    assert profile.parts and "No temporary file can be written" in profile.fast_rig_problem
-
-
 @pytest.mark.parametrize("arguments", [["m.onnx", "--profile"], ["m.onnx", "--fast-rig"]])
 def test_a_profile_takes_no_model(elbow_files, tmp_path, capfd, arguments):
     assert run("benchmark", elbow_files.rig, *arguments, "--json", tmp_path / "p.json") == 2
@@ -294,12 +287,6 @@ def test_the_button_stores_the_profile(slow_rig):
     assert (profile.fast_rig.bones, profile.fast_rig.kept_bones) == (14, 2) and not profile.fast_rig_problem
     assert profile.fast_rig.full.median > profile.fast_rig.fast.median
     assert len(slow_rig.armature_object.data.bones) == 14, "only a copy was pruned"
-
-
-def test_an_armature_in_rest_position_is_not_profiled(saved):
-    saved.armature_object.data.pose_position = "REST"
-    with pytest.raises(RuntimeError, match="The armature 'elbow_rig' shows its rest position; set it to pose"):
-        bpy.ops.fdda.profile_frame()
 
 
 def test_a_bound_model_does_not_play_while_its_rig_is_profiled(bound_elbow):

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operators that record and delete a recording, without a window: settings, cancellation and refusals."""
 
-import json
-import os
-import socket
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.files.file_lock import try_lock as lock_file
 from fdda_addon.core.recording.index import read_index
-from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job
 from fdda_addon.scene.scene_rig import SceneRig
@@ -86,18 +81,6 @@ def test_a_canceled_recording_keeps_its_poses_and_is_resumed(saved, tmp_path, mo
         record(saved)
     assert record(saved, resume=True) == {"FINISHED"}
     assert len(read_recording(recorded_folder(tmp_path)).positions) == 32
-
-
-def test_a_folder_locked_by_another_blender_is_refused(saved, tmp_path):
-    recorded_folder(tmp_path).mkdir()
-    lock = recorded_folder(tmp_path) / LOCK_NAME
-    lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
-    with lock.open("r+b") as held:
-        # The lock belongs to the open file, so a second open file in this process acts as another process.
-        assert lock_file(held.fileno())
-        with pytest.raises(RuntimeError, match=rf"Another Blender \(process {os.getppid()}\) is recording into"):
-            record(saved)
-    assert lock.exists()
 
 
 def test_deleting_a_recording_keeps_other_files(saved, tmp_path):

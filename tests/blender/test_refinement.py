@@ -177,9 +177,3 @@ def test_options_of_the_goal_that_contradict_are_refused(elbow_files, recording,
     assert "give RECORDING and MODEL.onnx before the training settings" in capfd.readouterr().err
     assert run("train", recording, tmp_path / "m.onnx", "--goal-mm", 1, "--refine", tmp_path / "no.blend") == 1
     assert "There is no file" in capfd.readouterr().err
-
-
-def test_the_help_of_train_says_how_to_refine(capfd):
-    assert run("train", "--help") == 0
-    out = capfd.readouterr().out
-    assert "--goal-mm" in out and "--refine RIG.blend" in out and "poses to add in each" in out

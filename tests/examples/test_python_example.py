@@ -2,7 +2,6 @@
 """The Python example computes the same poses as Blender and the same shapes as the add-on, and reports errors."""
 
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -39,13 +38,10 @@ def read_obj(path: Path) -> tuple[np.ndarray, list[list[int]]]:
     return np.array(vertices), [[int(corner) - 1 for corner in row[1:]] for row in rows if row[0] == "f"]
 
 
-def test_rotations_match_those_of_blender(chain: Character, tmp_path: Path):
+def test_rotations_match_those_of_blender_and_the_default_is_the_rest_pose(chain: Character, tmp_path: Path):
     positions = run_and_load(tmp_path, chain.model, *TURN_OPTIONS)
     assert np.abs(positions - expected_positions(chain.model, ROTATIONS)).max() < 1e-5
     assert np.abs(positions - expected_positions(chain.model, {})).max() > 0.1
-
-
-def test_the_default_is_the_rest_pose(chain: Character, tmp_path: Path):
     assert np.abs(run_and_load(tmp_path, chain.model) - expected_positions(chain.model, {})).max() < 1e-5
 
 
@@ -148,17 +144,3 @@ def test_a_recording_of_a_different_mesh_is_refused(chain: Character, tmp_path: 
         result.stderr
         == f"{recording} is a recording of a different mesh; choose the one that the model was trained on.\n"
     )
-
-
-def test_the_documented_command_runs(chain: Character, tmp_path: Path):
-    """The working folder has the files of `make demo`, with the chain instead of the arm."""
-    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    (command,) = re.findall(r"^    (python examples/python/.*)$", page, re.MULTILINE)
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
-    (tmp_path / "out" / "demo").mkdir(parents=True)
-    (tmp_path / "out" / "demo" / "arm.onnx").symlink_to(chain.model)
-    (tmp_path / "out" / "demo" / "recording").symlink_to(chain.recording)
-    arguments = shlex.split(command.replace(" elbow ", " bone_1 "))
-    result = subprocess.run([sys.executable, *arguments[1:]], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert len(read_obj(tmp_path / "posed.obj")[1]) == 88

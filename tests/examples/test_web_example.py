@@ -222,14 +222,3 @@ def test_faces_are_split_into_fans_of_triangles():
     faces = prepare.triangulate(np.int32([0, 3, 8, 12]), np.int32([5, 6, 7, 0, 1, 2, 3, 4, 9, 8, 7, 6, 1, 2, 3]))
     expected = [(5, 6, 7), (0, 1, 2), (0, 2, 3), (0, 3, 4), (9, 8, 7), (9, 7, 6), (1, 2, 3)]
     assert faces.dtype == np.dtype("<u4") and [tuple(face) for face in faces.tolist()] == expected
-
-
-def test_the_lock_file_contains_no_host():
-    text = (WEB / "package-lock.json").read_text()
-    assert "http" not in text and '"integrity"' in text
-
-
-def test_the_documentation_contains_the_tested_commands():
-    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    for command in ("npm ci", "npm run build", "python prepare.py ../../out/demo/arm.onnx ../../out/demo/recording"):
-        assert f"    {command}\n" in page

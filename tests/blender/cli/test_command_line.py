@@ -228,12 +228,6 @@ def test_binding_does_not_write_rig_and_model_nor_an_identical_model_in_the_fold
     assert (elbow_files.rig.read_bytes(), elbow_files.model.read_bytes()) == before[1:]
 
 
-def test_binding_can_overwrite_the_rig_s_file(elbow_files, tmp_path):
-    rig = shutil.copy(elbow_files.rig, tmp_path / "rig.blend")
-    assert run("bind", rig, elbow_files.model, rig, "--overwrite") == 0
-    assert_plays(open_in_new_session(rig), elbow_files.model)
-
-
 def test_binding_a_bound_file_again_keeps_one_modifier(elbow_files, tmp_path):
     assert run("bind", elbow_files.bound, elbow_files.model, tmp_path / "b.blend") == 0
     mesh_object = open_in_new_session(tmp_path / "b.blend")
@@ -255,13 +249,6 @@ def test_bind_sets_use_in_render_and_without_the_add_on_the_file_shows_the_rig(e
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
     error = abs(evaluated_positions(bpy.data.objects["elbow"]) - rig_shape).max()
     assert error < 1e-6 < abs(model_shape - rig_shape).max()
-
-
-def test_recording_a_bound_file_records_the_rig(elbow_files, tmp_path):
-    assert run("record", elbow_files.bound, tmp_path / "bound", "--poses", 5) == 0
-    assert run("record", elbow_files.rig, tmp_path / "rig", "--poses", 5) == 0
-    first, second = (file_contents(tmp_path / name) for name in ("bound", "rig"))
-    assert first["positions.npy"] == second["positions.npy"]
 
 
 def test_verbs_restore_whether_the_add_on_is_registered(elbow_files, tmp_path):

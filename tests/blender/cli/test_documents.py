@@ -99,11 +99,3 @@ def test_code_of_the_development_page_runs(elbow_files, tmp_path):
         float(distance) for distance in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE)
     )
     assert playback < 1e-5 and playback < model < 0.002 < linear
-
-
-def dotted_keys(value: dict, prefix: str = "") -> set[str]:
-    """Return the names of all keys; a nested key has the form `a.b`."""
-    keys = set()
-    for key, inner in value.items():
-        keys |= dotted_keys(inner, f"{prefix}{key}.") if isinstance(inner, dict) else {prefix + key}
-    return keys

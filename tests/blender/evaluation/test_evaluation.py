@@ -49,26 +49,6 @@ def test_the_table_says_where_the_model_is_farther_than_linear_skinning():
     assert lines.index("walk, 2 poses") < index < lines.index("run, 2 poses")
 
 
-def test_the_report_has_its_documented_keys(report):
-    assert list(report) == [
-        *("unit", "poses", "vertices", "fdda", "linear", "partitions"),
-        *("actions", "scaled_ranges", "named", "normals", "edges"),
-    ]
-    assert (report["unit"], report["poses"], report["vertices"]) == ("mm", 12, 300)
-    assert list(report["fdda"]) == list(report["linear"]) == STATISTIC_NAMES
-    for partition in report["partitions"]:
-        assert list(partition) == ["joint", "vertices", "fdda", "linear"]
-        assert list(partition["fdda"]) == list(partition["linear"]) == STATISTIC_NAMES
-    assert [p["joint"] for p in report["partitions"]] == ["upper", "lower"]
-    assert sum(p["vertices"] for p in report["partitions"]) == 300
-    assert [(e["name"], e["poses"]) for e in report["actions"]] == [("elbow_wave", 30)]
-    assert [(e["name"], e["poses"]) for e in report["scaled_ranges"]] == [
-        ("1.5 times the range", 3),
-        ("2 times the range", 3),
-    ]
-    assert report["named"] == []
-
-
 def test_the_model_is_nearer_than_linear_skinning(report):
     assert 0 < report["fdda"]["mean"] < report["linear"]["mean"] / 3
     for values in (report["fdda"], report["linear"]):
@@ -195,24 +175,6 @@ def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path, capf
     assert run("benchmark", elbow_files.rig, elbow_files.model, "--json", path, "--frames", 12) == 0
     report = json.loads(path.read_text())
     methods = ["rig", "linear", "fdda", "floor", "without_meshes", "bones", "inference"]
-    assert list(report) == [
-        "unit",
-        "armature",
-        "vertices",
-        "meshes",
-        "frames",
-        "blender",
-        "processor",
-        "cores",
-        *methods,
-        "model_alone",
-        "ratio",
-        "ratio_quartiles",
-        "is_faster",
-        "is_estimate",
-        "processor_share",
-        "constant_bytes",
-    ]
     assert (report["unit"], report["vertices"]) == ("ms", 300)
     # At least five rounds of three frames; more while the times vary.
     assert report["frames"] in range(15, 3 * MAX_ROUNDS + 1, 3)

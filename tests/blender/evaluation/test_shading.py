@@ -8,16 +8,11 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.mathematics.surface import Surface
-from fdda_addon.evaluation.run import evaluate
-from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.mesh import topology
-from fdda_addon.scene.scene_rig import SceneRig
 
 from ..conftest import run, train
-from ..scene_state import drain
 
 EDGES = ["across", "beside", "inside", "ratio"]
 APPROXIMATE = 0.05
@@ -75,39 +70,6 @@ def report(elbow_files, tmp_path) -> dict:
     options = ["--poses", 24, "--seed", 3, "--action", "elbow_wave", "--range-scale", 2]
     assert run("evaluate", elbow_files.rig, elbow_files.model, "--json", path, *options) == 0
     return json.loads(path.read_text())
-
-
-def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(report, rig: SceneRig, elbow_files):
-    """The positions of the true rig and of linear skinning go into meshes of Blender's."""
-    evaluation = drain(evaluate(rig, elbow_files.model, EvaluationSettings(poses=24, seed=3)))
-    arrays = read_rig(rig)
-    skinning = LinearSkinning(arrays)
-    partition_of = {int(vertex): p.joint for p in skinning.partitions for vertex in p.vertices}
-    mesh = rig.mesh_object.data.copy()
-    edges = np.array([edge.vertices[:] for edge in mesh.edges])
-    crosses = np.array([partition_of[a] != partition_of[b] for a, b in edges])
-    assert crosses.any() and not crosses.all()
-
-    def shown(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        mesh.vertices.foreach_set("co", positions.reshape(-1))
-        mesh.update()
-        return blender_normals(mesh).copy(), np.linalg.norm(np.subtract(*positions[edges.T]), axis=1)
-
-    rest = shown(arrays.rest_positions)[1]
-    angles, lengths = [], []
-    for pose, true in zip(evaluation.held_out.pose_matrices, evaluation.held_out.positions, strict=True):
-        (true_normals, true_lengths), (normals, moved_lengths) = shown(true), shown(skinning.positions(pose[None])[0])
-        angles.append(degrees(true_normals, normals))
-        lengths.append(np.abs(moved_lengths - true_lengths) / rest)
-    found, edge_errors = report["normals"]["linear"], report["edges"]["linear"]
-    assert found["mean"] == pytest.approx(np.mean(angles), abs=0.01)
-    assert found["p99"] == pytest.approx(np.percentile(angles, 99), abs=APPROXIMATE)
-    assert found["max"] == pytest.approx(np.max(angles), abs=2 * APPROXIMATE)
-    assert edge_errors["across"] == pytest.approx(np.mean(np.array(lengths)[:, crosses]), rel=1e-3)
-    assert edge_errors["inside"] == pytest.approx(np.mean(np.array(lengths)[:, ~crosses]), rel=1e-3)
-    at_border = np.isin(edges, edges[crosses]).any(axis=1) & ~crosses
-    assert edge_errors["beside"] == pytest.approx(np.mean(np.array(lengths)[:, at_border]), rel=1e-3)
-    assert edge_errors["ratio"] == pytest.approx(edge_errors["across"] / edge_errors["inside"])
 
 
 def test_the_model_shades_better_than_linear_skinning_everywhere_it_was_compared(report):

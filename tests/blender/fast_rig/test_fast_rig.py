@@ -88,13 +88,6 @@ def test_a_fast_rig_has_the_same_names_and_plays(folder):
     assert "times as fast" in lines[4] and len(lines) == 5
 
 
-def test_keyed_controls_lose_no_channels(folder):
-    lines = output_of(*fast_rig_arguments(folder, "--frames", 0)).out
-    assert len(lines) == 3
-    bpy.ops.wm.open_mainfile(filepath=str(folder / "fast.blend"))
-    assert UNUSED in bpy.data.objects[ELBOW_RIG].data.bones
-
-
 def test_both_rigs_play_the_same_action_without_the_models_of_the_full_rig(folder, monkeypatch):
     """The full rig has an action more, which keys only removed bones, and a second bound mesh."""
     bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
@@ -249,20 +242,6 @@ def test_a_joint_that_is_infinite_in_one_rig_differs():
     assert infinite_bones(poses, before) == {"first": 1}
     after[1, 1, 2, 2] = np.nan
     assert differing_bones(poses, before, after, 1e-5) == {"second": np.inf}
-
-
-def test_nothing_is_compared_with_what_is_left_of_the_rig(folder, capsys):
-    assert run(*fast_rig_arguments(folder, "--frames", 0)) == 0
-    fast, model = folder / "fast.blend", folder / "model.onnx"
-    for arguments in (
-        ("record", fast, folder / "again", "--object", ELBOW),
-        ("evaluate", fast, model, "--object", ELBOW, "--json", folder / "errors.json"),
-        ("benchmark", fast, model, "--object", ELBOW, "--json", folder / "times.json"),
-        ("benchmark", fast, "--profile", "--object", ELBOW, "--json", folder / "times.json"),
-    ):
-        assert run(*arguments) == 1
-        assert "'elbow' belongs to a fast rig, which lacks modifiers and bones of the full" in capsys.readouterr().err
-    assert sorted(path.name for path in folder.iterdir()) == ["fast.blend", "full.blend", "model.onnx"]
 
 
 def test_refusals(folder, capsys):

@@ -117,14 +117,6 @@ def test_colors_follow_the_timeline(active, evaluated_action, view):
     refused(bpy.ops.fdda.fit_color_range, "choose another frame, or show the mean")
 
 
-def test_mean_and_largest_errors_are_computed_once(active, evaluated_action):
-    for statistic in ("mean", "max"):
-        errors = evaluated_action.vertex_errors("fdda", statistic)
-        assert evaluated_action.vertex_errors("fdda", statistic) is errors
-        np.testing.assert_array_equal(errors, getattr(evaluated_action.errors["fdda"], statistic)(axis=0))
-        assert evaluated_action.vertex_errors("linear", statistic) is not errors
-
-
 def test_overlay_follows_edited_and_replaced_faces(active, monkeypatch):
     monkeypatch.setattr(overlay, "gpu", SimpleNamespace(types=SimpleNamespace(GPUIndexBuf=lambda type, seq: seq)))
     drawn = overlay.Overlay()
@@ -216,16 +208,6 @@ def active_model(mesh_object):
     return model_path(mesh_object)
 
 
-def test_a_missing_report_is_refused_with_its_path(active, elbow_files, monkeypatch):
-    report = elbow_files.model.with_name("report.html")
-    assert report.is_file()
-    report.rename(report.with_suffix(".away"))
-    try:
-        refused(bpy.ops.fdda.open_report, f"There is no report '{report}'")
-    finally:
-        report.with_suffix(".away").rename(report)
-
-
 def test_the_view_goes_to_the_worst_vertex(active, evaluated_action):
     bpy.ops.fdda.jump_to_worst(rank=1, zoom=True)
     index, _ = evaluated_action.worst_poses(1)[0]
@@ -275,19 +257,6 @@ def test_colors_are_hidden_in_edit_mode_and_by_another_topology(active, colors):
         assert not heat_map.is_hidden(active)
     finally:
         heat_map.clear_all()
-
-
-def test_the_newer_of_two_evaluations_of_a_character_returns():
-    """The older one stays stored if it could not return, because its model was missing when the file was opened."""
-    character, evaluations = ("shot.blend", "elbow"), []
-    for uid in (-2, -1):
-        evaluations.append(last_evaluation.LastEvaluation("", "m", 0, 0, {}, {}, (), (), closed_character=character))
-        last_evaluation.restore(SimpleNamespace(session_uid=uid), evaluations[-1])
-    try:
-        assert last_evaluation.closed(character) is evaluations[1]
-    finally:
-        for uid in (-2, -1):
-            last_evaluation.remove(SimpleNamespace(session_uid=uid))
 
 
 def test_only_the_latest_evaluations_are_stored(active):

@@ -256,9 +256,3 @@ def test_a_job_is_not_finishing_when_a_preparing_stage_is_complete(stage):
     state = JobState("record", "Recording")
     state.show(Progress(stage, 10, 10))
     assert not state.is_finishing
-
-
-def test_the_check_of_a_target_is_counted_in_poses():
-    state = JobState("record", "Recording")
-    state.show(Progress("target", 2, 5))
-    assert state.sentence == "Poses of the target checked: 2 of 5" and state.heading == "Recording"

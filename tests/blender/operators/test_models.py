@@ -51,10 +51,6 @@ def test_removing_a_model_unbinds_it(rig, elbow_files, second):
     refused(bpy.ops.fdda.remove_model, "The model library is empty")
 
 
-def test_the_model_list_is_saved_with_the_file(bound_elbow, elbow_files):
-    assert [(entry.name, entry.path) for entry in bound_elbow.fdda.models] == [("elbow", "//elbow.onnx")]
-
-
 def test_a_model_of_another_rig_is_not_added(rig, elbow_files):
     rig.armature_object.data.bones["lower"].name = "forearm"
     refused(lambda: bpy.ops.fdda.add_model(filepath=str(elbow_files.model)), "it does not know the joint 'forearm'")

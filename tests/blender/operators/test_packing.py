@@ -58,16 +58,6 @@ def test_find_model_with_an_unsuitable_file_changes_nothing(packed_elbow, elbow_
     assert not packed_elbow.fdda.models and packed_elbow.fdda.is_bound
 
 
-def test_a_packed_model_plays_after_an_undo(packed_elbow, elbow_files):
-    bpy.ops.ed.undo_push(message="packed")
-    pose(angle=0.9)
-    bpy.ops.ed.undo_push(message="posed")
-    bpy.ops.ed.undo()
-    pose(angle=1.3)
-    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
-    assert bpy.data.objects[ELBOW].fdda.packed is not None
-
-
 def test_a_packed_model_can_be_unbound_bound_again_and_measured(packed_elbow, elbow_files):
     bpy.ops.fdda.unbind()
     assert len(bpy.data.texts) == 1

@@ -5,13 +5,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.rig.reading import read_model_rig
-from fdda_addon.runtime.model_files import network_of
-from fdda_addon.runtime.session import session
-from fdda_addon.scene.scene_rig import find_rig
-
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
-from ..crowds import crowd_of
 from ..evaluations import add_shape_key
 from ..rig_changes import (
     EDIT_MODE_CHANGES,
@@ -149,17 +143,6 @@ def test_changes_unrelated_to_the_rig_keep_the_model_playing(bound_elbow, elbow_
     assert_plays(bound_elbow, elbow_files.model)
 
 
-def test_a_moved_armature_object_keeps_the_model_playing(bound_elbow, elbow_files):
-    """The transform between mesh and armature may be animated, so it is not part of the rig."""
-    bpy.data.objects[ELBOW_RIG].location = (0.3, 0.1, 0)
-    bpy.data.objects[ELBOW_RIG].rotation_euler = (0.2, 0.1, 0.4)
-    bpy.context.view_layer.update()
-    bound_elbow.data.update()
-    session.passed_checks.clear()
-    pose(angle=1.1)
-    assert_plays(bound_elbow, elbow_files.model)
-
-
 def test_a_change_in_mode_rig_is_found_when_the_mode_changes(bound_elbow, capsys):
     bound_elbow.fdda.mode = "RIG"
     change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
@@ -251,19 +234,6 @@ def change_in_another_process(path) -> None:
     subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, capture_output=True, timeout=120)
 
 
-def test_a_change_of_one_character_leaves_the_others_playing(bound_elbow, elbow_files):
-    crowd = crowd_of(bound_elbow, 5)
-    for frame in (1, 2, 3):
-        bpy.context.scene.frame_set(frame)
-    crowd[2].data = crowd[2].data.copy()
-    crowd[2].vertex_groups["lower"].add([0], 0.3, "ADD")
-    bpy.context.scene.frame_set(4)
-    assert [o.fdda.mode for o in crowd] == ["FDDA", "FDDA", "RIG", "FDDA", "FDDA"]
-    bpy.context.scene.frame_set(5)
-    for mesh_object in crowd[:2] + crowd[3:]:
-        assert_plays(mesh_object, elbow_files.model)
-
-
 def test_weight_paint_mode_delays_the_check(bound_elbow, capsys):
     """The rig is checked after the mesh has left the mode."""
     pose(angle=1.0)
@@ -275,10 +245,3 @@ def test_weight_paint_mode_delays_the_check(bound_elbow, capsys):
     bpy.ops.object.mode_set(mode="OBJECT")
     bpy.context.view_layer.update()
     assert_rig_shown(bound_elbow, WEIGHTS_DIFFER, capsys)
-
-
-def test_added_bones_do_not_change_the_order_of_joints(bound_elbow):
-    rig = bpy.data.objects[ELBOW_RIG]
-    change_in_edit_mode(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
-    info = network_of(bound_elbow).info
-    assert read_model_rig(find_rig(), info).joints == info.joints

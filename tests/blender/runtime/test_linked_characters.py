@@ -28,12 +28,6 @@ from ..rendering import render_positions, rig_pixels, set_camera, still
 CROWD_SIZE = 20
 
 
-def test_each_override_plays_its_own_pose(pair, library):
-    assert_overrides_play(library)
-    bend_elbow(pair[0], 0.8)
-    assert_overrides_play(library, (0.8, 1.4))
-
-
 @pytest.mark.parametrize("is_editable", [True, False], ids=["editable", "system override"])
 def test_overrides_play_when_another_process_opens_the_shot(library, tmp_path, is_editable):
     collection = link_character(library.path)

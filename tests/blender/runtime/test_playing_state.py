@@ -173,16 +173,6 @@ def test_an_auto_saved_file_shows_the_mesh_without_the_addon(bound_elbow, elbow_
     assert np.abs(evaluated_positions(mesh_object) - rest).max() < 1e-6
 
 
-def test_reverting_a_file(bound_elbow, elbow_files):
-    path = elbow_files.bound.with_name("reverted.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    for angle in (0.4, 1.2):
-        pose(angle=angle)
-        bpy.ops.wm.revert_mainfile()
-        pose(angle=angle + 0.1)
-        assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
-
-
 def test_a_joint_that_is_not_a_number(bound_elbow, elbow_files):
     """Vertices of this joint follow its parent, and the rest of the character does not change."""
     armature_object = bpy.data.objects[ELBOW_RIG]

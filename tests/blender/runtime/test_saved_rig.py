@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fdda_addon
-from fdda_addon.runtime import model_files
 
 from ..conftest import ADDED, ELBOW, assert_plays, evaluated_positions, pose
 from ..evaluations import add_shape_key
@@ -109,16 +108,6 @@ def test_the_mode_is_restored_with_the_file(bound_elbow, elbow_files, mode):
     assert mesh_object.fdda.mode == mode and state(mesh_object) == shown
     pose(angle=1.2)
     assert np.abs(evaluated_positions(mesh_object) - before).max() < 1e-6
-
-
-def test_a_linked_character_plays(elbow_files):
-    model_files.allow_path(elbow_files.model)
-    with bpy.data.libraries.load(str(elbow_files.bound), link=True) as (_, wanted):
-        wanted.objects = [ELBOW, "elbow_rig"]
-    for linked in wanted.objects:
-        bpy.context.scene.collection.objects.link(linked)
-    pose(angle=1.2)
-    assert_plays(wanted.objects[0], elbow_files.model)
 
 
 def test_undo_across_a_save(bound_elbow, elbow_files):

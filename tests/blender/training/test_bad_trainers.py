@@ -6,7 +6,6 @@ import re
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 
@@ -126,16 +125,6 @@ def test_a_trainer_that_fails_is_reported(train_refusal, tmp_path, monkeypatch, 
     text = train_refusal(status=status)
     # A sentence with a full stop is the whole message.
     assert text == start if start.endswith(("again.", "wait.", "Enough.")) else text.startswith(start)
-
-
-def test_a_missing_temporary_folder_is_reported(refusal, elbow_files, tmp_path, monkeypatch):
-    arguments = ["train", elbow_files.recording, tmp_path / "m.onnx"]
-    with monkeypatch.context() as patch:
-        patch.setattr(tempfile, "tempdir", None)
-        patch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "none")])
-        text = refusal(*arguments, status=TRY_AGAIN)
-    assert text.startswith("No temporary file can be written (No usable temporary directory found in [")
-    assert text.endswith("); make room there, or name another folder in TMPDIR.")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="/dev/full is Linux's")

@@ -3,7 +3,6 @@
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import bpy
@@ -55,16 +54,6 @@ def test_a_detached_training_continues_and_is_read_from_its_start(elbow_files, t
     assert message_types[-1] is MessageType.FINISHED
     assert read_model_info(model).training["passes"] == 30
     assert not detached_process.is_detached(model)
-
-
-def test_attaching_to_a_training_that_has_ended(elbow_files, tmp_path):
-    model = tmp_path / "m.onnx"
-    detach_in_another_process(elbow_files, model, 3)
-    deadline = time.monotonic() + 60
-    while detached_process._ProcessFiles(model).is_running() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    with detached_process.AttachedTraining(model) as training:
-        assert [message.type for message in training.messages()][-1] is MessageType.FINISHED
 
 
 def test_attaching_to_a_killed_training_raises_an_error(elbow_files, tmp_path):

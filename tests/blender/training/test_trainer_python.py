@@ -176,24 +176,6 @@ def test_a_training_without_blenders_program_finds_the_environment_that_blender_
     assert done.stderr.startswith(f"Error: The trainer's Python '{python}' cannot be started ("), done.stderr
 
 
-@pytest.mark.parametrize(
-    ("error", "advice"),
-    [
-        (
-            "OSError('[WinError 1114] … Error loading \"c10.dll\"')",
-            "install Microsoft's Visual C++ runtime from https:",
-        ),
-        (
-            "OSError('libtorch.so: cannot open shared object file')",
-            "install the package of this Linux that has 'libtorch",
-        ),
-    ],
-)
-def test_the_advice_on_a_library_that_cannot_be_loaded_is_shown(packages: Path, error: str, advice: str):
-    (packages / "torch/__init__.py").write_text(f"raise {error}\n")
-    assert f"); {advice}" in asked(sys.executable).message
-
-
 @pytest.mark.one_blender_version
 def test_pythons_are_searched_on_the_path_of_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The launcher comes first; the alias of the Microsoft Store is skipped."""
