@@ -17,8 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.model_cost import measure  # noqa: E402
-from fdda_addon.runtime.network import Network  # noqa: E402
+from benchmarks.measure import inference  # noqa: E402
 
 CONFIGURATIONS = [((64, 64), "silu"), *itertools.product(
     ((128, 128), (128, 128, 128), (512, 512), (512, 512, 512)), ("silu", "tanh", "relu")
@@ -59,10 +58,9 @@ def main() -> None:
             print(f"{model.parent.name} …", file=sys.stderr, flush=True)
             settings = ("--hidden", *units, "--activation", activation, "--seed", seed, "--detail-mm", DETAIL_MM)
             run("trainer", recording, model, *settings)
-    costs = measure([Network(paths[0]) for paths in models.values()])
     print("| hidden layers | activation | mean, mm | 99.9 % | largest | training, s | one pose, ms | MB |")
     print("|---|---|---|---|---|---|---|---|")
-    for ((units, activation), paths), cost in zip(models.items(), costs, strict=True):
+    for (units, activation), paths in models.items():
         reports = [json.loads((path.parent / "report.json").read_text(encoding="utf-8")) for path in paths]
         errors = [[report["fdda"]["held_out"][name] for report in reports] for name in ("mean", "p999", "max")]
         seconds, size = (statistics.median(values) for values in zip(
@@ -71,7 +69,7 @@ def main() -> None:
         mean, p999, largest = map(statistics.median, errors)
         print(
             f"| {' '.join(map(str, units))} | {activation} | {mean:.4f} ({min(errors[0]):.4f} to {max(errors[0]):.4f}) "
-            f"| {p999:.2f} | {largest:.2f} | {seconds:.0f} | {cost['cold']:.2f} | {size:.2f} |"
+            f"| {p999:.2f} | {largest:.2f} | {seconds:.0f} | {inference(str(paths[0]))['ms_at_1']:.2f} | {size:.2f} |"
         )
 
 
