@@ -195,6 +195,8 @@ def _export(path: Path, frames: range, samples: int, show_progress: Callable[[in
                 convert_world_material=False,
                 xform_op_mode="MAT",
                 allow_unicode=True,
+                # The mesh has the name of its object, not of its data.
+                merge_parent_xform=True,
             )
     except RuntimeError as error:
         raise OutputError(f"Blender could not write the file: {report_message(error)}") from error

@@ -14,6 +14,7 @@ from ..core.progress import Job
 from ..core.sentences.window import for_window
 from ..jobs.job import JobRunner, current, redraw, request_cancel, stop, unregister
 from ..jobs.state import JobState
+from ..scene.blend_file import report_message
 from .rig_operator import RigOperator
 
 TICK_BUDGET, MAX_BUDGET = 0.03, 0.2
@@ -81,7 +82,14 @@ class JobOperator(RigOperator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         if self.is_confirming:
             operator = getattr(bpy.ops.fdda, self.bl_idname.lower().rpartition("_ot_")[2])
-            return operator("INVOKE_DEFAULT", **self.as_keywords())
+            try:
+                return operator("INVOKE_DEFAULT", **self.as_keywords())
+            except RuntimeError as error:
+                if "Traceback" in str(error):
+                    raise
+                # A job that fails at once has reported this.
+                self.report({"ERROR"}, report_message(error))
+                return {"CANCELLED"}
         if not self._begin(context):
             return {"CANCELLED"}
         while not self._run.work(BACKGROUND_STEP_SECONDS):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Baked files show in every frame what the model showed, also without the add-on; a bake that fails writes nothing."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -47,6 +48,7 @@ def subdivide(rig: SceneRig) -> None:
     modifier = rig.mesh_object.modifiers.new("Finer", "SUBSURF")
     modifier.levels = modifier.render_levels = 1
     modifier.use_pin_to_last = True
+    rig.mesh_object.data.name = "Mesh.001"
 
 
 def play_strip(rig: SceneRig) -> None:
@@ -85,7 +87,8 @@ def test_a_baked_file_shows_the_model_in_every_frame(elbow_files, tmp_path, chan
         assert [o.type for o in bpy.data.objects].count("MESH") == 1 and not mesh_object.fdda.is_bound
         assert bpy.context.scene.frame_start, bpy.context.scene.frame_end == (max(frames[0], 1), frames[-1])
     else:
-        (mesh_object,) = import_baked(out).values()
+        ((name_in_file, mesh_object),) = import_baked(out).items()
+        assert name_in_file == re.sub(r"\W", "_", name)
     assert_shown(world_positions(mesh_object, frames), expected)
 
 

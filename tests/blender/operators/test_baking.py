@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operator that bakes the open file, as it is shown."""
 
+import re
+
 import bpy
 import numpy as np
 
+from fdda_addon.jobs.job import state_of
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..baked_files import import_baked, read_baked
@@ -87,6 +90,8 @@ def test_the_skinning_of_the_recorded_mesh_is_exported(saved, elbow_files, tmp_p
     saved.mesh_object.fdda.settings.recording = str(elbow_files.recording)
     out = tmp_path / "skinned.blend"
     assert bpy.ops.fdda.export_skinning(filepath=str(out)) == {"FINISHED"}
+    outcome = state_of("export_skinning").outcome
+    assert re.fullmatch(r"Wrote skinned.blend\. Mean .*, mm: own weights [\d.]+, fitted weights [\d.]+\.", outcome)
     bpy.ops.wm.open_mainfile(filepath=str(out))
     assert [modifier.type for modifier in bpy.data.objects[ELBOW].modifiers] == ["ARMATURE"]
     assert {group.name for group in bpy.data.objects[ELBOW].vertex_groups} == {"upper", "lower"}

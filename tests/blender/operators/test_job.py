@@ -37,6 +37,11 @@ class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wa
     def subject(self, _context: bpy.types.Context) -> int:
         return 0
 
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if self.what.startswith("confirm "):
+            self.what, self.is_confirming = self.what.removeprefix("confirm "), True
+        return super().execute(context)
+
     def steps(self, _context: bpy.types.Context) -> Iterator[object]:
         try:
             for number in range(self.upto):
@@ -98,9 +103,12 @@ def test_a_job_that_changes_the_file_adds_an_undo_step_and_marks_the_file_as_cha
     assert bpy.context.scene["counted"] == 3
 
 
-def test_an_error_is_reported_and_cancels_the_operator():
-    with pytest.raises(RuntimeError, match=r"The number 1 is missing; count again\."):
-        bpy.ops.fdda.count(at=1, what="fail")
+@pytest.mark.parametrize("what", ["fail", "confirm fail"])
+def test_an_error_is_reported_and_cancels_the_operator(what):
+    """Blender shows an exception of an operator that a dialog has called as a fault of the add-on."""
+    with pytest.raises(RuntimeError) as caught:
+        bpy.ops.fdda.count(at=1, what=what)
+    assert str(caught.value).strip() == "Error: The number 1 is missing; count again."
     assert events == ["given back"]
     assert job.state_of("count").outcome_level == "ERROR" and job.current() is None
     assert bpy.ops.fdda.count() == {"FINISHED"}
@@ -113,9 +121,10 @@ def test_a_canceled_job_cleans_up_and_reports_its_progress():
     assert (state.outcome, state.outcome_level) == ("Counting canceled at 2.", "WARNING")
 
 
-def test_a_bug_propagates_and_does_not_block_the_next_job():
+@pytest.mark.parametrize("what", ["bug", "confirm bug"])
+def test_a_bug_propagates_and_does_not_block_the_next_job(what):
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-        bpy.ops.fdda.count(at=1, what="bug")
+        bpy.ops.fdda.count(at=1, what=what)
     assert events == ["given back"] and job.current() is None
 
 
