@@ -43,7 +43,7 @@ test-trainer: .venv  ## run the tests of the training, export and report
 test-blender: .venv  ## run the tests that need Blender
 	.venv/bin/python -m pytest $(IN_PARALLEL) tests/blender $(NOT_SLOW)
 
-test-slow: .venv  ## run the tests that make test leaves out: whole trainings, simulations, most characters, a short soak
+test-slow: .venv  ## run the tests that make test leaves out: whole trainings, simulations, most characters
 	.venv/bin/python -m pytest $(IN_PARALLEL) -m slow tests/trainer tests/blender
 
 test-examples: .venv  ## run the tests of the examples in docs/formats.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)

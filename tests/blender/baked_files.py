@@ -10,10 +10,7 @@ import numpy as np
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
-from .conftest import ELBOW, ElbowFiles, evaluated_positions, predicted_positions
-
-WAVE_FRAMES = range(1, 31)
-"""Frames of the action `elbow_wave`."""
+from .conftest import ELBOW, evaluated_positions, predicted_positions
 
 
 def predicted_in_frames(frames, model: Path) -> np.ndarray:
@@ -23,12 +20,6 @@ def predicted_in_frames(frames, model: Path) -> np.ndarray:
         bpy.context.scene.frame_set(frame)
         positions.append(predicted_positions(bpy.data.objects[ELBOW], model).copy())
     return np.array(positions)
-
-
-def predicted_wave(elbow_files: ElbowFiles) -> np.ndarray:
-    """Return the model's positions (30, V, 3) in all frames of the action `elbow_wave`."""
-    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
-    return predicted_in_frames(WAVE_FRAMES, elbow_files.model)
 
 
 def world_positions(mesh_object: bpy.types.Object, frames: Iterable[float]) -> np.ndarray:
