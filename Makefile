@@ -87,9 +87,6 @@ bench: .venv  ## time the arm at three mesh densities and other rigs, into out/b
 soak: .venv  ## test damaged files, kills and full disks, into out/soak (10 minutes at most)
 	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
 
-faults: .venv  ## seed faults into a copy of the code and list the tests that catch them, into out/faults (OPTIONS="--only ID"; 6 minutes)
-	.venv/bin/python benchmarks/faults.py out/faults $(OPTIONS)
-
 study: .venv  ## compare sizes and activations of the networks, into out/study (an hour)
 	.venv/bin/python benchmarks/study.py out/study
 
@@ -137,4 +134,4 @@ requirements: .venv  ## pin the packages that pyproject.toml names, and their de
 clean:  ## remove all built files and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-core .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench soak faults study simulation characters pictures films map fixtures lint package release requirements clean
+.PHONY: help .venv .venv-core .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench soak study simulation characters pictures films map fixtures lint package release requirements clean
