@@ -415,7 +415,7 @@ def make_files(folder: Path) -> None:
     from fdda_addon.cli.main import main as run_verb
 
     fdda_addon.register()
-    bind_elbow(folder)
+    bind_elbow(folder, 1)
     recording = folder / "short recording"
     command = ["record", str(folder / "elbow.blend"), str(recording), "--poses", str(POSES)]
     if not recording.exists() and run_verb(command, "fdda"):
