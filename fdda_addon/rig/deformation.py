@@ -13,6 +13,7 @@ from operator import attrgetter
 import bpy
 import numpy as np
 
+from ..core.controls import MESH_OBJECT, SHAPE_KEYS
 from ..core.deformation import versionless_path
 from ..core.mathematics.key_joints import with_sources
 from ..core.recording.index import RecordedBones
@@ -22,7 +23,7 @@ from ..scene.compatibility import node_input_settings
 from ..scene.controls import owner_name
 from ..scene.mesh import vertex_layers
 from ..scene.node_groups import read_texts
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.temporary_state import animated_paths
 from .modifier_stack import BIND_PROPERTIES, is_fdda_modifier, recorded_modifiers
 from .references import DependencyGraph, Node, add_bones, add_drivers, ik_chain, split_bone_path
@@ -207,9 +208,14 @@ def read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
 def _read_target(
     scene_rig: SceneRig, variable: bpy.types.DriverVariable, target: bpy.types.DriverTarget
 ) -> Iterator[str]:
-    # Leave out the names of other objects, because they differ in a duplicate of the character.
-    owner = "" if target.id is None else owner_name(scene_rig, target.id)
-    yield owner.partition(":")[0]
+    # Leave out the names of objects, because they differ in a duplicate of the character, and which of the character's
+    # meshes is read, because each may be read first.
+    if isinstance(target.id, bpy.types.Key):
+        yield SHAPE_KEYS
+    elif getattr(target.id, "type", "") == "MESH" and armature_of(target.id) == scene_rig.armature_object:
+        yield MESH_OBJECT
+    else:
+        yield owner_name(scene_rig, target.id).partition(":")[0]
     if variable.type == "SINGLE_PROP":
         yield target.data_path
     else:

@@ -24,13 +24,13 @@ from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.rig.deformation import describe_bones
+from fdda_addon.rig.deformation import describe_bones, read_unread_bones
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.session import session
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import rest_positions
-from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.scene.scene_rig import SceneRig, find_rig, join_rigs
 
 from .conftest import assert_plays, run, train
 from .rig_changes import change_in_edit_mode, trigger_check
@@ -243,6 +243,30 @@ def test_bones_that_move_only_bones_that_are_not_read_are_compared():
     bones = describe_bones(rig, rig_data, (), ())
     unread = find_unread_bones(bones.sources, bones.controlled, rig_data, MAIN_BONES)
     assert unread == sorted([*HELPERS, "mechanism", "above", "pole"]) and set(unread) <= bones.settings.keys()
+
+
+@pytest.mark.parametrize("owner", ["object", "keys", "armature"])
+def test_drivers_of_bones_that_read_a_mesh_are_equal_for_each_mesh_of_the_character(owner):
+    """A recording reads the bones with all meshes, and playback may read them with any."""
+    rig = build_limb()
+    shirt = rig.mesh_object.copy()
+    shirt.data = rig.mesh_object.data.copy()
+    bpy.context.scene.collection.objects.link(shirt)
+    shirt.shape_key_add(name="Basis")
+    shirt.shape_key_add(name="wide")
+    variable = rig.armature_object.animation_data.drivers[0].driver.variables.new()
+    variable.type, target = "SINGLE_PROP", variable.targets[0]
+    target.id_type, target.id, target.data_path = {
+        "object": ("OBJECT", shirt, "location[0]"),
+        "keys": ("KEY", shirt.data.shape_keys, 'key_blocks["wide"].value'),
+        "armature": ("OBJECT", rig.armature_object, "location[0]"),
+    }[owner]
+    rigs = [find_rig(rig.mesh_object.name), find_rig(shirt.name)]
+    readings = [read_unread_bones(each, HELPERS) for each in (*rigs, join_rigs(rigs), join_rigs(rigs[::-1]))]
+    assert readings[0]["push.1"]["drivers"] or readings[0]["push.2"]["drivers"]
+    assert all(reading == readings[0] for reading in readings)
+    target.id_type, target.id, target.data_path = "SCENE", bpy.context.scene, "frame_current"
+    assert read_unread_bones(rig, HELPERS) != readings[0]
 
 
 def test_a_fast_rig_has_only_the_bones_that_the_model_reads(limb_files, tmp_path):
