@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.joint_option import parse_joints
 from fdda_addon.core.mathematics.key_joints import KeyJointReport, select_joints
-from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, weights_match
+from fdda_addon.core.mathematics.skin_fit import FitReport
 from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig, rig_differences
 
 REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
@@ -106,21 +106,3 @@ def test_the_report_is_read_back_and_says_what_is_lost():
 def test_damaged_reports_are_refused(key, value):
     with pytest.raises((TypeError, ValueError)):
         KeyJointReport.from_json({**REPORT.to_json(), key: value})
-
-
-@pytest.mark.parametrize(
-    ("fit", "options", "matches"),
-    [
-        (None, ("", "all"), True),
-        (None, ("", "auto"), True),
-        (None, ("smooth", "all"), False),
-        (SkinFit("hard", 100, ERRORS, ERRORS), ("hard", "auto"), True),
-        (SkinFit("hard", 100, ERRORS, ERRORS), ("", "auto"), False),
-        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("", "auto"), True),
-        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("hard", "auto"), False),
-        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("smooth", "all"), False),
-        (SkinFit("smooth", 100, ERRORS, ERRORS, REPORT), ("", "60"), False),
-    ],
-)
-def test_a_recording_has_the_weights_that_options_ask_for(fit, options, matches):
-    assert weights_match(fit, *options) is matches

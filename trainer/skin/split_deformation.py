@@ -2,6 +2,7 @@
 """Splits the recorded deformation into linear skinning and residuals: all steps up to partitions and influences."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from fdda_addon.core.joint_option import ALL
 from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.key_joints import find_unread_bones, joints_with_indices, select_joints
 from fdda_addon.core.mathematics.metrics import distances
-from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.mathematics.references import choose_references
 from fdda_addon.core.mathematics.skin_fit import DEFAULT_KIND, FitReport, SkinFit
 from fdda_addon.core.mathematics.skinning import LinearSkinning
@@ -24,7 +24,6 @@ from ..config import TrainingConfig
 from ..progress import MessageSink
 from .choice import choose_key_joints
 from .fit_poses import FitPoses, read_fit_poses
-from .key_joints import KeyJoints
 from .solver import fit_skin
 
 REFERENCE_POSES = 48
@@ -38,122 +37,95 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
         recording: the recording.
         config: settings of the training.
         sink: receives the progress and the results of the fit.
+
+    Raises:
+        TrainingError: the rig has no skin weights, and none are fitted.
     """
-    rig, joint_count = recording.rig, len(recording.rig.joints)
-    joints, choice, fit = np.arange(joint_count), None, None
-    has_key_joints, unweighted = config.bones_to_read != ALL, rig.unweighted_vertices
-    if has_key_joints or config.base_skinning or len(unweighted):
-        vertices = None if has_key_joints or config.base_skinning else unweighted
-        poses = read_fit_poses(recording, has_key_joints, vertices)
-        if has_key_joints:
-            choice = choose_key_joints(
-                poses,
-                config.bones_to_read,
-                lambda done, total: sink.send(MessageType.PREPARING, stage=KEY_JOINTS_STAGE, done=done, total=total),
-            )
-        removes_joints = choice is not None and len(choice.joints) < joint_count
-        if choice and not removes_joints:
-            sink.send(MessageType.LOG, text=choice.report.sentence())
-        fits_all = removes_joints or bool(config.base_skinning)
-        if fits_all or len(unweighted):
+    rig, chooses_joints, unweighted = recording.rig, config.bones_to_read != ALL, recording.rig.unweighted_vertices
+    joints, choice, fit, follows = np.arange(len(rig.joints)), None, None, None
+
+    def send_progress(stage: str, done: int, total: int) -> None:
+        sink.send(MessageType.PREPARING, stage=stage, done=done, total=total)
+
+    def log(text: str) -> None:
+        sink.send(MessageType.LOG, text=text)
+
+    fits_all = chooses_joints or bool(config.base_skinning)
+    if fits_all or len(unweighted):
+        poses = read_fit_poses(recording, chooses_joints, None if fits_all else unweighted)
+        if chooses_joints:
+            choice = choose_key_joints(poses, config.bones_to_read, partial(send_progress, KEY_JOINTS_STAGE))
+            if len(choice.joints) == len(joints):
+                log(choice.report.sentence())
+                fits_all = bool(config.base_skinning)
+                poses = poses if fits_all else poses.of_vertices(unweighted)
+            else:
+                follows, joints = (choice.acts, choice.inputs), choice.joints
+        if poses.rig.vertex_count:
             if not fits_all:
                 meshes = zip(rig.meshes, rig.mesh_slices, strict=True)
                 names = [mesh.name for mesh, part in meshes if part.start in unweighted]
                 subject = format_with_noun(names, "mesh", "meshes")
-                verb = "has" if len(names) == 1 else "have"
-                sink.send(MessageType.LOG, text=f"Skin weights are fitted for {subject}, which {verb} none.")
-                poses = poses.of_vertices(unweighted) if vertices is None else poses
-            kind, weighted = config.base_skinning or DEFAULT_KIND, choice.weighted_joints if removes_joints else joints
+                log(f"Skin weights are fitted for {subject}, which {'has' if len(names) == 1 else 'have'} none.")
+            weighted = choice.weighted_joints if follows else joints
+            kind = config.base_skinning or DEFAULT_KIND
             training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
             fitted_joints, weights = fit_skin(
-                training.with_joints(weighted) if removes_joints else training,
+                training.with_joints(weighted) if follows else training,
                 kind,
-                lambda done: sink.send(MessageType.PREPARING, stage=FIT_STAGE, done=done, total=poses.rig.vertex_count),
+                lambda done: send_progress(FIT_STAGE, done, poses.rig.vertex_count),
             )
-            fitted = weighted[fitted_joints].astype(np.int32), weights
-            fitted_rig = replace(poses.rig, skin_joints=fitted[0], skin_weights=fitted[1])
-            reports = measure_skin(held_out, fitted_rig), measure_skin(training, fitted_rig)
+            fitted_joints = weighted[fitted_joints].astype(np.int32)
+            fitted_rig = replace(poses.rig, skin_joints=fitted_joints, skin_weights=weights)
+            errors = measure_skin(held_out, fitted_rig), measure_skin(training, fitted_rig)
+            fit = SkinFit(kind, len(poses.positions), *errors, choice.report if follows else None)
+            log(fit.sentence())
             if not fits_all:
-                fitted = [np.pad(each, ((0, 0), (0, rig.skin_joints.shape[1] - each.shape[1]))) for each in fitted]
-                own = rig.skin_joints.copy(), rig.skin_weights.copy()
-                for array, rows in zip(own, fitted, strict=True):
-                    array[unweighted] = rows
-                fitted = own
-            rig = replace(rig, skin_joints=fitted[0], skin_weights=fitted[1])
-            fit = SkinFit(kind, len(poses.positions), *reports, choice.report if removes_joints else None)
-            sink.send(MessageType.LOG, text=fit.sentence())
-            if removes_joints:
-                joints, rig = choice.joints, keep_key_joints(recording, rig, choice)
-            rig = _choose_references(recording, rig, joints, poses)
-    if fit is None:
-        check_has_weights(recording)
-
-    def follow(partition: Partition, influences: np.ndarray) -> np.ndarray:
-        if len(joints) == joint_count:
-            return influences
-        influences[:joint_count] |= choice.acts[partition.vertices].any(axis=0)
-        return influences @ choice.inputs
-
-    skinned = skin_recording(
-        recording,
-        rig,
-        joints,
-        follow,
-        config.min_vertices_per_part,
-        config.influence_tolerance,
-        lambda text: sink.send(MessageType.LOG, text=text),
-    )
+                padding, fitted = ((0, 0), (0, rig.skin_joints.shape[1] - weights.shape[1])), (fitted_joints, weights)
+                fitted_joints, weights = rig.skin_joints.copy(), rig.skin_weights.copy()
+                fitted_joints[unweighted], weights[unweighted] = (np.pad(each, padding) for each in fitted)
+            rig = replace(rig, skin_joints=fitted_joints, skin_weights=weights)
+            if follows:
+                rig = keep_key_joints(recording, rig, joints)
+            # Choose the reference joints of a rig with fitted weights.
+            rig = replace(rig, joints=tuple(replace(joint, reference=None) for joint in rig.joints))
+            compared = np.unique(np.linspace(0, len(poses.positions) - 1, REFERENCE_POSES).round().astype(int))
+            is_fixed = np.isin(joints, recording.info.bones.fixed)
+            rig = choose_references(rig, is_fixed, poses.pose_matrices[compared][:, joints])
+    if not rig.has_weights:
+        raise TrainingError(
+            f"The vertices of '{rig.meshes[0].name}' follow no bone by skin weights, so there is no linear skinning to "
+            "learn from; have one fitted (--base-skinning smooth, or Base Skinning in the sidebar), or paint weights "
+            "and record again."
+        )
+    settings = config.min_vertices_per_part, config.influence_tolerance
+    skinned = skin_recording(recording, rig, joints, follows, *settings, note=log)
     return replace(skinned, fit=fit, key_joints=choice.report if choice else None)
 
 
-def keep_key_joints(recording: Recording, fitted_rig: Rig, choice: KeyJoints) -> Rig:
-    """Return a rig with its key joints alone; its fingerprint describes the bones that follow these."""
-    own_rig = recording.rig
-    key_rig = select_joints(own_rig, joints_with_indices(own_rig, choice.joints.tolist()))
-    bones = recording.info.bones
-    unread = {
-        name: bones.settings[name]
-        for name in find_unread_bones(bones.sources, bones.controlled, own_rig, key_rig.joint_names)
-        if name in bones.settings
-    }
+def keep_key_joints(recording: Recording, fitted_rig: Rig, joints: np.ndarray) -> Rig:
+    """Return a rig with its key joints alone; its fingerprint describes the bones that follow these.
+
+    Args:
+        recording: the recording of the rig.
+        fitted_rig: the rig with all joints and fitted skin weights.
+        joints: (K,) ascending indices of the key joints.
+    """
+    bones, own_rig = recording.info.bones, recording.rig
+    key_rig = select_joints(own_rig, joints_with_indices(own_rig, joints.tolist()))
+    names = find_unread_bones(bones.sources, bones.controlled, own_rig, key_rig.joint_names)
+    unread = {"unread_bones": {name: bones.settings[name] for name in names if name in bones.settings}}
+    fingerprints = [
+        replace(mesh.fingerprint, deformation=mesh.fingerprint.deformation | unread) for mesh in key_rig.meshes
+    ]
     indices = np.zeros(len(own_rig.joints), np.int32)
-    indices[choice.joints] = np.arange(len(choice.joints))
+    indices[joints] = np.arange(len(joints))
     return replace(
         key_rig,
         skin_joints=indices[fitted_rig.skin_joints],
         skin_weights=fitted_rig.skin_weights,
-        meshes=tuple(
-            replace(
-                mesh,
-                fingerprint=replace(
-                    mesh.fingerprint, deformation=mesh.fingerprint.deformation | {"unread_bones": unread}
-                ),
-            )
-            for mesh in key_rig.meshes
-        ),
+        meshes=tuple(replace(m, fingerprint=each) for m, each in zip(key_rig.meshes, fingerprints, strict=True)),
     )
-
-
-def _choose_references(recording: Recording, rig: Rig, joints: np.ndarray, poses: FitPoses) -> Rig:
-    """Choose the reference joints of a rig with fitted weights; `joints` are the indices of its joints."""
-    rig = replace(rig, joints=tuple(replace(joint, reference=None) for joint in rig.joints))
-    compared = np.linspace(0, len(poses.positions) - 1, REFERENCE_POSES).round().astype(int)
-    is_fixed = np.isin(joints, recording.info.bones.fixed)
-    return choose_references(rig, is_fixed, poses.pose_matrices[np.unique(compared)][:, joints])
-
-
-def check_has_weights(recording: Recording) -> None:
-    """Check that vertices of the rig have weights on deforming bones.
-
-    Raises:
-        TrainingError: no vertex follows a bone.
-    """
-    if not recording.rig.has_weights:
-        raise TrainingError(
-            f"The vertices of '{recording.rig.meshes[0].name}' follow no bone by skin weights, so there is no linear "
-            "skinning to learn from; have one fitted (--base-skinning smooth, or Base Skinning in the sidebar), or "
-            "paint weights and record again."
-        )
 
 
 def measure_skin(poses: FitPoses, fitted: Rig) -> FitReport:

@@ -88,19 +88,6 @@ class SkinFit:
         )
 
 
-def weights_match(fit: SkinFit | None, kind: str, joints: str) -> bool:
-    """Return whether a recording has the weights that options of `record` ask for.
-
-    Args:
-        fit: the fit of the recording; None if it has the weights of the rig.
-        kind: one of `FIT_KINDS`; empty for the weights of the rig, and for `DEFAULT_KIND` with key joints.
-        joints: the option `joints`. A recording with all joints may be the result of a choice.
-    """
-    if fit is None or fit.key_joints is None:
-        return kind == (fit.kind if fit else "")
-    return fit.kind == (kind or DEFAULT_KIND) and fit.key_joints.requested == joints
-
-
 def _read_fit_report(value: dict) -> FitReport:
     distances = [
         {weights_kind: float(value[name][weights_kind]) for weights_kind in ("rig", "fitted")}

@@ -116,7 +116,7 @@ def skin_recording(
     recording: Recording,
     rig: Rig | None = None,
     joints: np.ndarray | None = None,
-    follow: Callable[[Partition, np.ndarray], np.ndarray] = lambda partition, influences: influences,
+    follows: tuple[np.ndarray, np.ndarray] | None = None,
     min_vertices_per_part: int = MIN_VERTICES_PER_PART.default,
     influence_tolerance: float = INFLUENCE_TOLERANCE,
     note: Callable[[str], None] = lambda text: None,
@@ -129,8 +129,8 @@ def skin_recording(
         recording: a recording with J joints and C controls.
         rig: the rig with K of the joints and the skin weights of linear skinning; None for the recorded rig.
         joints: (K,) indices of these joints in the recording; None for all.
-        follow: returns the (K + C,) bool inputs of the model from which a partition follows, for the partition and
-            the (J + C,) bool inputs of the recording that influence it.
+        follows: the (V, J) vertices on which each joint acts that the model does not read, and the (J + C, K + C)
+            inputs of the model from which each input of the recording follows, both bool; None if it reads all.
         min_vertices_per_part: partitions with fewer vertices are merged into others; 0 to merge no partitions.
         influence_tolerance: as in `detect_influences`.
         note: receives a note about positions that are not finite.
@@ -146,6 +146,11 @@ def skin_recording(
         influences, text = detect_influences(recording, rig, joints, partitions, influence_tolerance)
         if text:
             note(text)
+    if follows:
+        acts, inputs = follows
+        for partition, influencing in zip(partitions, influences, strict=True):
+            influencing[: acts.shape[1]] |= acts[partition.vertices].any(axis=0)
+        influences = influences @ inputs
     # The poses that move one input alone are not read again.
     release_pages(recording.positions)
     info, rows = recording.info, np.delete(np.arange(recording.info.poses), recording.info.alone_poses)
@@ -154,9 +159,7 @@ def skin_recording(
         recording.path,
         replace(info, poses=len(rows), complete=len(rows), sampling=replace(info.sampling, sources=sources)),
         rig,
-        tuple(
-            add_influences(p, follow(p, inputs), len(joints)) for p, inputs in zip(partitions, influences, strict=True)
-        ),
+        tuple(_add_influences(*each, len(joints)) for each in zip(partitions, influences, strict=True)),
         np.array(recording.pose_matrices[rows])[:, joints],
         np.array(recording.controls[rows]),
         recording.positions,
@@ -231,7 +234,7 @@ def detect_influences(
     )
 
 
-def add_influences(partition: Partition, needed_inputs: np.ndarray, joint_count: int) -> Partition:
+def _add_influences(partition: Partition, needed_inputs: np.ndarray, joint_count: int) -> Partition:
     """Return a partition with the inputs of a (J + C,) bool array added to its influences; `joint_count` is J."""
     joints, controls = np.flatnonzero(needed_inputs[:joint_count]), np.flatnonzero(needed_inputs[joint_count:])
     return replace(
