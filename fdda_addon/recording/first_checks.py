@@ -16,9 +16,9 @@ from ..core.mathematics.skinning import LinearSkinning
 from ..core.progress import Progress
 from ..core.recording.index import SIMULATION
 from ..poses.clip_player import ClipPlayer
+from ..rig.reading import PoseEvaluator
 from ..scene.armature import clear_pose
 from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control
-from .plan import RecordedRig
 from .pose_plan import PosePlan
 
 MAX_TARGET_POSES, MAX_SEAM_POSES = 20, 10
@@ -37,7 +37,7 @@ MAX_CHANGE_RATIO = 1 / 8
 """A range saturates if the surface changes in at most this part of it."""
 
 
-def check_target_moves(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
+def check_target_moves(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
     """Check that a target moves in poses in which the rig moves.
 
     A simulation is checked in its first frames, other targets in poses that are far apart. Poses that are held settle,
@@ -49,9 +49,9 @@ def check_target_moves(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer
     Raises:
         RigError: the target does not move.
     """
-    if not recorded.rig.has_weights:
+    if not evaluator.rig.has_weights:
         return
-    rig, size, target = recorded.rig, recorded.rig.size, plan.pose_setter.target
+    rig, size, target = evaluator.rig, evaluator.rig.size, plan.pose_setter.target
     skinning, is_simulation = LinearSkinning(rig), target.follows == SIMULATION
     spread_indices = sorted(
         {int(number * GOLDEN_RATIO * plan.total) % plan.total for number in range(MAX_TARGET_POSES)}
@@ -62,7 +62,7 @@ def check_target_moves(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer
     first_positions, rig_motion, target_motion = None, 0.0, 0.0
     with closing(plan.show_poses(player, pose_indices)) as poses:
         for checked_count, _ in enumerate(poses, 1):
-            pose_matrices, positions, _ = recorded.evaluator.evaluate()
+            pose_matrices, positions, _ = evaluator.evaluate()
             skinned_positions = skinning.positions(pose_matrices[None])[0]
             if first_positions is None:
                 first_positions = skinned_positions, positions
@@ -76,20 +76,20 @@ def check_target_moves(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer
     player.stop()
     if rig_motion > MIN_RIG_MOTION_RATIO * size and target_motion <= MAX_STILL_TARGET_RATIO * size:
         raise RigError(
-            f"The target '{target.name}' does not move while '{recorded.scene_rig.mesh_object.name}' does, by "
+            f"The target '{target.name}' does not move while '{evaluator.scene_rig.mesh_object.name}' does, by "
             f"{rig_motion * rig.metres_per_unit * 1000:.0f} mm; look whether its modifiers are on and its cache "
             "is that of this action, or choose another target."
         )
 
 
-def check_follows_pose(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer) -> float:
+def check_follows_pose(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> float:
     """Check that the surface of a rig does not change between frames while pose and controls are the same.
 
     Two poses of the plan are held in the first, middle and last frame of the scene. Poses that change with the frame
     are skipped.
 
     Args:
-        recorded: the rig, prepared by `temporary_rig_state`.
+        evaluator: evaluates the rig, prepared by `temporary_rig_state`.
         plan: plan of the poses.
         player: player of the clips of the plan.
 
@@ -106,10 +106,10 @@ def check_follows_pose(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer
                 clip_frame, first_evaluation = player.current_clip_frame, None
                 for checked_frame in (frame, *sorted(other_frames)):
                     player.set_clip_frame(clip_frame, checked_frame)
-                    evaluation = recorded.evaluator.evaluate()
+                    evaluation = evaluator.evaluate()
                     evaluation_count += 1
                     first_evaluation = first_evaluation or evaluation
-                    _compare_surfaces(recorded, (frame, checked_frame), first_evaluation, evaluation)
+                    _compare_surfaces(evaluator, (frame, checked_frame), first_evaluation, evaluation)
     finally:
         player.stop()
         player.reset_pose()
@@ -118,59 +118,61 @@ def check_follows_pose(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer
 
 
 def _compare_surfaces(
-    recorded: RecordedRig, frames: tuple[int, int], first: Sequence[np.ndarray], other: Sequence[np.ndarray]
+    evaluator: PoseEvaluator, frames: tuple[int, int], first: Sequence[np.ndarray], other: Sequence[np.ndarray]
 ) -> None:
     """Raise a RigError if the positions of two evaluations differ, and pose matrices and controls do not."""
     if not all(np.allclose(first[index], other[index], rtol=POSE_TOLERANCE, atol=POSE_TOLERANCE) for index in (0, 2)):
         return
-    differences, rig = np.linalg.norm(first[1] - other[1], axis=1), recorded.rig
+    differences, rig = np.linalg.norm(first[1] - other[1], axis=1), evaluator.rig
     largest_difference = float(differences.max())
-    mesh_object = recorded.scene_rig.mesh_object
+    mesh_object = evaluator.scene_rig.mesh_object
     extent = max(float(np.abs(rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
     if largest_difference > max(INFLUENCE_TOLERANCE * rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
+        slices = zip(evaluator.scene_rig.mesh_objects, rig.mesh_slices, strict=True)
+        name = next(o.name for o, part in slices if differences.argmax() < part.stop)
         raise RigError(
-            f"The surface of '{recorded.name_of_vertex(int(differences.argmax()))}' differs by "
+            f"The surface of '{name}' differs by "
             f"{largest_difference * rig.metres_per_unit * 1000:.2g} mm between frames {frames[0]} and {frames[1]} in "
             "the same pose, so it does not follow from the pose; find the keys, drivers, Geometry Nodes or constraint "
             "targets that depend on the frame, and make them controls or switch them off."
         )
 
 
-def check_seams(recorded: RecordedRig, plan: PosePlan, player: ClipPlayer) -> str:
+def check_seams(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> str:
     """Return a sentence if cuts of a mesh open in poses that are far apart; empty if not.
 
     Args:
-        recorded: the rig, prepared by `temporary_rig_state`.
+        evaluator: evaluates the rig, prepared by `temporary_rig_state`.
         plan: plan of the poses.
         player: player of the clips of the plan.
     """
-    skinning = LinearSkinning(recorded.rig)
+    skinning = LinearSkinning(evaluator.rig)
     pose_indices = set(np.linspace(0, plan.total - 1, MAX_SEAM_POSES).round().astype(int).tolist())
 
     def evaluate_residuals() -> Iterator[np.ndarray]:
         with closing(plan.show_poses(player, pose_indices)) as poses:
             for _ in poses:
-                pose_matrices, positions, _ = recorded.evaluator.evaluate()
+                pose_matrices, positions, _ = evaluator.evaluate()
                 yield skinning.local_residuals(pose_matrices[None], positions[None])[0]
 
     with closing(evaluate_residuals()) as residuals:
-        warnings = find_open_seams(recorded.rig, residuals)
+        warnings = find_open_seams(evaluator.rig, residuals)
     player.stop()
-    clear_pose(recorded.scene_rig.armature_object)
+    clear_pose(evaluator.scene_rig.armature_object)
     player.restore_numbers()
-    return f"{recorded.scene_rig.mesh_object.name}: {warnings[0]}" if warnings else ""
+    return f"{evaluator.scene_rig.mesh_object.name}: {warnings[0]}" if warnings else ""
 
 
-def check_saturation(recorded: RecordedRig) -> str:
+def check_saturation(evaluator: PoseEvaluator) -> str:
     """Return a sentence about the controls whose effect ends far inside their ranges; empty if there is none.
 
     Random poses would hardly ever show the values between the two ends of the effect.
 
     Args:
-        recorded: the rig in its rest pose, prepared by `temporary_rig_state`.
+        evaluator: evaluates the rig in its rest pose, prepared by `temporary_rig_state`.
     """
-    scene_rig, sentences = recorded.scene_rig, []
-    for control in recorded.rig.controls:
+    scene_rig, sentences = evaluator.scene_rig, []
+    for control in evaluator.rig.controls:
         owner, (low, high) = owner_of(scene_rig, control.owner), (control.low, control.high)
         if high - low < MIN_CHECKED_WIDTH or not can_be_set(control.name) or is_driven(owner, control.path):
             continue
@@ -181,9 +183,9 @@ def check_saturation(recorded: RecordedRig) -> str:
             surfaces = []
             for value in compared.tolist():
                 set_control(scene_rig, control.name, value)
-                surfaces.append(recorded.evaluator.evaluate()[1])
+                surfaces.append(evaluator.evaluate()[1])
             moves = np.linalg.norm(np.diff(surfaces, axis=0), axis=2).max(axis=1)
-            changed = np.flatnonzero(moves > INFLUENCE_TOLERANCE * recorded.rig.size)
+            changed = np.flatnonzero(moves > INFLUENCE_TOLERANCE * evaluator.rig.size)
             if len(changed):
                 low, high = float(compared[changed[0]]), float(compared[changed[-1] + 1])
             if not 0 < len(changed) <= MAX_CHANGE_RATIO * (VALUE_COUNT - 1) or high - low < 1:

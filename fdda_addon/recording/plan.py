@@ -28,7 +28,7 @@ from ..poses.sampling import (
 )
 from ..rig.dependencies import read_dependencies
 from ..rig.pose_setter import NO_TARGET, TargetSettings
-from ..rig.reading import PoseEvaluator, read_rig
+from ..rig.reading import read_rig
 from ..rig.shape_keys import find_unposed_keys, key_distances
 from ..rig.target import find_target
 from ..scene.controls import owner_name, parse_controls
@@ -72,26 +72,6 @@ class RecordingSettings:
     mirror: bool = MIRROR.field()
     target: TargetSettings = NO_TARGET
     overwrite: bool = False
-
-
-@dataclass(eq=False)
-class RecordedRig:
-    """A rig that is recorded.
-
-    Attributes:
-        scene_rig: the rig as scene objects.
-        rig: the rig as arrays, with its own skin weights and all joints.
-        evaluator: evaluates the meshes, or the target.
-    """
-
-    scene_rig: SceneRig
-    rig: Rig
-    evaluator: PoseEvaluator
-
-    def name_of_vertex(self, vertex: int) -> str:
-        """Return the name of the mesh object that has a vertex."""
-        slices = self.rig.mesh_slices
-        return next(o.name for o, part in zip(self.scene_rig.mesh_objects, slices, strict=True) if vertex < part.stop)
 
 
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:

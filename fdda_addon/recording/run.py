@@ -31,7 +31,7 @@ from ..scene.scene_rig import SceneRig, check_full_rig
 from .alone_poses import plan_alone_poses
 from .appender import PoseAppender
 from .first_checks import check_follows_pose, check_saturation, check_seams, check_target_moves
-from .plan import RecordedRig, RecordingSettings, find_actions, make_sampling, read_sampled_rig
+from .plan import RecordingSettings, find_actions, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
 from .reference_joints import find_fixed_joints, find_references
 
@@ -91,19 +91,19 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     target = pose_setter.target
-    recorded = RecordedRig(scene_rig, rig, PoseEvaluator(scene_rig, rig, target))
+    evaluator = PoseEvaluator(scene_rig, rig, target)
     with ExitStack() as exit_stack:
         if target:
             exit_stack.enter_context(target.prepared())
         player = exit_stack.enter_context(temporary_rig_state(scene_rig, rig, channels, clips))
         seconds_per_pose, alone = None, None
         if target:
-            yield from check_target_moves(recorded, plan, player)
+            yield from check_target_moves(evaluator, plan, player)
         # A target that depends on time does not follow a moved joint at once.
         follows_pose = not target or target.follows == POSE
         if follows_pose:
-            seconds_per_pose = check_follows_pose(recorded, plan, player)
-            notes += [check_seams(recorded, plan, player), check_saturation(recorded)]
+            seconds_per_pose = check_follows_pose(evaluator, plan, player)
+            notes += [check_seams(evaluator, plan, player), check_saturation(evaluator)]
         for note in filter(None, notes):
             yield Progress("poses", 0, plan.total, note)
         fixed_joints = find_fixed_joints(scene_rig)
@@ -130,7 +130,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         check_disk_space(path, recording_bytes(rig, info.poses))
         writer = exit_stack.enter_context(RecordingWriter(path, rig, info, settings.resume, settings.overwrite))
         # The appender ends before the writer, so that an interrupted recording keeps the evaluated poses.
-        appender = exit_stack.enter_context(PoseAppender(recorded.evaluator, writer, rig.vertex_count, pose_setter))
+        appender = exit_stack.enter_context(PoseAppender(evaluator, writer, rig.vertex_count, pose_setter))
         start, alone_count = min(appender.pose_count, plan.total), len(info.alone_poses)
         if writer.note:
             yield Progress("poses", start, plan.total, writer.note)
@@ -157,7 +157,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         if plan.repeatable_poses and settings.target.repeatability_poses:
             appender.flush()
             count = settings.target.repeatability_poses
-            yield from measure_repeatability(recorded.evaluator, plan, player, writer, count)
+            yield from measure_repeatability(evaluator, plan, player, writer, count)
 
 
 def measure_repeatability(

@@ -7,7 +7,7 @@ A simulation gets a pre-roll before actions, and random poses are held until it 
 import time
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import bpy
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import Channel
-from ..core.recording.index import FRAMES, POSE, SIMULATION, RecordedTarget
+from ..core.recording.index import FRAMES, SIMULATION, RecordedTarget
 from ..core.settings import LEARN_FROM, PRE_ROLL, REPEATABILITY_POSES, REST_THRESHOLD_MM, SETTLE_FRAMES
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
@@ -74,73 +74,6 @@ def blend_from_rest(
     return set_fraction
 
 
-class PoseSetter:
-    """Sets poses of a rig; `SimulatedPoseSetter` sets those of a simulated target.
-
-    Attributes:
-        target: the target; None for the rig itself.
-    """
-
-    def __init__(self, target: Target | None = None, pre_roll: int = 0):
-        """Prepare to set poses.
-
-        Args:
-            target: as in the class.
-            pre_roll: as in `TargetSettings`.
-        """
-        self.target, self._pre_roll = target, pre_roll
-
-    @property
-    def recorded_target(self) -> RecordedTarget | None:
-        """Return the description of the target in a recording; None without a target."""
-        return RecordedTarget(self.target.name, self.target.follows, self._pre_roll) if self.target else None
-
-    @property
-    def depends_on_history(self) -> bool:
-        """Return whether the surface may depend on earlier poses, not only on the current one."""
-        return False
-
-    @property
-    def is_settling(self) -> bool:
-        """Return whether random poses are held until the target is at rest."""
-        return False
-
-    @property
-    def is_at_rest(self) -> bool:
-        """Return whether the last random pose came to rest, or was not held."""
-        return True
-
-    @property
-    def rest_description(self) -> str:
-        """Return how the target came to rest in the last random pose; empty if poses are not held."""
-        return ""
-
-    @property
-    def seconds_per_pose(self) -> float | None:
-        """Return the seconds that the last random pose took to settle; None if they were not measured."""
-        return None
-
-    @contextmanager
-    def prepared(self) -> Iterator[None]:
-        """Prepare the target for random poses; restore it afterwards."""
-        yield
-
-    def set_pose(self, pose: PoseFunction, via_pose: PoseFunction | None = None) -> None:
-        """Set a random pose; a simulation moves through `via_pose` on the way."""
-        pose(1)
-
-    def show_frames(self, player: ClipPlayer, clip: Clip, frame_indices: Container[int]) -> Iterator[int]:
-        """Show frames of a clip in their order, one for each iteration, and yield their indices in the clip."""
-        for index, frame in enumerate(clip.frames):
-            if index in frame_indices:
-                player.show(clip, frame)
-                yield index
-
-
-DIRECT_POSE_SETTER = PoseSetter()
-"""Sets poses of a rig, whose surface follows from the pose at once."""
-
-
 APPROACH_FRAMES = 10
 """Frames in which the rig moves from the rest pose to a pose that is held."""
 MAX_REVERSED_FRAMES = 100
@@ -150,63 +83,68 @@ MIN_REST_FRAMES = 3
 each turning point."""
 
 
-@dataclass(frozen=True)
-class RestState:
-    """How a target came to rest in a pose.
+def reversible_frames(clip: Clip) -> range:
+    """Return the indices of the frames of a clip that can be shown in reverse: later frames must come before them."""
+    return range(min(len(clip.frames) - APPROACH_FRAMES, MAX_REVERSED_FRAMES))
+
+
+class PoseSetter:
+    """Sets poses of a rig, or of a target, whose surface may depend on earlier poses.
 
     Attributes:
-        held_frame_count: number of frames for which the pose was held.
-        speed_mm: speed of the fastest vertex in the last frame, mm per frame.
-        is_at_rest: the target came to rest.
-        seconds: time that the evaluation of these frames took.
+        target: the target; None for the rig itself.
+        depends_on_history: the target has simulations, so its surface may depend on earlier poses.
+        is_settling: random poses are held until the target is at rest, so that its surface depends on the pose alone.
+        is_at_rest: the last random pose came to rest, or was not held.
+        rest_description: how the target came to rest in the last random pose; empty if poses are not held.
+        seconds_per_pose: the time that the last random pose took to settle; None if none was held.
     """
 
-    held_frame_count: int
-    speed_mm: float
-    is_at_rest: bool
-    seconds: float
-
-    def __str__(self) -> str:
-        duration = f"{self.held_frame_count} frames, {self.seconds:.1f} s"
-        return duration if self.is_at_rest else f"not at rest after {duration}: {self.speed_mm:.2g} mm per frame"
-
-
-class Settler:
-    """Holds poses until a simulated target is at rest, so that its surface depends on the pose alone.
-
-    Attributes:
-        max_frames: largest number of frames for which a pose is held.
-        rest_threshold_mm: the target is at rest when no vertex moves by more in a frame, mm.
-        last_rest_state: the rest state of the last pose; None before the first pose.
-    """
-
-    def __init__(self, target: Target, max_frames: int, rest_threshold_mm: float = REST_THRESHOLD_MM.default):
-        """Prepare to settle a target.
+    def __init__(self, target: Target | None = None, settings: TargetSettings = NO_TARGET):
+        """Prepare to set poses.
 
         Args:
-            target: a target with simulations.
-            max_frames, rest_threshold_mm: as above.
+            target: as in the class.
+            settings: settings of the target.
         """
-        self._target, self.max_frames, self.rest_threshold_mm = target, max_frames, rest_threshold_mm
-        self._mm_per_unit = 1000 * metres_per_unit(target.scene_rig.mesh_object)
-        self._first_frame = target.first_frame
-        self.last_rest_state: RestState | None = None
+        self.target, self._settings = target, settings
+        self.depends_on_history = target is not None and bool(target.simulations)
+        self.is_settling = settings.settle_frames > 0
+        self.is_at_rest, self.rest_description = True, ""
+        self.seconds_per_pose: float | None = None
+
+    @property
+    def recorded_target(self) -> RecordedTarget | None:
+        """Return the description of the target in a recording; None without a target."""
+        settings = self._settings
+        settling = (settings.settle_frames, settings.rest_threshold_mm) if self.is_settling else ()
+        return (
+            RecordedTarget(self.target.name, self.target.follows, settings.pre_roll, *settling) if self.target else None
+        )
 
     @contextmanager
     def prepared(self) -> Iterator[None]:
-        """Extend the simulations of the target to the frames that `settle` needs; restore them afterwards."""
-        last_frame = self._first_frame + 2 * APPROACH_FRAMES + self.max_frames
-        with temporary_frame_range(self._target, self._first_frame, last_frame):
+        """Extend the simulations of the target to the frames that held poses need; restore them afterwards."""
+        if not self.is_settling:
+            yield
+            return
+        last_frame = self.target.first_frame + 2 * APPROACH_FRAMES + self._settings.settle_frames
+        with temporary_frame_range(self.target, self.target.first_frame, last_frame):
             yield
 
-    def settle(self, pose: PoseFunction, via_pose: PoseFunction | None = None) -> RestState:
-        """Move from the rest pose to a pose, and hold it until the target is at rest, for at most `max_frames` frames.
+    def set_pose(self, pose: PoseFunction, via_pose: PoseFunction | None = None) -> None:
+        """Set a random pose. If poses settle, move from the rest pose to it, and hold it until the target is at rest.
 
         Args:
-            via_pose: another pose through which the rig moves on the way.
+            pose: sets the pose.
+            via_pose: sets another pose, through which the rig moves on the way if poses settle.
         """
-        start_time, scene, frame = time.perf_counter(), bpy.context.scene, self._first_frame
-        self._target.restart_simulations()
+        if not self.is_settling:
+            pose(1)
+            return
+        start_time, scene, frame = time.perf_counter(), bpy.context.scene, self.target.first_frame
+        mm_per_unit = 1000 * metres_per_unit(self.target.scene_rig.mesh_object)
+        self.target.restart_simulations()
         all_steps, later_steps = range(APPROACH_FRAMES + 1), range(1, APPROACH_FRAMES + 1)
         movements = [(via_pose, all_steps), (pose, later_steps)] if via_pose else [(pose, all_steps)]
         for set_fraction, steps in movements:
@@ -214,92 +152,30 @@ class Settler:
                 set_fraction(step / APPROACH_FRAMES)
                 scene.frame_set(frame)
                 frame += 1
-        previous_positions, rest_frame_count, held_frame_count, speed_mm = self._positions(), 0, 0, 0.0
-        while held_frame_count < self.max_frames and rest_frame_count < MIN_REST_FRAMES:
+        previous_positions = self.target.positions(bpy.context.evaluated_depsgraph_get())
+        rest_frame_count, held_frame_count, speed_mm = 0, 0, 0.0
+        while held_frame_count < self._settings.settle_frames and rest_frame_count < MIN_REST_FRAMES:
             scene.frame_set(frame + held_frame_count)
-            current_positions = self._positions()
+            current_positions = self.target.positions(bpy.context.evaluated_depsgraph_get())
             offsets = current_positions - previous_positions
-            speed_mm = float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max())) * self._mm_per_unit
+            speed_mm = float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max())) * mm_per_unit
             previous_positions, held_frame_count = current_positions, held_frame_count + 1
-            rest_frame_count = rest_frame_count + 1 if speed_mm <= self.rest_threshold_mm else 0
-        self.last_rest_state = RestState(
-            held_frame_count, speed_mm, rest_frame_count >= MIN_REST_FRAMES, time.perf_counter() - start_time
-        )
-        return self.last_rest_state
-
-    def _positions(self) -> np.ndarray:
-        return self._target.positions(bpy.context.evaluated_depsgraph_get())
-
-
-def reversible_frames(clip: Clip) -> range:
-    """Return the indices of the frames of a clip that can be shown in reverse: later frames must come before them."""
-    return range(min(len(clip.frames) - APPROACH_FRAMES, MAX_REVERSED_FRAMES))
-
-
-class SimulatedPoseSetter(PoseSetter):
-    """Sets poses of a target with simulations, whose surface depends on earlier poses."""
-
-    def __init__(self, target: Target, pre_roll: int = 0, settler: Settler | None = None):
-        """Prepare to set poses.
-
-        Args:
-            target, pre_roll: as in `PoseSetter`.
-            settler: holds the random poses until the target is at rest; None if there are only frames of clips.
-        """
-        super().__init__(target, pre_roll)
-        self._settler = settler
-
-    @property
-    def recorded_target(self) -> RecordedTarget:
-        description = super().recorded_target
-        if self._settler is None:
-            return description
-        settling = {"settle_frames": self._settler.max_frames, "rest_threshold_mm": self._settler.rest_threshold_mm}
-        return replace(description, **settling)
-
-    @property
-    def depends_on_history(self) -> bool:
-        return True
-
-    @property
-    def is_settling(self) -> bool:
-        return self._settler is not None
-
-    @property
-    def _rest_state(self) -> RestState | None:
-        return self._settler.last_rest_state if self._settler else None
-
-    @property
-    def is_at_rest(self) -> bool:
-        return self._rest_state is None or self._rest_state.is_at_rest
-
-    @property
-    def rest_description(self) -> str:
-        return str(self._rest_state) if self._settler else ""
-
-    @property
-    def seconds_per_pose(self) -> float | None:
-        return self._rest_state.seconds if self._rest_state else None
-
-    @contextmanager
-    def prepared(self) -> Iterator[None]:
-        with self._settler.prepared() if self._settler else nullcontext():
-            yield
-
-    def set_pose(self, pose: PoseFunction, via_pose: PoseFunction | None = None) -> None:
-        if self._settler:
-            self._settler.settle(pose, via_pose)
-        else:
-            pose(1)
+            rest_frame_count = rest_frame_count + 1 if speed_mm <= self._settings.rest_threshold_mm else 0
+        self.seconds_per_pose = time.perf_counter() - start_time
+        self.is_at_rest = rest_frame_count >= MIN_REST_FRAMES
+        duration = f"{held_frame_count} frames, {self.seconds_per_pose:.1f} s"
+        text = f"not at rest after {duration}: {speed_mm:.2g} mm per frame"
+        self.rest_description = duration if self.is_at_rest else text
 
     def show_frames(self, player: ClipPlayer, clip: Clip, frame_indices: Container[int]) -> Iterator[int]:
-        """Show frames of a clip as `PoseSetter` does, and visit all frames up to the last of `frame_indices`."""
+        """Show frames of a clip in their order, one for each iteration, and yield their indices in the clip.
+
+        A simulation visits all frames up to the last of `frame_indices`.
+        """
         indices = [index for index in range(len(clip.frames)) if index in frame_indices]
-        if not indices:
-            return
-        with self._started_simulations(player, clip):
-            for index, frame in enumerate(clip.frames[: indices[-1] + 1]):
-                player.show(clip, frame)
+        with self._started_simulations(player, clip) if self.depends_on_history and indices else nullcontext():
+            for index in range(indices[-1] + 1) if self.depends_on_history and indices else indices:
+                player.show(clip, clip.frames[index])
                 if index in frame_indices:
                     yield index
 
@@ -327,11 +203,12 @@ class SimulatedPoseSetter(PoseSetter):
     @contextmanager
     def _started_simulations(self, player: ClipPlayer, clip: Clip, extra_frames: int = 0) -> Iterator[None]:
         """Play simulations up to the frame before a clip; inside, they can continue past the end of the clip."""
-        first_frame = clip.frames[0] - self._pre_roll if self._pre_roll else None
+        pre_roll = self._settings.pre_roll
+        first_frame = clip.frames[0] - pre_roll if pre_roll else None
         last_frame = clip.frames[-1] + extra_frames
-        needs_range = self._pre_roll or extra_frames
+        needs_range = pre_roll or extra_frames
         with temporary_frame_range(self.target, first_frame, last_frame) if needs_range else nullcontext():
-            if self._pre_roll:
+            if pre_roll:
                 # Move from the rest pose towards the first pose of the clip, up to the frame before the clip.
                 player.show(clip, clip.frames[0])
                 end_channels = player.current_clip_frame.channels
@@ -352,6 +229,10 @@ class SimulatedPoseSetter(PoseSetter):
                 for frame in range(self.target.first_frame, clip.frames[0]):
                     player.show(clip, frame)
             yield
+
+
+DIRECT_POSE_SETTER = PoseSetter()
+"""Sets poses of a rig, whose surface follows from the pose at once."""
 
 
 def _interpolate_channel(name: str, start: np.ndarray, end: np.ndarray, fraction: np.float32) -> np.ndarray:
@@ -395,23 +276,13 @@ def make_pose_setter(
             "random pose depends on the pose before; let it settle, or record 0 of them, and actions."
         )
     if settings.settle_frames and (target.follows != SIMULATION or any(not c.is_simulation for c in target.caches)):
-        raise RigError(
-            f"The target '{target.name}' cannot settle: {_reason_against_settling(target)}; leave settling out."
-        )
+        ranged = [cache.description for cache in target.caches if not cache.is_simulation]
+        reason = f"{ranged[0]} has a fixed range of frames" if ranged else "it follows the pose at once"
+        raise RigError(f"The target '{target.name}' cannot settle: {reason}; leave settling out.")
     if settings.settle_frames and clips:
         raise RigError(
             f"Settled poses are random ones, and '{clips[0].name}' is to be recorded too, frame by frame; leave it "
             "out, or make a recording of each."
         )
     check_clips(target, clips, settings.pre_roll)
-    settler = Settler(target, settings.settle_frames, settings.rest_threshold_mm) if settings.settle_frames else None
-    if target.simulations:
-        return SimulatedPoseSetter(target, settings.pre_roll, settler)
-    return PoseSetter(target, settings.pre_roll)
-
-
-def _reason_against_settling(target: Target) -> str:
-    if target.follows == POSE:
-        return "it follows the pose at once"
-    cache = next(cache for cache in target.caches if not cache.is_simulation)
-    return f"{cache.description} has a fixed range of frames"
+    return PoseSetter(target, settings)

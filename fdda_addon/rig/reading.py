@@ -331,7 +331,11 @@ class PoseReader:
 
 
 class PoseEvaluator:
-    """Evaluates the current pose of a scene and reads pose matrices, positions and controls."""
+    """Evaluates the current pose of a scene and reads pose matrices, positions and controls.
+
+    Attributes:
+        scene_rig, rig: the rig.
+    """
 
     def __init__(self, scene_rig: SceneRig, rig: Rig, target: Target | None = None):
         """Prepare to read a rig.
@@ -339,7 +343,7 @@ class PoseEvaluator:
         Args:
             target: the target whose positions replace those of the rig.
         """
-        self._scene_rig, self._rig, self._target = scene_rig, rig, target
+        self.scene_rig, self.rig, self._target = scene_rig, rig, target
         self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
         self._controls = ControlReader(scene_rig, rig.controls)
 
@@ -351,18 +355,18 @@ class PoseEvaluator:
             the controls, (C,) float32.
         """
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)
-        armature_object = self._scene_rig.armature_object.evaluated_get(depsgraph)
+        mesh_object = self.scene_rig.mesh_object.evaluated_get(depsgraph)
+        armature_object = self.scene_rig.armature_object.evaluated_get(depsgraph)
         if self._target is not None:
             positions = self._target.positions(depsgraph)
         else:
-            mesh_objects = self._scene_rig.mesh_objects
+            mesh_objects = self.scene_rig.mesh_objects
             positions = join_positions(
-                [mesh_io.evaluated_positions(each, depsgraph) for each in mesh_objects], self._rig.meshes
+                [mesh_io.evaluated_positions(each, depsgraph) for each in mesh_objects], self.rig.meshes
             )
-            for part, other in zip(self._rig.meshes[1:], mesh_objects[1:], strict=True):
+            for part, other in zip(self.rig.meshes[1:], mesh_objects[1:], strict=True):
                 self._check_transform(part, mesh_object, other.evaluated_get(depsgraph))
-        controls = self._controls.read(self._scene_rig, depsgraph)
+        controls = self._controls.read(self.scene_rig, depsgraph)
         return self._reader.read(mesh_object, armature_object), positions, controls
 
     def _check_transform(self, part: MeshPart, first: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
@@ -372,7 +376,7 @@ class PoseEvaluator:
             return
         corners = np.array([[*corner, 1.0] for corner in mesh_object.bound_box])
         moves = (corners @ difference.T)[:, :3]
-        if np.linalg.norm(moves, axis=1).max() > MAX_MESH_MOTION_RATIO * self._rig.size:
+        if np.linalg.norm(moves, axis=1).max() > MAX_MESH_MOTION_RATIO * self.rig.size:
             raise RigError(
                 f"The object '{mesh_object.name}' moves against '{first.name}', and meshes of one recording move "
                 f"together; record '{mesh_object.name}' by itself."
