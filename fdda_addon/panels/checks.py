@@ -70,7 +70,7 @@ def _check(mesh_object: bpy.types.Object) -> RigCheck | None:
     uid, signature = mesh_object.session_uid, _change_signature(scene_rig)
     previous = timed_values.last(_check, mesh_object)
     if previous and _changes.signatures[uid][0] == signature[0] and not _changes.has_mesh(mesh_object):
-        result = previous.recheck(scene_rig, settings)
+        result = check_recordable_rig(scene_rig, settings, previous)
     else:
         result = check_recordable_rig(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)

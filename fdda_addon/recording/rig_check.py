@@ -46,15 +46,6 @@ class RigCheck:
     extra_joints: tuple[str, ...] | None = None
     include_static_joint: bool = False
 
-    def recheck(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> "RigCheck":
-        """Check again without reading the mesh, after changes of modifiers, modes, ranges of motion and settings."""
-        return _check(scene_rig, settings, self)
-
-
-def check_recordable_rig(scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> RigCheck:
-    """Check a rig. While a model plays, the modifiers of the rig are off, so they are not checked."""
-    return _check(scene_rig, settings, None)
-
 
 def check_has_weights(scene_rig: SceneRig) -> None:
     """Check that vertices of some mesh follow deforming bones, so that there is linear skinning to learn from.
@@ -72,7 +63,17 @@ def check_has_weights(scene_rig: SceneRig) -> None:
         )
 
 
-def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: RigCheck | None) -> RigCheck:
+def check_recordable_rig(
+    scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS, previous_check: RigCheck | None = None
+) -> RigCheck:
+    """Check a rig. While a model plays, the modifiers of the rig are off, so they are not checked.
+
+    Args:
+        scene_rig: the rig.
+        settings: settings of the recording.
+        previous_check: the result of an earlier check, whose mesh is not read again: only modifiers, modes, ranges of
+            motion and settings may have changed since.
+    """
     result = RigCheck((), None, ())
     problems: list[str] = []
     stack = None
@@ -103,8 +104,7 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous_check: Rig
             rig = previous_check.rig
         else:
             rig = read_rig(scene_rig, extra_joints, include_static_joint)
-        if rig.controls != selection.controls:
-            rig = replace(rig, controls=selection.controls)
+        rig = replace(rig, controls=selection.controls)
         user_controls = listed_controls(scene_rig, settings)
         automatic_controls = tuple(control for control in selection.controls if control not in user_controls)
         result = replace(

@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import RecordingError, os_error_text
 from ..files.input_file import open_input
 from ..mathematics.skinning import are_invertible
+from ..rig import Rig
 
 NPY_HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
 """Errors that numpy raises for a damaged header of a `.npy` file, apart from ValueError."""
@@ -57,18 +58,18 @@ def array_shapes(
     }
 
 
+def rig_array_shapes(rig: Rig, poses: int) -> dict[str, tuple[tuple, type]]:
+    """Return shape and dtype of each array of a recording of a rig, by name."""
+    return array_shapes(
+        *(poses, len(rig.joints), rig.vertex_count, rig.skin_joints.shape[1]),
+        *(len(rig.face_starts), len(rig.face_vertices), len(rig.controls)),
+    )
+
+
 ARRAY_NAMES = tuple(array_shapes(1, 1, 1, 1, faces=1, corners=1, controls=1))
 """Names of all arrays of a recording."""
 STREAMED_ARRAY_NAMES = (POSE_MATRICES, POSITIONS, "controls")
 """Names of the arrays with one row per pose."""
-
-
-def streamed_arrays(
-    pose_matrices: np.ndarray, positions: np.ndarray, controls: np.ndarray | None, control_count: int
-) -> dict[str, np.ndarray]:
-    """Return the arrays with one row per pose, by name; `control_count` is the number of controls of the rig."""
-    control_arrays = {"controls": controls} if control_count else {}
-    return {POSE_MATRICES: pose_matrices, POSITIONS: positions, **control_arrays}
 
 
 def open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:

@@ -13,7 +13,7 @@ from ..errors import DiskFullError
 from ..files.output import nearest_existing_folder
 from ..rig import Rig
 from ..wording import format_count
-from .arrays import array_shapes
+from .arrays import rig_array_shapes
 
 MIN_SHOWN_BYTES = 10**6
 """Smaller sizes are shown as "less than 1 MB"."""
@@ -58,11 +58,8 @@ def format_poses(poses: int, alone_poses: int) -> str:
 
 def recording_bytes(rig: Rig, poses: int) -> int:
     """Return the size of the arrays of a recording in bytes; the size of the index is negligible."""
-    shapes = array_shapes(
-        *(poses, len(rig.joints), rig.vertex_count, rig.skin_joints.shape[1]),
-        *(len(rig.face_starts), len(rig.face_vertices), len(rig.controls)),
-    )
-    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
+    shapes = rig_array_shapes(rig, poses).values()
+    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes)
 
 
 def check_disk_space(folder: Path, size: int) -> None:

@@ -370,22 +370,17 @@ def _check_index(index: dict) -> None:
             raise ValueError(f"'{key}' is {index[key]!r}")
     if index.get("corners", 0) < MIN_CORNERS * index.get("faces", 0):
         raise ValueError(f"{index['faces']} faces cannot have {index.get('corners', 0)} corners")
-    controls = read_controls(index["controls"])
+    read_controls(index["controls"])
     for text in (index["blender"], index["rig"]["file"]):
         if not isinstance(text, str):
             raise TypeError(f"{text!r} is not a string")
-    joint_count = len(read_joints(index["joints"]))
+    read_joints(index["joints"])
     read_meshes(index["meshes"])
     read_unit(index)
-    if "target" in index:
-        RecordedTarget.from_json(index["target"])
-    if "repeatability" in index:
-        Repeatability.from_json(index["repeatability"], index["complete"])
     _check_indices(index.get("unsettled", []), "unsettled pose", index["complete"], "it")
-    alone_counts = [source.poses for source in _read_sampling(index["sampling"]).sources if source.kind == ALONE]
-    expected_counts = []
-    if "alone" in index:
-        expected_counts = [AloneMoves.from_json(index["alone"], joint_count, len(controls)).poses]
+    info = read_info(index)
+    alone_counts = [source.poses for source in info.sampling.sources if source.kind == ALONE]
+    expected_counts = [info.alone.poses] if info.alone else []
     if alone_counts != expected_counts:
         raise ValueError(f"it has {alone_counts} poses in which one input moves alone, not {expected_counts}")
 
@@ -430,20 +425,23 @@ def _read_source(value: dict) -> Source:
 
 
 def read_info(index: dict) -> RecordingInfo:
-    """Return the pose counts and the origin of a recording from its index."""
+    """Return the pose counts and the origin of a recording from its index, which may lack its `bones`.
+
+    Raises:
+        KeyError, TypeError, ValueError: the index is damaged.
+    """
+    joint_count, control_count = len(index["joints"]), len(index["controls"])
     return RecordingInfo(
         index["poses"],
         index["complete"],
         index["rig"]["file"],
         index["blender"],
         _read_sampling(index["sampling"]),
-        RecordedBones.from_json(index["bones"], len(index["joints"])),
+        RecordedBones.from_json(index["bones"], joint_count) if "bones" in index else RecordedBones(),
         RecordedTarget.from_json(index["target"]) if "target" in index else None,
         tuple(index.get("unsettled", ())),
         Repeatability.from_json(index["repeatability"], index["complete"]) if "repeatability" in index else None,
-        AloneMoves.from_json(index["alone"], len(index["joints"]), len(index["controls"]))
-        if "alone" in index
-        else None,
+        AloneMoves.from_json(index["alone"], joint_count, control_count) if "alone" in index else None,
     )
 
 

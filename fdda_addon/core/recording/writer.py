@@ -19,12 +19,13 @@ from ..rig import Rig, rest_matrices_match
 from ..unit import read_unit, unit_to_json
 from ..wording import format_count
 from .arrays import (
+    POSE_MATRICES,
+    POSITIONS,
     STREAMED_ARRAY_NAMES,
     array_header,
-    array_shapes,
     check_pose_values,
     open_array,
-    streamed_arrays,
+    rig_array_shapes,
 )
 from .folder import RECORDING_FILES, check_folder, remove_recording_files, remove_temporary_files
 from .index import (
@@ -133,12 +134,7 @@ class RecordingWriter:
             )
 
     def _open_arrays(self) -> None:
-        rig = self.rig
-        shapes = array_shapes(
-            *(self.info.poses, len(rig.joints), rig.vertex_count, rig.skin_joints.shape[1]),
-            *(len(rig.face_starts), len(rig.face_vertices), len(rig.controls)),
-        )
-        for name, (shape, dtype) in shapes.items():
+        for name, (shape, dtype) in rig_array_shapes(self.rig, self.info.poses).items():
             path = self.path / f"{name}.npy"
             if not self.complete:
                 # The path may be a symbolic link, and the file that it points to must not be overwritten.
@@ -147,11 +143,14 @@ class RecordingWriter:
                 array = getattr(self.rig, name).astype(dtype)
                 if not self.complete:
                     np.save(path, array, allow_pickle=False)
-                elif not self._matches_rig(name, open_array(path, shape, dtype), array):
-                    raise RecordingError(
-                        f"Cannot resume '{self.path}': '{path.name}' is not of this rig; remove the recording and "
-                        "record again."
-                    )
+                else:
+                    recorded = open_array(path, shape, dtype)
+                    is_matrix, rig = name == "rest_matrices", self.rig
+                    if not (rest_matrices_match(recorded, rig) if is_matrix else np.array_equal(recorded, array)):
+                        raise RecordingError(
+                            f"Cannot resume '{self.path}': '{path.name}' is not of this rig; remove the recording and "
+                            "record again."
+                        )
                 continue
             header = array_header(shape, dtype)
             row_bytes = math.prod(shape[1:]) * np.dtype(dtype).itemsize
@@ -169,19 +168,15 @@ class RecordingWriter:
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, end_offset)
 
-    def _matches_rig(self, name: str, recorded: np.ndarray, array: np.ndarray) -> bool:
-        """Return whether a recorded array without a row per pose equals the array of the rig."""
-        return rest_matrices_match(recorded, self.rig) if name == "rest_matrices" else np.array_equal(recorded, array)
-
     def _index(self) -> dict:
-        info = self.info
+        info, face_count = self.info, len(self.rig.face_starts)
         return {
             "format": FORMAT,
             "version": VERSION,
             "poses": info.poses,
             "complete": self.complete,
             "influences": int(self.rig.skin_joints.shape[1]),
-            **self._face_counts(),
+            **({"faces": face_count, "corners": len(self.rig.face_vertices)} if face_count else {}),
             "units": {"length": "m", "angle": "rad"},
             **unit_to_json(self.rig.metres_per_unit),
             "blender": info.blender,
@@ -197,10 +192,6 @@ class RecordingWriter:
             # Converted to JSON text and back, so that it equals the value that is read from a file.
             "sampling": json.loads(json.dumps(info.sampling.to_json())),
         }
-
-    def _face_counts(self) -> dict[str, int]:
-        faces, corners = len(self.rig.face_starts), len(self.rig.face_vertices)
-        return {"faces": faces, "corners": corners} if faces else {}
 
     def _write_index(self) -> None:
         """Write the index; raise OSError, which `_write_error` converts."""
@@ -225,7 +216,9 @@ class RecordingWriter:
             OutputError: the disk is full or was disconnected; earlier poses stay complete.
             RecordingError: a value is not finite.
         """
-        arrays = streamed_arrays(pose_matrices, positions, controls, len(self.rig.controls))
+        arrays = {POSE_MATRICES: pose_matrices, POSITIONS: positions}
+        if self.rig.controls:
+            arrays["controls"] = controls
         check_pose_values(arrays, self.complete, self.rig.joint_names, self.info.alone_poses)
         previous_counts = self.complete, self.unsettled
         try:
