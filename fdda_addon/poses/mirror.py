@@ -50,7 +50,44 @@ class Mirror:
         self._partner_indices = np.array(
             [indices.get(flipped_name(name), index) for name, index in indices.items()], int
         )
-        _check_symmetric(armature_object, self._partner_indices)
+        # Check that each bone is the mirror image of its partner, given by (B,) int indices.
+        partner_indices = self._partner_indices
+        bones = armature_object.data.bones
+        matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
+        tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)
+        reflection = np.diag([-1.0, 1.0, 1.0, 1.0])
+        mirror_images = reflection @ matrices[partner_indices] @ reflection
+        bone_ends = np.concatenate([matrices[:, :3, 3], tails])
+        metres_per_armature_unit = metres_per_unit(armature_object)
+        size = metres_per_armature_unit * float(np.ptp(bone_ends, axis=0).max())
+        tolerance = max(MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE * size)
+        distances = metres_per_armature_unit * np.maximum(
+            np.linalg.norm(mirror_images[:, :3, 3] - matrices[:, :3, 3], axis=1),
+            np.linalg.norm(tails[partner_indices] * [-1, 1, 1] - tails, axis=1),
+        )
+        axis_distances = np.linalg.norm(mirror_images[:, :3, :3] - matrices[:, :3, :3], axis=1).max(axis=1)
+        for index, bone in enumerate(bones):
+            partner = bones[int(partner_indices[index])]
+            if distances[index] > tolerance:
+                difference = f"by {distances[index] * 1000:.1f} mm"
+            elif axis_distances[index] > AXIS_TOLERANCE:
+                angle = np.degrees(2 * np.arcsin(min(1.0, axis_distances[index] / 2)))
+                difference = f"in roll or direction, by {angle:.1f}°"
+            elif (
+                armature_object.pose.bones[bone.name].rotation_mode
+                != armature_object.pose.bones[partner.name].rotation_mode
+            ):
+                difference = "in rotation mode"
+            else:
+                continue
+            name, expected_partner_name = bone.name, flipped_name(bone.name)
+            if partner != bone:
+                problem = f"the bones '{name}' and '{partner.name}' differ {difference}; symmetrize the armature"
+            elif expected_partner_name != name:
+                problem = f"there is no bone '{expected_partner_name}' for '{name}'; add it"
+            else:
+                problem = f"the bone '{name}' differs from its mirror image {difference}; bring it into the middle"
+            raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
         paths = {(armature_object, path) for path in _custom_property_paths(armature_object)} | set(animated_numbers)
         self._mirrored_paths = [
             (datablock, path, flipped_path)
@@ -87,46 +124,6 @@ class Mirror:
         for datablock in {datablock for datablock, _ in values} | {self._armature_object}:
             # Custom properties do not tag their datablock.
             datablock.update_tag()
-
-
-def _check_symmetric(armature_object: bpy.types.Object, partner_indices: np.ndarray) -> None:
-    """Check that each bone is the mirror image of its partner, given by (B,) int indices."""
-    bones = armature_object.data.bones
-    matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
-    tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)
-    reflection = np.diag([-1.0, 1.0, 1.0, 1.0])
-    mirror_images = reflection @ matrices[partner_indices] @ reflection
-    bone_ends = np.concatenate([matrices[:, :3, 3], tails])
-    metres_per_armature_unit = metres_per_unit(armature_object)
-    size = metres_per_armature_unit * float(np.ptp(bone_ends, axis=0).max())
-    tolerance = max(MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE * size)
-    distances = metres_per_armature_unit * np.maximum(
-        np.linalg.norm(mirror_images[:, :3, 3] - matrices[:, :3, 3], axis=1),
-        np.linalg.norm(tails[partner_indices] * [-1, 1, 1] - tails, axis=1),
-    )
-    axis_distances = np.linalg.norm(mirror_images[:, :3, :3] - matrices[:, :3, :3], axis=1).max(axis=1)
-    for index, bone in enumerate(bones):
-        partner = bones[int(partner_indices[index])]
-        if distances[index] > tolerance:
-            difference = f"by {distances[index] * 1000:.1f} mm"
-        elif axis_distances[index] > AXIS_TOLERANCE:
-            angle = np.degrees(2 * np.arcsin(min(1.0, axis_distances[index] / 2)))
-            difference = f"in roll or direction, by {angle:.1f}°"
-        elif (
-            armature_object.pose.bones[bone.name].rotation_mode
-            != armature_object.pose.bones[partner.name].rotation_mode
-        ):
-            difference = "in rotation mode"
-        else:
-            continue
-        name, expected_partner_name = bone.name, flipped_name(bone.name)
-        if partner != bone:
-            problem = f"the bones '{name}' and '{partner.name}' differ {difference}; symmetrize the armature"
-        elif expected_partner_name != name:
-            problem = f"there is no bone '{expected_partner_name}' for '{name}'; add it"
-        else:
-            problem = f"the bone '{name}' differs from its mirror image {difference}; bring it into the middle"
-        raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
 
 
 def _custom_property_paths(armature_object: bpy.types.Object) -> list[str]:

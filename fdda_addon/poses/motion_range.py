@@ -96,13 +96,18 @@ def scale_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
 
 def _two_sided_limits(constraint: bpy.types.Constraint | None) -> dict[int, tuple[float, float]]:
     """Return the limits of the axes that a constraint limits on both sides; empty without a constraint."""
-    if constraint is None:
-        return {}
-    return {
-        axis: (getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}"))
-        for axis, letter in enumerate(AXES)
-        if getattr(constraint, f"use_min_{letter}") and getattr(constraint, f"use_max_{letter}")
-    }
+    limits = {axis: axis_limits(constraint, axis) for axis in range(3)} if constraint is not None else {}
+    return {axis: bounds for axis, bounds in limits.items() if np.isfinite(bounds).all()}
+
+
+def axis_limits(constraint: bpy.types.Constraint, axis: int) -> tuple[float, float]:
+    """Return the lower and the upper limit that a Limit constraint sets on an axis; infinite where it has none."""
+    letter = AXES[axis]
+    # Limit Rotation has one switch for both sides of an axis.
+    switches = (f"use_limit_{letter}",) * 2 if hasattr(constraint, f"use_limit_{letter}") else ()
+    low_switch, high_switch = switches or (f"use_min_{letter}", f"use_max_{letter}")
+    low = getattr(constraint, f"min_{letter}") if getattr(constraint, low_switch) else -np.inf
+    return low, getattr(constraint, f"max_{letter}") if getattr(constraint, high_switch) else np.inf
 
 
 def find_local_limit(bone: bpy.types.PoseBone, constraint_type: str) -> bpy.types.Constraint | None:
@@ -204,18 +209,15 @@ def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float
 
 def enforced_range(bone: bpy.types.PoseBone, constraint_type: str, axis: int) -> tuple[float, float]:
     """Return the range that Limit constraints in local space enforce on an axis; infinite without such a constraint."""
-    low, high, letter = -float("inf"), float("inf"), AXES[axis]
-    for constraint in bone.constraints:
-        if constraint.type != constraint_type or constraint.owner_space != "LOCAL":
-            continue
-        if constraint.mute or not constraint.influence:
-            continue
-        use_limit_name = f"use_limit_{letter}"
-        if getattr(constraint, use_limit_name if hasattr(constraint, use_limit_name) else f"use_min_{letter}"):
-            low = max(low, getattr(constraint, f"min_{letter}"))
-        if getattr(constraint, use_limit_name if hasattr(constraint, use_limit_name) else f"use_max_{letter}"):
-            high = min(high, getattr(constraint, f"max_{letter}"))
-    return low, high
+    limits = [
+        axis_limits(constraint, axis)
+        for constraint in bone.constraints
+        if constraint.type == constraint_type
+        and constraint.owner_space == "LOCAL"
+        and not constraint.mute
+        and constraint.influence
+    ]
+    return max([low for low, _ in limits], default=-np.inf), min([high for _, high in limits], default=np.inf)
 
 
 LIMIT_CONSTRAINTS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
@@ -260,13 +262,9 @@ class SuspendedLimits:
         for index, channel in enumerate(channels):
             if channel.kind in LIMIT_CONSTRAINT_TYPES:
                 channel_indices.setdefault((channel.name, LIMIT_CONSTRAINT_TYPES[channel.kind]), []).append(index)
-        self._limits = [
-            (
-                constraint,
-                limited_channels,
-                *_limits_of_axes(constraint, [channels[index].axis for index in limited_channels]),
-            )
-            for (name, constraint_type), limited_channels in channel_indices.items()
+        self._limits: list[tuple[bpy.types.Constraint, list[int], np.ndarray]] = [
+            (constraint, indices, np.array([axis_limits(constraint, channels[index].axis) for index in indices]))
+            for (name, constraint_type), indices in channel_indices.items()
             for constraint in armature_object.pose.bones[name].constraints
             if constraint.type == constraint_type
             and constraint.owner_space == "LOCAL"
@@ -276,9 +274,8 @@ class SuspendedLimits:
 
     def suspend(self, values: np.ndarray) -> None:
         """Mute the constraints that the (C,) channel values exceed, and unmute the others."""
-        for constraint, limited_channels, low, high in self._limits:
-            limited_values = values[limited_channels]
-            is_exceeded = bool(((limited_values < low) | (limited_values > high)).any())
+        for constraint, indices, limits in self._limits:
+            is_exceeded = bool(((values[indices] < limits[:, 0]) | (values[indices] > limits[:, 1])).any())
             if constraint.mute != is_exceeded:
                 constraint.mute = is_exceeded
 
@@ -288,20 +285,3 @@ class SuspendedLimits:
     def __exit__(self, *_: object) -> None:
         for constraint, *_ in self._limits:
             constraint.mute = False
-
-
-def _limits_of_axes(constraint: bpy.types.Constraint, axes: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper limits of a constraint for n axes, (n,) each; infinite where it has none."""
-    bounds = []
-    for side, infinite_value in (("min", -np.inf), ("max", np.inf)):
-        limits = []
-        for letter in (AXES[axis] for axis in axes):
-            # Limit Rotation has one switch for both sides of an axis.
-            switch_name = (
-                f"use_limit_{letter}" if hasattr(constraint, f"use_limit_{letter}") else f"use_{side}_{letter}"
-            )
-            limits.append(
-                getattr(constraint, f"{side}_{letter}") if getattr(constraint, switch_name) else infinite_value
-            )
-        bounds.append(np.array(limits))
-    return bounds[0], bounds[1]

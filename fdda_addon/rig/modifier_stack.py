@@ -429,19 +429,12 @@ def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
 
 
 @contextmanager
-def downstream_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Switch the downstream modifiers off, so that the evaluated mesh has the vertices of the original one."""
+def downstream_disabled(mesh_object: bpy.types.Object, *, checks_vertices: bool = True) -> Iterator[None]:
+    """Switch the downstream modifiers off, and check that the evaluated mesh has the vertices of the original one."""
     stack = read_stack(mesh_object)
     with _modifiers_disabled(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
-        _check_vertex_count(mesh_object, stack)
-        yield
-
-
-@contextmanager
-def downstream_disabled_unchecked(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Switch the downstream modifiers off, without checking the number of vertices."""
-    stack = read_stack(mesh_object)
-    with _modifiers_disabled(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
+        if checks_vertices:
+            _check_vertex_count(mesh_object, stack)
         yield
 
 

@@ -23,7 +23,7 @@ from ..scene.node_groups import SIMULATION_NODES, find_time_node
 from ..scene.scene_rig import SceneRig, is_flat
 from ..scene.stored_paths import resolve_path
 from ..scene.temporary_state import temporary_attributes
-from .modifier_stack import TIME_DEPENDENT_TYPES, downstream_disabled_unchecked, is_playback_modifier
+from .modifier_stack import TIME_DEPENDENT_TYPES, downstream_disabled, is_playback_modifier
 from .sources import Sources
 from .time_inputs import control_keys, time_inputs
 
@@ -247,7 +247,7 @@ class Target:
     @contextmanager
     def prepared(self) -> Iterator[None]:
         """Switch the downstream modifiers of the target off, such as a subdivision, and restore them afterwards."""
-        with downstream_disabled_unchecked(self.target_object):
+        with downstream_disabled(self.target_object, checks_vertices=False):
             yield
 
 
