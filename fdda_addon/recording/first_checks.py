@@ -2,7 +2,7 @@
 """Checks of a rig before its first pose is recorded: cuts, controls, the target, and what changes with the frame."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 
 import bpy
@@ -95,9 +95,15 @@ def check_follows_pose(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPla
 
     Returns:
         The mean time of an evaluation, seconds.
+
+    Raises:
+        RigError: the surface changes between frames, and pose matrices and controls do not.
     """
     scene, start_time, evaluation_count = bpy.context.scene, time.perf_counter(), 0
-    frame, subframe = scene.frame_current, scene.frame_subframe
+    frame, subframe, rig = scene.frame_current, scene.frame_subframe, evaluator.rig
+    places = rig.rest_positions.ravel(), evaluator.scene_rig.mesh_object.matrix_world.translation
+    extent = float(np.abs(np.concatenate(places)).max())
+    max_distance = max(INFLUENCE_TOLERANCE * rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent)
     other_frames = {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end} - {frame}
     try:
         for pose_index in {plan.total // 3, plan.total - 1}:
@@ -109,33 +115,24 @@ def check_follows_pose(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPla
                     evaluation = evaluator.evaluate()
                     evaluation_count += 1
                     first_evaluation = first_evaluation or evaluation
-                    _compare_surfaces(evaluator, (frame, checked_frame), first_evaluation, evaluation)
+                    tolerances = {"rtol": POSE_TOLERANCE, "atol": POSE_TOLERANCE}
+                    if not all(np.allclose(first_evaluation[i], evaluation[i], **tolerances) for i in (0, 2)):
+                        continue
+                    distances = np.linalg.norm(first_evaluation[1] - evaluation[1], axis=1)
+                    if distances.max() > max_distance:
+                        slices = zip(evaluator.scene_rig.mesh_objects, rig.mesh_slices, strict=True)
+                        name = next(o.name for o, part in slices if distances.argmax() < part.stop)
+                        raise RigError(
+                            f"The surface of '{name}' differs by {distances.max() * rig.metres_per_unit * 1000:.2g} mm "
+                            f"between frames {frame} and {checked_frame} in the same pose, so it does not follow from "
+                            "the pose; find the keys, drivers, Geometry Nodes or constraint targets that depend on the "
+                            "frame, and make them controls or switch them off."
+                        )
     finally:
         player.stop()
         player.reset_pose()
         scene.frame_set(frame, subframe=subframe)
     return (time.perf_counter() - start_time) / evaluation_count
-
-
-def _compare_surfaces(
-    evaluator: PoseEvaluator, frames: tuple[int, int], first: Sequence[np.ndarray], other: Sequence[np.ndarray]
-) -> None:
-    """Raise a RigError if the positions of two evaluations differ, and pose matrices and controls do not."""
-    if not all(np.allclose(first[index], other[index], rtol=POSE_TOLERANCE, atol=POSE_TOLERANCE) for index in (0, 2)):
-        return
-    differences, rig = np.linalg.norm(first[1] - other[1], axis=1), evaluator.rig
-    largest_difference = float(differences.max())
-    mesh_object = evaluator.scene_rig.mesh_object
-    extent = max(float(np.abs(rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
-    if largest_difference > max(INFLUENCE_TOLERANCE * rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
-        slices = zip(evaluator.scene_rig.mesh_objects, rig.mesh_slices, strict=True)
-        name = next(o.name for o, part in slices if differences.argmax() < part.stop)
-        raise RigError(
-            f"The surface of '{name}' differs by "
-            f"{largest_difference * rig.metres_per_unit * 1000:.2g} mm between frames {frames[0]} and {frames[1]} in "
-            "the same pose, so it does not follow from the pose; find the keys, drivers, Geometry Nodes or constraint "
-            "targets that depend on the frame, and make them controls or switch them off."
-        )
 
 
 def check_seams(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> str:

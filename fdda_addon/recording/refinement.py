@@ -18,7 +18,7 @@ from ..core.progress import Progress
 from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
 from ..core.recording.writer import RecordingExtension
-from ..core.rig import Rig, rig_differences
+from ..core.rig import rig_differences
 from ..core.settings import REFINEMENT_POSES, SPREAD
 from ..poses.sampling import model_channels, rig_allows_ranges
 from ..rig.modifier_stack import check_evaluable
@@ -70,7 +70,12 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     Yields:
         Progress of the stages "probes" and "poses".
     """
-    recording, stacks = _read_rig_recording(path), []
+    recording, stacks = read_recording(path), []
+    if recording.info.target:
+        raise RecordingError(
+            f"The recording '{path}' is of the target '{recording.info.target.object_name}', and poses are added of "
+            "rigs alone; record more poses of the target into another folder."
+        )
     for _, part in scene_rig.parts:
         check_full_rig(part.mesh_object)
         stacks.append(check_evaluable(part))
@@ -87,10 +92,11 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     recorded_count = len(recording.pose_matrices) - added_count
     with temporary_rig_state(scene_rig, rig, channels), set_keys_undriven(scene_rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
+        first_probe = PROBE_INDEX + recorded_count
         probe_poses = np.stack(
             [
-                _draw_probe_pose(channels, settings.seed, PROBE_INDEX + recorded_count + i)
-                for i in range(max(MIN_PROBES, settings.poses))
+                sample_pose(channels, settings.seed, index, WIDE_SPREAD if index % 2 else SPREAD.default)
+                for index in range(first_probe, first_probe + max(MIN_PROBES, settings.poses))
             ]
         )
         partitions = network.info.partitions_of(opened.linear_rig)
@@ -119,9 +125,12 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
             [sample_pose(channels, settings.seed, BASE_INDEX + recorded_count + i) for i in range(settings.poses)]
         )
         rng = np.random.default_rng([settings.seed, recorded_count])
-        chosen_poses = choose_poses(
-            probes, channels, _channels_by_partition(rig, partitions, channels), base_poses, rng
-        )
+        input_names = np.array([*rig.joint_names, *(control.name for control in rig.controls)])
+        joint_count = len(rig.joints)
+        inputs = [[*p.influencing, *(joint_count + control for control in p.controls)] for p in partitions]
+        channel_names = [channel.name for channel in channels]
+        influencing_channels = [np.flatnonzero(np.isin(channel_names, input_names[indices])) for indices in inputs]
+        chosen_poses = choose_poses(probes, channels, influencing_channels, base_poses, rng)
         recorded_evaluator = PoseEvaluator(scene_rig, recording.rig)
         with (
             RecordingExtension(recording, settings.poses - added_count, model.name, added_count) as extension,
@@ -131,16 +140,6 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
                 poser.set(pose)
                 appender.append_current_pose()
                 yield Progress("poses", appender.pose_count - recorded_count, settings.poses)
-
-
-def _read_rig_recording(path: Path) -> Recording:
-    recording = read_recording(path)
-    if recording.info.target:
-        raise RecordingError(
-            f"The recording '{path}' is of the target '{recording.info.target.object_name}', and poses are added of "
-            "rigs alone; record more poses of the target into another folder."
-        )
-    return recording
 
 
 def _evaluate_probes(
@@ -165,10 +164,6 @@ def _evaluate_probes(
         partition_errors.append([errors[partition.vertices].max() for partition in partitions])
         yield Progress("probes", index + 1, len(poses))
     return np.stack(pose_matrices), np.array(partition_errors)
-
-
-def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
-    return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else SPREAD.default)
 
 
 def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[Channel, ...]) -> None:
@@ -204,18 +199,3 @@ def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> in
         f"Cannot resume: '{model}' was trained on {info.trained_poses} poses, and the other "
         f"{added_count} of '{recording.path}' were not chosen for it; refine without --resume, or with the last model."
     )
-
-
-def _channels_by_partition(
-    rig: Rig, partitions: Sequence[Partition], channels: tuple[Channel, ...]
-) -> list[np.ndarray]:
-    """Return the indices of the channels that influence each partition."""
-    names, controls = rig.joint_names, rig.controls
-    influencing_names = [
-        {names[joint] for joint in partition.influencing} | {controls[control].name for control in partition.controls}
-        for partition in partitions
-    ]
-    return [
-        np.array([index for index, channel in enumerate(channels) if channel.name in names_of_partition], int)
-        for names_of_partition in influencing_names
-    ]

@@ -9,7 +9,7 @@ from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.joint_option import AUTO
 from fdda_addon.core.mathematics.partition import joints_with_weight, make_partitions
 from fdda_addon.core.mathematics.skinning import are_invertible, skin_matrices
-from fdda_addon.core.rig import STATIC_JOINT, Rig
+from fdda_addon.core.rig import STATIC_JOINT
 
 from .fit_poses import FitPoses
 from .key_joints import LENGTH_RATIO, TOLERANCE_RATIO, InputBlocks, KeyJoints, KeyJointSearch, joint_moments
@@ -74,13 +74,17 @@ def _measure_vertices(poses: FitPoses) -> tuple[np.ndarray, np.ndarray]:
     rig, joint_count = poses.rig, len(poses.rig.joints)
     patches = [patch for partition in make_partitions(rig) for patch in _cut(rig.rest_positions, partition.vertices)]
     representatives = np.array([patch[0] for patch in patches])
-    fitted_joints, fitted_weights = _fit_vertices(poses.subset(slice(0, None, 2)), representatives)
+    fitted_joints, fitted_weights = fit_skin(poses.subset(slice(0, None, 2)).of_vertices(representatives), "smooth")
     moments = joint_moments(rig.rest_positions, rig.skin_joints, rig.skin_weights, joint_count)
     fitted_moments = joint_moments(rig.rest_positions[representatives], fitted_joints, fitted_weights, joint_count)
     # The last element is the mean square weight.
     moments = np.where((moments[:, 3, 3] >= fitted_moments[:, 3, 3])[:, None, None], moments, fitted_moments)
     without_vertices = poses.is_dependency & (np.trace(moments, axis1=1, axis2=2) == 0)
-    moments[without_vertices] = _moments_at_heads(rig)[without_vertices]
+    # Take points around the heads of joints that move the mesh without weights.
+    offsets = LENGTH_RATIO * rig.size * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
+    points = rig.rest_matrices[without_vertices][:, None, :3, 3] + offsets
+    points = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
+    moments[without_vertices] = np.einsum("jpa,jpb->jab", points, points) / len(offsets)
     acts = joints_with_weight(rig.skin_joints, rig.skin_weights, joint_count)
     fitted_acts = joints_with_weight(fitted_joints, fitted_weights, joint_count)
     acts[np.concatenate(patches)] |= np.repeat(fitted_acts, [len(patch) for patch in patches], axis=0)
@@ -95,16 +99,3 @@ def _cut(rest_positions: np.ndarray, vertices: np.ndarray) -> list[np.ndarray]:
     ordered = vertices[np.argsort(rest_positions[vertices, axis], kind="stable")]
     halves = ordered[: len(ordered) // 2], ordered[len(ordered) // 2 :]
     return [patch for half in halves for patch in _cut(rest_positions, half)]
-
-
-def _fit_vertices(poses: FitPoses, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the weights of (n,) vertices to poses; returns (n, 4) joints and (n, 4) weights."""
-    return fit_skin(poses.of_vertices(vertices), "smooth")
-
-
-def _moments_at_heads(rig: Rig) -> np.ndarray:
-    """Return (J, 4, 4) moments of points around the heads of joints, for joints that move the mesh without weights."""
-    offsets = LENGTH_RATIO * rig.size * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
-    points = rig.rest_matrices[:, None, :3, 3] + offsets
-    points = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=2)
-    return np.einsum("jpa,jpb->jab", points, points) / len(offsets)

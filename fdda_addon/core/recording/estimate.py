@@ -2,7 +2,6 @@
 """Estimates of the disk space and the time that a recording needs, and a check of the free disk space."""
 
 import math
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,21 +72,16 @@ def check_disk_space(folder: Path, size: int) -> None:
         DiskFullError: the disk has too little free space.
         OutputError: the folder has no existing parent.
     """
-    needed_bytes = size - min(size, _used_bytes(folder))
+    # The length of a sparse file is larger than the space that it occupies.
+    stats = [path.stat() for path in folder.glob("*.npy")]
+    used_bytes = sum(getattr(stat, "st_blocks", -(-stat.st_size // 512)) * 512 for stat in stats)
+    needed_bytes = size - min(size, used_bytes)
     free_bytes = shutil.disk_usage(nearest_existing_folder(folder)).free
     if needed_bytes > free_bytes:
         raise DiskFullError(
             f"Cannot write the recording '{folder}': it takes {format_size(needed_bytes)} and the disk has "
             f"{format_size(free_bytes)} left; make room, record fewer poses, or choose another folder."
         )
-
-
-def _used_bytes(folder: Path) -> int:
-    """Return the number of bytes that a recording occupies on the disk, less than the length of its sparse files."""
-    if not os.path.isdir(folder):
-        return 0
-    stats = [path.stat() for path in folder.glob("*.npy")]
-    return sum(getattr(stat, "st_blocks", -(-stat.st_size // 512)) * 512 for stat in stats)
 
 
 def format_size(size: int) -> str:

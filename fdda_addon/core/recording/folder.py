@@ -189,7 +189,10 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None) -> FolderC
             f"'{path.name}' holds a recording of another rig: {'; '.join(rig_clauses)}. Choose another "
             "folder, or remove it.",
         )
-    different_keys = find_different_keys(_planned_sampling(index["sampling"]), sampling) if sampling is not None else []
+    # Some poses do not follow from the settings alone.
+    sources = [source for source in index["sampling"]["sources"] if source["kind"] not in (ALONE, REFINED)]
+    planned = index["sampling"] | {"sources": sources}
+    different_keys = find_different_keys(planned, sampling) if sampling is not None else []
     setting_names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in different_keys}))
     if pose_counts[0] == pose_counts[1]:
         sentence = f"It was recorded with other settings than those above: {setting_names}." if different_keys else ""
@@ -213,12 +216,6 @@ def recordings_in(folder: Path) -> list[Path]:
     if os.path.exists(folder / INDEX_NAME) or not os.path.isdir(folder):
         return []
     return sorted(path for path in folder.iterdir() if os.path.isfile(path / INDEX_NAME))
-
-
-def _planned_sampling(sampling: dict) -> dict:
-    """Return the JSON of a sampling without the poses that do not follow from the settings alone."""
-    sources = [source for source in sampling["sources"] if source["kind"] not in (ALONE, REFINED)]
-    return {**sampling, "sources": sources}
 
 
 def remove_recording(path: Path) -> None:
