@@ -128,24 +128,6 @@ def bones_without_location_range(
     ]
 
 
-def properties_without_range(
-    armature_object: bpy.types.Object, names: Iterable[str], controls: Iterable[Control]
-) -> list[tuple[str, str]]:
-    """Return the custom properties of control bones that are no controls, because they have no range.
-
-    Returns:
-        The names of bone and property of each, sorted.
-    """
-    paths = {control.path for control in controls}
-    bone_paths = [(name, armature_object.pose.bones[name].path_from_id()) for name in sorted(names)]
-    return [
-        (name, bpy.utils.unescape_identifier(property_path.removeprefix(path)[2:-2]))
-        for name, path in bone_paths
-        for property_path in sorted(custom_properties(armature_object, path))
-        if property_path not in paths
-    ]
-
-
 def describe_control_bones(
     armature_object: bpy.types.Object, names: Iterable[str], controls: tuple[Control, ...]
 ) -> str:
@@ -166,7 +148,14 @@ def describe_control_bones(
             f" The location of '{unlimited[0]}'{others} has no range, so random poses do not move it; lock it, give it "
             "a Limit Location, or record an action that moves it."
         )
-    if properties := properties_without_range(armature_object, names, controls):
+    paths = {control.path for control in controls}
+    bone_paths = [(name, armature_object.pose.bones[name].path_from_id()) for name in sorted(names)]
+    if properties := [
+        (name, bpy.utils.unescape_identifier(property_path.removeprefix(path)[2:-2]))
+        for name, path in bone_paths
+        for property_path in sorted(custom_properties(armature_object, path))
+        if property_path not in paths
+    ]:
         bone_name, property_name = properties[0]
         others = f" and {len(properties) - 1} more" if len(properties) > 1 else ""
         sentence += (

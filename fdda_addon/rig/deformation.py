@@ -65,7 +65,17 @@ def read_deformation(scene_rig: SceneRig) -> dict:
 def read_modifiers_and_drivers(scene_rig: SceneRig) -> dict:
     """Read the modifiers that deform the mesh of a rig, and digests of the drivers, as JSON values."""
     modifiers = [_read_modifier(scene_rig, modifier) for modifier in recorded_modifiers(scene_rig.mesh_object)]
-    return {"modifiers": modifiers, "drivers": read_drivers(scene_rig)}
+    # A model reads the values of shape keys, so whatever drives these may change.
+    mesh_object, drivers = scene_rig.mesh_object, {}
+    for owner in (mesh_object, mesh_object.data, mesh_object.data.shape_keys):
+        for curve in owner.animation_data.drivers if owner is not None and owner.animation_data else ():
+            is_rig = owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path)
+            if is_rig and not curve.mute and not is_shape_key_value(mesh_object, owner, curve.data_path):
+                name = (
+                    f"{owner_name(scene_rig, owner) or 'mesh'}/{versionless_path(curve.data_path)}[{curve.array_index}]"
+                )
+                drivers[name] = Fingerprint.digest_text(json.dumps(read_driver(scene_rig, curve)))
+    return {"modifiers": modifiers, "drivers": drivers}
 
 
 def read_b_bones(armature: bpy.types.Armature) -> dict:
@@ -162,23 +172,6 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
             settings["value"] = float(block == mesh_object.active_shape_key)
         shape_keys[block.name] = settings | {"shape": Fingerprint.digest(positions)}
     return shape_keys
-
-
-def read_drivers(scene_rig: SceneRig) -> dict[str, str]:
-    """Read digests of the drivers of the mesh, its shape keys and its modifiers that are not muted, by OWNER/PATH.
-
-    A model reads the values of shape keys, so whatever drives these may change.
-    """
-    mesh_object, drivers = scene_rig.mesh_object, {}
-    for owner in (mesh_object, mesh_object.data, mesh_object.data.shape_keys):
-        for curve in owner.animation_data.drivers if owner is not None and owner.animation_data else ():
-            is_rig = owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path)
-            if is_rig and not curve.mute and not is_shape_key_value(mesh_object, owner, curve.data_path):
-                name = (
-                    f"{owner_name(scene_rig, owner) or 'mesh'}/{versionless_path(curve.data_path)}[{curve.array_index}]"
-                )
-                drivers[name] = Fingerprint.digest_text(json.dumps(read_driver(scene_rig, curve)))
-    return drivers
 
 
 def _is_rig_modifier_path(mesh_object: bpy.types.Object, path: str) -> bool:

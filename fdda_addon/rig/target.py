@@ -48,16 +48,6 @@ class Cache:
     owner: "bpy.types.PointCache | bpy.types.Scene | None" = None
 
 
-def read_caches(
-    scene_rig: SceneRig, target_object: bpy.types.Object, controls: Iterable[Control] = ()
-) -> tuple[Cache, ...]:
-    """Find the simulations and caches of a target and of everything that it depends on, except the rig and controls."""
-    sources = Sources(scene_rig, target_object, [modifier.name for modifier in target_object.modifiers])
-    inputs = time_inputs(sources, control_keys(scene_rig, controls))
-    caches = [cache for scene_object in sources.objects for cache in _object_caches(scene_object)]
-    return tuple(dict.fromkeys([*caches, *(Cache(time_input.description) for time_input in inputs)]))
-
-
 def _object_caches(scene_object: bpy.types.Object) -> Iterator[Cache]:
     object_name = scene_object.name
     for modifier in scene_object.modifiers:
@@ -281,7 +271,14 @@ def find_target(scene_rig: SceneRig, name: str, controls: Iterable[Control] = ()
         raise RigError(f"The target '{name}' is in edit mode; leave it first.")
     if is_flat(target_object):
         raise RigError(f"The target '{name}' has a scale of zero; give it another.")
-    target = Target(scene_rig, target_object, read_caches(scene_rig, target_object, controls))
+    sources = Sources(scene_rig, target_object, [modifier.name for modifier in target_object.modifiers])
+    inputs = time_inputs(sources, control_keys(scene_rig, controls))
+    caches = [cache for scene_object in sources.objects for cache in _object_caches(scene_object)]
+    target = Target(
+        scene_rig,
+        target_object,
+        tuple(dict.fromkeys([*caches, *(Cache(time_input.description) for time_input in inputs)])),
+    )
     if not target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).is_evaluated:
         raise RigError(f"The target '{name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
     with target.prepared():

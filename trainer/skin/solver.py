@@ -150,20 +150,17 @@ class _Block:
                 np.argsort(-weights, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES], axis=1
             )
             candidates, weights = (np.take_along_axis(array, slot_order, axis=1) for array in (candidates, weights))
-            candidates = np.concatenate([candidates, self._steepest_joints(candidates, weights)], axis=1)
+            dense_weights = np.zeros((len(candidates), solver.joint_count))
+            np.put_along_axis(dense_weights, candidates, weights, axis=1)
+            combined = (dense_weights[:, :, None] * self.rest[:, None]).reshape(len(dense_weights), -1).T
+            slopes = self._project_to_joints(solver.gram @ combined - self.moments)
+            np.put_along_axis(slopes, candidates, np.inf, axis=1)
+            new_count = solver.joint_count - candidates.shape[1]
+            # Add the joints where adding weight lowers the error fastest.
+            steepest = np.argsort(slopes, axis=1, kind="stable")
+            candidates = np.concatenate([candidates, steepest[:, : min(ADDED_CANDIDATES, new_count)]], axis=1)
             weights, squared_errors = self._solve(candidates)
         return _pad_influences(*self._prune(candidates, weights, squared_errors), solver.influences)
-
-    def _steepest_joints(self, candidates: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return (B, n) further joints: those where adding weight lowers the error fastest."""
-        dense_weights = np.zeros((len(candidates), self._solver.joint_count))
-        np.put_along_axis(dense_weights, candidates, weights, axis=1)
-        combined = (dense_weights[:, :, None] * self.rest[:, None]).reshape(len(dense_weights), -1).T
-        slopes = self._project_to_joints(self._solver.gram @ combined - self.moments)
-        np.put_along_axis(slopes, candidates, np.inf, axis=1)
-        return np.argsort(slopes, axis=1, kind="stable")[
-            :, : min(ADDED_CANDIDATES, self._solver.joint_count - candidates.shape[1])
-        ]
 
     def _prune(
         self, candidates: np.ndarray, weights: np.ndarray, squared_errors: np.ndarray
@@ -217,7 +214,10 @@ class _Block:
         vertices = np.arange(len(candidates)) if vertices is None else vertices
         errors = self._errors(candidates[vertices], vertices)
         is_usable = np.ones(errors.shape[:2], bool) if is_allowed is None else is_allowed
-        is_usable = is_usable & ~_repeated_candidates(errors, self._solver.tie_squared_error)
+        # Leave out candidates that move the vertex as an earlier candidate does.
+        diagonal = np.einsum("vjj->vj", errors)
+        squared_distances = diagonal[:, :, None] + diagonal[:, None] - 2 * errors
+        is_usable = is_usable & ~(np.tril(squared_distances <= self._solver.tie_squared_error, -1)).any(axis=2)
         weights = simplex_weights(errors, is_usable, self._solver.tie_squared_error)
         return weights, np.maximum(np.einsum("vj,vjk,vk->v", weights, errors, weights), 0)
 
@@ -236,13 +236,6 @@ class _Block:
             - joint_moments[:, None]
             + self.recorded_squares[vertices, None, None]
         )
-
-
-def _repeated_candidates(errors: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return (B, C) bool, which candidates move the vertex as an earlier candidate does, within a squared distance."""
-    diagonal = np.einsum("vjj->vj", errors)
-    squared_distances = diagonal[:, :, None] + diagonal[:, None] - 2 * errors
-    return (np.tril(squared_distances <= tolerance, -1)).any(axis=2)
 
 
 def simplex_weights(errors: np.ndarray, is_usable: np.ndarray, ridge: float) -> np.ndarray:

@@ -396,23 +396,6 @@ def _check_indices(values: list, noun: str, count: int, owner: str) -> None:
         raise ValueError(f"{owner} has the same {noun} twice")
 
 
-def _read_sampling(value: dict) -> Sampling:
-    seed, spread = value["seed"], value["spread"]
-    if type(seed) is not int or seed < 0:
-        raise ValueError(f"its seed is {seed!r}")
-    if type(spread) not in (int, float) or not 0 < spread < math.inf:
-        raise ValueError(f"its spread is {spread!r}")
-    if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
-        raise TypeError("its range of motion or its sources are not a list")
-    sources = tuple(_read_source(source) for source in value["sources"])
-    overshoot = Overshoot.from_json(value["overshoot"]) if "overshoot" in value else None
-    random_pose_count = sum(source.poses for source in sources if source.kind == RANDOM)
-    if overshoot and overshoot.poses > random_pose_count:
-        raise ValueError(f"{overshoot.poses} of its {random_pose_count} random poses lie in the overshoot")
-    channels = tuple(Channel.from_json(channel) for channel in value["limits"])
-    return Sampling(seed, float(spread), channels, sources, overshoot)
-
-
 def _read_source(value: dict) -> Source:
     source = Source(value["kind"], value["poses"], read_name(value["name"]), tuple(value["frames"]))
     if source.kind not in SOURCE_KINDS:
@@ -431,12 +414,26 @@ def read_info(index: dict) -> RecordingInfo:
         KeyError, TypeError, ValueError: the index is damaged.
     """
     joint_count, control_count = len(index["joints"]), len(index["controls"])
+    value = index["sampling"]
+    seed, spread = value["seed"], value["spread"]
+    if type(seed) is not int or seed < 0:
+        raise ValueError(f"its seed is {seed!r}")
+    if type(spread) not in (int, float) or not 0 < spread < math.inf:
+        raise ValueError(f"its spread is {spread!r}")
+    if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
+        raise TypeError("its range of motion or its sources are not a list")
+    sources = tuple(_read_source(source) for source in value["sources"])
+    overshoot = Overshoot.from_json(value["overshoot"]) if "overshoot" in value else None
+    random_pose_count = sum(source.poses for source in sources if source.kind == RANDOM)
+    if overshoot and overshoot.poses > random_pose_count:
+        raise ValueError(f"{overshoot.poses} of its {random_pose_count} random poses lie in the overshoot")
+    channels = tuple(Channel.from_json(channel) for channel in value["limits"])
     return RecordingInfo(
         index["poses"],
         index["complete"],
         index["rig"]["file"],
         index["blender"],
-        _read_sampling(index["sampling"]),
+        Sampling(seed, float(spread), channels, sources, overshoot),
         RecordedBones.from_json(index["bones"], joint_count) if "bones" in index else RecordedBones(),
         RecordedTarget.from_json(index["target"]) if "target" in index else None,
         tuple(index.get("unsettled", ())),
