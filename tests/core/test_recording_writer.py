@@ -137,7 +137,7 @@ def test_poses_are_incomplete_if_the_index_cannot_be_written(tmp_path, monkeypat
         RecordingWriter(tmp_path / "r", rig, recording_info(POSE_COUNT)) as writer,
     ):
         writer.append(random_poses(POSE_COUNT)[:5], random_positions(POSE_COUNT)[:5])
-        monkeypatch.setattr(f"{RecordingWriter.__module__}.write_index", fail_to_write)
+        monkeypatch.setattr(f"{RecordingWriter.__module__}.write_json", fail_to_write)
         writer.append(random_poses(POSE_COUNT)[5:], random_positions(POSE_COUNT)[5:])
 
 

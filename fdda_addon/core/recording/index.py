@@ -158,7 +158,7 @@ class RecordedBones:
 
     def to_json(self) -> dict:
         """Return the JSON for `bones.json`."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        return asdict(self)
 
     @staticmethod
     def from_json(value: dict, joint_count: int) -> "RecordedBones":
@@ -243,13 +243,7 @@ class AloneMoves:
         return self.first_key_pose + len(self.keys)
 
     def to_json(self) -> dict:
-        inputs = [[kind, *indices] for kind, indices in self.inputs]
-        return {
-            "bases": self.bases,
-            "inputs": inputs,
-            "keys": list(self.keys),
-            "undetectable": list(self.undetectable),
-        }
+        return asdict(self) | {"inputs": [[kind, *indices] for kind, indices in self.inputs]}
 
     @staticmethod
     def from_json(value: dict, joints: int, controls: int) -> "AloneMoves":
@@ -440,11 +434,6 @@ def read_info(index: dict) -> RecordingInfo:
         Repeatability.from_json(index["repeatability"], index["complete"]) if "repeatability" in index else None,
         AloneMoves.from_json(index["alone"], joint_count, control_count) if "alone" in index else None,
     )
-
-
-def write_index(path: Path, index: dict) -> None:
-    """Replace the index of a recording."""
-    write_json(path / INDEX_NAME, {key: value for key, value in index.items() if key != "bones"})
 
 
 def write_json(path: Path, value: dict) -> None:

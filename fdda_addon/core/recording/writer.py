@@ -39,7 +39,6 @@ from .index import (
     Source,
     find_different_keys,
     read_index,
-    write_index,
     write_json,
 )
 from .lock import RecordingLock
@@ -100,7 +99,7 @@ class RecordingWriter:
             if not self._is_new:
                 self._read_previous(read_index(path))
             if self._is_new:
-                write_json(path / BONES_NAME, self._index()["bones"])
+                write_json(path / BONES_NAME, info.bones.to_json())
             # The index is written first: a folder with arrays but no index can neither be resumed nor used again.
             self._write_index()
             self._open_arrays()
@@ -124,7 +123,8 @@ class RecordingWriter:
             self.repeatability = Repeatability.from_json(previous["repeatability"], self.complete)
         # The scale of an object may be animated; no array depends on it.
         self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
-        current = self._index()
+        # Convert it to JSON text and back, so that it equals what is read from a file.
+        current = json.loads(json.dumps(self._index() | {"bones": self.info.bones.to_json()}))
         if different_keys := [
             key for key in find_different_keys(previous, current) if key.partition(".")[0] not in MUTABLE_KEYS
         ]:
@@ -184,18 +184,16 @@ class RecordingWriter:
             "meshes": [mesh.to_json() for mesh in self.rig.meshes],
             "joints": [joint.to_json() for joint in self.rig.joints],
             "controls": [control.to_json() for control in self.rig.controls],
-            "bones": json.loads(json.dumps(info.bones.to_json())),
             **({"alone": info.alone.to_json()} if info.alone else {}),
             **({"target": info.target.to_json()} if info.target else {}),
-            **({"unsettled": list(self.unsettled)} if self.unsettled else {}),
+            **({"unsettled": self.unsettled} if self.unsettled else {}),
             **({"repeatability": self.repeatability.to_json()} if self.repeatability else {}),
-            # Converted to JSON text and back, so that it equals the value that is read from a file.
-            "sampling": json.loads(json.dumps(info.sampling.to_json())),
+            "sampling": info.sampling.to_json(),
         }
 
     def _write_index(self) -> None:
         """Write the index; raise OSError, which `_write_error` converts."""
-        write_index(self.path, self._index())
+        write_json(self.path / INDEX_NAME, self._index())
 
     def append(
         self,
@@ -315,7 +313,7 @@ class RecordingExtension(RecordingWriter):
         sources = sampling.sources[:-1] if self._added_count else sampling.sources
         added_sources = (Source(REFINED, count, self._model_name),) if count else ()
         sampling = replace(sampling, sources=(*sources, *added_sources))
-        return super()._index() | {"poses": self.complete, "sampling": json.loads(json.dumps(sampling.to_json()))}
+        return super()._index() | {"poses": self.complete, "sampling": sampling.to_json()}
 
     def _write_error(self, error: OSError) -> OutputError:
         return OutputError(
