@@ -63,24 +63,21 @@ def find_clips(
     for name in actions:
         action = find_action(name)
         if not slots_of_action(action, datablocks):
-            raise RigError(_no_effect_message(action, roots))
+            identifiers = ", ".join(f"'{slot.identifier}'" for slot in action.slots)
+            reason = f"its slots are for something else: {identifiers}"
+            if not animation_curves(action):
+                reason = "it has no F-curves"
+            elif not any(unmuted_curves(action, slot) for slot in action.slots):
+                reason = "its F-curves are muted"
+            raise RigError(
+                f"The action '{name}' animates neither '{roots[0].name}' nor anything that moves '{roots[1].name}': "
+                f"{reason}; choose another action, or assign it to the object that it animates."
+            )
         clips.append(Clip(ACTION, name, action_frames(action)))
     clips += [Clip(STRIP, name, _strip_frames(find_strip(datablocks, name))) for name in strips]
     if mirror:
         clips = [version for clip in clips for version in (clip, replace(clip, is_mirrored=True))]
     return tuple(clips)
-
-
-def _no_effect_message(action: bpy.types.Action, roots: Sequence[bpy.types.Object]) -> str:
-    curves = animation_curves(action)
-    identifiers = ", ".join(f"'{slot.identifier}'" for slot in action.slots)
-    reason = f"its slots are for something else: {identifiers}" if curves else "it has no F-curves"
-    if curves and not any(unmuted_curves(action, slot) for slot in action.slots):
-        reason = "its F-curves are muted"
-    return (
-        f"The action '{action.name}' animates neither '{roots[0].name}' nor anything that moves '{roots[1].name}': "
-        f"{reason}; choose another action, or assign it to the object that it animates."
-    )
 
 
 def find_action(name: str) -> bpy.types.Action:

@@ -151,9 +151,7 @@ def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: fl
         if constraint is None:
             constraint = bone.constraints.new("LIMIT_ROTATION")
             constraint.owner_space = "LOCAL"
-        setattr(constraint, f"use_limit_{letter}", True)
-        setattr(constraint, f"min_{letter}", low)
-        setattr(constraint, f"max_{letter}", high)
+        set_constraint_limit(constraint, axis, low, high)
     bone.lock_rotation[axis] = False
 
 
