@@ -347,7 +347,7 @@ def test_the_sidebar_trains_with_other_joints_without_recording_again(tmp_path):
     recorded = (files[0] / "recording.json").read_bytes()
     sampling = read_index(files[0])["sampling"]
     sampling["sources"] = [source for source in sampling["sources"] if source["kind"] != "alone"]
-    for joints, base_skinning, joint_count in (("ALL", "RIG", 7), ("AUTO", "RIG", 3), ("NUMBER", "HARD", 5)):
+    for joints, base_skinning, joint_count in (("AUTO", "RIG", 3), ("NUMBER", "HARD", 5)):
         settings.bones_to_read, settings.bone_count, settings.base_skinning = joints, 5, base_skinning
         content = read_folder(files[0], read_rig(rig), sampling)
         assert (content.state, content.sentence) == (FolderState.COMPLETE, "")
@@ -355,7 +355,7 @@ def test_the_sidebar_trains_with_other_joints_without_recording_again(tmp_path):
         assert bpy.ops.fdda.train(object="limb", **paths) == {"FINISHED"}
         info = read_model_info(files[1])
         assert len(info.joints) == joint_count
-        assert info.training.get("fit", {}).get("kind") == {"ALL": None, "AUTO": "smooth", "NUMBER": "hard"}[joints]
+        assert info.training["fit"]["kind"] == {"AUTO": "smooth", "NUMBER": "hard"}[joints]
         bind(rig, files[1])
         pose_limb(rig.armature_object)
         assert_plays(rig.mesh_object, files[1])

@@ -109,24 +109,15 @@ def test_features_that_vary_like_rounded_keys_are_no_inputs(results_by_unit):
 
 
 @pytest.mark.parametrize("name", OTHER_UNITS)
-def test_models_have_the_same_errors(results_by_unit, name):
+def test_models_have_the_same_errors_and_ranges(results_by_unit, name):
     """Another unit changes nothing; far from the origin, positions are only as exact as one step of float32."""
-    report, reference = (results_by_unit[n][1] for n in (name, METER))
-    distance = UNITS_AND_DISTANCES[name][1]
+    (_, report, info), (_, reference_report, reference) = results_by_unit[name], results_by_unit[METER]
+    units_per_metre, distance = UNITS_AND_DISTANCES[name]
     step, ratio = (1000 * float(np.spacing(np.float32(distance))), 0.1) if distance else (0, 1e-6)
     for method in ("fdda", "linear"):
-        assert report[method]["held_out"] == pytest.approx(reference[method]["held_out"], rel=ratio, abs=step), method
-
-
-@pytest.mark.parametrize("name", OTHER_UNITS)
-def test_training_ranges_agree_in_meters(results_by_unit, name):
-    """The bounds that determine the confidence are equal in meters."""
-    (_, _, info), (_, _, reference) = results_by_unit[name], results_by_unit[METER]
-    units_per_metre, _ = UNITS_AND_DISTANCES[name]
-    for bounds, reference_bounds in (
-        (info.feature_low, reference.feature_low),
-        (info.feature_high, reference.feature_high),
-    ):
-        bounds = bounds.copy()
-        bounds[:, 3::4] /= units_per_metre
-        assert np.abs(bounds - reference_bounds)[1:].max() < 2e-4
+        expected = pytest.approx(reference_report[method]["held_out"], rel=ratio, abs=step)
+        assert report[method]["held_out"] == expected, method
+    for bounds in ("feature_low", "feature_high"):
+        in_meters = getattr(info, bounds).copy()
+        in_meters[:, 3::4] /= units_per_metre
+        assert np.abs(in_meters - getattr(reference, bounds))[1:].max() < 2e-4

@@ -119,23 +119,25 @@ def test_scale_and_rotation_of_the_character_do_not_change_surface_frames(record
     )
 
 
-def test_a_rig_that_does_not_smooth_has_no_surface_frames(tmp_path):
-    assert select_frames(write_tube(tmp_path / "tube", smooths=False)) is NO_SURFACE_FRAMES
-
-
-def test_chance_correlations_select_nothing(tmp_path):
-    """Bulges that grow with the bend correlate with the rotation of the adjacent surface."""
+def test_no_surface_frames_are_selected_where_they_explain_little(tmp_path, recording):
+    waves = write_tube(tmp_path / "waves", smooths=False)
     write_chain(tmp_path / "chain")
-    assert select_frames(read_skinned(tmp_path / "chain")) is NO_SURFACE_FRAMES
-
-
-def test_a_rig_that_smooths_one_partition_has_no_surface_frames(tmp_path, recording):
-    """Surface frames for a single partition would take as much time as for all, and lower the error less."""
-    waves = write_tube(tmp_path / "tube", smooths=False)
-    residuals = np.array(waves.residuals)
-    smooth = recording.partitions[0].vertices
+    residuals, smooth, no_faces = np.array(waves.residuals), recording.partitions[0].vertices, np.zeros(0, np.int32)
     residuals[:, smooth] = recording.residuals[:, smooth]
-    assert select_frames(replace(recording, residuals=residuals)) is NO_SURFACE_FRAMES
+    for reason, other in {
+        "the rig does not smooth": waves,
+        "bulges that grow with the bend correlate with the rotation of the adjacent surface": read_skinned(
+            tmp_path / "chain"
+        ),
+        "for one partition, they would take as much time as for all": replace(recording, residuals=residuals),
+        "a dozen poses are too few": write_tube(tmp_path / "few", pose_count=12),
+        "there are no faces": replace(
+            recording, rig=replace(recording.rig, face_starts=no_faces, face_vertices=no_faces)
+        ),
+    }.items():
+        assert select_frames(other) is NO_SURFACE_FRAMES, reason
+    split = split_recording(recording, TrainingConfig())
+    assert select_surface_frames(recording, split, detail_mm=100.0) is NO_SURFACE_FRAMES, "within the tolerance"
 
 
 def test_a_vertex_whose_fit_is_nan_selects_nothing(recording, monkeypatch):
@@ -150,10 +152,6 @@ def test_a_vertex_whose_fit_is_nan_selects_nothing(recording, monkeypatch):
     assert select_frames(recording) is NO_SURFACE_FRAMES
 
 
-def test_a_dozen_poses_are_too_few(tmp_path):
-    assert select_frames(write_tube(tmp_path / "tube", pose_count=12)) is NO_SURFACE_FRAMES
-
-
 def test_vertices_without_faces_are_ignored(recording, surface_frames):
     rig, added_count = recording.rig, 4 * recording.rig.vertex_count
     extended_arrays = {
@@ -166,19 +164,6 @@ def test_vertices_without_faces_are_ignored(recording, surface_frames):
         replace(recording, rig=rig, residuals=residuals, partitions=make_partitions(rig, INFLUENCING))
     )
     assert selected.vertices.tolist() == surface_frames.vertices.tolist()
-
-
-def test_a_mesh_without_faces_has_no_surface_frames(recording):
-    no_indices = np.zeros(0, np.int32)
-    assert (
-        select_frames(replace(recording, rig=replace(recording.rig, face_starts=no_indices, face_vertices=no_indices)))
-        is NO_SURFACE_FRAMES
-    )
-
-
-def test_vertices_within_the_tolerance_have_no_surface_frames(recording):
-    split = split_recording(recording, TrainingConfig())
-    assert select_surface_frames(recording, split, detail_mm=100.0) is NO_SURFACE_FRAMES
 
 
 def test_a_degenerate_surface_gives_finite_values(recording, surface_frames):

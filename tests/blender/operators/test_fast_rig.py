@@ -3,7 +3,6 @@
 
 import subprocess
 import sys
-import tempfile
 import time
 from types import SimpleNamespace
 
@@ -31,12 +30,13 @@ def saved(bound_elbow, tmp_path):
 
 def test_a_fast_rig_is_written_and_the_open_file_stays(saved, elbow_files):
     content = (saved / "elbow.blend").read_bytes()
-    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.blend")) == {"FINISHED"}
-    assert "fast.blend: 'elbow_rig' has 2 of 2 bones; the model reads 2" in job.state_of("fast_rig").outcome
+    """A point in the name is kept."""
+    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.v2")) == {"FINISHED"}
+    assert "fast.v2.blend: 'elbow_rig' has 2 of 2 bones; the model reads 2" in job.state_of("fast_rig").outcome
     assert "times as fast" in job.state_of("fast_rig").outcome
     assert bpy.data.filepath == str(saved / "elbow.blend") and (saved / "elbow.blend").read_bytes() == content
     assert not bpy.data.objects[ELBOW].fdda.is_fast_rig
-    bpy.ops.wm.open_mainfile(filepath=str(saved / "fast.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(saved / "fast.v2.blend"))
     mesh_object = bpy.data.objects[ELBOW]
     assert mesh_object.fdda.is_fast_rig and "CorrectiveSmooth" not in mesh_object.modifiers
     pose(angle=0.7)
@@ -113,18 +113,6 @@ def test_unsaved_files_and_missing_choices_are_refused(saved):
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, visible=False, keyed=False), "No controls were chosen")
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, collection="Faces"), "has no bone collection 'Faces'")
     refused(bpy.ops.fdda.fast_rig, "No file was chosen; give the name of a .blend file.")
-
-
-def test_a_missing_temporary_folder_is_reported(saved, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(tempfile, "tempdir", str(saved / "missing"))
-        text = "No temporary file can be written (No such file or directory"
-        refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.blend")), text)
-
-
-def test_a_point_in_the_name_of_the_file_is_kept(saved):
-    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.v2")) == {"FINISHED"}
-    assert (saved / "fast.v2.blend").is_file() and not (saved / "fast.blend").exists()
 
 
 @pytest.mark.parametrize("name", ["fast.blend", "FAST.BLEND"])

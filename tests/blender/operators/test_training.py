@@ -31,8 +31,9 @@ def train(rig: SceneRig, elbow_files, **options) -> set[str]:
     return bpy.ops.fdda.train(recording=str(elbow_files.recording), **options)
 
 
-def test_a_model_is_trained_with_the_settings_and_the_section_offers_the_next_step(saved, elbow_files, tmp_path):
-    saved.mesh_object.fdda.settings.model = "//models/a.onnx"
+def test_a_model_is_trained_with_the_settings_and_kept_when_it_is_trained_again(saved, elbow_files, tmp_path):
+    mesh_object = saved.mesh_object
+    mesh_object.fdda.settings.model = "//models/a.onnx"
     assert train(saved, elbow_files) == {"FINISHED"}
     model = tmp_path / "models" / "a.onnx"
     training = read_model_info(model).training
@@ -41,18 +42,11 @@ def test_a_model_is_trained_with_the_settings_and_the_section_offers_the_next_st
     assert (state.done, state.total) == (6, 6) and state.outcome.startswith("Trained 'a.onnx' in ")
     assert [len(state.curves[name]) for name in ("training", "validation")] == [6, 6]
     assert state.curves["validation"][-1] < state.curves["validation"][0]
-    bpy.context.view_layer.objects.active = saved.mesh_object
+    bpy.context.view_layer.objects.active = mesh_object
     checks.check_now(saved)
     texts = texts_of(draw_section("training"))
     assert any(", unseen poses: " in text for text in texts)
     assert len(texts) > texts.index("Bind a") > texts.index("Train Again")
-
-
-def test_training_again_keeps_the_former_model_in_the_library(saved, elbow_files, tmp_path):
-    mesh_object = saved.mesh_object
-    mesh_object.fdda.settings.model = "//models/a.onnx"
-    assert train(saved, elbow_files) == {"FINISHED"}
-    model = tmp_path / "models" / "a.onnx"
     former_files = {name: (model.parent / name).read_bytes() for name in ("a.onnx", "report.json", "report.html")}
     assert not (model.parent / "previous").exists() and [m.name for m in mesh_object.fdda.models] == ["a"]
     mesh_object.fdda.settings.training_seed = 4

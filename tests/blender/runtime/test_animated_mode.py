@@ -14,7 +14,7 @@ from fdda_addon.runtime.session import session
 from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import find_rig
 
-from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
+from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions
 from ..evaluations import shown_in
 from ..rendering import FRAME, animation, set_camera
 from ..rig_changes import change_in_edit_mode
@@ -43,17 +43,6 @@ def test_keyed_modes_show_like_modes_set_by_hand(bound_elbow, elbow_files):
         bpy.context.view_layer.update()
         assert np.abs(evaluated_positions(bound_elbow) - shown[frame]).max() < 1e-6, frame
     assert not bound_elbow.fdda.status
-
-
-def test_a_mode_set_by_hand_shows_at_once(bound_elbow, elbow_files):
-    pose(angle=1.1)
-    graph = bpy.context.view_layer.depsgraph
-    for mode in ("RIG", "FDDA", "LINEAR", "RIG", "LINEAR", "FDDA"):
-        bound_elbow.fdda.mode = mode
-        bpy.context.view_layer.update()
-        drawn_positions = shown_in(graph, bound_elbow)
-        assert np.array_equal(drawn_positions, evaluated_positions(bound_elbow)), mode
-    assert_plays(bound_elbow, elbow_files.model)
 
 
 def test_renders_follow_a_keyed_mode(bound_elbow, elbow_files, tmp_path):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Animated modes and the visibility of the FDDA modifier: jobs still read the rig, and messages give reasons."""
 
-import json
-
 import bpy
 import numpy as np
 import pytest
@@ -10,9 +8,8 @@ import pytest
 from fdda_addon.core.errors import ModelError
 from fdda_addon.runtime.binding import model_disabled, temporary_mode
 from fdda_addon.runtime.player import Player
-from fdda_addon.scene.blend_file import save_copy
 
-from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, run
+from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions
 from ..evaluations import handler
 from ..rendering import FRAME, animation, rig_pixels, set_camera, still
 
@@ -55,20 +52,6 @@ def test_an_animated_mode_shows_the_rig_while_the_model_is_disabled(bound_elbow,
         assert np.array_equal(evaluated_positions(bound_elbow), expected)
     pose(angle=1.0)
     assert_plays(bound_elbow, elbow_files.model)
-
-
-def test_an_evaluation_with_a_driven_mode_compares_with_the_rig(bound_elbow, elbow_files, tmp_path):
-    path, reports = tmp_path / "bound.blend", {}
-    for name, animate in (("plain", lambda _: None), ("driven", drive_mode)):
-        animate(bound_elbow)
-        bpy.context.view_layer.update()
-        save_copy(path)
-        report = tmp_path / f"{name}.json"
-        assert run("evaluate", path, elbow_files.model, "--poses", 3, "--json", report) == 0
-        reports[name] = json.loads(report.read_text())
-        bpy.ops.wm.open_mainfile(filepath=str(elbow_files.bound))
-        bound_elbow = bpy.data.objects["elbow"]
-    assert reports["driven"]["fdda"] == reports["plain"]["fdda"]
 
 
 def disable_modifier(mesh_object: bpy.types.Object) -> None:

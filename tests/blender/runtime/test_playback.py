@@ -9,9 +9,8 @@ import pytest
 
 from fdda_addon.runtime import playback_modifier
 from fdda_addon.runtime.binding import bind, unbind
-from fdda_addon.runtime.session import session
 
-from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
+from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose
 
 
 def test_each_bone_of_a_chain(bound_elbow, elbow_files):
@@ -62,23 +61,6 @@ def test_modes_and_strength_show_rig_linear_skinning_and_model(bound_elbow, elbo
     assert np.abs(evaluated_positions(bound_elbow) - linear).max() < 1e-5
 
 
-def test_undo_and_redo(bound_elbow, elbow_files):
-    bpy.ops.ed.undo_push(message="start")
-    pose(angle=0.5)
-    bpy.ops.ed.undo_push(message="first")
-    first = evaluated_positions(bound_elbow)
-    pose(angle=1.8)
-    bpy.ops.ed.undo_push(message="second")
-    second = evaluated_positions(bound_elbow)
-    bpy.ops.ed.undo()
-    assert bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] == pytest.approx(0.5)
-    assert np.array_equal(assert_plays(bpy.data.objects[ELBOW], elbow_files.model), first)
-    bpy.ops.ed.redo()
-    assert np.array_equal(assert_plays(bpy.data.objects[ELBOW], elbow_files.model), second)
-    pose(angle=1.1)
-    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
-
-
 @pytest.mark.parametrize("linked", [False, True], ids=["own mesh", "shared mesh"])
 def test_two_characters_play_different_poses(bound_elbow, elbow_files, linked):
     armature_object = bpy.data.objects[ELBOW_RIG]
@@ -117,17 +99,6 @@ def test_objects_with_different_transforms(rig, elbow_files):
     unbind(rig.mesh_object)
     rig.mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
     assert np.abs(evaluated_positions(rig.mesh_object) - linear).max() < 1e-5
-
-
-def test_path_out_of_the_folder_is_not_followed(bound_elbow, elbow_files, tmp_path):
-    bound_elbow.fdda.model = str(elbow_files.model)
-    path = tmp_path / "elsewhere.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-
-    session.chosen_paths.clear()
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    bpy.context.view_layer.update()
-    assert "outside the folder of 'elsewhere.blend'" in bpy.data.objects[ELBOW].fdda.status
 
 
 def test_hidden_armature(bound_elbow, elbow_files):

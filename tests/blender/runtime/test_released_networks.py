@@ -13,7 +13,7 @@ from fdda_addon.models.model_list import add_bound_model, pack_entry
 from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.blend_file import save_copy
 
-from ..conftest import ELBOW, assert_plays
+from ..conftest import ELBOW
 
 
 def opened(path) -> weakref.ref:
@@ -45,9 +45,3 @@ def test_the_networks_of_files_that_were_open_are_released(elbow_files, tmp_path
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     gc.collect()
     assert networks[-1]() is None
-
-
-def test_a_file_that_is_opened_again_plays(elbow_files):
-    for _ in range(3):
-        opened(elbow_files.bound)
-        assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
