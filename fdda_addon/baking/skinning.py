@@ -80,7 +80,7 @@ def export_skinning(
     """
     recording = read_recording(recording_path)
     _check_rig(scene_rig, recording)
-    network = Network(model) if model else None
+    model_positions = _model_positions(recording, Network(model)) if model else None
     with temporary_folder() as folder:
         yield from fit_skin(recording_path, folder / "skin.npz", influences, held_out_actions)
         with np.load(folder / "skin.npz") as arrays:
@@ -88,8 +88,8 @@ def export_skinning(
     fitted_rig = replace(recording.rig, skin_joints=fit["joints"].astype(np.int32), skin_weights=fit["weights"])
     methods = {OWN_WEIGHTS: _skinned_positions(recording, recording.rig)} if recording.rig.has_weights else {}
     methods[FITTED_WEIGHTS] = _skinned_positions(recording, fitted_rig)
-    if network:
-        methods[MODEL] = _model_positions(recording, network)
+    if model_positions:
+        methods[MODEL] = model_positions
     poses = {"held-out poses": fit["held_out"]} | {name: fit[f"action_{name}"] for name in held_out_actions}
     errors = {
         poses_name: {name: _measure(recording, indices, method) for name, method in methods.items()}
@@ -133,11 +133,14 @@ def _skinned_positions(recording: Recording, rig: Rig) -> PositionsFunction:
 def _model_positions(recording: Recording, network: Network) -> PositionsFunction:
     """Return a function that gives the positions of a model in poses of a recording."""
     joints, controls = recording.rig.joint_names, [control.name for control in recording.rig.controls]
-    try:
-        joint_indices = [joints.index(name) for name in network.info.joint_names]
-        control_indices = [controls.index(control.name) for control in network.info.controls]
-    except ValueError as error:
-        raise ModelError(f"The model '{network.path}' is not of the recorded rig; leave --model out.") from error
+    rigs = recording.rig, network.info
+    recorded, trained = ([mesh.fingerprint.rest_positions for mesh in rig.meshes] for rig in rigs)
+    names = set(network.info.joint_names) - set(joints) | {c.name for c in network.info.controls} - set(controls)
+    if recorded != trained or names:
+        text = "is not of the recorded meshes; record all of its meshes, or leave --model out"
+        raise ModelError(f"The model '{network.path}' {text}.")
+    joint_indices = [joints.index(name) for name in network.info.joint_names]
+    control_indices = [controls.index(control.name) for control in network.info.controls]
     return lambda poses: network.positions(
         recording.pose_matrices[poses][:, joint_indices], recording.controls[poses][:, control_indices]
     )

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Exported skinning: fitted weights on bones alone, which other programs play as Blender does."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
+from fdda_addon.core.formats.untrained_model import build_untrained_model
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.rig import Fingerprint
 
 from ..baked_files import world_positions
 from ..conftest import ELBOW, ELBOW_RIG, evaluated_positions, run
@@ -108,3 +111,8 @@ def test_recordings_of_other_rigs_and_wrong_numbers_are_refused(refusal, elbow_f
     text = refusal("export-skinning", elbow_files.rig, elbow_files.recording, out, "--hold-out", "jump")
     assert f"The recording '{elbow_files.recording}' has no action 'jump'; record it, too." in text
     assert run("export-skinning", rig, elbow_files.recording, out, "--influences", 17) == 2
+    recording, model = read_recording(elbow_files.recording), tmp_path / "longer.onnx"
+    mesh = replace(recording.rig.meshes[0], fingerprint=Fingerprint("", "", ""))
+    model.write_bytes(build_untrained_model(replace(recording.rig, meshes=(mesh,)), {}))
+    text = refusal("export-skinning", elbow_files.rig, elbow_files.recording, out, "--model", model)
+    assert f"The model '{model}' is not of the recorded meshes; record all of its meshes, or leave --model out." in text
