@@ -42,6 +42,5 @@ symbolic_links = pytest.mark.skipif(WINDOWS, reason="Windows lets only administr
 named_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders.")
 devices = pytest.mark.skipif(WINDOWS, reason="Windows has no devices in folders.")
 forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows does not fork processes.")
-file_size_limits = pytest.mark.skipif(WINDOWS, reason=NO_FILE_SIZE_LIMITS)
 sparse_files = pytest.mark.skipif(WINDOWS, reason="On Windows, Python writes all zeros of a sparse file to the disk.")
 drives = pytest.mark.skipif(not WINDOWS, reason="Only Windows has drives in paths.")

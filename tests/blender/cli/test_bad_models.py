@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Verbs that refuse models of another rig and damaged model files with one error message."""
 
-import json
-
 import bpy
 import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from fdda_addon.core.formats.model import METADATA_KEY
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
 from ... import systems
 from ..conftest import write_edited
 from ..refusals import save_elbow
-from ..rig_changes import change_in_edit_mode
 
 
 @pytest.fixture(params=["bind", "evaluate", "benchmark"])
@@ -29,56 +25,14 @@ def verb(request, tmp_path):
     return lambda rig, model: [request.param, rig, model, *more_arguments]
 
 
-def subdivide_mesh(rig) -> None:
-    change_in_edit_mode(rig.mesh_object, lambda: (bpy.ops.mesh.select_all(action="SELECT"), bpy.ops.mesh.subdivide()))
+def rename_bone(rig) -> None:
+    rig.armature_object.data.bones["lower"].name = "forearm"
 
 
-def bone_editor(change):
-    return lambda rig: change_in_edit_mode(rig.armature_object, lambda: change(rig.armature_object.data.edit_bones))
-
-
-def rename_bone(bones) -> None:
-    bones["lower"].name = "forearm"
-
-
-def move_tail(bones) -> None:
-    bones["lower"].tail.z += 0.1
-
-
-def unparent_bone(bones) -> None:
-    bones["lower"].parent = None
-
-
-def move_vertex(rig) -> None:
-    rig.mesh_object.data.vertices[5].co.x += 0.001
-
-
-def change_weight(rig) -> None:
-    rig.mesh_object.vertex_groups["lower"].add([0], 0.2, "REPLACE")
-
-
-def flip_face(rig) -> None:
-    rig.mesh_object.data.polygons[3].flip()
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (subdivide_mesh, "it has 300 vertices, the mesh has "),
-        (bone_editor(rename_bone), "the armature lacks the joint 'lower'; it does not know the joint 'forearm'"),
-        (bone_editor(move_tail), "the rest pose of the armature differs"),
-        (bone_editor(unparent_bone), "its joints have other parents"),
-        (move_vertex, "the rest pose of the mesh differs"),
-        (change_weight, "the skin weights differ"),
-        (flip_face, "the topology of the mesh differs"),
-    ],
-    ids=["vertex count", "joints", "rest pose", "parents", "rest positions", "weights", "topology"],
-)
-def test_a_model_of_another_rig_is_refused(refusal, verb, elbow_files, tmp_path, change, words):
-    assert len(json.loads((elbow_files.recording / "recording.json").read_text())["joints"]) == 2
-    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", change), elbow_files.model))
-    assert text.startswith(f"The model '{elbow_files.model}' was trained for another rig: {words}")
-    assert text.endswith(". Record and train this rig.")
+def test_a_model_of_another_rig_is_refused(refusal, verb, elbow_files, tmp_path):
+    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", rename_bone), elbow_files.model))
+    words = "the armature lacks the joint 'lower'; it does not know the joint 'forearm'. Record and train this rig."
+    assert text == f"The model '{elbow_files.model}' was trained for another rig: {words}"
 
 
 def test_a_missing_model_is_refused(refusal, verb, elbow_files, tmp_path):
@@ -87,42 +41,25 @@ def test_a_missing_model_is_refused(refusal, verb, elbow_files, tmp_path):
     assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
 
 
-def add_custom_operator(model) -> None:
-    model.graph.node.append(helper.make_node("Run", ["positions"], ["y"], domain="com.example"))
-    model.opset_import.append(helper.make_opsetid("com.example", 1))
-
-
 def remove_metadata(model) -> None:
     del model.metadata_props[:]
-
-
-def set_version_2(model) -> None:
-    (prop,) = (prop for prop in model.metadata_props if prop.key == METADATA_KEY)
-    prop.value = json.dumps({**json.loads(prop.value), "version": 2})
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (add_custom_operator, "it has the operator set com.example, which train does not write; give one"),
-        (remove_metadata, "is an ONNX file but not a model of this add-on; give one that train made"),
-        (set_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
-    ],
-)
-def test_onnx_files_that_are_not_models_of_the_add_on_are_refused(refusal, verb, elbow_files, tmp_path, change, words):
-    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
-    text = refusal(*verb(elbow_files.rig, path))
-    assert str(path) in text and words in text
 
 
 def use_double_input(model) -> None:
     model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
 
 
-def test_a_graph_with_double_inputs_is_refused(refusal, verb, elbow_files, tmp_path):
-    path = write_edited(elbow_files.model, tmp_path / "m.onnx", use_double_input)
+@pytest.mark.parametrize(
+    ("change", "start", "end"),
+    [
+        (remove_metadata, "The model '", " is an ONNX file but not a model of this add-on; give one that train made."),
+        (use_double_input, "ONNX Runtime refuses the model '", "); train it again."),
+    ],
+)
+def test_onnx_files_that_are_not_models_are_refused(refusal, verb, elbow_files, tmp_path, change, start, end):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
     text = refusal(*verb(elbow_files.rig, path))
-    assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
+    assert text.startswith(start + str(path)) and text.endswith(end)
 
 
 def output_nan(model) -> None:
