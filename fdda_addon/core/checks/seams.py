@@ -88,8 +88,9 @@ def _seam_pairs(rig: Rig) -> np.ndarray:
     if not (groups >= 0).any():
         return np.zeros((0, 2), np.int64)
     following = rig.face_vertices[adjacent_corners(rig.face_starts, rig.face_vertices)[1]]
-    edges = np.stack([rig.face_vertices, following], axis=1).astype(np.int64)
-    edges, face_counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    ends = np.sort(np.stack([rig.face_vertices, following], axis=1).astype(np.int64), axis=1)
+    edges, face_counts = np.unique(ends @ (rig.vertex_count, 1), return_counts=True)
+    edges = np.stack(np.divmod(edges, rig.vertex_count), axis=1)
     edges = edges[(face_counts == 1) & (groups[edges] >= 0).all(axis=1)]
     edges = np.take_along_axis(edges, np.argsort(groups[edges], axis=1), axis=1)
     places = groups[edges]
@@ -108,7 +109,11 @@ def _coincident_groups(rig: Rig) -> np.ndarray:
     """
     positions = (rig.rest_positions / max(rig.size, np.finfo(np.float32).tiny)).round(POSITION_DIGITS)
     groups = np.full(rig.vertex_count, -1)
-    vertices = np.flatnonzero(_equal_rows(positions)[1] > 1)
+    # One number for each place is sorted much faster than rows. Different places rarely have the same number.
+    places = positions.astype(np.float64) @ (1.0, np.sqrt(2.0), np.sqrt(3.0))
+    order = np.argsort(places)
+    is_next_equal = np.append(np.diff(places[order]) < 10.0**-POSITION_DIGITS * 1e-3, False)
+    vertices = np.sort(order[is_next_equal | np.roll(is_next_equal, 1)])
     if len(vertices):
         joints, weights = rig.skin_joints[vertices], rig.skin_weights[vertices]
         order = np.argsort(np.where(weights > 0, joints, -1), axis=1)

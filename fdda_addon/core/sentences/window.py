@@ -3,6 +3,13 @@
 
 import re
 
+from .. import settings
+
+LABELS = {
+    "--extra-input": "Extra Inputs",
+    **{s.option: s.label for s in vars(settings).values() if isinstance(s, settings.Setting) and s.label},
+}
+"""Labels of fields by options that are not spelled as their field; those of settings are in their declarations."""
 PHRASES = (
     ("--base-skinning smooth, or Base Skinning", "Base Skinning"),
     ("--base-skinning smooth", "Base Skinning"),
@@ -12,8 +19,6 @@ PHRASES = (
     ("give --action or --strip", "check an action or a strip"),
     ("0 random poses (--action NAME --poses 0)", "Random Poses at 0"),
     ("(--action NAME)", "in Training Poses"),
-    ("--settle-frames", "Settle"),
-    ("--extra-input", "Extra Inputs"),
 )
 """Phrases with options, and the words of the window where these differ."""
 SMALL_WORDS = {"To", "Per", "Of"}
@@ -25,7 +30,7 @@ def for_window(text: str) -> str:
         return text
     for phrase, label in PHRASES:
         text = text.replace(phrase, label)
-    return re.sub(r"(?<![\w-])--([a-z][a-z-]*)", lambda match: _title(match[1]), text)
+    return re.sub(r"(?<![\w-])--[a-z][a-z-]*", lambda match: LABELS.get(match[0]) or _title(match[0]), text)
 
 
 def _title(option: str) -> str:

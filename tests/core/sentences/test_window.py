@@ -28,8 +28,8 @@ from fdda_addon.core.sentences.window import for_window
             "or record actions alone, with Random Poses at 0.",
         ),
         (
-            "Remixed poses combine actions; name some (--action NAME).",
-            "Remixed poses combine actions; name some in Training Poses.",
+            "record more poses (--poses), or train longer (--passes)",
+            "record more poses (Random Poses), or train longer (Training Passes)",
         ),
         (
             "more bones (--bones-to-pose), or --min-vertices-per-part 8",
