@@ -43,6 +43,8 @@ def run(options: argparse.Namespace) -> None:
     open_file(options.rig)
     names = [mesh["name"] for mesh in index.get("meshes", ())]
     scene_rig = find_character([options.object] if options.object and len(names) < 2 else names or [""])
+    if info is None:
+        settings = RecordingSettings(**pose_settings(options, scene_rig))
     with ProgressPrinter() as progress, ExitStack() as stack:
         for mesh_object in scene_rig.mesh_objects:
             stack.enter_context(model_disabled(mesh_object))

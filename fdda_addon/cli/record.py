@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
     from ..core.recording.index import read_index, read_info
     from ..runtime.binding import model_disabled
     from .files import open_file
-    from .pose_notes import print_control_bones, print_remix_hint
+    from .pose_notes import print_bones_to_pose, print_control_bones
     from .progress import ProgressPrinter
     from .record_options import check_options
 
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     scene_rig = _find_rig(options)
     if not options.refine:
         print_control_bones(scene_rig, options)
-        print_remix_hint(scene_rig, options)
+        print_bones_to_pose(scene_rig, options)
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:
         for mesh_object in scene_rig.mesh_objects:
@@ -81,17 +81,17 @@ def _make_job(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[P
     from ..recording.plan import RecordingSettings
     from ..recording.refinement import RefinementSettings, refine
     from ..recording.run import record
-    from .target import pose_settings, requested_poses, target_settings
+    from .target import pose_settings, target_settings
 
-    poses = requested_poses(scene_rig, options)
-    pose_options = {} if poses is None else {"poses": poses}
     if options.refine:
+        pose_options = {} if options.poses is None else {"poses": options.poses}
         settings = RefinementSettings(seed=options.seed, resume=options.resume, **pose_options)
         return refine(scene_rig, options.recording, options.refine, settings)
     settings = RecordingSettings(
         resume=options.resume,
         overwrite=options.overwrite,
         target=target_settings(options),
-        **(pose_settings(options) | pose_options),
+        auto_poses=options.poses is None,
+        **pose_settings(options, scene_rig),
     )
     return record(scene_rig, options.recording, settings)

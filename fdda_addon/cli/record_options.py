@@ -5,7 +5,16 @@ import argparse
 from pathlib import Path
 
 from ..core.errors import WrongUsageError
-from ..core.settings import MIRROR, OVERSHOOT, POSES, REFINEMENT_POSES, REPEATABILITY_POSES, SEED, SPREAD
+from ..core.settings import (
+    MAX_AUTO_POSES,
+    MIRROR,
+    OVERSHOOT,
+    POSES,
+    REFINEMENT_POSES,
+    REPEATABILITY_POSES,
+    SEED,
+    SPREAD,
+)
 from .files import add_rig_argument
 from .target import add_target_options, target_settings
 
@@ -42,7 +51,10 @@ def _add_mesh_options(parser: argparse.ArgumentParser) -> None:
 
 def add_pose_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose poses."""
-    default_text = f"(default {POSES.default}, with --refine {REFINEMENT_POSES})"
+    default_text = (
+        f"(default: as many as are evaluated in about a minute, {POSES.default} to {MAX_AUTO_POSES}; with --refine "
+        f"{REFINEMENT_POSES})"
+    )
     POSES.add_option(parser, default=None, help=f"number of random poses {default_text}")
     for setting in (SEED, SPREAD, OVERSHOOT, MIRROR):
         setting.add_option(parser)
@@ -65,9 +77,10 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="WHAT",
-        help="bones that random poses move, instead of the deforming bones: collection:NAME, action:NAME (the bones "
-        "that the action keys, in the ranges that it uses), bone:NAME, selected, or remix (every second pose takes "
-        "each limb from a random frame of the actions of --action, with noise); repeatable",
+        help="bones that random poses move: collection:NAME, action:NAME (the bones that the action keys, in the "
+        "ranges that it uses), bone:NAME, selected, deforming, or remix (every second pose takes each limb from a "
+        "random frame of the actions of --action, else of all actions of the rig, with noise); repeatable (default: "
+        "remix if --action moves bones, or if no bone has limits; else deforming)",
     )
     parser.add_argument(
         "--extra-input",

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from ..scene.scene_rig import SceneRig
 
 
+DEFORMING = "deforming"
+"""Value of --bones-to-pose for the deforming bones, within their limits."""
+
+
 def add_target_options(parser: argparse.ArgumentParser) -> None:
     """Add the option --learn-from and the options of its settings."""
     for setting in (LEARN_FROM, PRE_ROLL, SETTLE_FRAMES, REST_THRESHOLD_MM):
@@ -32,37 +36,27 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
     return TargetSettings(options.learn_from, **values_from(options, settings))
 
 
-def pose_settings(options: argparse.Namespace) -> dict[str, object]:
-    """Return the arguments of `RecordingSettings` that choose poses, from the options of `add_pose_options`."""
-    from ..recording.plan import RecordingSettings
+def pose_settings(options: argparse.Namespace, scene_rig: "SceneRig | None" = None) -> dict[str, object]:
+    """Return the arguments of `RecordingSettings` that choose poses, from the options of `add_pose_options`.
 
-    values = values_from(options, settings_of(RecordingSettings))
+    Args:
+        scene_rig: the rig, whose actions choose the bones if no option does; None to leave them out.
+    """
+    from ..poses.remix import choose_bones
+    from ..recording.plan import RecordingSettings, find_actions
+
+    settings = [setting for setting in settings_of(RecordingSettings) if hasattr(options, setting.name)]
+    values = values_from(options, settings)
     lists = {
         "actions": options.action,
         "strips": options.strip,
         "bones_to_pose": options.bones_to_pose,
         "extra_inputs": options.extra_input,
     }
-    return {name: value for name, value in values.items() if value is not None} | {
-        n: tuple(v) for n, v in lists.items()
-    }
-
-
-def requested_poses(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
-    """Return the number of random poses; None for the default.
-
-    A target that depends on the frame has no random poses by default if actions or strips are given.
-    """
-    from ..recording.plan import RecordingSettings, depends_on_time, read_sample_selection
-    from ..rig.pose_setter import TargetSettings
-
-    if (
-        options.poses is not None
-        or not options.learn_from
-        or options.settle_frames
-        or not (options.action or options.strip)
-    ):
-        return options.poses
-    settings = RecordingSettings(**pose_settings(options), target=TargetSettings(options.learn_from))
-    selection, _ = read_sample_selection(scene_rig, settings)
-    return 0 if depends_on_time(scene_rig, settings, selection.controls) else None
+    values = {name: value for name, value in values.items() if value is not None}
+    values |= {name: tuple(value) for name, value in lists.items()}
+    if scene_rig and not options.bones_to_pose and options.poses != 0:
+        values["bones_to_pose"] = choose_bones(scene_rig, find_actions(RecordingSettings(**values)))
+    elif options.bones_to_pose == [DEFORMING]:
+        values["bones_to_pose"] = ()
+    return values

@@ -106,7 +106,16 @@ def values_from(owner: object, settings: list[Setting]) -> dict[str, Any]:
     }
 
 
-POSES = Setting("poses", 1000, "Number of random poses to record", "Poses", ui={"soft_max": 10000})
+POSES = Setting("poses", 1000, "Number of random poses to record", "Random Poses", ui={"soft_max": 10000})
+MAX_AUTO_POSES = 5000
+AUTO_POSES = Setting(
+    "auto_poses",
+    False,
+    f"Record as many random poses as this computer evaluates in about a minute, {POSES.default:,} to "
+    f"{MAX_AUTO_POSES:,}",
+    "Auto",
+    ui={"default": True},
+)
 SEED = Setting("seed", 0, "Random seed of the poses", "Seed")
 SPREAD = Setting(
     "spread",

@@ -12,12 +12,12 @@ from mathutils import Euler, Quaternion
 
 from ..core.progress import Job, Progress
 from ..poses.action_range import action_frames
-from ..scene.action_slots import ActionSlots, dependencies, slots_of_action
+from ..scene.action_slots import ActionSlots, constraint_actions, dependencies, slots_of_action
 from ..scene.animated_values import animated_values, set_value
 from ..scene.armature import PoseMatrixReader, clear_pose
 from ..scene.temporary_state import animation_state, assign_action, restore_animation, temporary_pose
 from ..scene.time_stretching import unstretched_time
-from .controls import animating_actions, constraint_actions
+from .controls import animating_actions
 from .object_values import DrivenProperty, ObjectReader, objects_evaluated
 
 RANDOM_POSE_COUNT = 200

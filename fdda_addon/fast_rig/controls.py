@@ -7,7 +7,7 @@ import bpy
 
 from ..core.errors import RigError, WrongUsageError
 from ..rig.references import split_bone_path
-from ..scene.action_slots import curves_of_actions
+from ..scene.action_slots import constraint_actions, curves_of_actions
 from ..scene.compatibility import is_bone_hidden
 
 VISIBLE, KEYED, COLLECTION = "visible", "keyed", "collection:"
@@ -71,17 +71,6 @@ def animating_actions(armature_object: bpy.types.Object) -> list[bpy.types.Actio
         for action in bpy.data.actions
         if action not in excluded and any(name in bones for name in keyed_bones(armature_object, action))
     ]
-
-
-def constraint_actions(armature_object: bpy.types.Object) -> set[bpy.types.Action]:
-    """Return the actions that only Action constraints of bones play."""
-    constraints = (constraint for bone in armature_object.pose.bones for constraint in bone.constraints)
-    actions = {c.action for c in constraints if c.type == "ACTION" and c.action is not None}
-    animation = armature_object.animation_data
-    if animation is not None:
-        strips = (strip for track in animation.nla_tracks for strip in track.strips)
-        actions -= {animation.action, *(strip.action for strip in strips)}
-    return actions
 
 
 def keyed_bones(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, int]:

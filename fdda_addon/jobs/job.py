@@ -84,6 +84,7 @@ class JobRunner:
         self.is_waiting = False
         self._finish, self._cancel_message, self._ends_itself = finish, cancel_message, ends_itself
         _runners[state.verb] = self
+        draw_cache.forget_actions()
 
     def work(self, seconds: float) -> bool:
         """Run the job for some seconds, or until it waits; return whether it has ended.

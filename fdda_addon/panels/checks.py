@@ -128,11 +128,14 @@ def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
         # Armatures are left out: Blender reports them as changed with every pose.
         if isinstance(update.id, bpy.types.Mesh):
             _changes.meshes.add(update.id.name)
+        elif isinstance(update.id, bpy.types.Action):
+            draw_cache.forget_actions()
 
 
 @persistent
 def _on_undo(*_: object) -> None:
     draw_cache.clear()
+    draw_cache.forget_actions()
     _changes.outdated.update(_changes.signatures)
     _changes.meshes.update(mesh.name for mesh in bpy.data.meshes)
 

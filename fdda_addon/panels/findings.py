@@ -4,7 +4,9 @@
 from typing import NamedTuple
 
 from ..core.checks.seams import count_split_vertices
+from ..core.rig import Rig
 from ..poses.motion_range import unlimited_bones
+from ..properties.recording_options import bones_to_pose
 from ..recording.rig_check import RigCheck
 from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig
@@ -29,8 +31,8 @@ def find(rig: SceneRig) -> tuple[Finding, ...]:
         *((m.show_viewport, getattr(m, "use_deform_preserve_volume", False)) for m in mesh_object.modifiers),
         settings.base_skinning,
         settings.bones_to_read,
-        settings.bones_to_pose,
-        settings.poses > 0,
+        bones_to_pose(rig),
+        settings.auto_poses or settings.poses > 0,
         bool(settings.learn_from),
     )
     return computed_once(("findings", mesh_object.session_uid), inputs, lambda: tuple(_find(rig, check)))
@@ -52,11 +54,28 @@ def _find(rig: SceneRig, check: RigCheck) -> list[Finding]:
     )
     if is_linear:
         findings.append(Finding(f"Only linear skinning deforms {mesh_object.name}: a model is not worth it."))
-    elif count := count_split_vertices(check.rig):
+    elif count := _count_split_vertices(rig, check.rig):
         text = f"{count:,} of {check.rig.vertex_count:,} vertices lie on others along cuts, which come apart."
         findings.append(Finding(text, "fdda.merge_vertices"))
     names = unlimited_bones(rig.armature_object, check.rig)
-    if names and settings.bones_to_pose == "WEIGHTS" and settings.poses and limits.has_any_limits(rig):
+    controlled_count = limits.count_controlled_bones(rig)
+    if 2 * controlled_count > len(joint_names):
+        text = f"{controlled_count:,} of {len(joint_names):,} deforming bones follow control bones. "
+        findings.append(Finding(f"{text}Check actions that move these, or choose them as Bones to Pose."))
+    elif (
+        names
+        and bones_to_pose(rig) == "WEIGHTS"
+        and (settings.auto_poses or settings.poses)
+        and limits.has_any_limits(rig)
+    ):
         text = f"{len(names):,} of {len(joint_names):,} bones have no rotation limits, and turn by ±45°."
         findings.append(Finding(text, "fdda.select_unlimited"))
     return findings
+
+
+def _count_split_vertices(rig: SceneRig, arrays: Rig) -> int:
+    """Count the split vertices of a mesh, again only if it was read again; most checks read no mesh."""
+    positions = arrays.rest_positions
+    name = "split vertices", rig.mesh_object.session_uid
+    # The array is stored with the count, so that no other array gets its id.
+    return computed_once(name, (id(positions),), lambda: (positions, count_split_vertices(arrays)))[1]

@@ -17,7 +17,7 @@ from ..poses.motion_range import (
     location_ranges,
     rotation_ranges,
 )
-from ..properties.recording_options import recorded_actions
+from ..properties.recording_options import bones_to_pose, recorded_actions
 from ..scene.compatibility import is_selected, selection_owner
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
@@ -90,7 +90,19 @@ def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[s
 
 def lacks_limits(rig: SceneRig) -> bool:
     """Return whether random poses rotate all bones by the default angle, because no bone has limits."""
-    return rig.mesh_object.fdda.settings.bones_to_pose == "WEIGHTS" and not has_any_limits(rig)
+    return bones_to_pose(rig) == "WEIGHTS" and not has_any_limits(rig)
+
+
+def count_controlled_bones(rig: SceneRig) -> int:
+    """Count the deforming bones that random poses cannot move, because constraints do; 0 if others are chosen."""
+    check, bones = checks.last_check(rig), rig.armature_object.pose.bones
+    if check is None or check.rig is None or bones_to_pose(rig) != "WEIGHTS":
+        return 0
+
+    def count() -> int:
+        return sum(is_moved_by_constraints(bones[name]) for name in check.rig.joint_names if name in bones)
+
+    return computed_once(("controlled bones", rig.mesh_object.session_uid), (check,), count)
 
 
 @draw_cached
@@ -113,7 +125,7 @@ def _have_limits(bones: Iterable[bpy.types.PoseBone]) -> bool:
 def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
     """Return the channels that random poses set, by bone; None for "Deforming Bones" or before the first check."""
     check = checks.last_check(rig)
-    if rig.mesh_object.fdda.settings.bones_to_pose == "WEIGHTS" or check is None or not check.channels:
+    if bones_to_pose(rig) == "WEIGHTS" or check is None or not check.channels:
         return None
 
     by_bone: dict[str, list[Channel]] = {}
@@ -171,7 +183,7 @@ def draw_limits(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
         if channels is None:
             _draw_limits(body.box(), rig, bone)
         elif bone.name in channels:
-            if rig.mesh_object.fdda.settings.bones_to_pose in {"ACTIONS", "REMIX"}:
+            if bones_to_pose(rig) in {"ACTIONS", "REMIX"}:
                 sampling.draw_channels(body.box(), bone, channels[bone.name])
             else:
                 _draw_limits(body.box(), rig, bone)

@@ -9,6 +9,7 @@ from ..core.mathematics.poses import CONTROL, Channel
 from ..models.changes import compare_with_model
 from ..models.entries import active_entry, format_file_size, is_bound
 from ..models.model_list import entry_info, entry_info_of_mesh
+from ..properties.recording_options import bones_to_pose
 from ..rig.reading import read_model_rig
 from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig, armature_of
@@ -37,9 +38,7 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
             info = entry_info_of_mesh(mesh_object, entry)
             if check is not None and check.rig is not None:
                 rig = rig_of_model(scene_rig, check.rig, info)
-                changes = compare_with_model(
-                    entry.name, info, rig, _compared_channels(mesh_object, check.channels, info)
-                )
+                changes = compare_with_model(entry.name, info, rig, _compared_channels(scene_rig, check.channels, info))
                 if changes.sentence:
                     problems[_entry_key(entry)] = ("ERROR" if changes.prevents_playback else "INFO", changes.sentence)
         except FDDAError as error:
@@ -48,10 +47,10 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
 
 
 def _compared_channels(
-    mesh_object: bpy.types.Object, channels: "tuple[Channel, ...]", info: "ModelInfo"
+    scene_rig: SceneRig, channels: "tuple[Channel, ...]", info: "ModelInfo"
 ) -> "tuple[Channel, ...]":
     """Return the rig's ranges to compare with those of a model; the model's own if the user chose the posed bones."""
-    if mesh_object.fdda.settings.bones_to_pose != "WEIGHTS":
+    if bones_to_pose(scene_rig) != "WEIGHTS":
         return info.limits
     return tuple(channel for channel in channels if channel.kind != CONTROL)
 

@@ -3,6 +3,7 @@
 
 import bpy
 
+from ..core.settings import MAX_AUTO_POSES, POSES
 from ..properties.recording_options import actions_of_rig
 from ..scene.scene_rig import SceneRig
 from . import limits, sampling
@@ -41,7 +42,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         rig = panel_rig(context)[0]
         if rig is None or not _has_poses(rig):
             return False
-        return not limits.lacks_limits(rig)
+        return not limits.lacks_limits(rig) and not limits.count_controlled_bones(rig)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
@@ -75,7 +76,12 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
     box = layout.box().column()
     column = box.column()
     column.use_property_split, column.use_property_decorate = True, False
-    column.prop(settings, "poses", text="Random Poses")
+    row = column.row(align=True, heading="Random Poses")
+    if settings.auto_poses:
+        row.prop(settings, "auto_poses", text=f"Auto ({POSES.default:,} to {MAX_AUTO_POSES:,})", toggle=1)
+    else:
+        row.prop(settings, "poses", text="")
+        row.prop(settings, "auto_poses", toggle=1)
     actions = actions_of_rig(rig)
     if not actions:
         return
@@ -89,7 +95,8 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
 
 def _has_poses(rig: SceneRig) -> bool:
     """Return whether there is something to record."""
-    return bool(rig.mesh_object.fdda.settings.poses) or any(action.fdda.record for action in actions_of_rig(rig))
+    settings = rig.mesh_object.fdda.settings
+    return settings.auto_poses or settings.poses > 0 or any(action.fdda.record for action in actions_of_rig(rig))
 
 
 CLASSES = (limits.FDDA_UL_bones, sampling.FDDA_UL_controls, FDDA_UL_actions, FDDA_PT_poses)

@@ -13,12 +13,19 @@ from ..core.mathematics.poses import Channel
 from ..core.recording.estimate import format_poses
 from ..core.recording.folder import FolderContent, FolderState, read_folder
 from ..core.recording.index import INDEX_NAME
+from ..core.settings import MAX_AUTO_POSES, POSES
 from ..core.wording import format_count
 from ..jobs import job
 from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder
 from ..properties.recording_options import recorded_actions, recording_settings
-from ..recording.plan import RecordingSettings, find_recorded_character, make_sampling, read_sampled_rig
+from ..recording.plan import (
+    RecordingSettings,
+    find_recorded_character,
+    keep_recorded_poses,
+    make_sampling,
+    read_sampled_rig,
+)
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
@@ -48,14 +55,15 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
             return read_folder(path)
         try:
             character = find_recorded_character(path, rig.mesh_object.name)
+            planned = keep_recorded_poses(settings, path)
             recorded_rig, channels = check.rig, check.channels
             if character.other_meshes:
-                recorded_rig, channels = read_sampled_rig(character, settings)
+                recorded_rig, channels = read_sampled_rig(character, planned)
         except RecordingError:
-            character, recorded_rig, channels = rig, check.rig, check.channels
+            character, planned, recorded_rig, channels = rig, settings, check.rig, check.channels
         except RigError as error:
             return replace(read_folder(path), state=FolderState.OTHER, sentence=str(error))
-        return read_folder(path, recorded_rig, _current_sampling(character, settings, channels))
+        return read_folder(path, recorded_rig, _current_sampling(character, planned, channels))
 
     name = ("recording folder", rig.mesh_object.session_uid)
     return computed_once(name, (path, modified_ns, check, settings), read)
@@ -164,6 +172,8 @@ def _describe_poses(rig: SceneRig) -> str:
     settings = rig.mesh_object.fdda.settings
     frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig)]
     parts = [format_count(settings.poses, "random pose")] if settings.poses or not frames else []
+    if settings.auto_poses:
+        parts = [f"{POSES.default:,} to {MAX_AUTO_POSES:,} random poses"]
     if frames:
         parts.append(f"{format_count(sum(frames), 'frame')} of {format_count(len(frames), 'action')}")
         if settings.mirror:

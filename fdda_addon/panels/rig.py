@@ -118,6 +118,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
             curves.draw(layout, state.curves)
         return
     _draw_verdict(layout, context, rig)
+    settings = rig.mesh_object.fdda.settings
     row = layout.row()
     row.scale_y = 1.3
     problem = file_problem(rig.mesh_object)
@@ -128,7 +129,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
     draw_button(row, context, "fdda.build_model", label, "PLAY")
     if problem:
         draw_wrapped(layout, context, problem, "INFO")
-    elif limits.lacks_limits(rig) and rig.mesh_object.fdda.settings.poses:
+    elif limits.lacks_limits(rig) and (settings.auto_poses or settings.poses):
         draw_wrapped(layout, context, "No rotation limits yet: set them in Training Poses first.", "ERROR")
 
 

@@ -6,7 +6,7 @@ import math
 import bpy
 
 from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
-from ..properties.recording_options import recorded_actions
+from ..properties.recording_options import describe_chosen_bones, recorded_actions
 from ..recording.rig_check import RigCheck
 from ..scene.scene_rig import SceneRig
 from . import checks
@@ -43,8 +43,10 @@ def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, r
     column.prop(settings, "bones_to_pose", text="")
     if settings.bones_to_pose == "COLLECTION":
         column.prop_search(settings, "bone_collection", rig.armature_object.data, "collections_all", text="")
-    elif settings.bones_to_pose in {"ACTIONS", "REMIX"} and not recorded_actions(rig):
+    elif settings.bones_to_pose == "ACTIONS" and not recorded_actions(rig):
         draw_wrapped(column, context, "Check the actions below that show how the rig moves.", "INFO")
+    elif settings.bones_to_pose in {"AUTO", "REMIX"}:
+        draw_wrapped(column, context, describe_chosen_bones(rig))
     elif settings.bones_to_pose == "SELECTED":
         count = len(settings.sampled_bones)
         if not count:

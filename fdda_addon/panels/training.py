@@ -74,7 +74,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         if (state := _last_training(rig)) is not None:
             curves.draw(layout, state.curves)
         if trained is not None and not trained.mismatch:
-            _draw_assessment(layout, context, trained)
+            _draw_assessment(layout, context, rig, trained)
             # Draw the buttons that follow a training: the model is bound, or improved.
             if not rig.mesh_object.fdda.is_bound:
                 row = layout.row()
@@ -178,7 +178,9 @@ def _draw_settings(
         draw_wrapped(layout, context, f"{trained.path.name} exists; Train Again keeps it as the previous model.")
 
 
-def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, trained: TrainedFile) -> None:
+def _draw_assessment(
+    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile
+) -> None:
     """Draw what the errors of the training mean, what its skin weights and key joints are, and what to do next."""
     report, assessment = _read_report(report_path(trained.path)), read_assessment(trained.path)
     if report is None or assessment is None:
@@ -190,7 +192,9 @@ def _draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, tra
     for warning in assessment.warnings:
         draw_wrapped(box, context, warning, "BLANK1")
     if assessment.next_step:
-        draw_wrapped(box, context, assessment.next_step, "BLANK1")
+        is_bound = rig.mesh_object.fdda.is_bound
+        text = assessment.next_step.replace("bind the model, then ", "") if is_bound else assessment.next_step
+        draw_wrapped(box, context, text, "BLANK1")
     if trained.skin_sentence:
         draw_wrapped(box, context, trained.skin_sentence, "BLANK1")
     if warnings := report.get("warnings"):

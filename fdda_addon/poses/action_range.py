@@ -4,11 +4,10 @@
 The measurement reads F-curves only: it does not evaluate or change the scene.
 """
 
-import hashlib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import TypeVar
 
 import bpy
 import numpy as np
@@ -19,17 +18,16 @@ from ..core.errors import RigError
 from ..core.mathematics.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.mathematics.rotations import euler_angles, rotation_vectors, total_range_width
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions
-from ..scene.arrays import KEYFRAME_ELEMENTS, read
 from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_name, owner_of
+from ..scene.draw_cache import actions_state, computed_once
 from ..scene.scene_rig import SceneRig
 
 _CONTROL_PATH = re.compile(r'.*(?:\]\.influence|key_blocks\["(?:[^"\\]|\\.)*"\]\.value|\["(?:[^"\\]|\\.)*"\])')
 
-MAX_CACHE_BYTES = 64_000_000
-"""Size of the cached rotations at which the cache is cleared."""
 CONTINUOUS_ANGLES_PREFERENCE = 0.9
 """Euler angles that are continuous over frames are used unless wrapped angles have ranges narrower by this factor."""
 
+Value = TypeVar("Value")
 ChannelRanges = dict[tuple[str, str, int], tuple[float, float]]
 """Lowest and highest value of channels, by bone, kind and axis."""
 
@@ -118,25 +116,6 @@ def axis_angle_to_quaternion(value: np.ndarray) -> Quaternion:
     return Quaternion(axis, value[0]) if axis.length else Quaternion()
 
 
-@dataclass(frozen=True)
-class _Measurement:
-    """The motion that an action keys.
-
-    Attributes:
-        content_key: identifies the measured keyframes; None if the motion depends on more than keyframes.
-        ranges: ranges of all channels, with Euler angles that are continuous over frames.
-        rotations: (F, 4) float32 quaternions by bone, of the bones that are not keyed as Euler angles.
-    """
-
-    content_key: tuple | None
-    ranges: ChannelRanges
-    rotations: dict[str, np.ndarray]
-
-
-_cache: dict[tuple[int, int], _Measurement] = {}
-"""Measurements by the session ids of the armature object and the action."""
-
-
 def action_frames(action: bpy.types.Action) -> range:
     """Return the whole frames of an action."""
     first_frame, last_frame = (round(frame) for frame in action.frame_range)
@@ -172,15 +151,23 @@ def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.
     Bones that are keyed as quaternions or axis angles have rotation vectors besides their Euler angles. Euler angles
     wrap, and have wide ranges near gimbal lock; the ranges of rotation vectors are about as wide as the motion.
     """
+    actions = list(actions)
+    return computed_for_actions(
+        "ranges", (armature_object,), actions, lambda: _measure_ranges(armature_object, actions)
+    )
+
+
+def _measure_ranges(armature_object: bpy.types.Object, actions: list[bpy.types.Action]) -> ChannelRanges:
     ranges: ChannelRanges = {}
     rotations: dict[str, list[np.ndarray]] = {}
-    actions = list(actions)
     for action, curves in zip(actions, curves_of_actions(actions, armature_object), strict=True):
-        measurement = _measure(armature_object, action, curves_by_bone(armature_object, curves))
-        for key, (low, high) in measurement.ranges.items():
-            lowest, highest = ranges.get(key, (np.inf, -np.inf))
-            ranges[key] = min(lowest, low), max(highest, high)
-        for bone, quaternions in measurement.rotations.items():
+        keyed_rotations: dict[str, np.ndarray] = {}
+        for name, bone_curves in curves_by_bone(armature_object, curves).items():
+            bone = armature_object.pose.bones[name]
+            for kind, axis, values in channel_values(bone, bone_curves, action_frames(action), keyed_rotations):
+                lowest, highest = ranges.get((name, kind, axis), (np.inf, -np.inf))
+                ranges[name, kind, axis] = min(lowest, float(values.min())), max(highest, float(values.max()))
+        for bone, quaternions in keyed_rotations.items():
             rotations.setdefault(bone, []).append(quaternions)
     for bone, arrays in rotations.items():
         quaternions = np.concatenate(arrays)
@@ -192,48 +179,34 @@ def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.
     return ranges
 
 
+def computed_for_actions(
+    name: str, datablocks: Sequence[bpy.types.Object], actions: Sequence[bpy.types.Action], compute: Callable[[], Value]
+) -> Value:
+    """Return what follows from actions and an armature object; it is computed again if one of them changes.
+
+    The sidebar asks with every check of a rig, and dozens of actions take seconds.
+
+    Args:
+        name: what is computed.
+        datablocks: the armature object, and what else the value depends on.
+        actions: the actions.
+        compute: returns the value.
+    """
+    bones, animation = datablocks[0].pose.bones, datablocks[0].animation_data
+    state = (
+        actions_state(),
+        animation and animation.action and animation.action.session_uid,
+        [(bone.name, bone.rotation_mode, *bone.lock_rotation) for bone in bones],
+        [tuple(action.frame_range) for action in actions],
+    )
+    key = (name, *(d.session_uid for d in (*datablocks, *actions)))
+    return computed_once(key, state, compute)
+
+
 def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> ChannelRanges:
     """Return the ranges of (n, 3) values of a bone."""
     bounds = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
     return {(bone, kind, axis): low_high for axis, low_high in enumerate(bounds)}
-
-
-def _measure(
-    armature_object: bpy.types.Object, action: bpy.types.Action, curves: dict[str, CurvesByChannel]
-) -> _Measurement:
-    """Measure an action, and cache the result until its keyframes change, because many bones take a second."""
-    frames = action_frames(action)
-    content_key = _keyframe_content_key(armature_object, frames, curves)
-    cache_key = armature_object.session_uid, action.session_uid
-    measurement = _cache.get(cache_key)
-    if content_key is None or measurement is None or measurement.content_key != content_key:
-        measurement = _Measurement(content_key, {}, {})
-        for name, bone_curves in curves.items():
-            bone = armature_object.pose.bones[name]
-            for kind, axis, values in channel_values(bone, bone_curves, frames, measurement.rotations):
-                measurement.ranges[name, kind, axis] = float(values.min()), float(values.max())
-        if sum(array.nbytes for cached in _cache.values() for array in cached.rotations.values()) > MAX_CACHE_BYTES:
-            _cache.clear()
-        _cache[cache_key] = measurement
-    return measurement
-
-
-def _keyframe_content_key(
-    armature_object: bpy.types.Object, frames: range, curves: dict[str, CurvesByChannel]
-) -> tuple[range, bytes, tuple] | None:
-    """Return a key that identifies the measured keyframes; None if the motion depends on more than keyframes."""
-    digest, curve_settings = hashlib.sha256(), []
-    for bone, channels in curves.items():
-        for channel, curves_by_index in channels.items():
-            for index, curve in curves_by_index.items():
-                keyframes = curve.keyframe_points
-                if curve.modifiers or not keyframes:
-                    return None
-                rotation_mode = armature_object.pose.bones[bone].rotation_mode
-                curve_settings.append((bone, rotation_mode, channel, index, len(keyframes), curve.extrapolation))
-                for keyframe_property in KEYFRAME_ELEMENTS:
-                    digest.update(read(keyframes, keyframe_property))
-    return frames, digest.digest(), tuple(curve_settings)
 
 
 def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Control, ...]:
@@ -280,7 +253,17 @@ def keyed_numbers(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> l
     Returns:
         For each action, (F,) float64 values in its frames, by owner and path as in `Control`.
     """
-    actions, numbers_by_action = list(actions), []
+    actions = list(actions)
+    return computed_for_actions(
+        "numbers",
+        (scene_rig.armature_object, *scene_rig.mesh_objects),
+        actions,
+        lambda: _evaluate_numbers(scene_rig, actions),
+    )
+
+
+def _evaluate_numbers(scene_rig: SceneRig, actions: list[bpy.types.Action]) -> list[dict[tuple[str, str], np.ndarray]]:
+    numbers_by_action = []
     curves_by_action = curves_of_actions(actions, *scene_rig.mesh_objects, scene_rig.armature_object)
     for action, curves in zip(actions, curves_by_action, strict=True):
         frames, numbers = action_frames(action), {}

@@ -240,6 +240,17 @@ def ranges_by_control(armature_object: bpy.types.Object, channels: Iterable[Chan
     return ranges
 
 
+def limited_bones(armature_object: bpy.types.Object) -> set[str]:
+    """Return the deforming bones that have rotation limits and are not moved by constraints."""
+    return {
+        bone.name
+        for bone in armature_object.pose.bones
+        if bone.bone.use_deform
+        and not is_moved_by_constraints(bone)
+        and any(rotation.source != DEFAULT for rotation in rotation_ranges(bone))
+    }
+
+
 def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
     """Return whether a constraint other than a limit moves a bone."""
     return any(c.type not in LIMIT_CONSTRAINTS and not c.mute and c.influence > 0 for c in bone.constraints)

@@ -2,6 +2,7 @@
 """Reads the frames of actions from which random poses combine limbs (`core.mathematics.remix`)."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 
 import bpy
 import numpy as np
@@ -11,24 +12,85 @@ from ..core.errors import RigError
 from ..core.mathematics.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION_VECTOR, SCALE, Channel
 from ..core.mathematics.remix import Remix, find_limbs
 from ..core.mathematics.rotations import rotation_vectors
-from ..scene.action_slots import curves_of_actions
+from ..core.wording import format_count
+from ..scene.action_slots import (
+    constraint_actions,
+    curves_of_actions,
+    dependencies,
+    slots_of_action,
+    unmuted_curves,
+)
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_range import (
     CurvesByChannel,
     action_frames,
     axis_angle_to_quaternion,
+    computed_for_actions,
     curves_by_bone,
     evaluate_curves,
     has_width,
     keyed_numbers,
+    keyed_ranges,
+    moving_ranges,
 )
+from .motion_range import limited_bones
 
+REMIX = "remix"
+"""Entry for the bones of actions whose limbs are combined from different frames (`mathematics.remix`)."""
+MAX_FRAMES = 3000
+"""Largest number of frames of actions that are read without being recorded."""
 _REST_VALUES = {ROTATION_VECTOR: 0.0, LOCATION: 0.0, SCALE: 1.0}
 
 
-def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remix:
-    """Read the frames of actions.
+def choose_bones(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Action]) -> tuple[str, ...]:
+    """Choose what random poses move if the user does not.
+
+    Limbs come from the recorded actions. Without any, deforming bones move within their limits. If they have none,
+    limbs come from all actions of the rig, because any other range would be a guess.
+
+    Returns:
+        The choice in the syntax of `sampling.parse_sample_selection`.
+    """
+    if not recorded_actions and limited_bones(scene_rig.armature_object):
+        return ()
+    actions = remixed_actions(scene_rig, recorded_actions)
+    return (REMIX,) if moving_ranges(keyed_ranges(scene_rig.armature_object, actions)) else ()
+
+
+def describe_bones(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Action]) -> str:
+    """Return a sentence about what `choose_bones` chooses."""
+    if not choose_bones(scene_rig, recorded_actions):
+        return "Random poses move the deforming bones within their limits."
+    count = len(remixed_actions(scene_rig, recorded_actions))
+    if recorded_actions:
+        return f"Random poses combine limbs from {format_count(count, 'recorded action')}."
+    not_recorded = "which is not recorded itself" if count == 1 else "which are not recorded themselves"
+    return f"Random poses combine limbs from {format_count(count, 'action')}, {not_recorded}."
+
+
+def remixed_actions(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Action]) -> tuple[bpy.types.Action, ...]:
+    """Return the actions whose limbs are combined: the recorded ones, or without any, all that key bones of a rig.
+
+    All actions are those with `MAX_FRAMES` frames together at most, in the order of their names.
+    """
+    if recorded_actions:
+        return tuple(recorded_actions)
+    armature_object, actions, frames = scene_rig.armature_object, [], 0
+    datablocks = dependencies(*scene_rig.mesh_objects, armature_object)
+    excluded = constraint_actions(armature_object)
+    for action in bpy.data.actions:
+        # An action that fits two objects equally is one of another rig.
+        with suppress(RigError):
+            slot = None if action in excluded else slots_of_action(action, datablocks).get(armature_object)
+            if slot and curves_by_bone(armature_object, {armature_object: unmuted_curves(action, slot)}):
+                frames += len(action_frames(action))
+                actions += [action] if frames <= MAX_FRAMES or not actions else []
+    return tuple(actions)
+
+
+def read_remix(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Action]) -> Remix:
+    """Read the frames of the actions whose limbs are combined (`remixed_actions`).
 
     A bone that an action does not key is in its rest pose in the frames of this action. Locations, scales and custom
     properties of a bone come from the same frame as its rotation, without noise; numbers that belong to no bone, such
@@ -37,6 +99,12 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
     Raises:
         RigError: the actions move no bone, or have one pose.
     """
+    actions = remixed_actions(scene_rig, recorded_actions)
+    datablocks = scene_rig.armature_object, *scene_rig.mesh_objects
+    return computed_for_actions("remix", datablocks, actions, lambda: _read_remix(scene_rig, actions))
+
+
+def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remix:
     armature_object = scene_rig.armature_object
     curves_by_action = curves_of_actions(actions, *scene_rig.mesh_objects, armature_object)
     clips = [
@@ -56,7 +124,8 @@ def read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Remi
                     columns.append((channel, values[:, axis], limbs[bone.name], has_noise))
     names = ", ".join(f"'{action.name}'" for action in actions)
     if not columns:
-        raise RigError(f"There is no pose to remix: {names} moves no bone of '{armature_object.name}'.")
+        moves = f"{names} moves no bone" if names else "no action moves a bone"
+        raise RigError(f"There is no pose to remix: {moves} of '{armature_object.name}'.")
     limbs_by_path = {bone.path_from_id(): limbs[bone.name] for bone in bones}
     for (owner, path), values in _number_values(scene_rig, actions).items():
         limb = limbs_by_path.get(path[: path.find('"]') + 2], len(bones))

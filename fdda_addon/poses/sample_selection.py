@@ -14,10 +14,9 @@ from ..scene.compatibility import is_selected
 from ..scene.scene_rig import SceneRig
 from .action_range import constant_controls, keyed_controls, keyed_ranges, measured_controls
 from .clip import find_action
-from .remix import read_remix
+from .motion_range import limited_bones
+from .remix import REMIX, read_remix, remixed_actions
 
-REMIX = "remix"
-"""Entry for the bones of the recorded actions, whose limbs are combined from different frames (`mathematics.remix`)."""
 SELECTED_BONES, COLLECTION_PREFIX, ACTION_PREFIX, BONE_PREFIX = "selected", "collection:", "action:", "bone:"
 """Forms of an entry: the selected bones, and the prefixes of a bone collection, an action and a single bone."""
 
@@ -78,10 +77,11 @@ def select_bones(
     remix = None
     for text in texts:
         if text == REMIX:
-            if not recorded_actions:
-                raise RigError("Remixed poses combine the limbs of recorded actions; name some (--action NAME).")
-            actions += recorded_actions
+            actions += remixed_actions(scene_rig, recorded_actions)
             remix = read_remix(scene_rig, recorded_actions)
+            # Bones that the actions leave at rest move within the limits that they have.
+            remixed_bones = {channel.name for channel in remix.channels}
+            selected_bones |= limited_bones(scene_rig.armature_object) - remixed_bones
         elif text.startswith(ACTION_PREFIX):
             actions.append(find_action(text.removeprefix(ACTION_PREFIX)))
             if not keyed_ranges(scene_rig.armature_object, actions[-1:]) and not keyed_controls(

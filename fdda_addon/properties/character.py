@@ -19,6 +19,7 @@ from bpy.props import (
 
 from ..core.errors import OutputError
 from ..core.settings import (
+    AUTO_POSES,
     DETAIL_MM,
     GOAL_MM,
     LEARN_FROM,
@@ -43,14 +44,18 @@ MAX_INT = (1 << 31) - 1
 """Largest value of an integer property."""
 
 
-def make_property(setting: Setting) -> object:
-    """Make Blender's property of a setting."""
+def make_property(setting: Setting, **arguments: object) -> object:
+    """Make Blender's property of a setting, with further arguments."""
     kinds = {bool: BoolProperty, int: IntProperty, float: FloatProperty, str: StringProperty}
     limits = {"min": setting.low} if setting.kind in (int, float) else {}
     if setting.high < MAX_INT:
         limits["max"] = setting.high
-    values = {"default": setting.default, **limits, **setting.ui}
+    values = {"default": setting.default, **limits, **setting.ui, **arguments}
     return kinds[setting.kind](name=setting.label, description=setting.description, **values)
+
+
+def _leave_automatic_poses(settings: "FDDA_PG_character", _context: bpy.types.Context) -> None:
+    settings.auto_poses = False
 
 
 @not_animatable
@@ -98,7 +103,8 @@ class FDDA_PG_control(bpy.types.PropertyGroup):
 class FDDA_PG_character(bpy.types.PropertyGroup):
     """Settings of the poses, the recording and the training of a character."""
 
-    poses: make_property(POSES)
+    poses: make_property(POSES, update=_leave_automatic_poses)
+    auto_poses: make_property(AUTO_POSES)
     seed: make_property(SEED)
     spread: make_property(SPREAD)
     overshoot: make_property(OVERSHOOT)
@@ -106,6 +112,12 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         name="Bones to Pose",
         description="Bones that random poses move",
         items=(
+            (
+                "AUTO",
+                "Automatic",
+                "Limbs from the checked actions. Without any, Deforming Bones within their limits; if there are no "
+                "limits, limbs from all actions of the rig",
+            ),
             ("WEIGHTS", "Deforming Bones", "The bones that deform the mesh, and all bones with limits"),
             ("COLLECTION", "Bone Collection", "The bones of a bone collection and of its child collections"),
             (
@@ -120,7 +132,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
             ),
             ("SELECTED", "Selected Bones", "The bones that were selected when Use Selected Bones was pressed"),
         ),
-        default="WEIGHTS",
+        default="AUTO",
     )
     bone_collection: StringProperty(name="Collection", description="Bone collection with the bones that animators pose")
     sampled_bones: CollectionProperty(type=FDDA_PG_bone)

@@ -4,13 +4,14 @@
 import bpy
 
 from ..core.errors import RigError
-from ..core.settings import settings_of, values_from
+from ..core.settings import MAX_AUTO_POSES, POSES, settings_of, values_from
 from ..poses.action_range import action_frames
+from ..poses.remix import REMIX, choose_bones, describe_bones
 from ..recording.plan import RecordingSettings
 from ..rig.pose_setter import TargetSettings
 from ..scene.action_slots import dependencies, may_animate
 from ..scene.active_rig import cached_active_rig
-from ..scene.draw_cache import draw_cached
+from ..scene.draw_cache import actions_state, computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from .character import FDDA_PG_character, default_model, default_recording
 
@@ -19,13 +20,17 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
     """Return the settings of a recording of a character."""
     settings = scene_rig.mesh_object.fdda.settings
     actions = recorded_actions(scene_rig)
+    values = values_from(settings, settings_of(RecordingSettings))
+    values["mirror"] &= bool(actions)
+    if settings.auto_poses:
+        values["poses"] = POSES.default
     return RecordingSettings(
         actions=actions,
         resume=resume,
-        bones_to_pose=_sample_options(settings, actions),
+        bones_to_pose=_sample_options(scene_rig, actions),
         extra_inputs=_control_options(settings),
         target=target_settings(settings),
-        **(values_from(settings, settings_of(RecordingSettings)) | {"mirror": settings.mirror and bool(actions)}),
+        **values,
     )
 
 
@@ -60,19 +65,47 @@ def copy_settings(mesh_object: bpy.types.Object, source_object: bpy.types.Object
                 setattr(copied_entry, attribute, getattr(entry, attribute))
 
 
-def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
+def bones_to_pose(scene_rig: SceneRig) -> str:
+    """Return the setting Bones to Pose of a character, with its choice in place of Automatic."""
+    setting = scene_rig.mesh_object.fdda.settings.bones_to_pose
+    if setting != "AUTO":
+        return setting
+    actions = recorded_actions(scene_rig)
+    inputs = actions_state(), actions, actions_of_rig(scene_rig)
+    name = "bones to pose", scene_rig.mesh_object.session_uid
+
+    def choose() -> str:
+        return "REMIX" if choose_bones(scene_rig, [bpy.data.actions[name] for name in actions]) else "WEIGHTS"
+
+    return computed_once(name, inputs, choose)
+
+
+@draw_cached
+def describe_chosen_bones(scene_rig: SceneRig) -> str:
+    """Return a sentence about the actions from which random poses combine limbs, or about the deforming bones."""
+    return describe_bones(scene_rig, [bpy.data.actions[name] for name in recorded_actions(scene_rig)])
+
+
+def _sample_options(scene_rig: SceneRig, actions: tuple[str, ...]) -> tuple[str, ...]:
     """Return the bones that random poses move, in the syntax of `poses.sampling.parse_sample_selection`."""
+    settings = scene_rig.mesh_object.fdda.settings
+    if settings.bones_to_pose == "AUTO":
+        if not (settings.auto_poses or settings.poses):
+            return ()
+        return (REMIX,) if bones_to_pose(scene_rig) == "REMIX" else ()
     if settings.bones_to_pose == "COLLECTION":
         if not settings.bone_collection:
             raise RigError(
                 "Bones to Pose is set to Bone Collection, but no collection is chosen; choose one in Training Poses."
             )
         return (f"collection:{settings.bone_collection}",)
-    if settings.bones_to_pose in {"ACTIONS", "REMIX"}:
+    if settings.bones_to_pose == "REMIX":
+        return (REMIX,)
+    if settings.bones_to_pose == "ACTIONS":
         if not actions:
-            label = settings.bl_rna.properties["bones_to_pose"].enum_items[settings.bones_to_pose].name
+            label = settings.bl_rna.properties["bones_to_pose"].enum_items["ACTIONS"].name
             raise RigError(f"Bones to Pose is set to {label}, but no action is checked; check one below it.")
-        return tuple(f"action:{name}" for name in actions) if settings.bones_to_pose == "ACTIONS" else ("remix",)
+        return tuple(f"action:{name}" for name in actions)
     if settings.bones_to_pose == "SELECTED":
         if not settings.sampled_bones:
             raise RigError(
@@ -100,7 +133,9 @@ def planned_pose_count(scene_rig: SceneRig) -> int:
     """Return the number of poses that a recording with the settings of a character has."""
     settings = scene_rig.mesh_object.fdda.settings
     frames = sum(len(action_frames(bpy.data.actions[name])) for name in recorded_actions(scene_rig))
-    return settings.poses + frames * (2 if settings.mirror else 1)
+    # The number of automatic poses is known once the first ones were evaluated.
+    poses = (POSES.default + MAX_AUTO_POSES) // 2 if settings.auto_poses else settings.poses
+    return poses + frames * (2 if settings.mirror else 1)
 
 
 def actions_of_active_rig(context: bpy.types.Context) -> list[str]:

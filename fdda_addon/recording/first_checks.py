@@ -21,8 +21,9 @@ from ..scene.armature import clear_pose
 from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control
 from .pose_plan import PosePlan
 
-MAX_TARGET_POSES, MAX_SEAM_POSES = 20, 10
-"""Number of poses in which the motion of a target is compared, and the gaps of a mesh with cuts are measured."""
+MAX_TARGET_POSES, MAX_SEAM_POSES, TIMED_POSES = 20, 10, 12
+"""Number of poses in which the motion of a target is compared, in which the gaps of a mesh with cuts are measured, and
+that are timed."""
 MIN_RIG_MOTION_RATIO, MAX_STILL_TARGET_RATIO = 0.02, 1e-5
 """Ratios of the rig's size. A target does not follow the rig if it moves by less than the second ratio while the rig
 moves by more than the first ratio."""
@@ -158,6 +159,19 @@ def check_seams(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) ->
     clear_pose(evaluator.scene_rig.armature_object)
     player.restore_numbers()
     return f"{evaluator.scene_rig.mesh_object.name}: {warnings[0]}" if warnings else ""
+
+
+def measure_seconds_per_pose(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> float:
+    """Return the median time of the first random poses."""
+    times = [time.perf_counter()]
+    with closing(plan.show_poses(player, range(min(plan.random_count, TIMED_POSES)))) as poses:
+        for _ in poses:
+            evaluator.evaluate()
+            times.append(time.perf_counter())
+    player.stop()
+    clear_pose(evaluator.scene_rig.armature_object)
+    player.restore_numbers()
+    return float(np.median(np.diff(times)))
 
 
 def check_saturation(evaluator: PoseEvaluator) -> str:

@@ -10,13 +10,13 @@ import bpy
 from ..core.controls import Control
 from ..core.mathematics.poses import CONTROL, Channel, Overshoot, make_overshoot
 from ..core.mathematics.remix import PoseSampler
-from ..core.recording.index import POSE, RANDOM, Sampling, Source, read_index
+from ..core.recording.index import INDEX_NAME, POSE, RANDOM, Sampling, Source, read_index, read_info
 from ..core.rig import Rig
-from ..core.settings import MIRROR, OVERSHOOT, POSES, SEED, SPREAD
+from ..core.settings import AUTO_POSES, MAX_AUTO_POSES, MIRROR, OVERSHOOT, POSES, SEED, SPREAD
 from ..poses.clip import find_clips
 from ..poses.control_bones import split_control_bones
-from ..poses.remix import read_remix
-from ..poses.sample_selection import REMIX, SampleSelection, select_bones
+from ..poses.remix import REMIX, read_remix
+from ..poses.sample_selection import SampleSelection, select_bones
 from ..poses.sampling import (
     ControlRanges,
     controls_of_bones,
@@ -34,6 +34,8 @@ from ..rig.target import find_target
 from ..scene.controls import owner_name, parse_controls
 from ..scene.scene_rig import SceneRig, find_character, find_rig
 
+AUTO_SECONDS, AUTO_STEP, MAX_AUTO_BYTES = 60.0, 500, 4_000_000_000
+"""Time and size of an automatic number of random poses, and what it is a multiple of."""
 INFLUENCE_POSES = 4
 """Number of base poses from which each input is moved alone."""
 
@@ -44,6 +46,7 @@ class RecordingSettings:
 
     Attributes:
         poses: number of random poses.
+        auto_poses: replace it by the number that is evaluated in about a minute (`automatic_poses`).
         seed: seed of the random poses.
         spread: standard deviation of the random poses as a ratio of half the range of motion.
         overshoot: factor that widens the range of motion for some random poses (`mathematics.poses.make_overshoot`); 1
@@ -60,6 +63,7 @@ class RecordingSettings:
     """
 
     poses: int = POSES.field()
+    auto_poses: bool = AUTO_POSES.field()
     seed: int = SEED.field()
     spread: float = SPREAD.field()
     overshoot: float = OVERSHOOT.field()
@@ -88,6 +92,24 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
     selection = replace(selection, controls=controls)
     rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings, selection.controls))
     return replace(rig, controls=controls), random_pose_channels(scene_rig, rig, selection) if settings.poses else ()
+
+
+def automatic_poses(seconds_per_pose: float, bytes_per_pose: int, free_bytes: int) -> int:
+    """Return the number of random poses that are evaluated in about a minute, 1,000 to 5,000.
+
+    A recording of more than 1,000 takes 4 GB and half of the free space of the disk at most.
+    """
+    size = min(MAX_AUTO_BYTES, free_bytes / 2)
+    count = min(AUTO_SECONDS / seconds_per_pose, size / bytes_per_pose, MAX_AUTO_POSES)
+    return max(POSES.default, int(count) // AUTO_STEP * AUTO_STEP)
+
+
+def keep_recorded_poses(settings: RecordingSettings, path: Path) -> RecordingSettings:
+    """Return settings with the number of random poses of the recording in a folder in place of an automatic one."""
+    if not settings.auto_poses or not (path / INDEX_NAME).exists():
+        return settings
+    sources = read_info(read_index(path)).sampling.sources
+    return replace(settings, poses=sum(s.poses for s in sources if s.kind == RANDOM), auto_poses=False)
 
 
 def random_pose_channels(scene_rig: SceneRig, rig: Rig, selection: SampleSelection) -> tuple[Channel, ...]:

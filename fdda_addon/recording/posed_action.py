@@ -13,7 +13,7 @@ from ..core.progress import Job, Progress
 from ..core.recording.index import ACTION, MIRRORED, RANDOM, STRIP, RecordingInfo
 from ..poses.clip import find_clips
 from ..poses.clip_player import ClipPlayer
-from ..poses.sample_selection import REMIX
+from ..poses.remix import REMIX
 from ..rig.temporary_rig_state import temporary_rig_state
 from ..scene.animated_values import read_value
 from ..scene.armature import clear_pose, pose_values

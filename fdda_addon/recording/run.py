@@ -14,10 +14,11 @@ from ..core.mathematics.metrics import distances, error_statistics
 from ..core.mathematics.partition import GOLDEN_RATIO
 from ..core.progress import Progress
 from ..core.recording.arrays import open_array
-from ..core.recording.estimate import Estimate, check_disk_space, recording_bytes
+from ..core.recording.estimate import Estimate, check_disk_space, free_bytes, recording_bytes
 from ..core.recording.folder import check_recordable
 from ..core.recording.index import ALONE, POSE, RecordingInfo, Repeatability, Source
 from ..core.recording.writer import RecordingWriter
+from ..core.wording import format_count
 from ..poses.clip import find_clips
 from ..poses.clip_player import ClipPlayer
 from ..rig.deformation import describe_bones
@@ -30,8 +31,23 @@ from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig, check_full_rig
 from .alone_poses import plan_alone_poses
 from .appender import PoseAppender
-from .first_checks import check_follows_pose, check_saturation, check_seams, check_target_moves
-from .plan import RecordingSettings, find_actions, make_sampling, read_sampled_rig
+from .first_checks import (
+    check_follows_pose,
+    check_saturation,
+    check_seams,
+    check_target_moves,
+    measure_seconds_per_pose,
+)
+from .plan import (
+    RecordingSettings,
+    automatic_poses,
+    depends_on_time,
+    find_actions,
+    keep_recorded_poses,
+    make_sampling,
+    read_sample_selection,
+    read_sampled_rig,
+)
 from .pose_plan import PosePlan
 from .reference_joints import find_fixed_joints, find_references
 
@@ -79,6 +95,14 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
                     f"which is off while '{read_object.name}' is recorded; switch it off in the viewport, or record "
                     f"'{mesh_object.name}' by itself."
                 )
+    if settings.resume:
+        settings = keep_recorded_poses(settings, path)
+    if settings.auto_poses and settings.target.name:
+        selection, _ = read_sample_selection(scene_rig, settings)
+        if depends_on_time(scene_rig, settings, selection.controls):
+            settings = replace(settings, auto_poses=False)
+            if clips and not settings.target.settle_frames:
+                settings = replace(settings, poses=0, bones_to_pose=())
     rig, channels = read_sampled_rig(scene_rig, settings)
     notes = [] if rig.has_weights else [MISSING_WEIGHTS.format(scene_rig.mesh_object.name)]
     if not settings.target.name:
@@ -103,6 +127,13 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         follows_pose = not target or target.follows == POSE
         if follows_pose:
             seconds_per_pose = check_follows_pose(evaluator, plan, player)
+            if settings.auto_poses:
+                seconds_per_pose = measure_seconds_per_pose(evaluator, plan, player)
+                bytes_per_pose = recording_bytes(rig, 1) - recording_bytes(rig, 0)
+                poses = automatic_poses(seconds_per_pose, bytes_per_pose, free_bytes(path))
+                settings = replace(settings, poses=poses, auto_poses=False)
+                plan = PosePlan(scene_rig, channels, settings, clips, pose_setter)
+                notes.append(f"{format_count(poses, 'random pose')}, at {1000 * seconds_per_pose:.1f} ms each.")
             notes += [check_seams(evaluator, plan, player), check_saturation(evaluator)]
         for note in filter(None, notes):
             yield Progress("poses", 0, plan.total, note)

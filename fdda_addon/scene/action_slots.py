@@ -113,6 +113,17 @@ def unmuted_curves(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> li
     return [curve for curve in curves if not (curve.mute or (curve.group and curve.group.mute))]
 
 
+def constraint_actions(armature_object: bpy.types.Object) -> set[bpy.types.Action]:
+    """Return the actions that only Action constraints of bones play."""
+    constraints = (constraint for bone in armature_object.pose.bones for constraint in bone.constraints)
+    actions = {c.action for c in constraints if c.type == "ACTION" and c.action is not None}
+    animation = armature_object.animation_data
+    if animation is not None:
+        strips = (strip for track in animation.nla_tracks for strip in track.strips)
+        actions -= {animation.action, *(strip.action for strip in strips)}
+    return actions
+
+
 def curves_of_actions(actions: Iterable[bpy.types.Action], *roots: bpy.types.ID) -> list[CurvesByDatablock]:
     """Return the F-curves with which each action animates datablocks and all that they depend on."""
     actions = list(actions)

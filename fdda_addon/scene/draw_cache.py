@@ -30,11 +30,13 @@ class _DrawCache:
         results: results of `draw_cached` functions, by function and arguments.
         expires_at: time of `time.monotonic` at which they are dropped.
         computed: the inputs and values of `computed_once`, by name.
+        actions: differs after each change of an action (`actions_state`).
     """
 
     results: dict[tuple, object] = field(default_factory=dict)
     expires_at: float = 0.0
     computed: dict[tuple, tuple[tuple, object]] = field(default_factory=dict)
+    actions: object = field(default_factory=object)
 
 
 _cache = _DrawCache()
@@ -75,6 +77,19 @@ def computed_once(name: tuple, inputs: tuple, compute: Callable[[], Value]) -> V
     return stored[1]
 
 
+def actions_state() -> object:
+    """Return an object that is the same until an action may have changed, as an input of `computed_once`.
+
+    Without a window each call returns another: scripts read actions right after they have changed them.
+    """
+    return object() if bpy.app.background else _cache.actions
+
+
+def forget_actions() -> None:
+    """Let what follows from actions be computed again, because one of them may have changed."""
+    _cache.actions = object()
+
+
 def _is_animation_playing() -> bool:
     """Return whether an animation plays in some window."""
     return any(window.screen.is_animation_playing for window in bpy.context.window_manager.windows)
@@ -88,4 +103,5 @@ def clear() -> None:
 def clear_all() -> None:
     """Drop everything, because another file was opened or the add-on is disabled."""
     clear()
+    forget_actions()
     _cache.computed.clear()

@@ -35,7 +35,7 @@ def test_a_recording_follows_the_settings_and_is_stored_beside_the_file(saved, t
     sampling = read_recording(recorded_folder(tmp_path)).info.sampling
     assert (sampling.seed, sampling.spread) == (5, 0.75)
     assert [(s.kind, s.poses, s.name) for s in sampling.sources] == [
-        ("random", 20, ""),
+        ("random", 20, "remix"),
         ("action", 30, "elbow_wave"),
         ("alone", 12, ""),
     ]

@@ -17,9 +17,10 @@ from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.recording import plan
 from fdda_addon.recording.alone_poses import follows_control_bones
 from fdda_addon.recording.appender import BATCH_POSES
-from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.plan import RecordingSettings, automatic_poses
 from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.armature import Poser
@@ -219,6 +220,36 @@ def test_a_recording_that_is_closed_keeps_its_poses(fresh, tmp_path, closed_afte
     assert {path.name: path.read_bytes() for path in (tmp_path / "r").iterdir()} == {
         path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()
     }
+
+
+@pytest.mark.parametrize(
+    ("milliseconds", "bytes_per_pose", "free_bytes", "poses"),
+    [
+        (40, 1e5, 1e12, 1500),
+        (1, 1e5, 1e12, 5000),
+        (500, 1e5, 1e12, 1000),
+        # 150,000 vertices, and a nearly full disk.
+        (12.1, 1.8e6, 1e12, 2000),
+        (1, 1e5, 5e8, 2500),
+        (1, 1e7, 1e6, 1000),
+    ],
+)
+def test_the_automatic_number_of_poses_is_bounded(milliseconds, bytes_per_pose, free_bytes, poses):
+    assert automatic_poses(milliseconds / 1000, bytes_per_pose, free_bytes) == poses
+
+
+def test_a_resumed_recording_keeps_its_automatic_number_of_poses(fresh, tmp_path, monkeypatch):
+    """The number depends on the machine and its load, so the recording has it."""
+    monkeypatch.setattr(plan, "AUTO_SECONDS", 1e-9)
+    steps = record(fresh, tmp_path / "r", RecordingSettings(auto_poses=True))
+    notes = [next(steps).note for _ in range(12)]
+    steps.close()
+    assert sum(note.startswith("1,000 random poses, at ") for note in notes) == 1
+    monkeypatch.setattr(plan, "AUTO_SECONDS", 1e9)
+    recording = recorded(fresh, tmp_path / "r", auto_poses=True, resume=True)
+    whole = recorded(fresh, tmp_path / "whole", poses=1000)
+    assert recording.info.sampling == whole.info.sampling
+    assert np.array_equal(recording.positions, whole.positions)
 
 
 def test_the_seed_determines_the_poses(fresh, tmp_path):

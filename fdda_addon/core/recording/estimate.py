@@ -61,6 +61,11 @@ def recording_bytes(rig: Rig, poses: int) -> int:
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes)
 
 
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the disk with a folder, which need not exist, in bytes."""
+    return shutil.disk_usage(nearest_existing_folder(folder)).free
+
+
 def check_disk_space(folder: Path, size: int) -> None:
     """Check that the disk has enough free space for a recording.
 
@@ -76,11 +81,11 @@ def check_disk_space(folder: Path, size: int) -> None:
     stats = [path.stat() for path in folder.glob("*.npy")]
     used_bytes = sum(getattr(stat, "st_blocks", -(-stat.st_size // 512)) * 512 for stat in stats)
     needed_bytes = size - min(size, used_bytes)
-    free_bytes = shutil.disk_usage(nearest_existing_folder(folder)).free
-    if needed_bytes > free_bytes:
+    available_bytes = free_bytes(folder)
+    if needed_bytes > available_bytes:
         raise DiskFullError(
             f"Cannot write the recording '{folder}': it takes {format_size(needed_bytes)} and the disk has "
-            f"{format_size(free_bytes)} left; make room, record fewer poses, or choose another folder."
+            f"{format_size(available_bytes)} left; make room, record fewer poses, or choose another folder."
         )
 
 

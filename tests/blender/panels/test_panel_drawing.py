@@ -59,6 +59,10 @@ def test_missing_limits_are_named_beside_the_button_that_records(rig: SceneRig, 
         for axis in range(3):
             clear_rotation_range(bone, axis)
     checks.check_now(rig)
+    # Limbs come from the action of the elbow.
+    assert text not in texts_of(draw_section("rig"))
+    bpy.data.actions.remove(bpy.data.actions["elbow_wave"])
+    checks.check_now(rig)
     assert text in texts_of(draw_section("rig"))
     set_rotation_range(bones[1], 0, 0.0, 2.0)
     checks.check_now(rig)
@@ -275,6 +279,41 @@ def test_what_makes_a_good_model_unlikely_has_a_remedy(saved: SceneRig, change, 
         saved.mesh_object.modifiers["Armature"].use_deform_preserve_volume = True
         checks.check_now(saved)
         assert not findings.find(saved)
+
+
+def test_deforming_bones_that_follow_control_bones_are_named(saved: SceneRig):
+    """Random poses would move the few others, and a tick would say that all is well."""
+    armature_object = saved.armature_object
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    control = armature_object.data.edit_bones.new("control")
+    control.tail, control.use_deform = (0, 0, 1), False
+    bpy.ops.object.mode_set(mode="OBJECT")
+    pose_bones = armature_object.pose.bones
+    for name in ("upper", "lower"):
+        constraint = pose_bones[name].constraints.new("COPY_ROTATION")
+        constraint.target, constraint.subtarget = armature_object, "control"
+    limit = pose_bones["control"].constraints.new("LIMIT_ROTATION")
+    limit.use_limit_x, limit.max_x, limit.owner_space = True, 1.0, "LOCAL"
+    checks.check_now(saved)
+    (finding,) = findings.find(saved)
+    assert finding.text == (
+        "2 of 2 deforming bones follow control bones. Check actions that move these, or choose them as Bones to Pose."
+    )
+    assert not bpy.types.FDDA_PT_rig.is_done(bpy.context) and not bpy.types.FDDA_PT_poses.is_done(bpy.context)
+    key_bone(pose_bones["control"])
+    bpy.data.actions["wave"].fdda.record = True
+    checks.check_now(saved)
+    assert not findings.find(saved) and bpy.types.FDDA_PT_poses.is_done(bpy.context)
+
+
+def key_bone(bone: bpy.types.PoseBone) -> None:
+    """Make an action "wave" in which a bone rotates."""
+    bone.id_data.animation_data.action = bpy.data.actions.new("wave")
+    bone.rotation_mode = "XYZ"
+    for frame in (1, 10):
+        bone.rotation_euler[0] = frame / 20
+        bone.keyframe_insert("rotation_euler", frame=frame)
 
 
 def test_merging_keeps_normals_and_the_cuts_that_weights_or_shape_keys_open(saved: SceneRig):

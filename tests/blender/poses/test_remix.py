@@ -7,13 +7,16 @@ import pytest
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION_VECTOR
+from fdda_addon.core.recording.index import read_index, read_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.panels import checks
-from fdda_addon.poses.remix import read_remix
-from fdda_addon.properties.recording_options import recording_settings
+from fdda_addon.poses.motion_range import clear_rotation_range
+from fdda_addon.poses.remix import choose_bones, read_remix, remixed_actions
+from fdda_addon.properties.recording_options import describe_chosen_bones, recording_settings
 from fdda_addon.recording.plan import RecordingSettings, make_pose_sampler, read_sampled_rig
 from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.compatibility import curves_of_slot
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from ..conftest import run
@@ -25,6 +28,8 @@ WAVE, STILL, TURN = "wave", "one frame", "turn the dial"
 def waving(rig: SceneRig) -> SceneRig:
     """The elbow with an action that rotates both bones, moves the upper one and turns a property."""
     armature_object = rig.armature_object
+    for action in list(bpy.data.actions):
+        bpy.data.actions.remove(action)
     upper, lower = armature_object.pose.bones["upper"], armature_object.pose.bones["lower"]
     armature_object.animation_data_create().action = bpy.data.actions.new(WAVE)
     armature_object["dial"] = 0.0
@@ -103,9 +108,40 @@ def test_a_recording_remixes_its_actions(waving, tmp_path):
     assert np.ptp(np.array(recording.pose_matrices[:30]), axis=0).max() > 0.5
 
 
-def test_remixed_poses_need_actions(waving):
-    with pytest.raises(RigError, match=r"Remixed poses combine the limbs of recorded actions; name some \(--action"):
+def remove_limits(scene_rig: SceneRig) -> None:
+    for bone in scene_rig.armature_object.pose.bones:
+        for axis in range(3):
+            clear_rotation_range(bone, axis)
+
+
+def test_without_recorded_actions_limbs_come_from_all_that_move_bones(waving):
+    """An action that only an Action constraint plays is no motion of the character."""
+    constraint = waving.armature_object.pose.bones["lower"].constraints.new("ACTION")
+    constraint.action = bpy.data.actions[WAVE].copy()
+    constraint.action.use_fake_user = True
+    assert remixed_actions(waving, []) == (bpy.data.actions[WAVE],)
+    # Limits of the rig are no guess.
+    assert choose_bones(waving, []) == ()
+    remove_limits(waving)
+    assert choose_bones(waving, []) == ("remix",)
+    np.testing.assert_array_equal(read_remix(waving, []).values, read_remix(waving, [bpy.data.actions[WAVE]]).values)
+    bpy.data.actions.remove(bpy.data.actions[WAVE])
+    assert choose_bones(waving, []) == ()
+    with pytest.raises(RigError, match="There is no pose to remix: no action moves a bone of 'elbow_rig'"):
         read_sampled_rig(waving, RecordingSettings(bones_to_pose=("remix",)))
+
+
+def test_bones_that_actions_leave_at_rest_move_within_their_limits(waving):
+    """Without limits they stay at rest: ±45° about each axis would be far from any motion of the character."""
+    action = bpy.data.actions[WAVE]
+    curves = curves_of_slot(action, action.slots[0])
+    for curve in [curve for curve in curves if '"lower"' in curve.data_path]:
+        action.layers[0].strips[0].channelbags[0].fcurves.remove(curve)
+    settings = RecordingSettings(bones_to_pose=("remix",), actions=(WAVE,))
+    ranges = [(c.axis, c.low, c.high) for c in read_sampled_rig(waving, settings)[1] if c.name == "lower"]
+    assert [axis for axis, _, _ in ranges] == [0]
+    remove_limits(waving)
+    assert "lower" not in {channel.name for channel in read_sampled_rig(waving, settings)[1]}
 
 
 def test_an_action_that_moves_no_bone_is_refused(waving):
@@ -136,36 +172,43 @@ def test_a_single_pose_is_refused(waving):
     read_sampled_rig(waving, RecordingSettings(bones_to_pose=("remix",), actions=(STILL, WAVE)))
 
 
-def test_the_sidebar_remixes_the_checked_actions(waving, tmp_path):
+def test_the_sidebar_chooses_limbs_from_actions(waving, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "waving.blend"))
-    settings = waving.mesh_object.fdda.settings
-    settings.bones_to_pose = "REMIX"
-    with pytest.raises(RigError, match="is set to Limbs from the Checked Actions, but no action is checked"):
-        recording_settings(waving)
-    bpy.data.actions[WAVE].fdda.record = True
-    assert recording_settings(waving).bones_to_pose == ("remix",)
+    settings, action = waving.mesh_object.fdda.settings, bpy.data.actions[WAVE]
+    assert recording_settings(waving).bones_to_pose == ()
+    assert describe_chosen_bones(waving) == "Random poses move the deforming bones within their limits."
+    action.fdda.record = True
+    assert describe_chosen_bones(waving) == "Random poses combine limbs from 1 recorded action."
     assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
+    # Frames of actions alone are recorded as before.
+    settings.poses = 0
+    assert (settings.auto_poses, recording_settings(waving).bones_to_pose) == (False, ())
+    settings.poses, action.fdda.record = 5, False
+    remove_limits(waving)
+    assert recording_settings(waving).bones_to_pose == ("remix",)
+    assert describe_chosen_bones(waving) == "Random poses combine limbs from 1 action, which is not recorded itself."
+    settings.bones_to_pose = "WEIGHTS"
+    assert recording_settings(waving).bones_to_pose == ()
 
 
 @pytest.mark.parametrize(
-    "options, has_hint",
+    "options, source, sentence",
     [
-        (["--action", WAVE], True),
-        (["--action", WAVE, "--action", STILL], True),
-        (["--action", WAVE, "--bones-to-pose", "remix"], False),
-        (["--action", WAVE, "--poses", 0], False),
-        ([], False),
+        (["--action", WAVE, "--action", STILL], "remix", "combine limbs from 2 recorded actions."),
+        ([], "", "within their limits."),
+        (["--bones-to-pose", "deforming"], "", ""),
         # There is no motion of bones to combine.
-        (["--action", STILL], False),
-        (["--action", TURN], False),
-        # Poses that are chosen already cannot change.
-        (["--action", WAVE, "--resume"], False),
+        (["--action", TURN], "", "within their limits."),
+        (["--action", WAVE, "--poses", 0], None, ""),
     ],
 )
-def test_recording_actions_with_random_poses_suggests_to_remix(waving, tmp_path, capsys, options, has_hint):
+def test_the_verb_chooses_limbs_from_actions(waving, tmp_path, capsys, options, source, sentence):
     add_actions_without_motion(waving.armature_object)
     path = tmp_path / "rig.blend"
     save_copy(path)
     poses = [] if "--poses" in options else ["--poses", 12]
     assert run("record", path, tmp_path / "recording", *poses, *options) == 0
-    assert ("with --bones-to-pose remix they combine limbs" in capsys.readouterr().out) == has_hint
+    output = capsys.readouterr().out
+    assert sentence in output if sentence else "Random poses" not in output
+    sources = read_info(read_index(tmp_path / "recording")).sampling.sources
+    assert next((s.name for s in sources if s.kind == "random"), None) == source
