@@ -19,6 +19,7 @@ import bpy
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 
+import choices_story
 import manual_story
 import path_story
 import session_story
@@ -30,6 +31,7 @@ from window import StepError, park_mouse, save_screenshot
 OUTPUT_FOLDER, STORY_NAME = Path(sys.argv[sys.argv.index("--") + 1]).resolve(), sys.argv[sys.argv.index("--") + 2]
 STEPS = {
     "path": path_story.STEPS,
+    "choices": choices_story.STEPS,
     "work": work_story.STEPS,
     "shot": shot_story.STEPS,
     "session": session_story.STEPS,

@@ -60,7 +60,7 @@ def choose_the_bones_to_pose(folder: Path) -> Iterator[float]:
     posed_bones = [bone.name for bone in bones if max(map(abs, bone.rotation_euler)) > 1e-6]
     require(posed_bones == [bone_name], f"the random pose moves {posed_bones}, not only {bone_name}")
     yield from save_screenshot(folder / "chosen_bone.png")
-    settings.bones_to_pose = "WEIGHTS"
+    settings.bones_to_pose = "AUTO"
     yield from redraw_window()
 
 
@@ -69,7 +69,8 @@ def set_the_number_of_poses(_folder: Path) -> Iterator[float]:
     yield from sidebar.press_button("fdda.rest_pose", across=0.85)
     rotated_bones = [b.name for b in bpy.data.objects["arm_rig"].pose.bones if max(map(abs, b.rotation_euler)) > 1e-6]
     require(not rotated_bones, f"{rotated_bones} are not at rest")
-    x, y = yield from sidebar.find_button("settings.poses", across=0.7)
+    yield from sidebar.press_button("settings.auto_poses", across=0.7)
+    x, y = yield from sidebar.find_button("settings.poses", across=0.6)
     yield from click(x, y, times=2)
     yield from press_keys("ctrl+a", *str(POSE_COUNT), "Return")
     poses = arm_object().fdda.settings.poses

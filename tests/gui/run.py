@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 1600, 1200
 INSTALL_MAX_SECONDS, STORY_MAX_SECONDS, TERMINATE_MAX_SECONDS = 60, 600, 5
 MISSING_REQUIREMENT_STATUS = 3
 MAX_BLANK_IMAGE_VALUES = 32
-STORIES = ("path", "work", "shot", "session")
+STORIES = ("path", "choices", "work", "shot", "session")
 """Names of the stories, in order. Each runs in a new Blender, and most use the files of the story `path`."""
 LONG_STORIES = ("manual",)
 """Stories that run only by name, because they take minutes."""
