@@ -138,7 +138,3 @@ class DiskFullError(OutputError):
     """The disk has too little free space."""
 
     exit_status = TRY_AGAIN
-
-
-class PointCacheError(FDDAError):
-    """A point cache cannot be read."""

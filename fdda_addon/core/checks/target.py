@@ -84,8 +84,9 @@ def _check_frames(recording: SkinnedRecording) -> list[RecordingWarning]:
     warnings = []
     if frozen:
         text = (
-            f"The target stands still in {format_count(len(frozen), 'frame')} in which the rig moves: "
-            f"{format_list(frozen)}: its cache ends before, or begins after; record frames that it has."
+            f"The target '{recording.info.target.object_name}' stands still in {format_count(len(frozen), 'frame')} in "
+            f"which the rig moves: {format_list(frozen)}: its cache ends before, or begins after; record frames that "
+            "it has."
         )
         warnings.append(RecordingWarning("frozen-frames", text))
     if jumps:

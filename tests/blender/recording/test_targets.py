@@ -10,7 +10,6 @@ import pytest
 
 from blend_fixtures.characters import targets
 from blend_fixtures.elbow import ACTION, FRAMES
-from fdda_addon.core.formats.alembic import read_time_range
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.core.rig import STATIC_JOINT
@@ -127,17 +126,6 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
     bpy.data.objects.remove(bpy.data.objects["flesh"])
     bpy.context.scene.frame_set(20)
     assert_plays(bpy.data.objects["elbow"], model)
-
-
-def test_the_time_range_of_alembic_files_is_read(tmp_path):
-    built(targets.target_alembic, tmp_path / "rig.blend")
-    path = Path(bpy.data.cache_files[0].filepath)
-    assert np.allclose(np.array(read_time_range(path)) * 24, (1, FRAMES))
-    data = path.read_bytes()
-    damaged = tmp_path / "damaged.abc"
-    for cut in (b"", data[:4], data[:12], data[:200], b"Ogawa\xff\x00\x01" + b"\xff" * 64):
-        damaged.write_bytes(cut)
-        assert read_time_range(damaged) is None
 
 
 def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
