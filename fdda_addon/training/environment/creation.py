@@ -16,6 +16,7 @@ from typing import IO
 
 from ...core.errors import TrainerEnvironmentError, os_error_text
 from ...core.files.child_process import child_options
+from ...core.files.path_limits import path_length_problem
 from ...core.progress import Job, Progress
 from .check import CheckResult, check
 from .folder import (
@@ -32,6 +33,8 @@ from .interpreters import Interpreter, find_interpreters, query_interpreter
 RUN_PIP = Path(__file__).with_name("run_pip.py")
 UNREADABLE_SETTINGS_STATUS = 78
 """Exit status of `RUN_PIP` if pip's settings cannot be read: EX_CONFIG of sysexits.h."""
+MAX_WHEEL_PATH_LENGTH = 126
+"""Length of the longest path in the wheels for Windows, a license file of torch 2.15.0."""
 MIN_FREE_GB = 9 if sys.platform.startswith("linux") else 2
 """Free disk space that the packages and downloads need. On Linux they include CUDA."""
 
@@ -86,8 +89,6 @@ class EnvironmentCreation:
             self._stop_if_cancelled()
             if not interpreters:
                 raise self._no_python_error(f"{candidates[0]} {candidates[0].problem}" if candidates else "none runs")
-            if self.wheels is not None:
-                _check_wheels(self.wheels, interpreters[0], log, self.log)
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
@@ -234,7 +235,16 @@ class EnvironmentCreation:
 
 
 def _check_source(folder: Path, wheels: Path | None) -> None:
-    """Raise a TrainerEnvironmentError if the disk is too full for downloads, or the folder of wheels is not there."""
+    """Check the lengths of the paths in an environment, and the free space for downloads or the folder of wheels.
+
+    Raises:
+        TrainerEnvironmentError: paths would be too long, the disk is too full, or there is no folder of wheels.
+    """
+    if problem := path_length_problem(folder / ("x" * MAX_WHEEL_PATH_LENGTH)):
+        raise TrainerEnvironmentError(
+            f"The training environment cannot be in '{folder}' ({problem}); allow long paths "
+            "(https://pip.pypa.io/warnings/enable-long-paths), or choose an existing Python that has torch."
+        )
     if wheels is None:
         free_gb = shutil.disk_usage(folder.parent).free / 1e9
         if free_gb < MIN_FREE_GB:
@@ -244,36 +254,6 @@ def _check_source(folder: Path, wheels: Path | None) -> None:
             )
     elif not wheels.is_dir():
         raise TrainerEnvironmentError(f"'{wheels}' is no folder; choose the folder that holds the packages.")
-
-
-def _check_wheels(wheels: Path, interpreter: Interpreter, log: IO[str], log_path: Path) -> None:
-    """Check that no wheel is missing. pip would report one late, and as a version conflict.
-
-    Raises:
-        TrainerEnvironmentError: wheels are missing; the log has the command that downloads them.
-    """
-    pinned = [
-        line for line in requirements_file(interpreter.version).read_text(encoding="utf-8").splitlines() if "==" in line
-    ]
-    pinned_versions = [line.split("==") for line in pinned if line.partition("==")[0] in PACKAGES]
-    missing = [
-        f"{name} {version}" for name, version in pinned_versions if not any(wheels.glob(f"{name}-{version}[-+]*.whl"))
-    ]
-    if missing:
-        version = f"{interpreter.version[0]}.{interpreter.version[1]}"
-        download = [
-            "pip",
-            "download",
-            "--only-binary=:all:",
-            f"--constraint={requirements_file(interpreter.version)}",
-            "--dest=wheels",
-        ]
-        log.write(f"With Python {version} on such a machine as this, but online:\n")
-        log.write(f"$ {subprocess.list2cmdline([f'python{version}', '-m', *download, *PACKAGES])}\n")
-        raise TrainerEnvironmentError(
-            f"The folder '{wheels}' lacks the packages {', '.join(missing)} for Python {version}; download "
-            f"them on a machine that is online, '{log_path}' has the command."
-        )
 
 
 @contextmanager

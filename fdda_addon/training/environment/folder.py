@@ -58,8 +58,7 @@ def user_folder() -> Path:
 def environment_folder() -> Path:
     """Return the folder of the environment, in the folder that Blender removes with the extension.
 
-    On Windows the path has 91 characters besides the user name. The longest path in the wheels has 126, a license file
-    of torch 2.15.0, so that user names of up to 33 characters fit into the 259 that Windows allows.
+    On Windows the path has 91 characters besides the user name, so that names of up to 33 fit with those of the wheels.
     """
     return user_folder() / "trainer"
 
