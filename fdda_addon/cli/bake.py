@@ -8,15 +8,14 @@ from ..baking.export import write_bake
 from ..baking.run import BakeSettings, bake_file
 from ..core.files.stop_signals import exit_on_stop_signal
 from ..core.wording import format_count
-from .files import add_rig_options
+from .files import add_model_argument, add_overwrite_option, add_rig_options
 from .folders import open_rigs
-from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
-    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
+    add_model_argument(parser)
     parser.add_argument(
         "out",
         metavar="OUT",

@@ -20,14 +20,13 @@ from ..runtime.model_meshes import describe_missing_meshes, find_mesh
 from ..scene.blend_file import save_copy
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import stored_path
-from .files import add_rig_options
+from .files import add_model_argument, add_overwrite_option, add_rig_options
 from .folders import open_rigs
-from .outputs import add_overwrite_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
-    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
+    add_model_argument(parser)
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, with the bound model")
     parser.add_argument(
         "--use-in-render", action="store_true", help="use the model in final renders too, instead of the rig"

@@ -11,7 +11,7 @@ from ..core.files.file_kind import BLEND
 from ..core.files.output import check_outputs
 from ..scene.blend_file import save_copy
 from ..scene.viewport import frame_objects
-from .outputs import add_overwrite_option
+from .files import add_overwrite_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

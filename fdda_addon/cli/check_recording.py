@@ -4,10 +4,17 @@
 import argparse
 from pathlib import Path
 
+from ..core.checks.recording import check_recording
+from ..core.checks.warning import raise_first_warning
+from ..core.errors import RecordingError
+from ..core.files.file_kind import WARNINGS
+from ..core.files.output import check_outputs, write_json
+from ..core.recording.reader import read_recording
+from ..core.recording.skinned import skin_recording
+from .files import add_overwrite_option
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .outputs import add_overwrite_option
-
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
     parser.add_argument("--strict", action="store_true", help="treat warnings as errors")
     parser.add_argument("--json", metavar="OUT.json", type=Path, help="file to write the warnings to")
@@ -21,14 +28,6 @@ def run(options: argparse.Namespace) -> None:
         RecordingError: the recording cannot be read, or --strict is given and there are warnings.
         OutputError: the file cannot be written.
     """
-    from ..core.checks.recording import check_recording
-    from ..core.checks.warning import raise_first_warning
-    from ..core.errors import RecordingError
-    from ..core.files.file_kind import WARNINGS
-    from ..core.files.output import check_outputs, write_json
-    from ..core.recording.reader import read_recording
-    from ..core.recording.skinned import skin_recording
-
     if options.json:
         check_outputs({options.json: WARNINGS}, overwrite=options.overwrite)
     recording = read_recording(options.recording)

@@ -23,16 +23,15 @@ from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from ..scene.time_stretching import time_ratio
 from ..timing.benchmark import benchmark
-from .files import add_rig_options
+from .files import add_model_argument, add_overwrite_option, add_rig_options
 from .folders import open_rigs, to_json_by_object, with_heading
-from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
 from .target import add_target_options, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
-    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
+    add_model_argument(parser)
     parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="file to write the errors to")
     parser.add_argument(
         "--poses",

@@ -11,8 +11,7 @@ from ..core.files.output import check_outputs
 from ..core.recording.index import read_index
 from ..recording.plan import find_recorded_character
 from ..scene.blend_file import save_copy
-from .files import add_rig_options, open_file
-from .outputs import add_overwrite_option
+from .files import add_overwrite_option, add_rig_options, open_file
 from .progress import ProgressPrinter
 
 MAX_INFLUENCES = 16

@@ -11,9 +11,8 @@ from ..core.wording import format_count, format_list
 from ..fast_rig.controls import check_choices
 from ..fast_rig.frame_times import measure_frames
 from ..fast_rig.run import FastRig, make_fast_rig
-from .files import add_rig_options
+from .files import add_model_argument, add_overwrite_option, add_rig_options
 from .folders import open_rigs
-from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
 
 MAX_LISTED = 10
@@ -22,7 +21,7 @@ DEFAULT_CONTROLS = ("visible", "keyed")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
-    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
+    add_model_argument(parser)
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, with the fast rig")
     parser.add_argument(
         "--controls",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Opens .blend files, and raises FDDAErrors in place of Blender's reports."""
+"""Options that verbs share, and opening of .blend files with FDDAErrors in place of Blender's reports."""
 
 import argparse
 from pathlib import Path
@@ -20,6 +20,18 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
 def add_rig_argument(parser: argparse.ArgumentParser) -> None:
     """Add the argument RIG.blend."""
     parser.add_argument("rig", metavar="RIG.blend", type=Path, help="the file with the rig")
+
+
+def add_model_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the argument MODEL.onnx."""
+    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
+
+
+def add_overwrite_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option --overwrite, for outputs that `core.files.output.check_outputs` refuses to overwrite."""
+    parser.add_argument(
+        "--overwrite", action="store_true", help="allow overwriting of input files and of files of another kind"
+    )
 
 
 def open_rig(options: argparse.Namespace) -> SceneRig:

@@ -13,8 +13,7 @@ from ..poses.action_range import measured_ranges
 from ..poses.clip import find_action
 from ..poses.measured_limits import DEFAULT_MARGIN, describe_limits, set_limits_from_actions
 from ..scene.blend_file import save_copy
-from .files import add_rig_options, open_rig
-from .outputs import add_overwrite_option
+from .files import add_overwrite_option, add_rig_options, open_rig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

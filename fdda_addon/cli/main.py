@@ -11,12 +11,14 @@ Exit status:
 
 import argparse
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 
 from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_fault_sentence
 from ..core.files.stop_signals import INTERRUPTED
 from ..core.files.terminal import escape_unencodable_output
-from .interruption import interruptible
+from .interruption import interruptible, raise_pending
 
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
@@ -73,8 +75,6 @@ def _run(arguments: list[str], program: str) -> int:
             return import_module(f".{verb}", __package__).run(arguments[1:])
         options = parser.parse_args(arguments)
         module = import_module(f".{VERBS[verb][0]}", __package__)
-        from .registered import registered
-
         with registered():
             module.run(options)
         return 0
@@ -90,3 +90,19 @@ def _run(arguments: list[str], program: str) -> int:
             raise
         print(f"Error: {text}", file=sys.stderr)
         return TRY_AGAIN
+
+
+@contextmanager
+def registered() -> Iterator[None]:
+    """Register the add-on for a `with` block. It stays registered if it was before."""
+    # Imported here, because a training without refinement needs no Blender.
+    from .. import registration
+
+    was_registered = registration.is_registered()
+    registration.register()
+    try:
+        raise_pending()
+        yield
+    finally:
+        if not was_registered:
+            registration.unregister()

@@ -2,7 +2,6 @@
 """`poses RIG.blend OUT.blend`: saves a copy of a file with an action of recorded or random poses, one per frame."""
 
 import argparse
-from contextlib import ExitStack
 from pathlib import Path
 
 from ..core.errors import WrongUsageError
@@ -15,8 +14,7 @@ from ..recording.posed_action import make_posed_action, recorded_settings
 from ..runtime.binding import model_disabled
 from ..scene.blend_file import save_copy
 from ..scene.scene_rig import find_character
-from .files import add_rig_options, open_file
-from .outputs import add_overwrite_option
+from .files import add_overwrite_option, add_rig_options, open_file
 from .progress import ProgressPrinter
 from .record_options import add_pose_options
 from .target import pose_settings
@@ -45,9 +43,7 @@ def run(options: argparse.Namespace) -> None:
     scene_rig = find_character([options.object] if options.object and len(names) < 2 else names or [""])
     if info is None:
         settings = RecordingSettings(**pose_settings(options, scene_rig))
-    with ProgressPrinter() as progress, ExitStack() as stack:
-        for mesh_object in scene_rig.mesh_objects:
-            stack.enter_context(model_disabled(mesh_object))
+    with ProgressPrinter() as progress, model_disabled(*scene_rig.mesh_objects):
         action, driven = progress.run(make_posed_action(scene_rig, settings, info))
     save_copy(options.out)
     if driven:

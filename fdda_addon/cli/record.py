@@ -6,34 +6,30 @@ With `--all`, or with several `--object`, one recording has several meshes of an
 
 import argparse
 import time
-from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
+from ..core.checks.target import unsettled_sentence
+from ..core.progress import Progress
+from ..core.recording.estimate import format_poses
+from ..core.recording.index import read_index, read_info
 from ..core.wording import format_count
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from ..core.progress import Progress
-    from ..scene.scene_rig import SceneRig
+from ..recording.plan import RecordingSettings, find_recorded_character
+from ..recording.refinement import RefinementSettings, refine
+from ..recording.run import record
+from ..runtime.binding import model_disabled
+from ..scene.scene_rig import SceneRig, find_character, find_whole_character
+from .files import open_file
+from .pose_notes import print_bones_to_pose, print_control_bones
+from .progress import ProgressPrinter
+from .record_options import add_record_options, check_options
+from .target import pose_settings, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .record_options import add_record_options
-
     add_record_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.checks.target import unsettled_sentence
-    from ..core.recording.estimate import format_poses
-    from ..core.recording.index import read_index, read_info
-    from ..runtime.binding import model_disabled
-    from .files import open_file
-    from .pose_notes import print_bones_to_pose, print_control_bones
-    from .progress import ProgressPrinter
-    from .record_options import check_options
-
     check_options(options)
     open_file(options.rig)
     scene_rig = _find_rig(options)
@@ -41,9 +37,7 @@ def run(options: argparse.Namespace) -> None:
         print_control_bones(scene_rig, options)
         print_bones_to_pose(scene_rig, options)
     start = time.monotonic()
-    with ProgressPrinter() as progress, ExitStack() as stack:
-        for mesh_object in scene_rig.mesh_objects:
-            stack.enter_context(model_disabled(mesh_object))
+    with ProgressPrinter() as progress, model_disabled(*scene_rig.mesh_objects):
         for step in _make_job(scene_rig, options):
             if step.note:
                 progress.end_line()
@@ -62,11 +56,8 @@ def run(options: argparse.Namespace) -> None:
     print(f"{options.recording}: {poses}{meshes}, in {seconds:.1f} s")
 
 
-def _find_rig(options: argparse.Namespace) -> "SceneRig":
+def _find_rig(options: argparse.Namespace) -> SceneRig:
     """Return the rig of the meshes to record, or of those of the recording that `--refine` extends."""
-    from ..recording.plan import find_recorded_character
-    from ..scene.scene_rig import find_character, find_whole_character
-
     if options.refine:
         return find_recorded_character(options.recording, *options.object[:1])
     if not options.all:
@@ -77,12 +68,7 @@ def _find_rig(options: argparse.Namespace) -> "SceneRig":
     return scene_rig
 
 
-def _make_job(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Progress]":
-    from ..recording.plan import RecordingSettings
-    from ..recording.refinement import RefinementSettings, refine
-    from ..recording.run import record
-    from .target import pose_settings, target_settings
-
+def _make_job(scene_rig: SceneRig, options: argparse.Namespace) -> Iterator[Progress]:
     if options.refine:
         pose_options = {} if options.poses is None else {"poses": options.poses}
         settings = RefinementSettings(seed=options.seed, resume=options.resume, **pose_options)

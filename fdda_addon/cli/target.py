@@ -2,15 +2,13 @@
 """Options of a target object, whose surface is recorded instead of that of the rig's mesh."""
 
 import argparse
-from typing import TYPE_CHECKING
 
 from ..core.errors import WrongUsageError
 from ..core.settings import LEARN_FROM, PRE_ROLL, REST_THRESHOLD_MM, SETTLE_FRAMES, settings_of, values_from
-
-if TYPE_CHECKING:
-    from ..rig.pose_setter import TargetSettings
-    from ..scene.scene_rig import SceneRig
-
+from ..poses.remix import choose_bones
+from ..recording.plan import RecordingSettings, find_actions
+from ..rig.pose_setter import TargetSettings
+from ..scene.scene_rig import SceneRig
 
 DEFORMING = "deforming"
 """Value of --bones-to-pose for the deforming bones, within their limits."""
@@ -22,29 +20,24 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
         setting.add_option(parser)
 
 
-def target_settings(options: argparse.Namespace) -> "TargetSettings":
+def target_settings(options: argparse.Namespace) -> TargetSettings:
     """Return the settings of the target from the options.
 
     Raises:
         WrongUsageError: there are options of a target, and no target.
     """
-    from ..rig.pose_setter import TargetSettings
-
     if (options.pre_roll or options.settle_frames) and not options.learn_from:
         raise WrongUsageError("--pre-roll and --settle-frames need a target; give --learn-from OBJECT.")
     settings = [setting for setting in settings_of(TargetSettings) if hasattr(options, setting.name)]
     return TargetSettings(options.learn_from, **values_from(options, settings))
 
 
-def pose_settings(options: argparse.Namespace, scene_rig: "SceneRig | None" = None) -> dict[str, object]:
+def pose_settings(options: argparse.Namespace, scene_rig: SceneRig | None = None) -> dict[str, object]:
     """Return the arguments of `RecordingSettings` that choose poses, from the options of `add_pose_options`.
 
     Args:
         scene_rig: the rig, whose actions choose the bones if no option does; None to leave them out.
     """
-    from ..poses.remix import choose_bones
-    from ..recording.plan import RecordingSettings, find_actions
-
     settings = [setting for setting in settings_of(RecordingSettings) if hasattr(options, setting.name)]
     values = values_from(options, settings)
     lists = {

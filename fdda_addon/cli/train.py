@@ -7,7 +7,6 @@ poses at the worst errors and continues the training, until the goal is met or m
 
 import argparse
 import subprocess
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,7 +107,7 @@ def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
             f"--refine takes one recording, and '{recording}' holds several; give one of them and its model."
         )
     # Imported here, because a training without refinement needs no Blender.
-    from .registered import registered
+    from .main import registered
 
     with registered():
         # Open the rig now, so that a wrong path or object raises an error before the training.
@@ -138,9 +137,7 @@ def _refine(recording: Path, model: Path, options: argparse.Namespace, round_ind
 
     scene_rig = _open_rig(recording, options)
     pose_options = {} if options.poses is None else {"poses": options.poses}
-    with ProgressPrinter() as progress, ExitStack() as stack:
-        for mesh_object in scene_rig.mesh_objects:
-            stack.enter_context(model_disabled(mesh_object))
+    with ProgressPrinter() as progress, model_disabled(*scene_rig.mesh_objects):
         for step in refine(scene_rig, recording, model, RefinementSettings(seed=round_index, **pose_options)):
             progress.show(step.stage, step.done, step.total)
     print(f"{recording}: added {format_count(step.total, 'pose')} at the worst errors of the model")

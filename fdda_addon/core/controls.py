@@ -74,11 +74,6 @@ class Control:
         return control
 
 
-def owner_of_mesh(owner: str, mesh: str) -> str:
-    """Return the owner that a control of one mesh has in a rig of several; `mesh` is empty for the first mesh."""
-    return f"{owner}:{mesh}" if mesh and owner in (MESH_OBJECT, SHAPE_KEYS) else owner
-
-
 def controls_of_mesh(controls: Iterable[Control], mesh: str) -> tuple[Control, ...]:
     """Return the controls of a rig as they are in a rig of one of its meshes, without those of the other meshes.
 

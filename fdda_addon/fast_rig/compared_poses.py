@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import bpy
 import numpy as np
-from mathutils import Euler, Quaternion
+from mathutils import Euler
 
 from ..core.progress import Job, Progress
 from ..poses.action_range import action_frames
 from ..scene.action_slots import ActionSlots, constraint_actions, dependencies, slots_of_action
 from ..scene.animated_values import animated_values, set_value
-from ..scene.armature import PoseMatrixReader, clear_pose
+from ..scene.armature import PoseMatrixReader, clear_pose, rotate_bone
 from ..scene.temporary_state import animation_state, assign_action, restore_animation, temporary_pose
 from ..scene.time_stretching import unstretched_time
 from .controls import animating_actions
@@ -81,8 +81,7 @@ def evaluate_poses(poses: ComparedPoses, stage: str) -> Job[Evaluation]:
     with (
         temporary_pose(armature_object, poses.actions),
         unstretched_time(),
-        _temporary_properties(poses),
-        _temporary_actions(poses),
+        _restored_values(poses),
         objects_evaluated({armature_object, *poses.objects}),
     ):
         # Some drivers read the pose before. So the first pose follows itself in each evaluation.
@@ -118,20 +117,8 @@ def differing_bones(poses: ComparedPoses, before: np.ndarray, after: np.ndarray,
     return {name: float(value) for name, value in zip(poses.bone_names, largest, strict=True) if value > tolerance}
 
 
-def moving_bones(poses: ComparedPoses, matrices: np.ndarray, tolerance: float) -> set[str]:
-    """Return the names of the bones that move between poses; arguments as for `differing_bones`."""
-    return set(differing_bones(poses, matrices, matrices[:1], tolerance))
-
-
 def infinite_bones(poses: ComparedPoses, matrices: np.ndarray) -> dict[str, int]:
-    """Count the poses in which bones have an infinite or undefined place, rotation or scale.
-
-    Args:
-        matrices: (P, B, 4, 4), as in `Evaluation`.
-
-    Returns:
-        The number of poses of each bone that has any, by name.
-    """
+    """Count, by name of the bone, the poses in which an element of its (P, B, 4, 4) matrices is not finite."""
     counts = (~np.isfinite(matrices)).any(axis=(2, 3)).sum(axis=0)
     return {name: int(count) for name, count in zip(poses.bone_names, counts, strict=True) if count}
 
@@ -154,7 +141,7 @@ def set_random_pose(armature_object: bpy.types.Object, names: Iterable[str], siz
         bone = armature_object.pose.bones[name]
         generator = np.random.default_rng((seed, index))
         angles = np.radians(ROTATION_DEGREES) * generator.normal(size=3)
-        _set_rotation(bone, np.where(bone.lock_rotation, 0.0, angles))
+        rotate_bone(bone, Euler(np.where(bone.lock_rotation, 0.0, angles)).to_quaternion())
         offsets = LOCATION_RATIO * size * generator.normal(size=3)
         bone.location = np.where(bone.lock_location, 0.0, offsets)
         bone.scale = np.where(bone.lock_scale, 1.0, 1.0 + SCALE_RATIO * generator.normal(size=3))
@@ -210,8 +197,9 @@ def _animated_slots(armature_object: bpy.types.Object, action: bpy.types.Action)
 
 
 @contextmanager
-def _temporary_actions(poses: ComparedPoses) -> Iterator[None]:
-    """Restore the actions of the datablocks other than the armature object that the actions animate, and the values."""
+def _restored_values(poses: ComparedPoses) -> Iterator[None]:
+    """Restore the custom properties that random poses set, and the actions and values of other animated datablocks."""
+    properties = _property_values(poses)
     animated = {d for action in poses.actions for d in _animated_slots(poses.armature_object, action)}
     before = [(d, animation_state(d), animated_values(d, poses.actions)) for d in animated - {poses.armature_object}]
     try:
@@ -221,17 +209,9 @@ def _temporary_actions(poses: ComparedPoses) -> Iterator[None]:
             restore_animation(datablock, state)
             for path, value in values.items():
                 set_value(datablock, path, value)
-
-
-def _set_rotation(bone: bpy.types.PoseBone, angles: np.ndarray) -> None:
-    rotation = Euler(angles)
-    if bone.rotation_mode == "QUATERNION":
-        bone.rotation_quaternion = rotation.to_quaternion()
-    elif bone.rotation_mode == "AXIS_ANGLE":
-        axis, angle = Quaternion(rotation.to_quaternion()).to_axis_angle()
-        bone.rotation_axis_angle = (angle, *axis)
-    else:
-        bone.rotation_euler = angles
+        _restore_properties(properties)
+        poses.armature_object.update_tag(refresh={"OBJECT", "DATA"})
+        bpy.context.view_layer.update()
 
 
 def _set_properties(owner: bpy.types.PoseBone | bpy.types.Object, generator: np.random.Generator) -> None:
@@ -251,18 +231,6 @@ def _ranged_properties(owner: bpy.types.PoseBone | bpy.types.Object) -> Iterator
             low, high = settings["soft_min"], settings["soft_max"]
             if 0 < high - low <= MAX_PROPERTY_WIDTH:
                 yield key, low, high
-
-
-@contextmanager
-def _temporary_properties(poses: ComparedPoses) -> Iterator[None]:
-    """Restore the custom properties that random poses set."""
-    values = _property_values(poses)
-    try:
-        yield
-    finally:
-        _restore_properties(values)
-        poses.armature_object.update_tag(refresh={"OBJECT", "DATA"})
-        bpy.context.view_layer.update()
 
 
 def _property_values(poses: ComparedPoses) -> list[tuple[bpy.types.bpy_struct, str, object]]:

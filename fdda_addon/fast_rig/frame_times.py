@@ -2,7 +2,6 @@
 """Times the frames of a full rig and of its fast rig, by opening both files in turns."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -83,11 +82,8 @@ def measure_frames(
             if action_name is None:
                 action_name = _action_name(armature_object)
             indices = range(round_index * frames_per_round - WARM_UP_FRAMES, (round_index + 1) * frames_per_round)
-            with ExitStack() as stack:
-                stack.enter_context(unstretched_time())
-                for scene_object in bpy.context.scene.objects if path == full else ():
-                    if scene_object.type == "MESH" and scene_object.fdda.is_bound:
-                        stack.enter_context(model_disabled(scene_object))
+            meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and o.fdda.is_bound and path == full]
+            with unstretched_time(), model_disabled(*meshes):
                 times[path] += time_calls(_frame_calls(armature_object, action_name, controls, size, indices))
             yield Progress("frames", 2 * round_index + index + 1, 2 * rounds)
     return RigTimes(tuple(times[full]), tuple(times[fast]))

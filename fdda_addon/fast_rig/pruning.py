@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Removes bones, drivers, objects and modifiers from the open file."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import bpy
@@ -79,14 +79,6 @@ def remove_objects(kept: set[Node]) -> list[str]:
     removed = [o for o in bpy.context.scene.objects if Node(o) not in kept]
     names = [scene_object.name for scene_object in removed]
     bpy.data.batch_remove(removed)
-    return names
-
-
-def remove_modifiers(mesh_object: bpy.types.Object, names: Iterable[str]) -> list[str]:
-    """Remove modifiers of a mesh object; return their names."""
-    names = list(names)
-    for name in names:
-        mesh_object.modifiers.remove(mesh_object.modifiers[name])
     return names
 
 

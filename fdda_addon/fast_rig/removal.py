@@ -13,7 +13,7 @@ from ..scene.action_slots import curves_of_actions
 from ..scene.controls import canonical_path
 from ..scene.scene_rig import SceneRig
 from .graph_reader import read_graph, shown_objects
-from .pruning import check_armature, remove_bones, remove_drivers, remove_modifiers, remove_objects
+from .pruning import check_armature, remove_bones, remove_drivers, remove_objects
 
 
 def unread_curves(
@@ -110,7 +110,11 @@ def remove_unneeded(
     worlds = [scene.world for scene in bpy.data.scenes if scene.world is not None]
     roots = [*map(Node, (*shown, *bpy.data.scenes, *worlds)), *nodes]
     roots += [Node(armature_object, name) for name in (*joint_names, *controls)]
-    replaced = {rig.mesh_object.name: _replaced_modifiers(rig.mesh_object) for rig in scene_rigs}
+    # A model replaces these modifiers, on or off.
+    replaced = {
+        o.name: {m.name for m in (*deforming_modifiers(o), *recorded_modifiers(o))}
+        for o in (rig.mesh_object for rig in scene_rigs)
+    }
     kept_with_curves = read_graph(scene_rigs, replaced).kept(roots)
     straight = unread_curves(armature_object, replaced, controls, kept_with_curves)
     graph = read_graph(scene_rigs, replaced, straight)
@@ -123,13 +127,15 @@ def remove_unneeded(
     # Before the bones, whose loss Blender would report for each removed object that needs them.
     objects = remove_objects(kept)
     bones = set(remove_bones(armature_object, kept))
-    modifiers = [name for rig in scene_rigs for name in _remove_replaced(rig, replaced[rig.mesh_object.name])]
+    modifiers = []
+    for mesh_object in (rig.mesh_object for rig in scene_rigs):
+        names = [modifier.name for modifier in mesh_object.modifiers if modifier.name in replaced[mesh_object.name]]
+        first_armature = next((name for name in names if mesh_object.modifiers[name].type == "ARMATURE"), None)
+        removed = [name for name in names if name != first_armature]
+        for name in removed:
+            mesh_object.modifiers.remove(mesh_object.modifiers[name])
+        modifiers += removed
     return Removed(bones, tuple(objects), tuple(modifiers), drivers)
-
-
-def _replaced_modifiers(mesh_object: bpy.types.Object) -> set[str]:
-    """Return the names of the modifiers that a model of an object replaces, on or off."""
-    return {m.name for m in (*deforming_modifiers(mesh_object), *recorded_modifiers(mesh_object))}
 
 
 def _write_names(owner: bpy.types.FCurve | bpy.types.DriverTarget, datablock: bpy.types.ID) -> None:
@@ -152,10 +158,3 @@ def _read_modifiers(mesh_object: bpy.types.Object, kept: set[Node]) -> set[str]:
         if any(path.startswith(f"{prefix}.") for path in paths):
             read.add(modifier.name)
     return read
-
-
-def _remove_replaced(scene_rig: SceneRig, names: set[str]) -> list[str]:
-    """Remove the replaced modifiers, except the first Armature modifier."""
-    mesh_object = scene_rig.mesh_object
-    kept = next((m.name for m in mesh_object.modifiers if m.type == "ARMATURE" and m.name in names), None)
-    return remove_modifiers(mesh_object, [m.name for m in mesh_object.modifiers if m.name in names - {kept}])

@@ -25,7 +25,6 @@ from .compared_poses import (
     differing_bones,
     evaluate_poses,
     infinite_bones,
-    moving_bones,
     playable_actions,
     rig_size,
 )
@@ -144,7 +143,7 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
         len(shown),
         len(before.matrices),
         max((*differing_bones(poses, before.matrices, after.matrices, -1.0).values(), *compared.values()), default=0.0),
-        len(moving_bones(poses, before.matrices, TOLERANCE) & set(joint_names)),
+        len(set(differing_bones(poses, before.matrices, before.matrices[:1], TOLERANCE)) & set(joint_names)),
         infinite_bones(poses, before.matrices),
         tuple(unrepeated),
     )

@@ -2,7 +2,7 @@
 """Binds a model to a mesh object."""
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import bpy
@@ -132,9 +132,13 @@ def temporary_mode(mesh_object: bpy.types.Object, mode: str) -> Iterator[None]:
             binding.mode = previous_mode
 
 
-def model_disabled(mesh_object: bpy.types.Object) -> AbstractContextManager[None]:
-    """Show the rig of a bound object, and restore its mode afterwards."""
-    return temporary_mode(mesh_object, "RIG")
+@contextmanager
+def model_disabled(*mesh_objects: bpy.types.Object) -> Iterator[None]:
+    """Show the rigs of bound objects, and restore their modes afterwards."""
+    with ExitStack() as stack:
+        for mesh_object in mesh_objects:
+            stack.enter_context(temporary_mode(mesh_object, "RIG"))
+        yield
 
 
 @contextmanager

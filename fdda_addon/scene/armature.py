@@ -118,7 +118,7 @@ class Poser:
             angles = [0.0, 0.0, 0.0]
             for index, axis in channels:
                 angles[axis] = values[index]
-            _rotate(bones[name], Euler(angles).to_quaternion() if kind == ROTATION else Quaternion(angles))
+            rotate_bone(bones[name], Euler(angles).to_quaternion() if kind == ROTATION else Quaternion(angles))
         if self._elements:
             # Blender does not notice values that are written as an array.
             armature_object.update_tag(refresh={"DATA"})
@@ -126,7 +126,7 @@ class Poser:
             set_control(self._scene_rig, name, float(values[index]))
 
 
-def _rotate(bone: bpy.types.PoseBone, rotation: Quaternion) -> None:
+def rotate_bone(bone: bpy.types.PoseBone, rotation: Quaternion) -> None:
     """Set the rotation of a bone relative to its rest pose, in its rotation mode."""
     if bone.rotation_mode == "QUATERNION":
         bone.rotation_quaternion = rotation

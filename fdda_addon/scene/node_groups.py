@@ -72,21 +72,15 @@ def read_bone_names(tree: bpy.types.NodeTree | None) -> Iterator[str]:
 
     An empty name stands for a bone that a linked socket names, which may be any bone.
     """
-    for node in tree.nodes if tree is not None else ():
-        if node.bl_idname == BONE_NODE:
-            socket = node.inputs["Bone Name"]
-            yield "" if socket.is_linked else socket.default_value
-        elif node.type == "GROUP":
-            yield from read_bone_names(node.node_tree)
+    for socket in (node.inputs["Bone Name"] for node in tree_nodes(tree) if node.bl_idname == BONE_NODE):
+        yield "" if socket.is_linked else socket.default_value
 
 
 def read_texts(tree: bpy.types.NodeTree | None) -> Iterator[str]:
     """Yield the texts in the nodes of a group and of nested groups, among them the names of attributes."""
-    for node in tree.nodes if tree is not None else ():
+    for node in tree_nodes(tree):
         yield from (socket.default_value for socket in node.inputs if socket.type == "STRING")
-        if node.type == "GROUP":
-            yield from read_texts(node.node_tree)
-        elif node.bl_idname == "FunctionNodeInputString":
+        if node.bl_idname == "FunctionNodeInputString":
             yield node.string
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import TrainingError, os_error_text
 from ..files.input_file import read_input
-from ..files.output import to_json_text, write_text
+from ..files.output import to_json_text
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 CHECKPOINT_SUFFIX = ".checkpoint.npz"
@@ -31,16 +31,9 @@ class Verdict(enum.Enum):
     """The error is above the goal, and more poses no longer help."""
 
 
-class _Nullable:
-    """Type of a value in a report that may also be null."""
-
-    def __init__(self, value_type: object):
-        self.value_type = value_type
-
-
 _ERROR_STATISTICS = dict.fromkeys(("mean", "rms", "p99", "p999", "max"), float)
 _ANGLE_STATISTICS = dict.fromkeys(("mean", "p99", "max"), float)
-_EDGE_ERROR_KEYS = dict.fromkeys(("inside", "beside", "across"), _Nullable(float))
+_EDGE_ERROR_KEYS = dict.fromkeys(("inside", "beside", "across"), (float, None))
 _PARTITION_KEYS = {
     "joint": str,
     "vertices": int,
@@ -82,15 +75,16 @@ _REPORT_KEYS = {
     "constant_bytes?": int,
     "fdda": {"training": _ERROR_STATISTICS, "held_out": _ERROR_STATISTICS},
     "linear": {"held_out": _ERROR_STATISTICS},
-    "normals?": _Nullable({"fdda": _ANGLE_STATISTICS, "linear": _ANGLE_STATISTICS}),
-    "edges?": _Nullable({"fdda": _EDGE_ERROR_KEYS, "linear": _EDGE_ERROR_KEYS}),
+    "normals?": ({"fdda": _ANGLE_STATISTICS, "linear": _ANGLE_STATISTICS}, None),
+    "edges?": ({"fdda": _EDGE_ERROR_KEYS, "linear": _EDGE_ERROR_KEYS}, None),
     "histogram": {"edges": [float], "fdda": [int], "linear": [int]},
     "partitions": [_PARTITION_KEYS],
     "warnings?": [{"name": str, "text": str}],
     "repeatability?": {"poses": [int], "distance_mm": _ERROR_STATISTICS},
     "goal?": {"goal": float, "p999": float, "verdict": Verdict},
 }
-"""Keys of a report and the types of their values. `?` marks an optional key; further keys are permitted."""
+"""Keys of a report and the types of their values. `?` marks an optional key, a pair with None a value that may
+be null; further keys are permitted."""
 _EVALUATION_KEYS = {"poses": int, "fdda": _ERROR_STATISTICS, "linear": _ERROR_STATISTICS}
 """Keys of the JSON that `evaluate` writes, as far as the page of a report shows them."""
 
@@ -110,13 +104,8 @@ def checkpoint_path(model_path: Path) -> Path:
     return model_path.with_suffix(CHECKPOINT_SUFFIX)
 
 
-def write_report(path: Path, report: dict) -> None:
-    """Write a report with `format` and `version`."""
-    write_text(path, report_text(report))
-
-
 def report_text(report: dict) -> str:
-    """Return the text that `write_report` writes; raise ValueError as `write_report` does."""
+    """Return the text of a report, with `format` and `version`; raise ValueError if keys or types are wrong."""
     _check_value(report, _REPORT_KEYS, "")
     return to_json_text({"format": FORMAT, "version": VERSION, **report})
 
@@ -166,9 +155,9 @@ def _read_json(path: Path, file_text: str, advice: str) -> object:
 
 def _check_value(value: object, expected_type: object, key_path: str) -> None:
     """Raise ValueError, with the path of the key, where a value does not have the expected type."""
-    if isinstance(expected_type, _Nullable):
+    if isinstance(expected_type, tuple):
         if value is not None:
-            _check_value(value, expected_type.value_type, key_path)
+            _check_value(value, expected_type[0], key_path)
     elif isinstance(expected_type, dict):
         if not isinstance(value, dict):
             raise ValueError(f"{key_path or 'it'} is no object")

@@ -7,7 +7,7 @@ import bpy
 
 import fdda_addon
 from fdda_addon.cli import interruption
-from fdda_addon.cli.registered import registered
+from fdda_addon.cli.main import registered
 from fdda_addon.registration import handler_table
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.files.output import write_text
 from fdda_addon.core.formats import report as report_format
-from fdda_addon.core.formats.report import checkpoint_path, page_path, read_report, report_path, write_report
+from fdda_addon.core.formats.report import checkpoint_path, page_path, read_report, report_path, report_text
 
 ERRORS = {"mean": 0.1, "rms": 0.2, "p99": 0.5, "p999": 1, "max": 2.5}
 REPORT = {
@@ -72,13 +73,13 @@ def test_paths_next_to_a_model():
 
 
 def test_a_report_is_read_back_unchanged(tmp_path):
-    write_report(tmp_path / "report.json", REPORT)
+    write_text(tmp_path / "report.json", report_text(REPORT))
     assert read_report(tmp_path / "report.json") == {"format": "fdda-report", "version": 1, **REPORT}
 
 
 @pytest.mark.parametrize("key", ["warnings", "goal", "normals", "edges"])
 def test_optional_keys_may_be_missing(tmp_path, key):
-    write_report(tmp_path / "report.json", damaged_report((key,), ...))
+    write_text(tmp_path / "report.json", report_text(damaged_report((key,), ...)))
     assert key not in read_report(tmp_path / "report.json")
 
 
@@ -105,7 +106,7 @@ def test_a_damaged_report_is_neither_written_nor_read(tmp_path, key_path, value,
     path = tmp_path / "report.json"
     report = damaged_report(key_path, value)
     with pytest.raises(ValueError, match=sentence.replace("[", r"\[")):
-        write_report(path, report)
+        write_text(path, report_text(report))
     assert not path.exists()
     path.write_text(json.dumps({"format": "fdda-report", "version": 1, **report}))
     with pytest.raises(TrainingError) as error:
@@ -116,7 +117,7 @@ def test_a_damaged_report_is_neither_written_nor_read(tmp_path, key_path, value,
 @pytest.mark.parametrize("number_text", ["NaN", "Infinity", "-Infinity", "1e999"])
 def test_non_finite_numbers_are_refused(tmp_path, number_text):
     path = tmp_path / "report.json"
-    write_report(path, REPORT)
+    write_text(path, report_text(REPORT))
     path.write_text(path.read_text().replace('"parity": 0.0001', f'"parity": {number_text}'))
     with pytest.raises(TrainingError, match="parity is out of all bounds"):
         read_report(path)
