@@ -7,20 +7,8 @@ from typing import NamedTuple
 from ..core.errors import TRY_AGAIN
 from ..core.files.native_library import runtime_url
 
-_WINDOWS_CRASHES = {
-    0x80000003: "a breakpoint",
-    0xC0000005: "access violation",
-    0xC0000006: "a page could not be read from the disk",
-    0xC0000017: "out of memory",
-    0xC000001D: "this processor lacks an instruction",
-    0xC0000094: "division by zero",
-    0xC00000FD: "stack overflow",
-    0xC000012D: "the paging file is too small",
-    0xC0000374: "the heap is corrupted",
-    0xC0000409: "aborted",
-    0xE06D7363: "an exception of C++",
-}
-"""Descriptions of the exit statuses of crashed processes on Windows."""
+_WINDOWS_CRASHES = {0x80000003, 0xE06D7363}
+"""Exit statuses after a breakpoint and an exception of C++; those of other crashes begin with 0xC."""
 _MISSING_DLL_STATUSES = {0xC0000135, 0xC0000139, 0xC0000142}
 _CONSOLE_CLOSED_STATUS = 0xC000013A
 _TERMINATED_STATUSES = {1, 15}
@@ -54,8 +42,7 @@ def explain_exit_status(status: int | None, is_silent: bool) -> ProcessExit:
     if code == _CONSOLE_CLOSED_STATUS:
         return ProcessExit("was ended with its console before it was done", True)
     if code in _WINDOWS_CRASHES or 0xC0000000 <= code < 0xD0000000:
-        reason = f"{_WINDOWS_CRASHES[code]}, " if code in _WINDOWS_CRASHES else ""
-        return ProcessExit(f"crashed: {reason}status 0x{code:08X}", True)
+        return ProcessExit(f"crashed: status 0x{code:08X}", True)
     if status < 0:
         return ProcessExit(f"was ended by signal {-status} before it was done", True)
     was_terminated = os.name == "nt" and is_silent and status in _TERMINATED_STATUSES

@@ -4,7 +4,7 @@
 import numpy as np
 
 from ..controls import SHAPE_KEY_PATH
-from ..mathematics.features import float32_rounding, joint_features_in_metres
+from ..mathematics.features import FEATURES_PER_JOINT, float32_rounding, joint_features_in_metres
 from ..recording.skinned import SkinnedRecording
 from ..rig import Rig
 from ..settings import MIN_VERTICES_PER_PART
@@ -138,25 +138,25 @@ def _check_large_residuals(recording: SkinnedRecording, scan: ResidualScan) -> l
 
 
 def _check_controls(recording: SkinnedRecording) -> list[RecordingWarning]:
+    """Warn about shape keys that are not moved, and about other controls that change neither residuals nor joints."""
     influencing = {control for partition in recording.partitions for control in partition.controls}
-    controls = recording.rig.controls
-    constant_controls = {control for control in range(len(controls)) if np.ptp(recording.controls[:, control]) == 0}
-    idle_controls = [
-        control for control in range(len(controls)) if control not in influencing and control not in constant_controls
-    ]
+    controls, values = recording.rig.controls, recording.controls
+    constant = {control for control in range(len(controls)) if np.ptp(values[:, control]) == 0}
+    constant_keys = sorted(control for control in constant if controls[control].is_shape_key)
     poses, features = _sampled_features(recording)
-    features = features.reshape(len(poses), -1)
     # A control that moves joints, such as a switch between IK and FK, has an effect.
-    idle_controls = [
+    idle = [
         control
-        for control in idle_controls
-        if not _are_related(recording.controls[poses, control : control + 1], features)
+        for control in range(len(controls))
+        if control not in constant_keys
+        and (
+            control in constant
+            or (control not in influencing and not _are_related(values[poses, control : control + 1], features))
+        )
     ]
-    constant_keys = {control for control in constant_controls if controls[control].is_shape_key}
-    dead_controls = sorted({*idle_controls, *constant_controls} - constant_keys)
     warnings = []
     if constant_keys:
-        names = [SHAPE_KEY_PATH.fullmatch(controls[control].path)["name"] for control in sorted(constant_keys)]
+        names = [SHAPE_KEY_PATH.fullmatch(controls[control].path)["name"] for control in constant_keys]
         it = "it" if len(names) == 1 else "them"
         text = (
             f"{format_with_noun(names, 'shape key')} {'has' if len(names) == 1 else 'have'} one value in all poses, so "
@@ -164,16 +164,16 @@ def _check_controls(recording: SkinnedRecording) -> list[RecordingWarning]:
             f"or mute {it}."
         )
         warnings.append(RecordingWarning("dead-controls", text))
-    if not dead_controls:
-        return warnings
-    constant_names = [controls[control].name for control in dead_controls if control in constant_controls]
-    constant_text = f", {format_list(constant_names)} of them always the same" if constant_names else ""
-    text = (
-        f"{format_with_noun([controls[control].name for control in dead_controls], 'control')} "
-        f"{'changes' if len(dead_controls) == 1 else 'change'} nothing in this recording{constant_text}: leave "
-        f"{'it' if len(dead_controls) == 1 else 'them'} out, or give a wider range, and record again."
-    )
-    return [*warnings, RecordingWarning("dead-controls", text)]
+    if idle:
+        constant_names = [controls[control].name for control in idle if control in constant]
+        constant_text = f", {format_list(constant_names)} of them always the same" if constant_names else ""
+        text = (
+            f"{format_with_noun([controls[control].name for control in idle], 'control')} "
+            f"{'changes' if len(idle) == 1 else 'change'} nothing in this recording{constant_text}: leave "
+            f"{'it' if len(idle) == 1 else 'them'} out, or give a wider range, and record again."
+        )
+        warnings.append(RecordingWarning("dead-controls", text))
+    return warnings
 
 
 def _check_joints(recording: SkinnedRecording) -> list[RecordingWarning]:
@@ -182,24 +182,24 @@ def _check_joints(recording: SkinnedRecording) -> list[RecordingWarning]:
     The channels of a joint may be controls, whose effect is then that of the controls.
     """
     rig = recording.rig
-    used_controls = {control for partition in recording.partitions for control in partition.controls}
-    used_paths = [rig.controls[control].path for control in used_controls]
+    used_paths = [rig.controls[control].path for partition in recording.partitions for control in partition.controls]
     sampled_names = {channel.name for channel in recording.info.sampling.channels}
-    is_skinning = np.zeros(len(rig.joints), bool)
-    is_skinning[rig.skin_joints[rig.skin_weights > 0]] = True
+    is_used = np.zeros(len(rig.joints), bool)
+    is_used[rig.skin_joints[rig.skin_weights > 0]] = True
     for joint in reversed(range(len(rig.joints))):
         if (parent := rig.joints[joint].parent) >= 0:
-            is_skinning[parent] |= is_skinning[joint]
-    influencing = {joint for partition in recording.partitions for joint in partition.influencing}
-    idle_joints = [
-        index
-        for index, joint in enumerate(rig.joints)
-        if joint.name in sampled_names
-        and not is_skinning[index]
-        and index not in influencing
-        and not any(path.startswith(_bone_path(joint.name)) for path in used_paths)
-    ]
-    dead_names = [rig.joints[index].name for index in idle_joints if not _moves_others(recording, index, sampled_names)]
+            is_used[parent] |= is_used[joint]
+    is_used[[joint for partition in recording.partitions for joint in partition.influencing]] = True
+    others = [index for index, joint in enumerate(rig.joints) if joint.name not in sampled_names]
+    features = _sampled_features(recording)[1].reshape(-1, len(rig.joints), FEATURES_PER_JOINT)
+    dead_names = []
+    for index, joint in enumerate(rig.joints):
+        bone_path = 'pose.bones["{}"]'.format(joint.name.replace("\\", "\\\\").replace('"', '\\"'))
+        if joint.name not in sampled_names or is_used[index] or any(path.startswith(bone_path) for path in used_paths):
+            continue
+        # Joints that are not sampled may follow it, through constraints for example.
+        if not _are_related(features[:, index], features[:, others].reshape(len(features), -1)):
+            dead_names.append(joint.name)
     if not dead_names:
         return []
     text = (
@@ -210,24 +210,12 @@ def _check_joints(recording: SkinnedRecording) -> list[RecordingWarning]:
     return [RecordingWarning("dead-joints", text)]
 
 
-def _bone_path(name: str) -> str:
-    """Return the start of the paths of the controls of a bone."""
-    return 'pose.bones["{}"]'.format(name.replace("\\", "\\\\").replace('"', '\\"'))
-
-
-def _moves_others(recording: SkinnedRecording, joint: int, sampled_names: set[str]) -> bool:
-    """Return whether joints that are not sampled follow a joint, through constraints for example."""
-    rig = recording.rig
-    driven_joints = [index for index, other_joint in enumerate(rig.joints) if other_joint.name not in sampled_names]
-    poses, features = _sampled_features(recording)
-    return _are_related(features[:, joint], features[:, driven_joints].reshape(len(poses), -1))
-
-
 def _sampled_features(recording: SkinnedRecording) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) indices of evenly spaced poses and their (n, J, 12) joint features."""
-    rig, pose_count = recording.rig, len(recording.pose_matrices)
+    """Return (n,) indices of evenly spaced poses and their (n, 12 J) joint features."""
+    pose_count = len(recording.pose_matrices)
     poses = np.unique(np.linspace(0, pose_count - 1, MAX_CORRELATED_POSES).round().astype(np.int64))
-    return poses, joint_features_in_metres(np.array(recording.pose_matrices[poses]), rig)
+    features = joint_features_in_metres(np.array(recording.pose_matrices[poses]), recording.rig)
+    return poses, features.reshape(len(poses), -1)
 
 
 def _are_related(first: np.ndarray, second: np.ndarray) -> bool:
@@ -264,16 +252,14 @@ def _check_still_vertices(
 
 
 def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarning]:
-    small_partitions = [
-        partition for partition in recording.partitions if len(partition.vertices) < MIN_VERTICES_PER_PART.default
-    ]
-    if not small_partitions or len(recording.partitions) == 1:
+    limit = MIN_VERTICES_PER_PART.default
+    small = [partition for partition in recording.partitions if len(partition.vertices) < limit]
+    if not small or len(recording.partitions) == 1:
         return []
-    names = [joint_name(recording.rig, partition.joint) for partition in small_partitions]
-    min_vertex_count = min(len(partition.vertices) for partition in small_partitions)
     text = (
-        f"{format_with_noun(names, 'partition')} {'has' if len(small_partitions) == 1 else 'have'} fewer than "
-        f"{MIN_VERTICES_PER_PART.default} vertices (the smallest {min_vertex_count}), and a network each: train with "
-        f"--min-vertices-per-part {MIN_VERTICES_PER_PART.default} to merge them into others."
+        f"{format_with_noun([joint_name(recording.rig, partition.joint) for partition in small], 'partition')} "
+        f"{'has' if len(small) == 1 else 'have'} fewer than {limit} vertices (the smallest "
+        f"{min(len(partition.vertices) for partition in small)}), and a network each: train with "
+        f"--min-vertices-per-part {limit} to merge them into others."
     )
     return [RecordingWarning("small-partitions", text)]

@@ -2,6 +2,7 @@
 """Blending of a model with linear skinning, by vertex mask and by strength."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -49,16 +50,14 @@ class SkinningBlend:
         rig: the rig, with the skin weights and the rest pose of the model.
         mask: the mask; None for a weight of 1 everywhere.
         """
-        self.mask = mask
-        self._rig = rig
-        self._full_skinning: LinearSkinning | None = None
-        self._partial_skinning: LinearSkinning | None = None
+        self.mask, self._rig = mask, rig
 
     def with_mask(self, mask: Mask | None) -> "SkinningBlend":
         """Return a copy with another mask."""
-        copy = SkinningBlend(self._rig, mask)
-        copy._full_skinning = self._full_skinning
-        return copy
+        blend = SkinningBlend(self._rig, mask)
+        if "_skinning" in vars(self):
+            blend._skinning = self._skinning
+        return blend
 
     def apply(self, positions: np.ndarray, pose_matrices: np.ndarray, strengths: np.ndarray) -> np.ndarray:
         """Blend the positions of several poses.
@@ -73,7 +72,7 @@ class SkinningBlend:
             (N, V, 3) float32, mesh-object space, mesh units; `positions` itself where it was overwritten.
         """
         if strengths.min() < 1:
-            linear_positions = self._full_linear_skinning().positions(pose_matrices)
+            linear_positions = self._skinning.positions(pose_matrices)
             model_weights = strengths.astype(np.float32)[:, None]
             if self.mask is not None:
                 model_weights = model_weights * self.mask.weights
@@ -84,28 +83,19 @@ class SkinningBlend:
             return linear_positions
         if self.mask is not None and len(self.mask.partial_vertices):
             partial_vertices = self.mask.partial_vertices
-            linear_positions = self._partial_linear_skinning().positions(pose_matrices)
+            linear_positions = self._partial_skinning.positions(pose_matrices)
             weights = self.mask.weights[partial_vertices][:, None]
             positions[:, partial_vertices] = linear_positions + weights * (
                 positions[:, partial_vertices] - linear_positions
             )
         return positions
 
-    def _full_linear_skinning(self) -> LinearSkinning:
-        if self._full_skinning is None:
-            self._full_skinning = LinearSkinning(self._rig)
-        return self._full_skinning
+    @cached_property
+    def _skinning(self) -> LinearSkinning:
+        return LinearSkinning(self._rig)
 
-    def _partial_linear_skinning(self) -> LinearSkinning:
+    @cached_property
+    def _partial_skinning(self) -> LinearSkinning:
         """Return the linear skinning of the partial vertices alone, which is cheaper than to skin the whole mesh."""
-        if self._partial_skinning is None:
-            rig, partial_vertices = self._rig, self.mask.partial_vertices
-            self._partial_skinning = LinearSkinning(
-                replace(
-                    rig,
-                    rest_positions=rig.rest_positions[partial_vertices],
-                    skin_joints=rig.skin_joints[partial_vertices],
-                    skin_weights=rig.skin_weights[partial_vertices],
-                )
-            )
-        return self._partial_skinning
+        vertices, names = self.mask.partial_vertices, ("rest_positions", "skin_joints", "skin_weights")
+        return LinearSkinning(replace(self._rig, **{name: getattr(self._rig, name)[vertices] for name in names}))

@@ -87,7 +87,7 @@ AGAIN = "no model was written, train again."
 NOISE = ("print('a warning')", "print('{}')", "sys.stdout.buffer.write(b'\\xfc\\n')", STARTED, "print()")
 # On Windows, a process that the Task Manager kills has exit status 1, like a process that fails.
 KILLED = "was ended from outside" if os.name == "nt" else "was ended by signal 9"
-CRASHED = "crashed: access violation, status 0xC0000005" if os.name == "nt" else "was ended by signal 11"
+CRASHED = "crashed: status 0xC0000005" if os.name == "nt" else "was ended by signal 11"
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ def test_the_error_of_a_failing_python_is_shown(tmp_path: Path):
     answer = asked(write_program(tmp_path / "program", "sys.exit('wrong machine of Jürgen 李')"))
     assert "(wrong machine of Jürgen 李)" in answer.message
     answer = asked(write_program(tmp_path / "crashes", "import faulthandler", "faulthandler._read_null()"))
-    assert ("(crashed: access violation" if os.name == "nt" else "(was ended by signal 11") in answer.message
+    assert ("(crashed: status 0xC0000005" if os.name == "nt" else "(was ended by signal 11") in answer.message
 
 
 def test_a_hanging_python_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
