@@ -26,7 +26,7 @@ sys.path.insert(0, str(PROJECT))
 
 from fdda_addon.core.errors import TRY_AGAIN  # noqa: E402
 from fdda_addon.core.files.child_process import child_options  # noqa: E402
-from fdda_addon.core.files.file_lock import wait_for_lock  # noqa: E402
+from fdda_addon.core.files.file_lock import try_lock  # noqa: E402
 from fdda_addon.core.files.output import write_text  # noqa: E402
 
 PAUSE_SECONDS = 10
@@ -46,7 +46,8 @@ def main() -> int:
     step.done.parent.mkdir(parents=True, exist_ok=True)
     step.result.parent.mkdir(parents=True, exist_ok=True)
     with open(step.done.with_name("lock"), "w") as lock:
-        wait_for_lock(lock.fileno())
+        while not try_lock(lock.fileno()):
+            time.sleep(0.05)
         status = run(step, lock.fileno())
     if status == TRY_AGAIN:
         time.sleep(PAUSE_SECONDS)

@@ -116,11 +116,6 @@ def perpendicular(axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return projection / np.linalg.norm(projection)
 
 
-def _rotated(vector: np.ndarray, axis: np.ndarray, degrees: float) -> np.ndarray:
-    angle = math.radians(degrees)
-    return vector * math.cos(angle) + np.cross(axis, vector) * math.sin(angle)
-
-
 def _joint(name, parent, head, tail, bend_direction, limits) -> Joint:
     head, tail = np.asarray(head, float), np.asarray(tail, float)
     axis = (tail - head) / np.linalg.norm(tail - head)
@@ -128,47 +123,33 @@ def _joint(name, parent, head, tail, bend_direction, limits) -> Joint:
     return Joint(name, parent, tuple(head.tolist()), tuple(tail.tolist()), tuple(bend.tolist()), limits)
 
 
-def _finger_joints(name: str, finger: Finger) -> list[Joint]:
-    palm = np.array([0.0, 0.0, -1.0])
-    joints = [_joint(f"{name}_0", "wrist", finger.base, finger.knuckle, palm, _FINGER_LIMITS[0])]
-    head, dip = np.array(finger.knuckle), 0.0
-    for bone_number, (length, bend) in enumerate(zip(finger.lengths, finger.bends, strict=True), start=1):
-        dip += bend
-        tail = head + heading_vector(finger.heading, dip) * length
-        joints.append(
-            _joint(f"{name}_{bone_number}", f"{name}_{bone_number - 1}", head, tail, palm, _FINGER_LIMITS[bone_number])
-        )
-        head = tail
-    return joints
-
-
-def _thumb_joints() -> list[Joint]:
-    joints = []
-    head, parent = np.array(THUMB_BASE), "wrist"
-    for bone_index, length in enumerate(THUMB_LENGTHS):
-        axis = heading_vector(THUMB_HEADINGS[bone_index], THUMB_DIPS[bone_index])
-        down = perpendicular(axis, np.array([0.0, 0.0, -1.0]))
-        tail = head + axis * length
-        name = f"thumb_{bone_index}"
-        joints.append(_joint(name, parent, head, tail, _rotated(down, axis, THUMB_ROTATION), _THUMB_LIMITS[bone_index]))
-        head, parent = tail, name
-    return joints
-
-
 def _arm_joints() -> list[Joint]:
     crease, palm = (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)
     elbow, wrist = (UPPER_ARM_LENGTH, 0.0, 0.0), (WRIST_X, 0.0, 0.0)
-    quarter_turns = (-90.0, 90.0)
-    return [
-        _joint("shoulder", None, (0.0, 0.0, 0.0), elbow, crease, (quarter_turns, quarter_turns, quarter_turns)),
+    joints = [
+        _joint("shoulder", None, (0.0, 0.0, 0.0), elbow, crease, ((-90.0, 90.0),) * 3),
         _joint("elbow", "shoulder", elbow, wrist, crease, ((0.0, ELBOW_FLEXION), LOCKED_RANGE, LOCKED_RANGE)),
         _joint("wrist", "elbow", wrist, (WRIST_X + 0.03, 0.0, 0.0), palm, ((-70.0, 70.0), LOCKED_RANGE, (-30.0, 20.0))),
     ]
+    head, parent, angle = np.array(THUMB_BASE), "wrist", math.radians(THUMB_ROTATION)
+    for index, length in enumerate(THUMB_LENGTHS):
+        axis = heading_vector(THUMB_HEADINGS[index], THUMB_DIPS[index])
+        down = perpendicular(axis, np.array(palm))
+        bend = down * math.cos(angle) + np.cross(axis, down) * math.sin(angle)
+        joints.append(_joint(f"thumb_{index}", parent, head, head + axis * length, bend, _THUMB_LIMITS[index]))
+        head, parent = head + axis * length, f"thumb_{index}"
+    for name, finger in FINGER_MEASURES.items():
+        joints.append(_joint(f"{name}_0", "wrist", finger.base, finger.knuckle, palm, _FINGER_LIMITS[0]))
+        head, dip = np.array(finger.knuckle), 0.0
+        for index, (length, bend) in enumerate(zip(finger.lengths, finger.bends, strict=True), start=1):
+            dip += bend
+            tail = head + heading_vector(finger.heading, dip) * length
+            joints.append(_joint(f"{name}_{index}", f"{name}_{index - 1}", head, tail, palm, _FINGER_LIMITS[index]))
+            head = tail
+    return joints
 
 
-JOINTS: tuple[Joint, ...] = tuple(
-    _arm_joints() + _thumb_joints() + [j for name in FINGERS for j in _finger_joints(name, FINGER_MEASURES[name])]
-)
+JOINTS: tuple[Joint, ...] = tuple(_arm_joints())
 JOINT_NAMES: tuple[str, ...] = tuple(joint.name for joint in JOINTS)
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 

@@ -53,7 +53,7 @@ def stop(reason: str, works_on: str = CHARACTER) -> None:
     """
     if runner := current_runner(works_on):
         try:
-            runner.close()
+            runner.steps.close()
         except FDDAError as error:
             reason = f"{reason} {error}"
         runner.end(reason, "WARNING")
@@ -87,7 +87,7 @@ class JobRunner:
         draw_cache.forget_actions()
 
     def work(self, seconds: float) -> bool:
-        """Run the job for some seconds, or until it waits; return whether it has ended.
+        """Run the job for some seconds, or until it waits; return whether it has ended. Closing it restores the scene.
 
         KeyboardInterrupt and unexpected exceptions propagate, after the scene was restored and the job has ended.
         """
@@ -95,7 +95,7 @@ class JobRunner:
         try:
             is_canceled = self.state.cancel_requested
             if is_canceled and not self._ends_itself:
-                self.close()
+                self.steps.close()
             elif not self.advance(seconds):
                 return False
             if is_canceled and self.result is None:
@@ -107,7 +107,7 @@ class JobRunner:
         except ReferenceError:
             self.end(f"{title} ended: its object was removed.", "ERROR")
         except BaseException:
-            self.close()
+            self.steps.close()
             self.end(f"{title} failed; see the system console.", "ERROR")
             raise
         return True
@@ -128,10 +128,6 @@ class JobRunner:
             self.state.show(step)
             if self.state.cancel_requested or time.monotonic() >= deadline:
                 return False
-
-    def close(self) -> None:
-        """Close the generator, which restores the scene."""
-        self.steps.close()
 
     def end(self, outcome: str, level: str) -> None:
         """Store the outcome and end the job, so that another job may start."""

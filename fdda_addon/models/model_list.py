@@ -8,7 +8,7 @@ import bpy
 
 from ..core.errors import ModelError, OutputError, os_error_text
 from ..core.files.output import atomic_write, check_writable
-from ..core.formats.model import MAX_BYTES, check_model, read_model, read_model_info
+from ..core.formats.model import check_model, read_model, read_model_info
 from ..core.formats.model_info import ModelInfo
 from ..evaluation import last_evaluation
 from ..runtime import model_files, packed_model, playback
@@ -40,11 +40,11 @@ def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGr
         if absolute_path(mesh_object, entry.path) == Path(os.path.normpath(path.absolute())):
             binding.model_index = index
             was_bound = is_bound(mesh_object, entry)
-            is_changed = (
-                _repack_if_changed(mesh_object, entry, path)
-                if entry.packed
-                else playback.has_outdated_model(mesh_object)
-            )
+            if not entry.packed:
+                is_changed = playback.has_outdated_model(mesh_object)
+            elif is_changed := entry.packed.get(packed_model.PACKED_MODEL_KEY) != read_model(path)[1]:
+                pack_entry(mesh_object, entry, path)
+                packed_model.remove_unused_texts()
             if was_bound and is_changed:
                 last_evaluation.remove(mesh_object)
                 if (armature_object := armature_of(mesh_object)) is not None:
@@ -200,15 +200,6 @@ def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pa
     return len(data)
 
 
-def _repack_if_changed(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
-    """Pack the file of a packed model again if the file has changed, and return whether it has changed."""
-    if entry.packed.get(packed_model.PACKED_MODEL_KEY) == read_model(path)[1]:
-        return False
-    pack_entry(mesh_object, entry, path)
-    packed_model.remove_unused_texts()
-    return True
-
-
 def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> None:
     """Write a packed model to a file, and use the file instead of the packed model.
 
@@ -219,11 +210,11 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
     data = packed_model.read(entry.packed)
     check_model(data, entry.packed.name)
     check_writable(path)
-    if not (os.path.lexists(path) and path.is_file() and _has_content(path, data)):
-        if os.path.lexists(path):
-            raise OutputError(f"There is another file '{path}'; choose another name.")
+    if not os.path.lexists(path):
         with atomic_write(path) as temporary:
             temporary.write_bytes(data)
+    elif not path.is_file() or path.stat().st_size != len(data) or path.read_bytes() != data:
+        raise OutputError(f"There is another file '{path}'; choose another name.")
     was_bound = is_bound(mesh_object, entry)
     entry.path, entry.packed, entry.packed_bytes = stored_path_for(mesh_object, path), None, 0
     model_files.allow_path(path)
@@ -266,7 +257,3 @@ def entry_info(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
 def entry_info_of_mesh(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:
     """Return the metadata of a model of the list for its mesh; raise the errors of `entry_info` and `find_mesh`."""
     return info_of_mesh(entry_path(mesh_object, entry), entry_info(mesh_object, entry), mesh_object)
-
-
-def _has_content(path: Path, data: bytes) -> bool:
-    return path.stat().st_size == len(data) <= MAX_BYTES and path.read_bytes() == data

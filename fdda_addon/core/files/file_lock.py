@@ -8,14 +8,12 @@ import errno
 import os
 import socket
 import sys
-import time
 
 if sys.platform == "win32":
     import msvcrt
 else:
     import fcntl
 
-POLL_SECONDS = 0.05
 LOCKED_BYTE_OFFSET = 1 << 30
 """Offset of the byte that Windows locks: past the end of the file, because Windows denies reading locked bytes."""
 
@@ -65,9 +63,3 @@ def has_ended(process_id: int, host: str) -> bool:
     except OSError:
         return False
     return False
-
-
-def wait_for_lock(descriptor: int) -> None:
-    """Wait until `try_lock` locks an open file."""
-    while not try_lock(descriptor):
-        time.sleep(POLL_SECONDS)

@@ -104,7 +104,12 @@ def _add_deformation(
     graph.add("Sigmoid", [confidence], CONFIDENCE_OUTPUT)
     # The networks.
     input_count = 16 * INFLUENCING_JOINTS + len(rig.controls)
-    columns = [_input_columns(rig, partition.joint, input_count) for partition in partitions]
+    # Each network reads the features of some joints, and all controls.
+    control_columns = 16 * joint_count + np.arange(len(rig.controls))
+    columns = [
+        np.append((16 * p.joint + np.arange(16 * INFLUENCING_JOINTS)) % (16 * joint_count), control_columns)
+        for p in partitions
+    ]
     values = graph.add("Gather", [clamped, graph.integers("columns", np.array(columns))], "network_inputs", axis=1)
     values = graph.add("Transpose", [values], "inputs_by_network", perm=[1, 0, 2])
     for index, (inputs, outputs) in enumerate(pairwise((input_count, HIDDEN_UNITS, HIDDEN_UNITS, COMPONENTS))):
@@ -147,12 +152,6 @@ def _add_deformation(
     positions = graph.add("Transpose", [positions], "positions_by_part", perm=[0, 2, 1])
     order = np.argsort(np.concatenate([partition.vertices for partition in partitions]))
     graph.add("Gather", [positions, graph.integers("order", order)], POSITIONS_OUTPUT, axis=1)
-
-
-def _input_columns(rig: Rig, joint: int, count: int) -> np.ndarray:
-    """Return the (count,) indices of the features that the network of a body part reads."""
-    joint_columns = (16 * joint + np.arange(count - len(rig.controls))) % (16 * len(rig.joints))
-    return np.append(joint_columns, 16 * len(rig.joints) + np.arange(len(rig.controls)))
 
 
 class _Part:
