@@ -23,7 +23,8 @@ def drop_components(prepared: Sequence[TrainedPartition], split: Split) -> list[
     """Drop the components that lower the mean error too little, or raise it.
 
     The error is measured on the validation poses. Overshoot poses and refined poses also count, with a lower weight,
-    because components may represent what only happens in extreme poses. These are all training poses.
+    because components may represent what only happens in extreme poses. These are all training poses. Errors are
+    relative to those of the same mesh.
 
     A network cannot predict a component that depends on more than its inputs, or on details that the poses do not show.
     The components are first replaced by the principal components of the predictions, which are fewer than those of
@@ -32,18 +33,20 @@ def drop_components(prepared: Sequence[TrainedPartition], split: Split) -> list[
     Returns:
         The partitions with the remaining components; a partition may lose all.
     """
-    measured, total_error, total_cost = [], 0.0, 0
+    measured = []
+    errors, costs = np.zeros((2, 1 + max(partition.mesh for partition in prepared)))
     for partition in prepared:
         predicted = partition.network.evaluate(partition.inputs[split.training]).astype(np.float64)
         # The columns are the principal directions of the predictions, largest first.
         change = np.linalg.eigh(predicted.T @ predicted)[1][:, ::-1]
         error, gains = _component_gains(partition, change, split)
         cost = 3 * partition.vertex_count + len(partition.network.weights[-1]) + 1
-        total_error, total_cost = total_error + error, total_cost + cost * len(gains)
+        errors[partition.mesh] += error
+        costs[partition.mesh] += cost * len(gains)
         measured.append((partition, change, gains, cost))
-    min_gain = MIN_GAIN_RATIO * total_error / max(total_cost, 1)
+    min_gains = MIN_GAIN_RATIO * errors / np.maximum(costs, 1)
     return [
-        _change_basis(partition, change[:, gains > min_gain * cost], split)
+        _change_basis(partition, change[:, gains > min_gains[partition.mesh] * cost], split)
         for partition, change, gains, cost in measured
     ]
 

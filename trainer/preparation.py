@@ -18,7 +18,7 @@ from .data.split import Split
 from .fits.basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
 from .fits.half_rotations import regression_matrices
 from .fits.joint_fit import JointFit, JointRegression, joint_regression
-from .fits.parts import divide_partition
+from .fits.parts import divide_by_mesh, divide_partition, mesh_of
 from .inputs.network_inputs import NetworkInputs
 
 DETAIL_RATIO = 0.01
@@ -42,6 +42,7 @@ class PartitionData:
         read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
         min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
         columns: (F,) int64, indices of the features among all features of `NetworkInputs`; None for 0 to F - 1.
+        mesh: index of the mesh that has its vertices.
     """
 
     features: np.ndarray
@@ -49,6 +50,7 @@ class PartitionData:
     read_regression: Callable[[], JointRegression] | None = None
     min_spread: np.ndarray | float = MIN_FEATURE_SPREAD
     columns: np.ndarray | None = None
+    mesh: int = 0
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class PreparedPartition:
         vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
         dropped_count: number of components that were dropped after the training (`compression`).
         dropped_rms: rms distance over training poses and vertices that they represent, mesh units.
+        mesh: index of the mesh that has its vertices.
     """
 
     vertex_count: int
@@ -88,6 +91,7 @@ class PreparedPartition:
     vertex_factors: np.ndarray | None = None
     dropped_count: int = 0
     dropped_rms: float = 0.0
+    mesh: int = 0
 
     @property
     def validation_truncation(self) -> np.ndarray:
@@ -96,29 +100,42 @@ class PreparedPartition:
         return np.sqrt((truncated**2).sum(axis=1) / self.vertex_count)
 
 
-def choose_detail(recording: SkinnedRecording, split: Split) -> float:
-    """Choose the detail of a training, mm, by the rms error of linear skinning on the training poses.
+def choose_details(recording: SkinnedRecording, split: Split) -> np.ndarray:
+    """Choose the detail of each mesh, mm, by the rms error of linear skinning on the training poses.
 
     A face moves by millimeters where a body moves by centimeters, so its details are smaller.
+
+    Returns:
+        (M,) float64.
     """
-    poses = split.training[:: -(-len(split.training) // MAX_DETAIL_POSES)]
-    squares = [np.einsum("vc,vc->v", r, r, dtype=np.float64).mean() for r in recording.iterate_residuals(poses)]
-    detail = max(float32_rounding(recording.pose_matrices), DETAIL_RATIO * float(np.sqrt(np.mean(squares))))
-    detail_mm = 1000 * recording.rig.metres_per_unit * detail
-    return min(max(MIN_DETAIL_MM, detail_mm), MAX_DETAIL_MM)
+    step, slices = -(-len(split.training) // MAX_DETAIL_POSES), recording.rig.mesh_slices
+    squares = [
+        [np.einsum("vc,vc->v", r[part], r[part], dtype=np.float64).mean() for part in slices]
+        for r in recording.iterate_residuals(split.training[::step])
+    ]
+    rms = np.sqrt(np.average(squares, axis=0, weights=split.weights()[::step]))
+    details = np.maximum(float32_rounding(recording.pose_matrices), DETAIL_RATIO * rms)
+    return np.clip(1000 * recording.rig.metres_per_unit * details, MIN_DETAIL_MM, MAX_DETAIL_MM)
 
 
-def make_parts(recording: SkinnedRecording, split: Split, tolerance: float) -> list[Partition]:
-    """Divide the partitions of a recording into parts that need different shape keys; `tolerance` in mesh units.
+def make_parts(
+    recording: SkinnedRecording, split: Split, tolerances: Sequence[float], min_vertices: int = 0
+) -> list[Partition]:
+    """Divide the partitions of a recording into parts, by mesh and by the shape keys that they need.
 
     A part is a partition with fewer vertices: it has its own fit, components and network. The parts of a partition
     have the same main joint and the same confidence. Their controls include the shape keys of adjacent partitions,
     because smoothing carries these across the border.
+
+    Args:
+        tolerances: the detail of each mesh, mesh units.
+        min_vertices: where a mesh has fewer vertices in a partition, they stay with those of another mesh.
     """
     rig = recording.rig
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations=False)
     parts = []
-    for partition in _with_adjacent_keys(rig, recording.partitions):
+    for partition in _with_adjacent_keys(rig, divide_by_mesh(rig, recording.partitions, min_vertices)):
+        tolerance = tolerances[mesh_of(rig, partition)]
         regression = joint_regression(rig, partition, matrices, recording.controls)
         groups = [np.arange(len(partition.vertices))]
         if len(regression.controls) and len(partition.vertices) >= MIN_DIVIDED_VERTICES:
@@ -171,6 +188,7 @@ def partition_data(
             lambda partition=partition: joint_regression(rig, partition, matrices, recording.controls),
             min_spread[columns],
             columns,
+            mesh_of(rig, partition),
         )
         for partition, columns in zip(parts or recording.partitions, inputs.columns, strict=True)
     ]
@@ -220,29 +238,36 @@ def prepare_partition(
         split.validation,
         residuals[split.validation],
         mm_per_unit,
+        mesh=partition.mesh,
     )
 
 
 def prepare_partitions(
     partitions: Sequence[PartitionData],
     split: Split,
+    details_mm: Sequence[float],
     config: TrainingConfig,
     metres_per_unit: float = 1.0,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> list[PreparedPartition]:
-    """Prepare partitions that share one tolerance (`allocate_components`).
+    """Prepare partitions; those of a mesh share one tolerance (`allocate_components`).
 
     Args:
+        details_mm: rms error that the components of each mesh may leave, mm.
         metres_per_unit: as in `Rig`.
         on_progress: called after each partition with the number of partitions that are prepared.
     """
-    prepared, fine_tolerance_mm = [], config.detail_mm / FINE_TOLERANCE_FACTOR
+    prepared, counts = [], np.zeros(len(partitions), np.int64)
     for partition in partitions:
+        fine_tolerance_mm = details_mm[partition.mesh] / FINE_TOLERANCE_FACTOR
         prepared.append(prepare_partition(partition, split, fine_tolerance_mm, config.seed, metres_per_unit))
         on_progress(len(prepared))
-    errors, vertex_counts = [p.basis.error_by_count for p in prepared], [p.vertex_count for p in prepared]
-    tolerance = config.detail_mm / (1000 * metres_per_unit)
-    counts = allocate_components(errors, vertex_counts, tolerance, config.hidden[-1] + 1)
+    for mesh, detail_mm in enumerate(details_mm):
+        indices = [index for index, partition in enumerate(prepared) if partition.mesh == mesh]
+        errors = [prepared[index].basis.error_by_count for index in indices]
+        vertex_counts = [prepared[index].vertex_count for index in indices]
+        tolerance = detail_mm / (1000 * metres_per_unit)
+        counts[indices] = allocate_components(errors, vertex_counts, tolerance, config.hidden[-1] + 1)
     return [
         replace(p, basis=p.basis.truncate(count), coefficients=np.ascontiguousarray(p.coefficients[:, :count]))
         for p, count in zip(prepared, counts, strict=True)

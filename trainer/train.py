@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import onnxruntime
 import torch
 
@@ -36,7 +37,7 @@ from .networks.loop import train
 from .networks.networks import TrainedPartition
 from .networks.warm_start import checkpoint_parts, initial_networks, read_initial_checkpoint, warm_start_config
 from .outputs import training_outputs
-from .preparation import PartitionData, choose_detail, make_parts, partition_data, prepare_partitions
+from .preparation import PartitionData, choose_details, make_parts, partition_data, prepare_partitions
 from .progress import MessageSink
 from .report.contents import make_report
 from .report.error_analysis import analyze_errors
@@ -75,11 +76,12 @@ def train_model(
     with stoppable():
         recording = split_deformation(read_recording(recording_path), config, sink)
         split = split_recording(recording, config)
+        details_mm = np.full(len(recording.rig.meshes), config.detail_mm)
         if not config.detail_mm:
-            config = replace(config, detail_mm=choose_detail(recording, split))
+            details_mm = choose_details(recording, split)
         holdout = holdout_fingerprint(recording, split)
         checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
-        job = _Job(config, sink, recording, split, checkpoint)
+        job = _Job(config, details_mm, sink, recording, split, checkpoint)
         warnings = job.start(strict)
         parts = job.make_parts()
         inputs = job.fit_inputs(parts)
@@ -110,9 +112,15 @@ def train_model(
 
 @dataclass
 class _Job:
-    """The steps of a training that send messages; `checkpoint` is that of a warm start, others as in `train_model`."""
+    """The steps of a training that send messages.
+
+    Attributes:
+        details_mm: detail of each mesh, mm.
+        checkpoint: that of a warm start.
+    """
 
     config: TrainingConfig
+    details_mm: np.ndarray
     sink: MessageSink
     recording: SkinnedRecording
     split: Split
@@ -150,26 +158,28 @@ class _Job:
             self.sink.send(MessageType.WARNING, **warning.to_json())
         if strict:
             raise_first_warning(warnings)
-        self.log(f"Detail: {self.config.detail_mm:.2g} mm.")
+        names = [f"'{mesh.name}' " if len(self.details_mm) > 1 else "" for mesh in self.recording.rig.meshes]
+        details = [f"{name}{detail:.2g} mm" for name, detail in zip(names, self.details_mm, strict=True)]
+        self.log(f"Detail: {', '.join(details)}.")
         return warnings
 
     def make_parts(self) -> list[Partition]:
         """Divide partitions into parts. A warm start keeps the parts of the checkpoint."""
         if self.checkpoint:
             return checkpoint_parts(self.checkpoint, self.recording)
-        return make_parts(self.recording, self.split, self._tolerance)
+        return make_parts(self.recording, self.split, self._tolerances, self.config.min_vertices_per_part)
 
     @property
-    def _tolerance(self) -> float:
-        """The tolerance, mesh units."""
-        return self.config.detail_mm / (1000 * self.recording.rig.metres_per_unit)
+    def _tolerances(self) -> np.ndarray:
+        """(M,) float64, the detail of each mesh, mesh units."""
+        return self.details_mm / (1000 * self.recording.rig.metres_per_unit)
 
     def fit_inputs(self, parts: list[Partition]) -> NetworkInputs:
         """Fit the inputs of the networks. A warm start keeps the inputs of the checkpoint."""
         if self.checkpoint:
             states = self.checkpoint.input_states
         else:
-            states = fit_inputs(self.recording, self.split, self.config)
+            states = fit_inputs(self.recording, self.split, replace(self.config, detail_mm=self.details_mm.min()))
         inputs = make_inputs(self.recording.rig, parts, states)
         for block in inputs.blocks:
             if block.log_text:
@@ -192,6 +202,7 @@ class _Job:
         prepared = prepare_partitions(
             partitions,
             self.split,
+            self.details_mm,
             config,
             self.recording.rig.metres_per_unit,
             lambda done: self.sink.send(
@@ -220,12 +231,17 @@ class _Job:
         remaining = drop_components(prepared, self.split)
         if text := dropped_components_sentence(prepared, remaining):
             self.log(text)
-        return [factorize_partition(*p, self.split, self._tolerance) for p in zip(remaining, partitions, strict=True)]
+        return [
+            factorize_partition(*pair, self.split, self._tolerances[pair[0].mesh])
+            for pair in zip(remaining, partitions, strict=True)
+        ]
 
     def export(self, trained_model: TrainedModel) -> ExportedModel:
         """Build the model, and compare it with PyTorch on the held-out poses."""
+        details = [round(detail, 6) for detail in self.details_mm.tolist()]
         training_info = {
             **self.config.to_json(),
+            "detail_mm": details if len(details) > 1 else details[0],
             "torch": str(torch.__version__),
             "onnxruntime": onnxruntime.__version__,
             "device": self.device,

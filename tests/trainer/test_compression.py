@@ -183,7 +183,7 @@ def test_factorized_networks_predict_the_projected_residuals(tmp_path):
     recording = read_skinned(tmp_path / "tube")
     split = split_recording(recording, CONFIG)
     data = partition_data(recording, make_inputs(recording.rig, recording.partitions))
-    prepared, rng = prepare_partitions(data, split, TrainingConfig()), np.random.default_rng(0)
+    prepared, rng = prepare_partitions(data, split, [0], TrainingConfig()), np.random.default_rng(0)
     for index, partition in enumerate(prepared):
         sizes = (len(partition.columns), 8, len(partition.basis.components))
         weights = [rng.normal(size=shape).astype(np.float32) for shape in pairwise(sizes)]

@@ -10,14 +10,14 @@ import pytest
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.formats.model import read_model_info
-from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer import preparation
 from trainer.__main__ import main
 from trainer.fits import parts
 from trainer.fits.joint_fit import JointFit
-from trainer.fits.parts import divide_partition
+from trainer.fits.parts import divide_by_mesh, divide_partition, mesh_of
 
 from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
@@ -43,6 +43,21 @@ def test_vertices_with_different_keys_are_divided_if_they_are_many(vertex_count)
         assert [group.tolist() for group in groups] == [list(range(200))]
     else:
         assert sorted(group[:3].tolist() for group in groups) == [[0, 2, 4], [1, 3, 5]]
+
+
+@pytest.mark.parametrize(
+    "counts, min_vertices, expected", [((4, 5), 4, [4, 5]), ((4, 5), 5, [9]), ((2, 3, 2, 4), 3, [3, 8])]
+)
+def test_partitions_are_divided_by_mesh_where_each_mesh_has_enough_vertices(counts, min_vertices, expected):
+    rig = chain_rig(vertex_count=100 + sum(counts))
+    rig = replace(rig, meshes=tuple(replace(rig.meshes[0], vertices=count) for count in (100, *counts)))
+    partition = Partition(0, (), np.arange(100, 100 + sum(counts), dtype=np.int32))
+    divided = sorted(divide_by_mesh(rig, [partition], min_vertices), key=lambda part: len(part.vertices))
+    assert [len(part.vertices) for part in divided] == expected
+    assert np.array_equal(np.sort(np.concatenate([part.vertices for part in divided])), partition.vertices)
+    assert all((np.diff(part.vertices) > 0).all() for part in divided)
+    if len(expected) == len(counts):
+        assert [mesh_of(rig, part) for part in divided] == [1, 2]
 
 
 @pytest.fixture

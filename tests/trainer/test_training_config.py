@@ -9,8 +9,8 @@ import pytest
 
 from fdda_addon.core.errors import TrainingError
 from trainer.config import TrainingConfig, add_options, config_from_arguments
-from trainer.data.split import split_recording
-from trainer.preparation import choose_detail
+from trainer.data.split import Split, split_recording
+from trainer.preparation import choose_details
 
 from ..recordings import read_skinned
 
@@ -49,7 +49,18 @@ def test_the_detail_is_a_part_of_the_error_of_skinning(recording, scale, detail_
     poses = split.training[:: -(-len(split.training) // 100)]
     rms_mm = 1000 * metres_per_unit * np.sqrt((residuals[poses].astype(np.float64) ** 2).sum(axis=2).mean())
     assert detail_mm or 0.005 < 0.01 * rms_mm < 0.04
-    assert choose_detail(source, split) == pytest.approx(detail_mm or 0.01 * rms_mm, rel=1e-5)
+    assert choose_details(source, split) == pytest.approx([detail_mm or 0.01 * rms_mm], rel=1e-5)
+
+
+def test_overshoot_poses_count_a_tenth_in_the_detail_and_each_mesh_has_its_own(recording):
+    source = read_skinned(recording)
+    meshes = tuple(replace(source.rig.meshes[0], vertices=n) for n in (10, source.rig.vertex_count - 10))
+    residuals = np.zeros_like(source.residuals)
+    residuals[:, :10, 0], residuals[:, 10:, 0], residuals[::2, :, 0] = 1e-3, 2e-3, 3e-3
+    source = replace(source, rig=replace(source.rig, meshes=meshes), residuals=residuals)
+    poses = np.arange(20)
+    details = choose_details(source, Split(poses, poses[:1], poses[:1], overshoot=poses[::2]))
+    assert details == pytest.approx([0.01 * np.sqrt(np.average([9, square], weights=[0.1, 1])) for square in (1, 4)])
 
 
 def test_the_joints_of_a_wrong_option_are_explained(capsys):

@@ -1,11 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Division of a partition with shape keys into parts that need different keys.
+"""Division of partitions into parts: by mesh, and by the shape keys that vertices need.
+
+A sleeve and the arm in it follow the same joints, but not the same way: common components would be those of the mesh
+that moves more, and each would cost constants for both.
 
 A key moves few vertices of a face, but the factors of one matrix have a number for each vertex and each direction in
 which any vertex of the matrix moves. So a large partition is bisected, as long as its parts need fewer parameters.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
+
+from fdda_addon.core.mathematics.partition import Partition
+from fdda_addon.core.rig import Rig
 
 from .joint_fit import JointFit
 from .low_rank import TOLERANCE_RATIO
@@ -14,6 +23,23 @@ PART_PARAMETERS = 20_000
 """Parameters and time of one more part, with its network and its products, as a number of parameters."""
 BISECTION_STEPS = 10
 """Number of times that vertices move to the nearer of two centers."""
+
+
+def mesh_of(rig: Rig, partition: Partition) -> int:
+    """Return the index of the mesh that has the first vertex of a partition."""
+    return int(np.searchsorted([part.stop for part in rig.mesh_slices], partition.vertices[0], side="right"))
+
+
+def divide_by_mesh(rig: Rig, partitions: Sequence[Partition], min_vertices: int) -> list[Partition]:
+    """Divide partitions by mesh; the vertices of a mesh that has fewer than `min_vertices` stay with others."""
+    divided = []
+    for partition in partitions:
+        pieces = np.split(partition.vertices, np.searchsorted(partition.vertices, [s.stop for s in rig.mesh_slices]))
+        pieces = sorted((piece for piece in pieces if len(piece)), key=len, reverse=True)
+        large = [piece for piece in pieces[1:] if len(piece) >= min_vertices]
+        first = np.sort(np.concatenate([pieces[0], *pieces[1 + len(large) :]]))
+        divided += [replace(partition, vertices=piece) for piece in (first, *large)]
+    return divided
 
 
 def divide_partition(fit: JointFit, spreads: np.ndarray, tolerance: float) -> list[np.ndarray]:
