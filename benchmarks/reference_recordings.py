@@ -16,7 +16,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -168,7 +168,7 @@ def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bo
     else:
         measured, trained_on = np.arange(TRAINING_POSES, pose_count), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
-    detail_mm = config.detail_mm or MAX_DETAIL_MM
+    detail_mm, config = config.detail_mm or MAX_DETAIL_MM, replace(config, passes=config.passes or 200)
     prepared = [prepare_partition(partition.data, split, detail_mm, config.seed) for partition in partitions]
     rows = []
     for partition, trained in zip(partitions, train(prepared, split, config, choose_device().device), strict=True):

@@ -21,6 +21,7 @@ from fdda_addon.core.recording.estimate import format_size, recording_bytes
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
+from fdda_addon.core.settings import automatic_passes
 
 from .compression import drop_components, dropped_components_sentence, factorize_partition
 from .config import TrainingConfig
@@ -76,6 +77,7 @@ def train_model(
     with stoppable():
         recording = split_deformation(read_recording(recording_path), config, sink)
         split = split_recording(recording, config)
+        config = replace(config, passes=config.passes or automatic_passes(len(recording.pose_matrices)))
         details_mm = np.full(len(recording.rig.meshes), config.detail_mm)
         if not config.detail_mm:
             details_mm = choose_details(recording, split)
@@ -160,7 +162,7 @@ class _Job:
             raise_first_warning(warnings)
         names = [f"'{mesh.name}' " if len(self.details_mm) > 1 else "" for mesh in self.recording.rig.meshes]
         details = [f"{name}{detail:.2g} mm" for name, detail in zip(names, self.details_mm, strict=True)]
-        self.log(f"Detail: {', '.join(details)}.")
+        self.log(f"{self.config.passes} passes. Detail: {', '.join(details)}.")
         return warnings
 
     def make_parts(self) -> list[Partition]:

@@ -13,7 +13,15 @@ from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.progress import Job, Progress
 from ..core.recording.index import read_index
-from ..core.settings import DETAIL_MM, GOAL_MM, MIN_VERTICES_PER_PART, PASSES, TRAINING_SEED, values_from
+from ..core.settings import (
+    DETAIL_MM,
+    GOAL_MM,
+    MIN_VERTICES_PER_PART,
+    PASSES,
+    TRAINING_SEED,
+    automatic_passes,
+    values_from,
+)
 from ..jobs.job import current
 from ..jobs.plan import JobPlan, JobStep, training_steps
 from ..models.former_model import add_former_model, keep_former_model
@@ -91,7 +99,7 @@ class TrainingOperator(JobOperator):
         fits_weights = settings.base_skinning != "RIG" or settings.bones_to_read != "ALL"
         group_count = max(len(mesh_object.vertex_groups) for mesh_object in mesh_objects)
         counts = group_count, sum(len(mesh_object.data.vertices) for mesh_object in mesh_objects), pose_count
-        return training_steps(*counts, settings.passes, fits_weights)
+        return training_steps(*counts, settings.passes or automatic_passes(pose_count), fits_weights)
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
         if not bpy.app.background and is_detached(model):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.settings import automatic_passes
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import Split, split_recording
 from trainer.preparation import choose_details
@@ -18,7 +19,7 @@ from ..recordings import read_skinned
 @pytest.mark.parametrize(
     "name, value",
     [
-        ("passes", 0),
+        ("passes", -1),
         ("detail_mm", -0.1),
         ("detail_mm", float("nan")),
         ("learning_rate", float("inf")),
@@ -82,3 +83,8 @@ def test_every_setting_is_an_option():
         3, 0.2, (8, 9, 10), "gelu", 7, 5, 0.1, 0.3, 0.3, 0.2, 0.5, True
     )
     assert config_from_arguments(parser.parse_args([])) == TrainingConfig()
+
+
+@pytest.mark.parametrize("poses, passes", [(1, 200), (1000, 200), (2000, 155), (4000, 120)])
+def test_passes_follow_from_the_number_of_poses(poses, passes):
+    assert automatic_passes(poses) == passes
