@@ -80,5 +80,5 @@ MECHANISMS = {
     "pieces of layers": Mechanism(
         {"trainer.export.network_nodes._chunk_size": lambda layer_sizes, *_: max(layer_sizes)}, is_export=True
     ),
-    "vertex order in blocks": Mechanism({"trainer.export.vertex_order.MIN_BLOCK_VERTICES": np.inf}, is_export=True),
+    "vertex order in blocks": Mechanism({"trainer.export.skinning_nodes.MIN_BLOCK_VERTICES": np.inf}, is_export=True),
 }

@@ -5,7 +5,7 @@ import itertools
 
 import torch
 
-from trainer.networks.optimizer import OneCycleAdamW
+from trainer.networks.loop import OneCycleAdamW
 
 TOTAL_STEPS = (1, 2, 7, 60)
 WARM_UP_FRACTIONS = (0.15, 0.4)

@@ -15,8 +15,7 @@ from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.export import network_nodes
-from trainer.export.export import check_parity, measure, open_session, reference_positions
-from trainer.export.graph import build_graph
+from trainer.export.export import build_graph, check_parity, measure, open_session, reference_positions
 from trainer.model import TrainedModel
 
 from ..recordings import read_skinned, write_recording

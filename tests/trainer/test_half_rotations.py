@@ -20,7 +20,7 @@ from fdda_addon.core.rig import Rig
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
-from trainer.export.graph import build_graph
+from trainer.export.export import build_graph
 from trainer.fits.half_rotations import half_rotation_matrices, half_rotations_help, regression_matrices
 from trainer.fits.joint_fit import JointFit, joint_regression
 from trainer.model import TrainedModel

@@ -10,8 +10,7 @@ import pytest
 from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from trainer.__main__ import main
 from trainer.inputs import network_inputs
-from trainer.inputs.controls import ControlFeatures
-from trainer.inputs.joints import JointFeatures
+from trainer.inputs.joints import ControlFeatures, JointFeatures
 from trainer.inputs.network_inputs import NetworkInputs, make_inputs
 from trainer.networks.confidence import MARGIN_RATIO, MIN_MARGINS, measure_training_range
 

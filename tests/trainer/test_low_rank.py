@@ -12,7 +12,7 @@ from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
 from fdda_addon.core.rig import Rig
 from trainer.__main__ import main
-from trainer.export.graph import build_graph
+from trainer.export.export import build_graph
 from trainer.fits import low_rank
 from trainer.fits.basis import make_basis
 from trainer.fits.joint_fit import JointFit, JointRegression, joint_regression

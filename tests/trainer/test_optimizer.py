@@ -6,7 +6,7 @@ import sys
 
 import torch
 
-from trainer.networks.optimizer import MIN_BETA_1, OneCycleAdamW
+from trainer.networks.loop import MIN_BETA_1, OneCycleAdamW
 
 from .conftest import REPOSITORY
 

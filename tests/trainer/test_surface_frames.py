@@ -18,8 +18,8 @@ from trainer.config import TrainingConfig
 from trainer.data.split import split_recording
 from trainer.inputs import surface_frame_fit
 from trainer.inputs.network_inputs import make_inputs
+from trainer.inputs.smoothed_surface import NO_SURFACE_FRAMES, SurfaceFrames
 from trainer.inputs.surface_frame_fit import MIN_EXPLAINED_VARIANCE, select_surface_frames
-from trainer.inputs.surface_frame_vectors import NO_SURFACE_FRAMES, SurfaceFrames
 from trainer.inputs.surface_frames import SurfaceFrameFeatures
 from trainer.networks.checkpoint import read_checkpoint
 

@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
-from trainer.export.vertex_order import VertexOrder, vertex_order
+from trainer.export.skinning_nodes import VertexOrder, vertex_order
 from trainer.graph_builder import GraphBuilder
 
 

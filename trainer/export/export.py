@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import onnxruntime
+from onnx import TensorProto, helper
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.model import (
@@ -37,8 +38,36 @@ from fdda_addon.core.mathematics.surface import Surface, SurfaceComparison, surf
 from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..fits.half_rotations import regression_matrices
+from ..graph_builder import GraphBuilder
 from ..model import TrainedModel
-from .graph import build_graph
+from .network_nodes import add_networks
+from .pose_nodes import add_features, add_range
+from .skinning_nodes import add_skinning
+
+OPSET = 17
+IR_VERSION = 8
+"""Supported by ONNX Runtime 1.17 and later."""
+
+
+def build_graph(trained_model: TrainedModel) -> onnx.ModelProto:
+    """Build the ONNX model of a trained model, without metadata."""
+    graph = GraphBuilder()
+    features = add_features(graph, trained_model)
+    clamped, outside = add_range(graph, features, trained_model)
+    coefficients = add_networks(graph, features, clamped, trained_model)
+    add_skinning(graph, features, coefficients, outside, trained_model)
+    inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(trained_model.rig.joints), 4, 4])]
+    if count := len(trained_model.rig.controls):
+        inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))
+    outputs = [
+        helper.make_tensor_value_info(POSITIONS_OUTPUT, TensorProto.FLOAT, ["N", trained_model.rig.vertex_count, 3]),
+        helper.make_tensor_value_info(CONFIDENCE_OUTPUT, TensorProto.FLOAT, ["N", len(trained_model.partitions)]),
+    ]
+    proto = helper.make_graph(graph.nodes, "deformation", inputs, outputs, graph.constants)
+    model = helper.make_model(proto, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="fdda")
+    model.ir_version = IR_VERSION
+    return model
+
 
 MAX_DIFFERENCE_METRES = 1e-5
 """Maximum difference of a position from the reference, meters. For rigs larger than a meter it is scaled by their size,

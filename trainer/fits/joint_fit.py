@@ -18,8 +18,6 @@ from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
-from .least_squares import add_ridge, solve_ridge
-
 RIDGE = 1e-4
 """Ridge, as a part of the number of poses. Joints that move alike share the fit, so that its factors are small.
 
@@ -303,3 +301,22 @@ def joints_on_path(references: np.ndarray, first: int, second: int) -> set[int]:
             chain.add(joint)
             joint = int(references[joint])
     return chains[0] ^ chains[1]
+
+
+def add_ridge(gram: np.ndarray, ridge: np.ndarray | float) -> np.ndarray:
+    """Add a ridge, one value or (n,) values, to the diagonal of an (n, n) Gram matrix; returns float64."""
+    return gram + np.diag(np.broadcast_to(np.asarray(ridge, np.float64), len(gram)))
+
+
+def solve_ridge(gram: np.ndarray, moments: np.ndarray, ridge: np.ndarray | float) -> np.ndarray:
+    """Minimize |A x - b|^2 + sum_i ridge_i x_i^2 (Tikhonov regularization).
+
+    Args:
+        gram: (n, n) A' A, or a kernel matrix.
+        moments: (n, m) or (n,) A' b, or the values of the kernel's samples.
+        ridge: one value or (n,) values, above 0 where the Gram matrix is singular.
+
+    Returns:
+        x, float64, in the shape of `moments`.
+    """
+    return np.linalg.solve(add_ridge(gram, ridge), moments)

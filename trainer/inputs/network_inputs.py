@@ -15,8 +15,7 @@ from fdda_addon.core.rig import Rig
 from ..config import TrainingConfig
 from ..data.split import Split
 from .block import FeatureBlock, State
-from .controls import ControlFeatures
-from .joints import JointFeatures
+from .joints import ControlFeatures, JointFeatures
 from .rotations import RotationFeatures
 from .surface_frames import SurfaceFrameFeatures
 

@@ -17,10 +17,8 @@ from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import Rig
 
 from ..data.split import Split
-from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
-from ..fits.least_squares import solve_ridge
-from .smoothed_surface import SmoothedSurface
-from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
+from ..fits.joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression, solve_ridge
+from .smoothed_surface import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SmoothedSurface, SurfaceFrames
 
 MAX_POSES = 400
 """Maximum number of training poses that are evaluated."""

@@ -25,8 +25,8 @@ from ..config import TrainingConfig
 from ..data.split import Split
 from ..graph_builder import GraphBuilder
 from .block import VECTOR_SIZE, FeatureBlock, JointVectors, State, Vectors
+from .smoothed_surface import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 from .surface_frame_fit import select_surface_frames
-from .surface_frame_vectors import MAX_JOINT_ENTRIES, NO_SURFACE_FRAMES, SurfaceFrames
 
 MATRIX_ROWS = 4
 """Number of rows of a pose matrix. The last row has no effect; removing it would take longer than computing with it."""

@@ -22,7 +22,7 @@ from fdda_addon.core.mathematics.key_joints import KeyJointReport
 from fdda_addon.core.mathematics.skinning import skin_matrices
 from fdda_addon.core.rig import reference_order
 
-from ..fits.least_squares import solve_ridge
+from ..fits.joint_fit import solve_ridge
 from .fit_poses import FitPoses
 
 TOLERANCE_RATIO = 1e-4

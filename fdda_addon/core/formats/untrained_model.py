@@ -85,7 +85,7 @@ def _with_skin_weights(rig: Rig) -> Rig:
 def _add_deformation(
     graph: "_Graph", rig: Rig, partitions: tuple[Partition, ...], key_distances: Mapping[str, np.ndarray]
 ) -> None:
-    """Add the nodes from the inputs to the outputs, in the order of `trainer.export.graph.build_graph`."""
+    """Add the nodes from the inputs to the outputs, in the order of `trainer.export.export.build_graph`."""
     joint_count, part_count = len(rig.joints), len(partitions)
     random = np.random.default_rng(0)
     parents = graph.integers("parents", np.maximum(rig.parents, 0))
