@@ -16,7 +16,8 @@ BUFFER_KEY = "fdda_position_buffer"
 
 def create_buffer(mesh_object: bpy.types.Object) -> bpy.types.Object:
     """Create a position buffer with as many vertices as a mesh object, at the rest positions of its mesh."""
-    name = f"{mesh_object.name} {MODIFIER_NAME} positions"
+    # Blender hides names that begin with a dot where objects are listed, also after an undo.
+    name = f".{mesh_object.name} {MODIFIER_NAME} positions"
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(mesh_object.data.vertices))
     set_mesh_positions(mesh, mesh_positions(mesh_object.data))

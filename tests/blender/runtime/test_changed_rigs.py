@@ -161,6 +161,8 @@ def test_the_model_plays_again_after_undo(bound_elbow, elbow_files):
     bpy.context.view_layer.update()
     pose(angle=1.0)
     assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
+    # Blender lists no objects whose names begin with a dot.
+    assert [o.name[0] for o in bpy.data.objects if o.is_runtime_data] == ["."]
     bpy.ops.ed.redo()
     bpy.context.view_layer.update()
     assert "rest pose" in bpy.data.objects[ELBOW].fdda.status
