@@ -4,7 +4,9 @@
 import bpy
 
 from ..core.settings import MAX_AUTO_POSES, POSES
-from ..properties.recording_options import actions_of_rig
+from ..core.wording import format_list
+from ..properties.recording_options import actions_of_rig, meshes_with_other_settings
+from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
 from . import limits, sampling
 from .section import Section, draw_advanced, draw_button, draw_wrapped, panel_rig
@@ -49,6 +51,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         rig = panel_rig(context)[0]
         if rig is None:
             return
+        _draw_shared(layout, context, rig)
         limits.draw_limit_sources(layout, rig)
         sampling.draw_bones_to_pose(layout, context, rig)
         _draw_table(layout, context, rig)
@@ -68,6 +71,16 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         if (advanced := draw_advanced(layout, "fdda_poses_advanced")) is not None:
             for name in ("seed", "spread", "overshoot"):
                 advanced.prop(rig.mesh_object.fdda.settings, name)
+
+
+def _draw_shared(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    """Say that the fields belong to all meshes that are recorded together, and which have other values until then."""
+    mesh_objects = [each.mesh_object for each in cached_rigs_of_active_armature(context)]
+    if not (mesh_objects and context.window_manager.fdda.all_meshes):
+        return
+    layout.label(text=f"Shared by {len(mesh_objects)} Meshes", icon="LINKED")
+    if names := meshes_with_other_settings(rig.mesh_object, mesh_objects):
+        draw_wrapped(layout, context, f"Record replaces other settings of {format_list(names)}.", "INFO")
 
 
 def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Converts the properties of a character to the settings of a recording."""
 
+from collections.abc import Iterable
+
 import bpy
 
 from ..core.errors import RigError
@@ -14,6 +16,10 @@ from ..scene.active_rig import cached_active_rig
 from ..scene.draw_cache import actions_state, computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from .character import FDDA_PG_character, default_model, default_recording
+
+SHARED_VALUES = (*(setting.name for setting in settings_of(RecordingSettings)), "bones_to_pose", "bone_collection")
+SHARED_LISTS = {"sampled_bones": ("name",), "extra_inputs": ("name", "has_range", "low", "high")}
+"""Settings that the meshes of a recording share, and the attributes of the entries of lists."""
 
 
 def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
@@ -54,15 +60,35 @@ def copy_settings(mesh_object: bpy.types.Object, source_object: bpy.types.Object
     settings, source = mesh_object.fdda.settings, source_object.fdda.settings
     settings.recording = source.recording or default_recording(source_object)
     settings.model = source.model or default_model(source_object)
-    for name in (*(setting.name for setting in settings_of(RecordingSettings)), "bones_to_pose", "bone_collection"):
+    for name in SHARED_VALUES:
         setattr(settings, name, getattr(source, name))
-    for name, attributes in (("sampled_bones", ("name",)), ("extra_inputs", ("name", "has_range", "low", "high"))):
+    for name, attributes in SHARED_LISTS.items():
         collection = getattr(settings, name)
         collection.clear()
         for entry in getattr(source, name):
             copied_entry = collection.add()
             for attribute in attributes:
                 setattr(copied_entry, attribute, getattr(entry, attribute))
+
+
+def meshes_with_other_settings(shown_object: bpy.types.Object, mesh_objects: Iterable[bpy.types.Object]) -> list[str]:
+    """Return the names of meshes with settings of their own, which `copy_settings` would replace."""
+    shown = shown_object.fdda.settings
+    folder = shown.recording or default_recording(shown_object)
+    names = []
+    for mesh_object in mesh_objects:
+        settings = mesh_object.fdda.settings
+        is_other = settings.recording not in ("", folder) or any(
+            settings.is_property_set(name) and getattr(settings, name) != getattr(shown, name) for name in SHARED_VALUES
+        )
+        for name, attributes in SHARED_LISTS.items():
+            own, others = (
+                [tuple(getattr(entry, attribute) for attribute in attributes) for entry in getattr(owner, name)]
+                for owner in (settings, shown)
+            )
+            is_other |= bool(own) and own != others
+        names += [mesh_object.name] if is_other and mesh_object != shown_object else []
+    return names
 
 
 def bones_to_pose(scene_rig: SceneRig) -> str:

@@ -16,6 +16,7 @@ from fdda_addon.operators.meshes import MENU_OPERATORS
 from fdda_addon.panels import MODULES, checks, findings, models, playback
 from fdda_addon.panels.timed_value import timed_values
 from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
+from fdda_addon.properties.recording_options import copy_settings, meshes_with_other_settings
 from fdda_addon.scene.compatibility import is_selected
 from fdda_addon.scene.scene_rig import SceneRig
 
@@ -305,6 +306,25 @@ def test_deforming_bones_that_follow_control_bones_are_named(saved: SceneRig):
     bpy.data.actions["wave"].fdda.record = True
     checks.check_now(saved)
     assert not findings.find(saved) and bpy.types.FDDA_PT_poses.is_done(bpy.context)
+
+
+def test_shared_settings_are_named_and_other_ones_before_they_are_replaced(saved: SceneRig):
+    sleeve = saved.mesh_object.copy()
+    sleeve.name = "sleeve"
+    bpy.context.collection.objects.link(sleeve)
+    bpy.context.view_layer.objects.active = saved.armature_object
+    shared = "Shared by 2 Meshes"
+    assert shared in texts_of(draw_section("poses"))
+    assert meshes_with_other_settings(saved.mesh_object, [saved.mesh_object, sleeve]) == []
+    for name, value in (("seed", 3), ("poses", 50), ("bones_to_pose", "WEIGHTS"), ("recording", "//other")):
+        setattr(sleeve.fdda.settings, name, value)
+        assert meshes_with_other_settings(saved.mesh_object, [saved.mesh_object, sleeve]) == ["sleeve"]
+        copy_settings(sleeve, saved.mesh_object)
+        assert meshes_with_other_settings(saved.mesh_object, [saved.mesh_object, sleeve]) == []
+    assert sleeve.fdda.settings.auto_poses
+    sleeve.fdda.settings.extra_inputs.add().name = "bulge"
+    text = " ".join(" ".join(texts_of(draw_section("poses"))).split())
+    assert "Record replaces other settings of 'sleeve'." in text or "of 'elbow'." in text
 
 
 def key_bone(bone: bpy.types.PoseBone) -> None:
