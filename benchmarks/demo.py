@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from fdda_addon import register, unregister
 from fdda_addon.arm.joints import ACTION_NAME, ELBOW_FLEXION, FINGERS
-from fdda_addon.cli.evaluate import run_evaluation, table
+from fdda_addon.cli.evaluate import run_evaluations, table
 from fdda_addon.cli.files import open_file
 from fdda_addon.cli.main import main as run_verb
 from fdda_addon.core.files.output import write_json
@@ -110,7 +110,7 @@ def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
     settings = EvaluationSettings(
         HELD_OUT_POSES, actions=(ACTION_NAME,), range_scales=(1.5, 2.0, 3.0), named=EXTREME_POSES
     )
-    evaluation = run_evaluation(scene_rig, model, settings)
+    evaluation = run_evaluations({"": (scene_rig, model)}, settings)[""]
     write_json(out, evaluation.to_json())
 
     pictures.mkdir(exist_ok=True)

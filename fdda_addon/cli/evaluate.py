@@ -2,6 +2,7 @@
 """`evaluate RIG.blend MODEL.onnx --json OUT.json`: measures the distance between the model and its rig."""
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 
 import bpy
@@ -15,7 +16,7 @@ from ..core.wording import format_count
 from ..evaluation.film import FDDA, LABELS, LINEAR, RIG, FilmSettings, film
 from ..evaluation.pictures import draw_comparison, representative_poses
 from ..evaluation.results import Evaluation
-from ..evaluation.run import evaluate
+from ..evaluation.run import evaluate_meshes
 from ..evaluation.settings import EvaluationSettings
 from ..evaluation.video import check_video_path
 from ..poses.clip import find_clips
@@ -108,7 +109,7 @@ def run(options: argparse.Namespace) -> None:
     )
     if options.learn_from and len(rigs) > 1:
         raise WrongUsageError("--learn-from is of one mesh; give --object.")
-    evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
+    evaluations = run_evaluations(rigs, settings)
     with atomic_write_all(*(path for path, _ in outputs)) as (errors, *pictures):
         for picture in pictures:
             name, (scene_rig, model) = next(iter(rigs.items()))
@@ -139,10 +140,17 @@ def write_video(scene_rig: SceneRig, model: Path, evaluation: Evaluation, option
             progress.run(film(scene_rig, model, evaluation.actions[0], clip.frames.start, options.video, settings))
 
 
-def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:
-    """Evaluate a model, and print the progress to stderr."""
-    with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
-        return progress.run(evaluate(scene_rig, model, settings))
+def run_evaluations(rigs: dict[str, tuple[SceneRig, Path]], settings: EvaluationSettings) -> dict[str, Evaluation]:
+    """Evaluate the models of rigs by their names, those of one model together; print the progress to stderr."""
+    evaluations = {}
+    with ProgressPrinter() as progress, ExitStack() as stack:
+        for scene_rig, _ in rigs.values():
+            stack.enter_context(model_disabled(scene_rig.mesh_object))
+        for model in dict.fromkeys(model for _, model in rigs.values()):
+            names = [name for name in rigs if rigs[name][1] == model]
+            results = progress.run(evaluate_meshes([rigs[name][0] for name in names], model, settings))
+            evaluations |= dict(zip(names, results, strict=True))
+    return {name: evaluations[name] for name in rigs}
 
 
 def table(evaluation: Evaluation) -> str:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compares a model and linear skinning with the rig, on poses that were not used in training."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,14 +19,7 @@ from ..core.progress import Job, Progress
 from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable
-from ..rig.pose_setter import (
-    DIRECT_POSE_SETTER,
-    NO_TARGET,
-    PoseSetter,
-    TargetSettings,
-    blend_from_rest,
-    make_pose_setter,
-)
+from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest, make_pose_setter
 from ..rig.reading import PoseEvaluator
 from ..rig.shape_keys import set_keys_undriven
 from ..rig.temporary_rig_state import temporary_rig_state
@@ -44,42 +38,67 @@ poses differ from all recorded poses, even with the same seed."""
 
 
 def evaluate(scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings) -> Job[Evaluation]:
-    """Compare a model with its rig while the generator is iterated.
+    """Compare a model with the rig of one mesh; arguments and errors as of `evaluate_meshes`."""
+    return (yield from evaluate_meshes([scene_rig], model, settings))[0]
 
-    If the mesh object has a mask, the mask is applied to the model. The scene is restored when the generator ends, is
+
+def evaluate_meshes(
+    rigs: Sequence[SceneRig], model: Path | Network, settings: EvaluationSettings
+) -> Job[list[Evaluation]]:
+    """Compare a model with the rigs of its meshes while the generator is iterated; each pose is evaluated once.
+
+    If a mesh object has a mask, the mask is applied to the model. The scene is restored when the generator ends, is
     closed, or raises.
 
     Args:
+        rigs: the rigs of meshes of the model, on one armature.
         model: path of the model, or the loaded model.
         settings: the poses to compare.
+
+    Returns:
+        The errors of each mesh, in the order of the rigs.
 
     Raises:
         RigError: the rig cannot be evaluated.
         ModelError: the model cannot be read, or was trained for another rig.
     """
+    scene_rig, *other_rigs = rigs
     clips = find_clips([scene_rig], settings.actions, settings.strips)
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     random_pose_count = settings.poses or len(settings.range_scales) or len(settings.named)
-    check_full_rig(scene_rig.mesh_object)
-    modifier_stack = check_evaluable(scene_rig)
-    opened = open_model(scene_rig, model)
-    network, rig = opened.network, opened.linear_rig
-    if not settings.target.name:
-        check_time_inputs(scene_rig, rig.controls, modifier_stack)
-    skinning = LinearSkinning(rig, network.info.partitions_of(rig))
-    pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count, network.info.controls)
+    network = model if isinstance(model, Network) else Network(model)
+    opened_models, skinnings = [], []
+    for rig in rigs:
+        check_full_rig(rig.mesh_object)
+        modifier_stack = check_evaluable(rig)
+        opened_models.append(open_model(rig, network.model))
+        if not settings.target.name:
+            check_time_inputs(rig, opened_models[-1].linear_rig.controls, modifier_stack)
+        linear_rig = opened_models[-1].linear_rig
+        skinnings.append(LinearSkinning(linear_rig, opened_models[-1].network.info.partitions_of(linear_rig)))
+    info, skinning = opened_models[0].network.info, skinnings[0]
+    pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count, info.controls)
     # A rig that is posed only by actions may have no channels to sample.
-    channels = model_channels(scene_rig, skinning.rig, network.info) if settings.poses or settings.range_scales else ()
+    channels = model_channels(scene_rig, skinning.rig, info) if settings.poses or settings.range_scales else ()
     random_poses = partial(_random_poses, scene_rig, pose_setter, settings.seed)
+    character = replace(scene_rig, other_meshes=tuple((rig.mesh_object.name, rig.mesh_object) for rig in other_rigs))
     with ExitStack() as stack:
         if pose_setter.target:
             stack.enter_context(pose_setter.target.prepared())
-        player = stack.enter_context(temporary_rig_state(scene_rig, skinning.rig, channels, clips))
-        evaluator = PoseEvaluator(scene_rig, skinning.rig, pose_setter.target)
-        mask = read_mask(scene_rig.mesh_object)
-        comparison = _Comparison(evaluator, network, skinning, settings.total_poses(clips), settings.surface, mask)
-        held_out = None
+        player = stack.enter_context(temporary_rig_state(character, skinning.rig, channels, clips))
+        parts = [
+            _MeshComparison(
+                PoseEvaluator(rig, part_skinning.rig, pose_setter.target),
+                opened.network,
+                part_skinning,
+                settings.surface,
+                read_mask(rig.mesh_object),
+            )
+            for rig, opened, part_skinning in zip(rigs, opened_models, skinnings, strict=True)
+        ]
+        comparison = _Comparison(parts, settings.total_poses(clips))
+        held_out: list[PoseErrors] = []
         if settings.poses:
             poses = random_poses(channels, FIRST_HELD_OUT_INDEX, settings.poses)
             held_out = yield from comparison.compare("held-out poses", poses)
@@ -93,23 +112,23 @@ def evaluate(scene_rig: SceneRig, model: Path | Network, settings: EvaluationSet
         for clip in clips:
             poses = pose_setter.show_frames(player, clip, range(len(clip.frames)))
             action_errors.append((yield from comparison.compare(clip.title, poses)))
-    return Evaluation(
-        skinning.partitions,
-        skinning.rig.joint_names,
-        held_out or action_errors[0],
-        action_errors,
-        scaled_range_errors,
-        named_errors,
-        channels,
-    )
+    return [
+        Evaluation(
+            part_skinning.partitions,
+            part_skinning.rig.joint_names,
+            (held_out or action_errors[0])[index],
+            [errors[index] for errors in action_errors],
+            [errors[index] for errors in scaled_range_errors],
+            [errors[index] for errors in named_errors],
+            channels,
+        )
+        for index, part_skinning in enumerate(skinnings)
+    ]
 
 
-def evaluate_action(
-    scene_rig: SceneRig, model: Path | Network, name: str, target: TargetSettings = NO_TARGET
-) -> Job[Evaluation]:
+def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> Job[Evaluation]:
     """Compare only the positions, and only on the frames of one action, which become `Evaluation.held_out`."""
-    settings = EvaluationSettings(poses=0, actions=(name,), surface=False, target=target)
-    evaluation = yield from evaluate(scene_rig, model, settings)
+    evaluation = yield from evaluate(scene_rig, model, EvaluationSettings(poses=0, actions=(name,), surface=False))
     evaluation.actions = []
     return evaluation
 
@@ -151,69 +170,64 @@ def _named_pose(scene_rig: SceneRig, pose: NamedPose, pose_setter: PoseSetter) -
         yield
 
 
-class _Comparison:
-    """Compares rig, model and linear skinning in sets of poses, and counts the poses to report progress."""
+class _MeshComparison:
+    """Compares rig, model and linear skinning of one mesh in a set of poses."""
 
     def __init__(
-        self,
-        evaluator: PoseEvaluator,
-        network: Network,
-        skinning: LinearSkinning,
-        total: int,
-        surface: bool,
-        mask: Mask | None,
+        self, evaluator: PoseEvaluator, network: Network, skinning: LinearSkinning, surface: bool, mask: Mask | None
     ):
         self._mask = mask
         self._evaluator, self._network, self._skinning = evaluator, network, skinning
-        self._compared_count, self._total_count = 0, total
         rig, self._surface = skinning.rig, None
         self._metres_per_unit = rig.metres_per_unit
         if surface and len(rig.face_starts):
             faces = Surface(rig.face_starts, rig.face_vertices)
             self._surface = SurfaceComparison(faces, rig.rest_positions, skinning.partitions)
+        self._poses: list[tuple[np.ndarray, ...]] = []
+        self._surfaces: list[tuple] = []
 
-    def compare(self, name: str, poses: Iterator[None]) -> Job[PoseErrors]:
+    def add_pose(self, name: str) -> None:
+        """Compare the current pose of the scene, of a set of poses with a name."""
+        pose_matrices, rig_positions, controls = self._evaluator.evaluate()
+        model_positions = self._network.positions(pose_matrices[None], controls[None])[0]
+        for positions, subject in ((rig_positions, "The rig"), (model_positions, f"The model '{self._network.path}'")):
+            if not np.isfinite(positions).all():
+                raise FDDAError(
+                    f"{subject} gives positions that are not numbers ({name}, pose {len(self._poses)}); "
+                    "look for a scale of zero or a broken driver in the rig, else train again."
+                )
+        linear_positions = self._skinning.positions(pose_matrices[None])[0]
+        if self._mask is not None:
+            model_positions = self._mask.blend(linear_positions, model_positions)
+        errors = (distances(p, rig_positions, self._metres_per_unit) for p in (model_positions, linear_positions))
+        self._poses.append((pose_matrices, rig_positions, controls, *errors))
+        if self._surface:
+            self._surfaces.append(self._surface.compare(rig_positions, (model_positions, linear_positions)))
+
+    def end_set(self, name: str) -> PoseErrors:
+        """Return the errors of the compared poses, and begin another set."""
+        arrays = (np.stack(values) for values in zip(*self._poses, strict=True))
+        errors = PoseErrors(name, *arrays, *(surface_errors(rows) for rows in zip(*self._surfaces, strict=True)))
+        self._poses, self._surfaces = [], []
+        return errors
+
+
+class _Comparison:
+    """Compares meshes in sets of poses, and counts the poses to report progress."""
+
+    def __init__(self, parts: list[_MeshComparison], total: int):
+        self._parts, self._compared_count, self._total_count = parts, 0, total
+
+    def compare(self, name: str, poses: Iterator[None]) -> Job[list[PoseErrors]]:
         """Compare rig, model and linear skinning in a set of poses.
 
         Args:
             name: name of the set.
             poses: iterator that sets the next pose in each iteration.
         """
-        all_matrices, all_positions, all_controls, fdda_errors, linear_errors, surface_comparisons = (
-            [],
-            [],
-            [],
-            [],
-            [],
-            [],
-        )
         for _ in poses:
-            pose_matrices, rig_positions, controls = self._evaluator.evaluate()
-            model_positions = self._network.positions(pose_matrices[None], controls[None])[0]
-            for positions, subject in (
-                (rig_positions, "The rig"),
-                (model_positions, f"The model '{self._network.path}'"),
-            ):
-                if not np.isfinite(positions).all():
-                    raise FDDAError(
-                        f"{subject} gives positions that are not numbers ({name}, pose {len(fdda_errors)}); "
-                        "look for a scale of zero or a broken driver in the rig, else train again."
-                    )
-            all_matrices.append(pose_matrices)
-            all_positions.append(rig_positions)
-            all_controls.append(controls)
-            linear_positions = self._skinning.positions(pose_matrices[None])[0]
-            if self._mask is not None:
-                model_positions = self._mask.blend(linear_positions, model_positions)
-            fdda_errors.append(distances(model_positions, rig_positions, self._metres_per_unit))
-            linear_errors.append(distances(linear_positions, rig_positions, self._metres_per_unit))
-            if self._surface:
-                surface_comparisons.append(self._surface.compare(rig_positions, (model_positions, linear_positions)))
+            for part in self._parts:
+                part.add_pose(name)
             self._compared_count += 1
             yield Progress("evaluation", self._compared_count, self._total_count)
-        stacked_arrays = (
-            np.stack(arrays) for arrays in (all_matrices, all_positions, all_controls, fdda_errors, linear_errors)
-        )
-        return PoseErrors(
-            name, *stacked_arrays, *(surface_errors(rows) for rows in zip(*surface_comparisons, strict=True))
-        )
+        return [part.end_set(name) for part in self._parts]

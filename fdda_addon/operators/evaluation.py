@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section "Compare with Rig": evaluate the model, color the mesh, show the rig, open the report."""
 
+from contextlib import ExitStack
 from dataclasses import replace
 
 import bpy
@@ -11,7 +12,7 @@ from ..core.progress import Job
 from ..core.settings import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..evaluation import heat_map, last_evaluation, side_by_side
 from ..evaluation.results import Evaluation
-from ..evaluation.run import evaluate, evaluate_action
+from ..evaluation.run import evaluate_meshes
 from ..evaluation.settings import EvaluationSettings
 from ..models import model_list
 from ..models.entries import bound_entry, bound_model_name
@@ -55,21 +56,26 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Job[list[tuple[int, Evaluation]]]:
         rigs = self.bound_rigs(context)
         self._action = self._action_name(rigs[0]) if self.source == "ACTION" else ""
+        # Meshes of one model are compared in one pass; one that learned from another object is compared alone.
+        passes: dict[tuple, list[SceneRig]] = {}
+        for rig in rigs:
+            learn_from = rig.mesh_object.fdda.settings.learn_from
+            passes.setdefault((network_of(rig.mesh_object).model, learn_from and rig.mesh_object), []).append(rig)
         evaluations: list[tuple[int, Evaluation]] = []
-        for scene_rig in rigs:
-            mesh_object = scene_rig.mesh_object
-            self.state.begin_object(mesh_object.name if len(rigs) > 1 else "")
-            network, uid = network_of(mesh_object), mesh_object.session_uid
-            target = target_settings(mesh_object.fdda.settings)
-            with model_disabled(mesh_object):
+        with ExitStack() as stack:
+            for rig in rigs:
+                stack.enter_context(model_disabled(rig.mesh_object))
+            for (network, _), group in passes.items():
+                self.state.begin_object(group[0].mesh_object.name if len(passes) > 1 else "")
+                target = target_settings(group[0].mesh_object.fdda.settings)
                 if self._action:
-                    job = evaluate_action(scene_rig, network, self._action, replace(target, settle_frames=0))
+                    target = replace(target, settle_frames=0)
+                    settings = EvaluationSettings(poses=0, actions=(self._action,), surface=False, target=target)
                 else:
-                    settings = EvaluationSettings(
-                        self.poses, self.seed, surface=False, target=replace(target, pre_roll=0)
-                    )
-                    job = evaluate(scene_rig, network, settings)
-                evaluations.append((uid, (yield from job)))
+                    target = replace(target, pre_roll=0)
+                    settings = EvaluationSettings(self.poses, self.seed, surface=False, target=target)
+                uids = [rig.mesh_object.session_uid for rig in group]
+                evaluations += zip(uids, (yield from evaluate_meshes(group, network, settings)), strict=True)
         return evaluations
 
     def finish(self, context: bpy.types.Context, result: list[tuple[int, Evaluation]]) -> str:
