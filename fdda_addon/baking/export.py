@@ -10,12 +10,12 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import DiskFullError, ModelError, OutputError, RigError
+from ..core.errors import DiskFullError, OutputError, RigError
 from ..core.files import file_kind
 from ..poses.clip import find_clips
 from ..poses.clip_player import clip_player
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers, is_fdda_modifier
-from ..runtime.binding import bind, temporary_mode, unbind
+from ..runtime.binding import bind, check_plays, temporary_mode, unbind
 from ..scene.action_slots import dependencies
 from ..scene.blend_file import blender_path, report_message, save_copy
 from ..scene.compatibility import animation_curves
@@ -77,7 +77,7 @@ def write_bake(
         with _export_state(names, is_copy_saved):
             _export(temporaries[-1], frames, settings.samples, show_progress)
         for mesh_object in mesh_objects:
-            _check_played(mesh_object)
+            check_plays(mesh_object)
         if is_copy_saved:
             _play_alembic(names, temporaries[-1], out.with_suffix(ALEMBIC_SUFFIX), frames)
             save_copy(temporaries[0])
@@ -92,14 +92,8 @@ def _bind_local(scene_rig: SceneRig, model: Path, linear: Sequence[str]) -> Scen
     check_evaluable(scene_rig)
     bind(scene_rig, model, use_in_render=True)
     mesh_object.fdda.mode = "LINEAR" if mesh_object.name in linear else "FDDA"
-    bpy.context.view_layer.update()
-    _check_played(mesh_object)
+    check_plays(mesh_object)
     return scene_rig
-
-
-def _check_played(mesh_object: bpy.types.Object) -> None:
-    if mesh_object.fdda.status:
-        raise ModelError(mesh_object.fdda.status)
 
 
 def _default_frames(rigs: Sequence[SceneRig], times: Sequence[range]) -> tuple[int, int]:

@@ -6,16 +6,14 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-import bpy
-
-from ..core.errors import FDDAError, ModelError, OutputError
+from ..core.errors import FDDAError, OutputError
 from ..core.files.file_kind import BLEND
 from ..core.files.open_files import remove_file
 from ..core.files.output import atomic_write, check_outputs
 from ..core.formats.model import read_model_info
 from ..models.entries import bound_entry
 from ..models.model_list import add_bound_model
-from ..runtime.binding import bind, unbind
+from ..runtime.binding import bind, check_plays, unbind
 from ..runtime.model_meshes import describe_missing_meshes, find_mesh
 from ..scene.blend_file import save_copy
 from ..scene.scene_rig import SceneRig
@@ -79,9 +77,9 @@ def _bind(scene_rig: SceneRig, model: Path, use_in_render: bool) -> None:
     if note := bind(scene_rig, model, use_in_render):
         print(note)
     # Evaluate now, so that a model that cannot play raises an error here.
-    bpy.context.view_layer.update()
-    if scene_rig.mesh_object.fdda.status:
-        raise ModelError(scene_rig.mesh_object.fdda.status)
+    check_plays(scene_rig.mesh_object)
+    if warning := scene_rig.mesh_object.fdda.status:
+        print(warning)
 
 
 def _copy_model_beside(scene_rig: SceneRig, model: Path, out: Path) -> Path:

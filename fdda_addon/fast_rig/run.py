@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import ModelError, RigError
+from ..core.errors import RigError
 from ..core.formats.model import read_model
 from ..core.progress import Job
 from ..core.rig import STATIC_JOINT
@@ -14,7 +14,7 @@ from ..core.wording import format_count
 from ..rig.modifier_stack import check_evaluable
 from ..rig.references import Node, driven_node, split_bone_path
 from ..runtime import packed_model
-from ..runtime.binding import bind, unbind
+from ..runtime.binding import bind, check_plays, unbind
 from ..runtime.model_files import network_of
 from ..scene.blend_file import save_copy
 from ..scene.controls import owner_of
@@ -176,7 +176,7 @@ def bind_packed_models(rigs_and_models: list[tuple[SceneRig, Path]]) -> tuple[st
         entry = binding.models.add()
         entry.name, entry.path, entry.packed, entry.packed_bytes = model.stem, binding.model, text, len(data)
         binding.model_index = 0
-        _evaluate_model(mesh_object)
+        check_plays(mesh_object)
         joint_names += network_of(mesh_object).info.joint_names
     return tuple(dict.fromkeys(name for name in joint_names if name != STATIC_JOINT))
 
@@ -191,15 +191,8 @@ def remove_unneeded_parts(
     for scene_rig in scene_rigs:
         scene_rig.mesh_object.fdda.is_fast_rig = True
         scene_rig.mesh_object.fdda.mode = "FDDA"
-        _evaluate_model(scene_rig.mesh_object)
+        check_plays(scene_rig.mesh_object)
     return removed
-
-
-def _evaluate_model(mesh_object: bpy.types.Object) -> None:
-    """Evaluate the scene, and raise a ModelError if the model of an object cannot play."""
-    bpy.context.view_layer.update()
-    if mesh_object.fdda.status:
-        raise ModelError(mesh_object.fdda.status)
 
 
 def _model_nodes(scene_rigs: list[SceneRig]) -> list[Node]:

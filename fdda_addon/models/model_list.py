@@ -12,7 +12,7 @@ from ..core.formats.model import check_model, read_model, read_model_info
 from ..core.formats.model_info import ModelInfo
 from ..evaluation import last_evaluation
 from ..runtime import model_files, packed_model, playback
-from ..runtime.binding import bind, unbind
+from ..runtime.binding import bind, check_plays, unbind
 from ..runtime.model_meshes import info_of_mesh
 from ..runtime.opened_model import read_matching_rig
 from ..scene.draw_cache import computed_once
@@ -127,15 +127,16 @@ def _bind(scene_rig: SceneRig, path: Path, packed_text: bpy.types.Text | None = 
     previous_binding = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
     note = bind(scene_rig, path, use_in_render, packed_text)
     # Evaluate now, so that a model that cannot play raises the error here and not in the next frame.
-    bpy.context.view_layer.update()
-    if problem := binding.status:
+    try:
+        check_plays(mesh_object)
+    except ModelError:
         has_other_model = previous_binding is not None and previous_binding[:2] != (binding.model, binding.packed)
         unbind(mesh_object)
         if has_other_model:
             previous_model, previous_text, previous_mode = previous_binding
             bind(scene_rig, absolute_path(mesh_object, previous_model), use_in_render, previous_text)
             binding.model, binding.mode = previous_model, previous_mode
-        raise ModelError(problem)
+        raise
     return note
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import RigError
+from ..core.errors import ModelError, RigError
 from ..rig.modifier_stack import check_stack
 from ..rig.time_inputs import check_time_inputs
+from ..scene.control_reader import ABSENT_INPUTS
 from ..scene.scene_rig import SceneRig, armature_modifier
 from ..scene.stored_paths import stored_path_for
 from . import effects, model_files, playback, playback_modifier
@@ -94,6 +95,18 @@ def _check_editable(mesh_object: bpy.types.Object) -> None:
             f"'{mesh_object.name}' is linked from '{file_name}' and cannot be changed here; give it a library "
             "override, or bind the model in that file."
         )
+
+
+def check_plays(mesh_object: bpy.types.Object) -> None:
+    """Evaluate the scene, and check that a bound object plays its model.
+
+    Raises:
+        ModelError: it does not play, or has a warning other than that a mesh with extra inputs is missing.
+    """
+    bpy.context.view_layer.update()
+    status = mesh_object.fdda.status
+    if status and ABSENT_INPUTS not in status:
+        raise ModelError(status)
 
 
 def on_property_update(mesh_object: bpy.types.Object) -> None:

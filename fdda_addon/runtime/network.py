@@ -36,6 +36,7 @@ class Network:
         model: the model itself, of a view too.
         vertices: the vertices of `info` in the output of the model.
         mesh_to_model: (4, 4) float64, from the space of the mesh object to that of the model; None for the identity.
+        own_partitions: indices of the partitions with vertices of `info`; None until `confidence` has found them.
     """
 
     def __init__(self, path: Path, data: bytes | None = None):
@@ -82,6 +83,7 @@ class Network:
         self._execution: Execution | None = None
         self.model, self.vertices = self, slice(0, self.info.vertex_count)
         self.mesh_to_model: np.ndarray | None = None
+        self.own_partitions: list[int] | None = None
         self._views: dict[str, Network] = {}
 
     def of_mesh(self, name: str) -> "Network":
@@ -93,7 +95,7 @@ class Network:
             view.info, view.vertices = self.info.of_mesh(mesh), vertices
             view.mesh_to_model = None if mesh.transform == IDENTITY else mesh.matrix
             view._skin = None if self._skin is None else tuple(values[vertices] for values in self._skin)
-            view._execution, view._views = None, {}
+            view._execution, view._views, view.own_partitions = None, {}, None
         return self._views.get(name, self)
 
     def to_mesh_space(self, positions: np.ndarray) -> np.ndarray:

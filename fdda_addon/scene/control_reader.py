@@ -19,6 +19,10 @@ MAX_HIDDEN_MOTION = 1e-3
 """Largest motion of a control bone along an axis that is no control, as a part of its length, without a warning."""
 
 
+ABSENT_INPUTS = "so its extra inputs count as 0"
+"""A clause of the warning about a missing mesh, with which a model plays all the same."""
+
+
 class ControlReader:
     """Reads the values of controls of a rig.
 
@@ -29,7 +33,8 @@ class ControlReader:
 
     Attributes:
         sources: one number of each struct that is read. Whoever depends on them depends on all controls.
-        warning: names a bone that constraints have moved along an axis that is no control; empty for none.
+        warning: names a mesh that is missing with its controls, or a bone that constraints have moved along an axis
+            that is no control; empty for none.
     """
 
     def __init__(self, scene_rig: SceneRig, controls: tuple[Control, ...]):
@@ -100,7 +105,7 @@ class ControlReader:
         values, self.warning = np.zeros(len(self._controls), np.float32), ""
         bone_count, source_count = len(self._bone_names), len(owners) - len(self._key_readers)
         for (key_controls, reader), shape_keys in zip(self._key_readers, owners[source_count:], strict=True):
-            if shape_keys is not None or not self._is_absent_mesh(key_controls[0]):
+            if shape_keys is not None or not self._warn_of_absent_mesh(key_controls[0]):
                 values[key_controls] = reader.read(shape_keys)
         remaining = set(range(bone_count))
         for bone_indices, bones in self._constrained_bones:
@@ -126,7 +131,7 @@ class ControlReader:
         for index, owner in zip(self._single_controls, owners[bone_count:source_count], strict=True):
             control = self._controls[index]
             value = None if owner is None else number_at(owner, control.path)
-            if owner is None and self._is_absent_mesh(index):
+            if owner is None and self._warn_of_absent_mesh(index):
                 value = 0.0
             values[index] = np.nan if value is None else value
         if not (is_finite := np.isfinite(values)).all():
@@ -136,9 +141,15 @@ class ControlReader:
             )
         return values
 
-    def _is_absent_mesh(self, index: int) -> bool:
+    def _warn_of_absent_mesh(self, index: int) -> bool:
         """Return whether a control without an owner belongs to another mesh: without that mesh, its value is 0."""
-        return MESH_OWNER.fullmatch(self._controls[index].owner) is not None
+        if (match := MESH_OWNER.fullmatch(self._controls[index].owner)) is None:
+            return False
+        self.warning = (
+            f"The mesh '{match['mesh']}' of the model is missing, {ABSENT_INPUTS}; add it again, or record and train "
+            "without it."
+        )
+        return True
 
 
 class KeyReader:

@@ -13,8 +13,10 @@ import pytest
 
 import fdda_addon
 from blend_fixtures.characters.meshes import dressed_limb
-from fdda_addon.rig.reading import PoseReader
+from fdda_addon.rig.reading import PoseEvaluator, PoseReader
 from fdda_addon.runtime.binding import bind, unbind
+from fdda_addon.runtime.confidence import partition_confidence
+from fdda_addon.runtime.model_files import network_of
 from fdda_addon.runtime.session import session
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import armature_of, find_rig
@@ -210,6 +212,10 @@ def test_without_one_mesh_the_others_play(meshes, files, counts, action, name):
     runs, readings = play(12, counts)
     assert runs == [1] and len(readings) == 1
     for mesh_object in meshes.values():
+        # The body plays without the numbers of the sleeve, and says so.
+        lacks_inputs = (action, name) == ("delete", SLEEVE)
+        assert ("'sleeve' of the model is missing" in mesh_object.fdda.status) == lacks_inputs
+        mesh_object.fdda.status = ""
         assert_plays(mesh_object, files.model)
     if action == "unbind":
         bind(find_rig(name), files.model)
@@ -226,6 +232,22 @@ def test_a_mesh_plays_another_model(meshes, files, counts, tmp_path):
     assert play(12, counts)[0] == [1, 1]
     for mesh_object in meshes.values():
         assert_plays(mesh_object, files.model)
+
+
+def test_the_confidence_of_a_mesh_has_its_own_parts(meshes):
+    bpy.context.scene.frame_set(12)
+    network = network_of(meshes[ELBOW])
+    parts = {name: {part for part, _ in partition_confidence(meshes[name])} for name in NAMES}
+    assert set.union(*parts.values()) == {network.info.joint_names[p.joint] for p in network.info.partitions}
+    for name in NAMES:
+        sums = dict.fromkeys(network.info.joint_names, 0.0)
+        mesh_object = meshes[name]
+        if name == CUFF:
+            continue  # It has fitted weights.
+        for vertex in mesh_object.data.vertices:
+            largest = max(vertex.groups, key=lambda g: g.weight)
+            sums[mesh_object.vertex_groups[largest.group].name] += 1
+        assert parts[name] == {joint for joint, count in sums.items() if count}
 
 
 @pytest.mark.parametrize("count", [3, 4])
@@ -246,6 +268,9 @@ def test_characters_of_a_crowd_run_the_model_once(meshes, files, counts, count):
     bpy.data.objects.remove(crowd[1].pop(SLEEVE))
     for frame in range(1, 5):
         play(frame, counts)
+    for mesh_object in crowd[1].values():
+        assert "is missing" in mesh_object.fdda.status
+        mesh_object.fdda.status = ""
     for each in crowd:
         for mesh_object in each.values():
             assert_plays(mesh_object, files.model)
@@ -355,10 +380,37 @@ def test_the_operator_binds_all_meshes_or_one(files, is_packed, preferences):
     assert [o.fdda.is_bound for o in meshes.values()] == [True, False, True]
 
 
-def test_all_meshes_are_evaluated_and_baked(files, tmp_path):
-    json_path, out, frames = tmp_path / "errors.json", tmp_path / "baked.abc", (1, 12)
-    assert run("evaluate", files.rig, files.model, "--poses", 10, "--json", json_path) == 0
-    assert list(json.loads(json_path.read_text())["objects"]) == list(NAMES)
+def test_meshes_are_evaluated_in_one_pass(files, tmp_path, monkeypatch):
+    """Each pose is evaluated once, and each mesh has the errors of an evaluation alone."""
+    json_path, evaluated = tmp_path / "errors.json", []
+    evaluate = PoseEvaluator.evaluate
+
+    def evaluate_pose(evaluator: PoseEvaluator) -> tuple:
+        rotations = (tuple(b.matrix_basis.to_quaternion()) for b in bpy.data.objects[ELBOW_RIG].pose.bones)
+        evaluated.append((bpy.context.scene.frame_current, *rotations))
+        return evaluate(evaluator)
+
+    monkeypatch.setattr(PoseEvaluator, "evaluate", evaluate_pose)
+    options = ("--poses", 4, "--action", "elbow_wave", "--json", json_path, "--overwrite")
+
+    def errors(*object_options: str) -> dict:
+        evaluated.clear()
+        assert run("evaluate", files.rig, files.model, *options, *object_options) == 0
+        return json.loads(json_path.read_text())
+
+    together = errors()["objects"]
+    assert list(together) == list(NAMES) and evaluated[::3] == evaluated[1::3] == evaluated[2::3]
+    for name in NAMES:
+        alone = errors("--object", name)
+        for key in ("mean", "max"):
+            assert together[name]["fdda"][key] == pytest.approx(alone["fdda"][key], rel=1e-4)
+            assert together[name]["actions"][0]["linear"][key] == pytest.approx(
+                alone["actions"][0]["linear"][key], rel=1e-4
+            )
+
+
+def test_all_meshes_are_baked(files, tmp_path):
+    out, frames = tmp_path / "baked.abc", (1, 12)
     assert run("bake", files.rig, files.model, out, "--action", "elbow_wave", "--frames", *frames) == 0
     bpy.ops.wm.open_mainfile(filepath=str(files.bound))
     expected = {name: world_positions(bpy.data.objects[name], frames) for name in NAMES}
