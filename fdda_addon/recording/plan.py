@@ -31,7 +31,7 @@ from ..rig.pose_setter import NO_TARGET, TargetSettings
 from ..rig.reading import read_rig
 from ..rig.shape_keys import find_unposed_keys, key_distances
 from ..rig.target import find_target
-from ..scene.controls import owner_name, parse_controls
+from ..scene.controls import parse_controls
 from ..scene.scene_rig import SceneRig, find_character, find_rig
 
 AUTO_SECONDS, AUTO_STEP, MAX_AUTO_BYTES = 60.0, 500, 4_000_000_000
@@ -83,9 +83,9 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
     selection, extra_joints = read_sample_selection(scene_rig, settings)
     # A shape key that moves no vertex is no input.
     moving_keys = {
-        f"{owner_name(scene_rig, mesh_object.data.shape_keys)}/{path}"
+        name
         for mesh_object in scene_rig.mesh_objects
-        for path, distances in key_distances(mesh_object).items()
+        for name, distances in key_distances(scene_rig, mesh_object).items()
         if distances.any()
     }
     controls = tuple(c for c in selection.controls if not c.is_shape_key or c.name in moving_keys)

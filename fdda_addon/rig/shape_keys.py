@@ -34,13 +34,14 @@ def key_positions(shape_keys: bpy.types.Key) -> Iterator[tuple[bpy.types.ShapeKe
             yield block, read(block.data, COORDINATE_ELEMENT), relative_positions[relative_key.name]
 
 
-def key_distances(mesh_object: bpy.types.Object) -> dict[str, np.ndarray]:
-    """Return how far each shape key moves the vertices of a mesh at most, (V,) float32, by the path of its value."""
+def key_distances(scene_rig: SceneRig, mesh_object: bpy.types.Object) -> dict[str, np.ndarray]:
+    """Return how far each shape key moves the vertices of a mesh at most, (V,) float32, by the name of its control."""
     distances, shape_keys = {}, mesh_object.data.shape_keys
     for block, positions, relative_positions in key_positions(shape_keys) if shape_keys else ():
         path = f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value'
         largest_value = max(abs(block.slider_min), abs(block.slider_max))
-        distances[path] = np.linalg.norm(positions - relative_positions, axis=1) * largest_value
+        name = f"{owner_name(scene_rig, shape_keys)}/{path}"
+        distances[name] = np.linalg.norm(positions - relative_positions, axis=1) * largest_value
     return distances
 
 

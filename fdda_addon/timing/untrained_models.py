@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Untrained models of the meshes of a character, which measure how fast trained models will be on this machine."""
+"""The untrained model of a character, which measures how fast a trained model will be on this machine."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from ..core.errors import FDDAError
 from ..core.files.temporary import temporary_folder
@@ -16,31 +17,38 @@ from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import read_rig
 from ..rig.shape_keys import key_distances
 from ..rig.time_inputs import check_time_inputs
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, join_rigs
 
 
 @contextmanager
 def untrained_models(
     rigs: Iterable[SceneRig],
 ) -> Iterator[tuple[dict[bpy.types.Object, Path], dict[bpy.types.Object, str]]]:
-    """Write an untrained model of each rig to a temporary folder; remove the folder afterwards.
+    """Write an untrained model of the meshes of an armature to a temporary folder; remove the folder afterwards.
 
     Yields:
-        The paths of the models, and why the other rigs can have none, by mesh object.
+        The path of the model, and why other meshes can have none, by mesh object.
     """
-    models, reasons = {}, {}
+    rigs_of_model, reasons = [], {}
+    for scene_rig in rigs:
+        try:
+            check_time_inputs(scene_rig, read_dependencies(scene_rig).controls, check_evaluable(scene_rig))
+            read_rig(scene_rig)
+        except FDDAError as error:
+            reasons[scene_rig.mesh_object] = str(error)
+        else:
+            rigs_of_model.append(scene_rig)
     with temporary_folder() as folder:
-        for scene_rig in rigs:
-            mesh_object, path = scene_rig.mesh_object, folder / f"untrained_{len(models)}.onnx"
-            try:
-                stack = check_evaluable(scene_rig)
-                distances, dependencies = key_distances(mesh_object), read_dependencies(scene_rig)
-                controls = tuple(c for c in dependencies.controls if c.path not in distances or distances[c.path].any())
-                check_time_inputs(scene_rig, controls, stack)
-                rig = replace(read_rig(scene_rig, dependencies.bones), controls=controls)
-                path.write_bytes(build_untrained_model(rig, distances))
-            except FDDAError as error:
-                reasons[mesh_object] = str(error)
-            else:
-                models[mesh_object] = path
-        yield models, reasons
+        path = folder / "untrained.onnx"
+        if rigs_of_model:
+            character = join_rigs(rigs_of_model)
+            dependencies = read_dependencies(character)
+            rig = read_rig(character, dependencies.bones)
+            distances = {}
+            for mesh_object, vertices in zip(character.mesh_objects, rig.mesh_slices, strict=True):
+                for name, values in key_distances(character, mesh_object).items():
+                    distances[name] = np.zeros(rig.vertex_count, np.float32)
+                    distances[name][vertices] = values
+            controls = (c for c in dependencies.controls if c.name not in distances or distances[c.name].any())
+            path.write_bytes(build_untrained_model(replace(rig, controls=tuple(controls)), distances))
+        yield {scene_rig.mesh_object: path for scene_rig in rigs_of_model}, reasons

@@ -31,9 +31,9 @@ def build_untrained_model(rig: Rig, key_distances: Mapping[str, np.ndarray]) -> 
     """Build the bytes of an untrained model.
 
     Args:
-        rig: the rig, with the controls that a model would read. If it has no skin weights, each vertex follows the
-            nearest joint.
-        key_distances: (V,) distances by which each shape key moves the vertices, by the path of its value.
+        rig: the rig, with the controls that a model would read. The vertices of a mesh without skin weights follow the
+            nearest joints.
+        key_distances: (V,) distances by which each shape key moves the vertices, by the name of its control.
     """
     skinned = _with_skin_weights(rig)
     partitions = make_merged_partitions(skinned)
@@ -71,15 +71,19 @@ def build_untrained_model(rig: Rig, key_distances: Mapping[str, np.ndarray]) -> 
 
 
 def _with_skin_weights(rig: Rig) -> Rig:
-    """Return a rig whose vertices follow the nearest joint, if no bone has a weight."""
+    """Return a rig in which the vertices of meshes without weights on bones follow the nearest joint."""
     is_bone = np.array([name != STATIC_JOINT for name in rig.joint_names], bool)
-    if is_bone[np.unique(rig.skin_joints[rig.skin_weights > 0])].any() or not is_bone.any():
-        return rig
-    heads, nearest = rig.rest_matrices[is_bone][:, :3, 3], []
-    for positions in np.array_split(rig.rest_positions, max(1, rig.vertex_count // 1000)):
-        nearest.append(((positions[:, None] - heads[None]) ** 2).sum(axis=2).argmin(axis=1))
-    joints = np.flatnonzero(is_bone)[np.concatenate(nearest)][:, None].astype(np.int32)
-    return replace(rig, skin_joints=joints, skin_weights=np.ones(joints.shape, np.float32))
+    has_weight = (is_bone[rig.skin_joints] & (rig.skin_weights > 0)).any(axis=1)
+    joints, weights, heads = rig.skin_joints.copy(), rig.skin_weights.copy(), rig.rest_matrices[is_bone][:, :3, 3]
+    for mesh in rig.mesh_slices if is_bone.any() else ():
+        if has_weight[mesh].any():
+            continue
+        for first in range(mesh.start, mesh.stop, 1000):
+            part = slice(first, min(first + 1000, mesh.stop))
+            distances = ((rig.rest_positions[part, None] - heads[None]) ** 2).sum(axis=2)
+            joints[part], weights[part] = np.flatnonzero(is_bone)[distances.argmin(axis=1)][:, None], 0.0
+            weights[part, 0] = 1.0
+    return replace(rig, skin_joints=joints, skin_weights=weights)
 
 
 def _add_deformation(
@@ -125,7 +129,7 @@ def _add_deformation(
     ones = graph.add("Gather", [poses, graph.integers("last_element", np.array([15]))], "ones", axis=1)
     scalars = [ones, CONFIDENCE_OUTPUT, coefficients, *([CONTROLS_INPUT] if rig.controls else [])]
     scalars = graph.add("Concat", scalars, "scalars", axis=1)
-    distances = {i: key_distances[c.path] for i, c in enumerate(rig.controls) if c.path in key_distances}
+    distances = {i: key_distances[c.name] for i, c in enumerate(rig.controls) if c.name in key_distances}
     parts = [
         _Part(rig, index, p, part_count, [i for i in distances if distances[i][p.vertices].any()])
         for index, p in enumerate(partitions)

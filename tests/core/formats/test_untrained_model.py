@@ -20,7 +20,7 @@ KEYS = tuple(Control("shape_keys", f'key_blocks["key {index}"].value', 0.0, 1.0)
 @pytest.mark.parametrize("controls", [(), (Control("armature_object", '["fist"]', 0.0, 1.0), *KEYS)])
 def test_an_untrained_model_is_linear_skinning(controls):
     rig = replace(make_rig(), controls=controls)
-    distances = {control.path: np.ones(rig.vertex_count) for control in KEYS}
+    distances = {control.name: np.ones(rig.vertex_count) for control in KEYS}
     data = build_untrained_model(rig, distances)
     info = check_model(data, "untrained")
     assert info.meshes == rig.meshes and info.controls == controls and info.constant_bytes > 0
