@@ -12,7 +12,7 @@ from ..properties.recording_options import planned_pose_count
 from ..recording.rig_check import check_has_weights
 from ..scene.scene_rig import SceneRig, armature_of
 from .playback import bind_model
-from .recording import is_recorded, record_character, recording_plan
+from .recording import is_recorded, record_character, recordable_character, recording_plan
 from .training import TrainingOperator
 
 
@@ -28,7 +28,8 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
     ends_itself = True
 
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
-        shown, character = self.rig(context), self.character(context)
+        shown = self.rig(context)
+        character, self._note = recordable_character(self.rigs(context), shown)
         mesh_object = shown.mesh_object
         mesh_objects = [mesh_object, *(o for o in character.mesh_objects if o != mesh_object)]
         if mesh_object.library is not None:
@@ -58,7 +59,7 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
                 sentence, mesh_objects = bind_model(SceneRig(mesh_object, armature_object), model)
                 sentences.append(sentence)
                 bound_objects += mesh_objects
-        return f"Trained in {result:.0f} s. {' '.join(sentences)}"
+        return " ".join(filter(None, [f"Trained in {result:.0f} s.", *sentences, self._note]))
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
         self.add_trained_models_to_list()

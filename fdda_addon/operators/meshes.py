@@ -7,7 +7,8 @@ The menu makes Blender's search (F3) find the operators. It leaves out those tha
 import bpy
 
 from ..jobs.job import redraw
-from ..scene.active_rig import cached_active_rig, cached_rigs_of_active_armature, rigs_of_active_armature
+from ..scene.active_rig import cached_active_rig, cached_rigs_together
+from ..scene.scene_rig import rigs_of_armature
 from .rig_operator import RigOperator
 
 MENU_OPERATORS = (
@@ -41,11 +42,15 @@ class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
     waits_for_jobs = False
 
     def apply(self, context: bpy.types.Context) -> str:
-        context.window_manager.fdda.mesh = self.rig(context).mesh_object.name
+        shown = self.rig(context)
+        context.window_manager.fdda.mesh = shown.mesh_object.name
         # The sidebar prefers a mesh that is selected together with the armature.
-        for rig in rigs_of_active_armature(context):
+        for rig in rigs_of_armature(shown.armature_object):
             if rig.mesh_object.select_get():
                 rig.mesh_object.select_set(False)
+        if context.view_layer.objects.active.type == "MESH":
+            shown.mesh_object.select_set(True)
+            context.view_layer.objects.active = shown.mesh_object
         redraw()
         return ""
 
@@ -55,7 +60,7 @@ class FDDA_MT_main(bpy.types.Menu):
     bl_label = "FDDA"
 
     def draw(self, context: bpy.types.Context) -> None:
-        has_several_meshes = context.window_manager.fdda.all_meshes and bool(cached_rigs_of_active_armature(context))
+        has_several_meshes = bool(cached_rigs_together(context))
         for index, group in enumerate(MENU_OPERATORS):
             if index:
                 self.layout.separator()

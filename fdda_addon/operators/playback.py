@@ -12,9 +12,9 @@ from ..models import model_list
 from ..models.entries import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
-from ..runtime.binding import unbind
+from ..runtime.binding import check_plays, unbind
 from ..runtime.model_meshes import describe_missing_meshes, find_model_rigs
-from ..scene.scene_rig import SceneRig, check_full_rig, remaining_rig_note
+from ..scene.scene_rig import SceneRig, check_full_rig, describe_left_out, left_out_reason, remaining_rig_note
 from .rig_operator import NEEDS_MODEL, ModelFileOperator, RigOperator
 
 LARGE_MODEL_BYTES = 32_000_000
@@ -66,6 +66,9 @@ def bind_model(
     if len(info.meshes) > 1 and not is_alone:
         rigs = find_model_rigs(model_list.entry_path(mesh_object, entry), info, scene_rig.armature_object)
         for other_rig in [rig for rig in rigs.values() if rig.mesh_object != mesh_object]:
+            if not other_rig.mesh_object.fdda.in_model:
+                notes.append(describe_left_out({other_rig.mesh_object: left_out_reason(other_rig.mesh_object)}))
+                continue
             try:
                 model_list.bind_entry(other_rig, model_list.copy_entry(other_rig.mesh_object, mesh_object, entry))
                 mesh_objects.append(other_rig.mesh_object)
@@ -195,10 +198,8 @@ class FDDA_OT_set_mode(RigOperator, bpy.types.Operator):
                 check_full_rig(rig.mesh_object)
         for binding in bindings:
             binding.mode = mode
-        context.view_layer.update()
-        for binding in bindings:
-            if binding.status:
-                raise ModelError(binding.status)
+        for rig in rigs:
+            check_plays(rig.mesh_object)
         names = " and ".join(f"'{rig.mesh_object.name}'" for rig in rigs)
         return f"{names} {'is' if len(rigs) == 1 else 'are'} deformed by {MODE_NAMES[mode]}."
 

@@ -19,11 +19,35 @@ from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import copy_settings, planned_pose_count, recording_settings
 from ..recording.plan import find_recorded_character
 from ..recording.refinement import RefinementSettings, refine
+from ..recording.rig_check import check_recordable_rig
 from ..recording.run import record
 from ..runtime.binding import model_disabled
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, describe_left_out, join_rigs, left_out_reason
 from .job import JobOperator
 from .rig_operator import RigOperator
+
+
+def recordable_character(rigs: list[SceneRig], shown: SceneRig) -> tuple[SceneRig, str]:
+    """Join the rigs that can be recorded.
+
+    Args:
+        shown: the rig that the sidebar shows, which stays in: its problems end the recording.
+
+    Returns:
+        The joined rig, and a sentence about the meshes that are left out; empty for none.
+    """
+    reasons, problems = {}, []
+    for rig in [rig for rig in rigs if rig != shown]:
+        if reason := left_out_reason(rig.mesh_object):
+            reasons[rig.mesh_object] = reason
+            continue
+        with model_disabled(rig.mesh_object):
+            if found := check_recordable_rig(rig, recording_settings(shown)).problems:
+                problems.append(f"Left out '{rig.mesh_object.name}': {found[0]}")
+                reasons[rig.mesh_object] = ""
+    text = describe_left_out({o: reason for o, reason in reasons.items() if reason})
+    character = join_rigs([rig for rig in rigs if rig.mesh_object not in reasons])
+    return character, " ".join(filter(None, [text, *problems]))
 
 
 def record_character(
@@ -78,7 +102,8 @@ class FDDA_OT_record(JobOperator, bpy.types.Operator):
         return cls.bl_description
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        shown, character = self.rig(context), self.character(context)
+        shown = self.rig(context)
+        character, self._note = recordable_character(self.rigs(context), shown)
         self.state.plan = JobPlan(recording_plan(shown))
         # The other meshes get the settings of the shown one.
         self.changes_file = len(character.mesh_objects) > 1
@@ -88,7 +113,8 @@ class FDDA_OT_record(JobOperator, bpy.types.Operator):
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
         info = read_info(read_index(self._path))
-        return f"Recorded {format_poses(info.poses, len(info.alone_poses))}, into '{self._path.name}'."
+        poses_text = format_poses(info.poses, len(info.alone_poses))
+        return f"Recorded {poses_text}, into '{self._path.name}'. {self._note}".rstrip()
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
         if self.state.stage not in ("poses", "influences", "repeatability") or not self.state.done:

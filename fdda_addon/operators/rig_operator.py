@@ -8,7 +8,7 @@ import bpy
 from ..core.errors import FDDAError, ModelError, RigError
 from ..core.sentences.window import for_window
 from ..jobs.job import current
-from ..scene.active_rig import active_rig, any_mesh_object, cached_active_rig, rigs_of_active_armature
+from ..scene.active_rig import active_rig, any_mesh_object, cached_active_rig, rigs_together
 from ..scene.scene_rig import SceneRig, armature_of, join_rigs
 
 
@@ -43,7 +43,7 @@ class RigOperator:
     )
     all_meshes: bpy.props.BoolProperty(
         name="All Meshes",
-        description="Apply to all meshes of the active armature",
+        description="Apply to all checked meshes of the armature",
         options={"SKIP_SAVE"},
     )
 
@@ -76,8 +76,8 @@ class RigOperator:
         return active_rig(context, self.object)
 
     def rigs(self, context: bpy.types.Context) -> list[SceneRig]:
-        """Return the rigs to apply the operator to: with `all_meshes` all rigs of the active armature, else one rig."""
-        together = rigs_of_active_armature(context) if self.all_meshes and not self.object else []
+        """Return the rigs to apply the operator to: with `all_meshes` those of all checked meshes, else one rig."""
+        together = rigs_together(context) if self.all_meshes and not self.object else []
         return together or [self.rig(context)]
 
     def character(self, context: bpy.types.Context) -> SceneRig:

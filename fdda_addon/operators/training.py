@@ -12,7 +12,7 @@ from bpy.app.handlers import persistent
 from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.progress import Job, Progress
-from ..core.recording.index import read_index
+from ..core.recording.index import INDEX_NAME, read_index
 from ..core.settings import (
     DETAIL_MM,
     GOAL_MM,
@@ -27,7 +27,7 @@ from ..jobs.plan import JobPlan, JobStep, training_steps
 from ..models.former_model import add_former_model, keep_former_model
 from ..models.model_list import add_model, check_matches_rig
 from ..properties.character import model_file, recording_folder
-from ..scene.scene_rig import armature_of
+from ..scene.scene_rig import armature_of, describe_left_out
 from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
 from ..training.process import Training
 from .job import JobOperator
@@ -233,9 +233,14 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
         # Meshes of one recording have one model.
         meshes_of_files: dict[tuple[Path, Path], list[bpy.types.Object]] = {}
-        shown_object = self.rig(context).mesh_object
-        for mesh_object in sorted(self.character(context).mesh_objects, key=lambda o: o != shown_object):
-            meshes_of_files.setdefault(self._files(mesh_object), []).append(mesh_object)
+        shown_object, unrecorded = self.rig(context).mesh_object, {}
+        for mesh_object in sorted((rig.mesh_object for rig in self.rigs(context)), key=lambda o: o != shown_object):
+            files = self._files(mesh_object)
+            if mesh_object == shown_object or (files[0] / INDEX_NAME).exists() or is_detached(files[1]):
+                meshes_of_files.setdefault(files, []).append(mesh_object)
+            else:
+                unrecorded[mesh_object] = "not recorded"
+        self._note = describe_left_out(unrecorded)
         files = [(mesh_objects, *paths) for paths, mesh_objects in meshes_of_files.items()]
         plans = (self.training_plan(mesh_objects, _pose_count(recording)) for mesh_objects, recording, _ in files)
         self.state.plan = JobPlan([step for plan in plans for step in plan])
@@ -244,7 +249,7 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         self.add_trained_models_to_list()
         names = " and ".join(dict.fromkeys(f"'{model.name}'" for _, model in self.trained_models))
-        return f"Trained {names} in {result:.0f} s."
+        return f"Trained {names} in {result:.0f} s. {self._note}".rstrip()
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
         self.add_trained_models_to_list()

@@ -16,6 +16,7 @@ from ..timing import measurements
 from ..timing.benchmark import FDDA, RIG
 from .bone_names import short_bone_name
 from .frame_profile import draw_model_times
+from .meshes import draw_meshes
 from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
 from .timed_value import timed_values
 from .trained_file import find_trained_file
@@ -68,6 +69,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         mesh_object = scene_rig.mesh_object
         if note := remaining_rig_note(mesh_object):
             draw_wrapped(layout, context, note, "ERROR")
+        draw_meshes(layout, context, scene_rig, playback=True)
         if not mesh_object.fdda.is_bound:
             self._draw_unbound(context, scene_rig)
             return
@@ -120,6 +122,8 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             box = layout.box()
             box.alert = True
             draw_wrapped(box, context, binding.status)
+        # A warning leaves the mode as it is.
+        if binding.status and binding.mode == "RIG":
             row = layout.row(align=True)
             row.operator("fdda.relink", text="Find Model…", icon="FILEBROWSER")
             if any(map(is_playback_modifier, mesh_object.modifiers)):

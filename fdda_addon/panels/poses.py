@@ -6,7 +6,7 @@ import bpy
 from ..core.settings import MAX_AUTO_POSES, POSES
 from ..core.wording import format_list
 from ..properties.recording_options import actions_of_rig, meshes_with_other_settings
-from ..scene.active_rig import cached_rigs_of_active_armature
+from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
 from . import limits, sampling
 from .section import Section, draw_advanced, draw_button, draw_wrapped, panel_rig
@@ -75,8 +75,8 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
 
 def _draw_shared(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """Say that the fields belong to all meshes that are recorded together, and which have other values until then."""
-    mesh_objects = [each.mesh_object for each in cached_rigs_of_active_armature(context)]
-    if not (mesh_objects and context.window_manager.fdda.all_meshes):
+    mesh_objects = [each.mesh_object for each in cached_rigs_together(context)]
+    if not mesh_objects:
         return
     layout.label(text=f"Shared by {len(mesh_objects)} Meshes", icon="LINKED")
     if names := meshes_with_other_settings(rig.mesh_object, mesh_objects):

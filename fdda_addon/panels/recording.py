@@ -29,6 +29,7 @@ from ..recording.plan import (
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
+from .meshes import draw_meshes
 from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
 
 
@@ -99,6 +100,7 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
         rig = panel_rig(context)[0]
         if rig is None:
             return
+        draw_meshes(layout, context, rig)
         _draw_folder(layout, context, rig)
         draw_job(layout, context, "record", ("ERROR",))
         draw_job(layout, context, "export_skinning")

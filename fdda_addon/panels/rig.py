@@ -7,16 +7,15 @@ from ..core.recording.folder import FolderState
 from ..core.wording import format_count
 from ..jobs import job
 from ..properties.character import file_problem
-from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
 from . import checks, curves, findings, limits
 from .frame_profile import draw_profile, draw_times
+from .meshes import draw_meshes
 from .recording import read_content
 from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
 from .trained_file import find_trained_file
 from .training import read_assessment
 
-MAX_MESHES = 8
 MODIFIER_ICONS = {
     "ARMATURE": "MOD_ARMATURE", "CORRECTIVE_SMOOTH": "MOD_SMOOTH", "SMOOTH": "MOD_SMOOTH", "LATTICE": "MOD_LATTICE",
     "NODES": "GEOMETRY_NODES", "SURFACE_DEFORM": "MOD_MESHDEFORM", "MESH_DEFORM": "MOD_MESHDEFORM",
@@ -51,7 +50,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         is_fast_rig = rig.mesh_object.fdda.is_fast_rig
         if not is_fast_rig:
             _draw_build_model(layout, context, rig)
-        _draw_meshes(layout, context, rig)
+        draw_meshes(layout, context, rig)
         check = checks.last_check(rig)
         column = layout.column(align=True)
         column.label(
@@ -85,29 +84,6 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         if not is_fast_rig:
             draw_times(layout, context, rig)
             draw_profile(layout, context, rig)
-
-
-def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    """Draw the meshes of the active armature if it has several, and the option to apply buttons to all."""
-    rigs = cached_rigs_of_active_armature(context)
-    if not rigs:
-        return
-    box = layout.box().column(align=True)
-    box.label(text=f"{len(rigs)} meshes follow {rig.armature_object.name}")
-    for listed_rig in rigs[:MAX_MESHES]:
-        is_shown = listed_rig.mesh_object == rig.mesh_object
-        row = box.row(align=True)
-        row.alignment = "LEFT"
-        icon = "RADIOBUT_ON" if is_shown else "RADIOBUT_OFF"
-        button = row.operator("fdda.show_mesh", text=listed_rig.mesh_object.name, icon=icon, emboss=False)
-        button.object = listed_rig.mesh_object.name
-        if listed_rig.mesh_object.fdda.is_bound:
-            row.label(text="", icon="LINKED")
-        elif findings.find(listed_rig):
-            row.label(text="", icon="ERROR")
-    if len(rigs) > MAX_MESHES:
-        box.label(text=f"and {len(rigs) - MAX_MESHES} more; select one to see it")
-    box.prop(context.window_manager.fdda, "all_meshes", text=f"Apply to All {len(rigs)} Meshes")
 
 
 def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

@@ -7,9 +7,10 @@ import bpy
 from ..core.errors import RigError
 from ..core.sentences.window import for_window
 from ..jobs import job
-from ..scene.active_rig import active_rig, cached_active_rig, cached_rigs_of_active_armature
+from ..scene.active_rig import active_rig, cached_active_rig, cached_rigs_together
 from ..scene.draw_cache import draw_cached
-from ..scene.scene_rig import SceneRig
+from ..scene.scene_rig import SceneRig, left_out_reason
+from . import checks
 
 TEXT_MARGIN, ICON_WIDTH = 74, 22
 """Width of both margins of a text together, and width of an icon, pixels at a UI scale of 1."""
@@ -65,19 +66,38 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
 
 def mesh_count(context: bpy.types.Context) -> int:
     """Return the number of meshes that buttons apply to; 0 if they apply to the shown mesh only."""
-    rigs = cached_rigs_of_active_armature(context)
-    return len(rigs) if rigs and context.window_manager.fdda.all_meshes else 0
+    return len(cached_rigs_together(context))
 
 
 def draw_button(
     layout: bpy.types.UILayout, context: bpy.types.Context, name: str, text: str, icon: str
 ) -> bpy.types.OperatorProperties:
-    """Draw the button of an operator that may apply to all meshes; its text then has the number of meshes."""
-    count = mesh_count(context)
-    properties = layout.operator(name, text=f"{text} ({count} Meshes)" if count else text, icon=icon)
-    if count:
-        properties.all_meshes = True
+    """Draw the button of an operator that may apply to several meshes; its text then has their number."""
+    rigs = cached_rigs_together(context)
+    count = sum(map(COUNTED_MESHES.get(name, lambda _: True), rigs))
+    properties = layout.operator(name, text=f"{text} ({count} Meshes)" if count > 1 else text, icon=icon)
+    properties.all_meshes = bool(rigs)
     return properties
+
+
+def mesh_problem(rig: SceneRig) -> str:
+    """Return why a mesh cannot be recorded, at its last check; empty without a reason."""
+    check = checks.last_check(rig)
+    return check.problems[0] if check is not None and check.problems else ""
+
+
+def _is_recorded(rig: SceneRig) -> bool:
+    return not (left_out_reason(rig.mesh_object) or mesh_problem(rig))
+
+
+def _is_bound(rig: SceneRig) -> bool:
+    return rig.mesh_object.fdda.is_bound
+
+
+COUNTED_MESHES = dict.fromkeys(("fdda.record", "fdda.build_model"), _is_recorded) | dict.fromkeys(
+    ("fdda.unbind", "fdda.evaluate", "fdda.bake"), _is_bound
+)
+"""The meshes to which a button applies, of the checked ones; all of them if it is not named."""
 
 
 def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
@@ -153,8 +173,9 @@ def draw_job(
         return False
     if not state.is_running:
         rig = panel_rig(context)[0]
-        is_of_shown_mesh = not state.subject or (rig is not None and rig.mesh_object.session_uid == state.subject)
-        if is_of_shown_mesh and state.outcome_level in levels:
+        shown_rigs = cached_rigs_together(context) or ((rig,) if rig is not None else ())
+        is_shown = not state.subject or any(each.mesh_object.session_uid == state.subject for each in shown_rigs)
+        if is_shown and state.outcome_level in levels:
             draw_wrapped(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
         return False
     column = layout.column(align=True)

@@ -13,6 +13,7 @@ from bpy.props import (
 )
 
 from ..runtime.binding import on_mask_update, on_property_update
+from ..scene import draw_cache
 from .character import FDDA_PG_character
 from .not_animatable import not_animatable
 
@@ -76,6 +77,16 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         name="Packed Model",
         description="The text that holds the model inside this file",
         type=bpy.types.Text,
+        override=OVERRIDABLE,
+    )
+    in_model: BoolProperty(
+        name="In the Model",
+        description=(
+            "Record, train and bind this mesh together with the other checked meshes of its armature. An unchecked "
+            "mesh is left out; select it to give it a model of its own"
+        ),
+        default=True,
+        update=lambda _binding, _context: draw_cache.clear(),
         override=OVERRIDABLE,
     )
     model_mesh: StringProperty(name="Mesh", description="Name of this mesh in the model", override=OVERRIDABLE)

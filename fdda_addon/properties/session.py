@@ -50,11 +50,6 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
     """State of the sidebar: the shown mesh, the active entries of lists, and the previewed pose."""
 
     mesh: StringProperty(name="Mesh", description="Mesh of the active armature that the sidebar shows")
-    all_meshes: BoolProperty(
-        name="All Meshes",
-        description="Make the buttons work on all meshes of this armature, not only on the one that is shown",
-        default=True,
-    )
 
     pose_index: IntProperty(
         name="Pose Index", description="Index of the random pose that is shown; -1 before the first", default=-1, min=-1

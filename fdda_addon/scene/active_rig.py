@@ -56,8 +56,8 @@ def _cached_active_rig(
         return None
 
 
-def cached_rigs_of_active_armature(context: bpy.types.Context) -> tuple[SceneRig, ...]:
-    """Find the rigs of the active armature, cached for drawing."""
+def cached_rigs_together(context: bpy.types.Context) -> tuple[SceneRig, ...]:
+    """Find the rigs of `rigs_together`, cached for drawing."""
     return _cached_rigs(context, context.view_layer.objects.active, context.scene)
 
 
@@ -65,7 +65,7 @@ def cached_rigs_of_active_armature(context: bpy.types.Context) -> tuple[SceneRig
 def _cached_rigs(
     context: bpy.types.Context, _active_object: bpy.types.Object, _scene: bpy.types.Scene
 ) -> tuple[SceneRig, ...]:
-    return tuple(rigs_of_active_armature(context))
+    return tuple(rigs_together(context))
 
 
 def any_mesh_object(context: bpy.types.Context, predicate: Callable[[bpy.types.Object], object]) -> bool:
@@ -83,13 +83,14 @@ def _any_mesh_object(scene: bpy.types.Scene, predicate: Callable[[bpy.types.Obje
     return any(o.type == "MESH" and predicate(o) for o in scene.objects) or None
 
 
-def rigs_of_active_armature(context: bpy.types.Context) -> list[SceneRig]:
-    """Find the rigs of all meshes of the active armature; empty if no armature is active or it has a single mesh."""
-    active_object = context.view_layer.objects.active
-    if active_object is None or active_object.type != "ARMATURE":
+def rigs_together(context: bpy.types.Context) -> list[SceneRig]:
+    """Find the rigs of the checked meshes of the active character, if the active rig is one of several; else none."""
+    try:
+        rig = active_rig(context)
+    except RigError:
         return []
-    rigs = rigs_of_armature(active_object)
-    return rigs if len(rigs) > 1 else []
+    rigs = [each for each in rigs_of_armature(rig.armature_object) if each.mesh_object.fdda.in_model]
+    return rigs if len(rigs) > 1 and rig in rigs else []
 
 
 def _choose_mesh(context: bpy.types.Context, armature_object: bpy.types.Object) -> bpy.types.Object:

@@ -2,7 +2,7 @@
 """Finds the rigs of a scene, without evaluating anything."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import bpy
@@ -134,23 +134,42 @@ def find_whole_character() -> tuple[SceneRig, str]:
     """
     meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
     rigs = [SceneRig(o, armature) for o in meshes if (armature := armature_of(o)) is not None]
-    visible_rigs = [rig for rig in rigs if rig.mesh_object.visible_get()]
-    if not visible_rigs:
+    learnable_rigs = [rig for rig in rigs if not left_out_reason(rig.mesh_object)]
+    if not learnable_rigs:
         return find_rig(), ""
-    character = join_rigs(visible_rigs)
-    hidden = [rig.mesh_object.name for rig in rigs if rig not in visible_rigs]
-    carried = [
-        o.name
-        for o in meshes
-        if armature_of(o) is None and o.parent in {character.armature_object, *character.mesh_objects}
-    ]
-    reasons = ((hidden, "hidden"), (carried, "moved as a whole, which is nothing to learn"))
+    character = join_rigs(learnable_rigs)
+    return character, describe_left_out(left_out_meshes(character.armature_object))
+
+
+def left_out_reason(mesh_object: bpy.types.Object) -> str:
+    """Say why a mesh that follows an armature is left out of recordings of all meshes; empty if it is not."""
+    if not mesh_object.fdda.in_model:
+        return "unchecked in the sidebar"
+    return "" if mesh_object.visible_get() else "hidden"
+
+
+def left_out_meshes(armature_object: bpy.types.Object) -> dict[bpy.types.Object, str]:
+    """Return why meshes that belong to an armature are left out of recordings of all meshes, by mesh object."""
+    followers = [rig.mesh_object for rig in rigs_of_armature(armature_object)]
+    reasons = {o: reason for o in followers if (reason := left_out_reason(o))}
+    carriers = {armature_object, *followers}
+    carried = (o for o in bpy.context.scene.objects if o.type == "MESH" and o.parent in carriers and o not in carriers)
+    for mesh_object in carried:
+        if not is_comparison(mesh_object) and armature_of(mesh_object) is None:
+            reasons[mesh_object] = "moved as a whole, which is nothing to learn"
+    return reasons
+
+
+def describe_left_out(reasons: Mapping[bpy.types.Object, str]) -> str:
+    """Name the meshes that are left out, with their reasons; empty for none."""
+    names: dict[str, list[str]] = {}
+    for mesh_object, reason in reasons.items():
+        names.setdefault(reason, []).append(mesh_object.name)
     clauses = [
-        f"{format_with_noun(names, 'mesh', 'meshes')}, {'which is' if len(names) == 1 else 'which are'} {reason}"
-        for names, reason in reasons
-        if names
+        f"{format_with_noun(group, 'mesh', 'meshes')}, {'which is' if len(group) == 1 else 'which are'} {reason}"
+        for reason, group in names.items()
     ]
-    return character, f"Left out: {'; '.join(clauses)}." if clauses else ""
+    return f"Left out: {'; '.join(clauses)}." if clauses else ""
 
 
 def check_full_rig(mesh_object: bpy.types.Object) -> None:

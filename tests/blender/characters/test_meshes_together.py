@@ -9,7 +9,7 @@ from fdda_addon.evaluation import last_evaluation
 from fdda_addon.jobs import job
 from fdda_addon.panels import checks
 from fdda_addon.properties.character import recording_folder
-from fdda_addon.scene.active_rig import rigs_of_active_armature
+from fdda_addon.scene.active_rig import active_rig, rigs_together
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from ..conftest import ELBOW, ELBOW_RIG
@@ -36,7 +36,7 @@ def two(tmp_path) -> tuple[bpy.types.Object, bpy.types.Object]:
 
 
 def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
-    assert [rig.mesh_object for rig in rigs_of_active_armature(bpy.context)] == list(two)
+    assert [rig.mesh_object for rig in rigs_together(bpy.context)] == list(two)
     assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
     assert two[1].fdda.settings.poses == 30, "the other takes over how the first is recorded"
     paths = [recording_folder(mesh_object) for mesh_object in two]
@@ -78,12 +78,52 @@ def test_one_button_records_trains_and_binds_all_meshes(two):
     assert all(mesh_object.fdda.mode == "FDDA" for mesh_object in two)
 
 
-def test_all_meshes_is_nothing_where_a_mesh_is_active(two):
-    bpy.context.view_layer.objects.active = two[1]
-    assert rigs_of_active_armature(bpy.context) == []
-    two[1].fdda.settings.poses = 5
+@pytest.mark.parametrize("left_out", [None, "unchecked", "hidden", "unrecordable"])
+def test_the_sidebar_is_about_the_character_with_a_mesh_active(two, left_out):
+    """All meshes are recorded and bound whichever is active; one that is left out is named, with the reason."""
+    first, other = two
+    bpy.context.view_layer.objects.active = first
+    reasons = {"unchecked": "", "hidden": "Left out: the mesh 'elbow.001', which is hidden.", None: ""}
+    if left_out == "unchecked":
+        other.fdda.in_model = False
+    elif left_out == "hidden":
+        other.hide_set(True)
+    elif left_out:
+        other.modifiers.new("Decimate", "DECIMATE")
+        other.modifiers.move(len(other.modifiers) - 1, 0)
+        reasons[left_out] = "Left out: 'elbow.001'"
+    for rig in (SceneRig(o, armature_of(o)) for o in two):
+        checks.check_now(rig)
+    for section in ("rig", "recording"):
+        texts = texts_of(draw_section(section))
+        assert f"{1 + (left_out != 'unchecked')} of 2 Meshes Checked" in texts
+        assert any(text.startswith(reasons[left_out][:9]) for text in texts)
+    assert bpy.ops.fdda.build_model(all_meshes=True) == {"FINISHED"}
+    assert first.fdda.mode == "FDDA" and other.fdda.is_bound == (left_out is None)
+    meshes = [mesh["name"] for mesh in read_index(recording_folder(first))["meshes"]]
+    assert meshes == [o.name for o in two[: 1 if left_out else 2]]
+    assert reasons[left_out].removesuffix(".") in job.state_of("build_model").outcome.replace(
+        "out 'elbow", "out: 'elbow"
+    )
+    assert "2 of 2 Meshes Checked" in texts_of(draw_section("playback")) or left_out == "unchecked"
+
+
+def test_an_unchecked_mesh_is_by_itself(two):
+    first, other = two
+    other.fdda.in_model, other.fdda.settings.poses = False, 5
+    bpy.context.view_layer.objects.active = other
+    assert rigs_together(bpy.context) == []
     assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
-    assert job.state_of("record").subject == two[1].session_uid
+    assert job.state_of("record").subject == other.session_uid
+    assert [mesh["name"] for mesh in read_index(recording_folder(other))["meshes"]] == [other.name]
+    assert first.fdda.settings.poses == 30
+
+
+def test_a_click_in_the_list_shows_another_mesh(two):
+    for active in (two[0], two[0].parent or armature_of(two[0])):
+        bpy.context.view_layer.objects.active = active
+        bpy.ops.fdda.show_mesh(object=two[1].name)
+        assert active_rig(bpy.context).mesh_object == two[1]
 
 
 def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
@@ -94,9 +134,9 @@ def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
     bpy.context.view_layer.objects.active = two[0]
     bpy.ops.fdda.record()
     bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW_RIG]
-    with pytest.raises(RuntimeError, match="two_elbow_001_recording' is not a recording"):
-        bpy.ops.fdda.train(all_meshes=True)
-    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"], "it was trained before the other failed"
+    assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
+    assert job.state_of("train").outcome.endswith("Left out: the mesh 'elbow.001', which is not recorded.")
+    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"]
     bpy.context.view_layer.objects.active = two[0]
     two[0].fdda.models.clear()
     rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.evaluation import side_by_side
-from fdda_addon.scene.active_rig import rigs_of_active_armature
+from fdda_addon.scene.active_rig import rigs_together
 from fdda_addon.scene.comparison import comparison_objects, hidden_comparison_objects, is_comparison
 from fdda_addon.scene.scene_rig import armature_of, find_rig, find_rigs
 
@@ -89,7 +89,7 @@ def test_the_displayed_rig_is_no_character(active):
     bpy.ops.fdda.show_rig(placement="BESIDE")
     assert find_rig().mesh_object == active and [rig.mesh_object for rig in find_rigs()] == [active]
     bpy.context.view_layer.objects.active = armature_of(active)
-    assert rigs_of_active_armature(bpy.context) == []
+    assert rigs_together(bpy.context) == []
 
 
 def test_the_displayed_rig_is_not_saved_and_stays_visible(active, elbow_files, tmp_path):

@@ -136,7 +136,6 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     settings = mesh_object.fdda.settings
     settings.learn_from, settings.poses, settings.settle_frames = "flesh", 0, 0
     bpy.data.actions[ACTION].fdda.record = True
-    bpy.context.window_manager.fdda.all_meshes = False
     assert bpy.ops.fdda.record() == {"FINISHED"}
     recording = read_recording(tmp_path / "rig_elbow_recording")
     assert np.abs(recording.positions[:FRAMES] - own.positions[:FRAMES]).max() <= EXACT * own.rig.size
