@@ -73,100 +73,64 @@ def read_skin(
     """
     vertex_count = len(mesh_object.data.vertices)
     bones = [bone for bone in armature_object.data.bones if bone.use_deform]
-    entries = _SkinEntries(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))]
     if modifier is not None:
-        has_group = np.zeros(vertex_count, bool)
         if modifier.use_vertex_groups:
-            entries, has_group = _group_weights(mesh_object, armature_object, bones)
-        if modifier.use_bone_envelopes and not has_group.all():
-            ungrouped = np.flatnonzero(~has_group)
-            entries = entries.concatenated(_envelope_weights(mesh_object, armature_object, bones, ungrouped))
-    deformation_factors = _modifier_factors(mesh_object, modifier, vertex_count)
-    weight_sums = np.bincount(entries.vertices, entries.weights, vertex_count)
-    deformation_factors[weight_sums <= MIN_WEIGHT_SUM] = 0
-    entries = entries.selected((entries.weights > 0) & (deformation_factors[entries.vertices] > 0))
-    weights = (
-        entries.weights
-        / np.bincount(entries.vertices, entries.weights, vertex_count).astype(np.float32)[entries.vertices]
-    )
-    entries = _SkinEntries(
-        entries.vertices, entries.bone_indices, weights * deformation_factors[entries.vertices].astype(np.float32)
-    )
-    static_vertices = np.flatnonzero(deformation_factors < 1)
-    static_joint = np.full(len(static_vertices), len(bones))
-    entries = entries.concatenated(
-        _SkinEntries(static_vertices, static_joint, (1 - deformation_factors[static_vertices]).astype(np.float32))
-    ).sorted()
+            parts.append(_group_weights(mesh_object, armature_object, bones))
+        ungrouped = np.setdiff1d(np.arange(vertex_count), parts[-1][0])
+        if modifier.use_bone_envelopes and len(ungrouped):
+            parts.append(_envelope_weights(mesh_object, armature_object, bones, ungrouped))
+    vertices, indices, weights = map(np.concatenate, zip(*parts, strict=True))
+    factors = _modifier_factors(mesh_object, modifier, vertex_count)
+    factors[np.bincount(vertices, weights, vertex_count) <= MIN_WEIGHT_SUM] = 0
+    is_used = (weights > 0) & (factors[vertices] > 0)
+    vertices, indices, weights = vertices[is_used], indices[is_used], weights[is_used]
+    weights = weights / np.bincount(vertices, weights, vertex_count).astype(np.float32)[vertices]
+    static = np.flatnonzero(factors < 1)
+    weights = np.concatenate([weights * factors[vertices].astype(np.float32), (1 - factors[static]).astype(np.float32)])
+    vertices = np.concatenate([vertices, static])
+    indices = np.concatenate([indices, np.full(len(static), len(bones))])
+    order = np.argsort(vertices, kind="stable")
     bone_names = np.array([*(bone.name for bone in bones), STATIC_JOINT], object)
-    used_bone_indices, bone_indices = np.unique(entries.bone_indices, return_inverse=True)
-    return Skin(tuple(bone_names[used_bone_indices]), entries.vertices, bone_indices, entries.weights, vertex_count)
+    used_bones, bone_indices = np.unique(indices[order], return_inverse=True)
+    return Skin(tuple(bone_names[used_bones]), vertices[order], bone_indices, weights[order], vertex_count)
 
 
-@dataclass(frozen=True)
-class _SkinEntries:
-    """Weights as in `Skin`, with indices into all deforming bones, not yet divided by their sum."""
-
-    vertices: np.ndarray
-    bone_indices: np.ndarray
-    weights: np.ndarray
-
-    def concatenated(self, other: "_SkinEntries") -> "_SkinEntries":
-        fields = ("vertices", "bone_indices", "weights")
-        return _SkinEntries(*(np.concatenate([getattr(self, field), getattr(other, field)]) for field in fields))
-
-    def selected(self, mask: np.ndarray) -> "_SkinEntries":
-        return _SkinEntries(self.vertices[mask], self.bone_indices[mask], self.weights[mask])
-
-    def sorted(self) -> "_SkinEntries":
-        return self.selected(np.argsort(self.vertices, kind="stable"))
+Entries = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""As in `Skin`: vertices, indices into all deforming bones, and weights that are not yet divided by their sum."""
 
 
 def _group_weights(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone]
-) -> tuple[_SkinEntries, np.ndarray]:
-    """Read the weights of vertex groups.
-
-    Returns:
-        The weights, and (V,) bool whether a vertex is in a group of a deforming bone, with any weight.
-    """
+) -> Entries:
+    """Read the weights of vertex groups of deforming bones; a weight may be 0."""
     bone_indices = {bone.name: index for index, bone in enumerate(bones)}
-    group_bones = {
-        group.index: bone_indices[group.name] for group in mesh_object.vertex_groups if group.name in bone_indices
-    }
+    groups = {g.index: bone_indices[g.name] for g in mesh_object.vertex_groups if g.name in bone_indices}
     rows = [
-        (vertex.index, group_bones[element.group], element.weight)
+        (vertex.index, groups[element.group], element.weight)
         for vertex in mesh_object.data.vertices
         for element in vertex.groups
-        if element.group in group_bones
+        if element.group in groups
     ]
-    vertices, indices, weights = zip(*rows, strict=True) if rows else ((), (), ())
-    entries = _SkinEntries(np.array(vertices, np.int64), np.array(indices, np.int64), np.array(weights, np.float32))
-    has_group = np.zeros(len(mesh_object.data.vertices), bool)
-    has_group[entries.vertices] = True
+    columns = zip(*rows, strict=True) if rows else ((), (), ())
+    vertices, indices, weights = map(np.array, columns, (np.int64, np.int64, np.float32))
     if any(bone.use_envelope_multiply for bone in bones):
-        weights = entries.weights.copy()
-        points = _rest_points(mesh_object, armature_object, np.arange(len(mesh_object.data.vertices)))
+        points = _rest_points(mesh_object, armature_object, vertices)
         for bone_index, bone in enumerate(bones):
             if bone.use_envelope_multiply:
-                rows = np.flatnonzero(entries.bone_indices == bone_index)
-                weights[rows] *= _envelope(bone, points[entries.vertices[rows]])
-        entries = _SkinEntries(entries.vertices, entries.bone_indices, weights)
-    return entries, has_group
+                of_bone = np.flatnonzero(indices == bone_index)
+                weights[of_bone] *= _envelope(bone, points[of_bone])
+    return vertices, indices, weights
 
 
 def _envelope_weights(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone], vertices: np.ndarray
-) -> _SkinEntries:
+) -> Entries:
     """Compute the weights of the envelopes of all bones for some vertices, given by their (n,) int64 indices."""
     points = _rest_points(mesh_object, armature_object, vertices)
-    bone_weights = [_envelope(bone, points) * bone.envelope_weight for bone in bones]
-    rows_inside = [np.flatnonzero(weights > 0) for weights in bone_weights]
-    positive_weights = [weights[rows] for weights, rows in zip(bone_weights, rows_inside, strict=True)]
-    return _SkinEntries(
-        np.concatenate([np.zeros(0, np.int64), *(vertices[rows] for rows in rows_inside)]),
-        np.repeat(np.arange(len(bones)), [len(rows) for rows in rows_inside]),
-        np.concatenate([np.zeros(0), *positive_weights]).astype(np.float32),
-    )
+    weights = np.array([_envelope(bone, points) * bone.envelope_weight for bone in bones]).reshape(len(bones), -1)
+    indices, rows = np.nonzero(weights > 0)
+    return vertices[rows], indices, weights[indices, rows].astype(np.float32)
 
 
 def _envelope(bone: bpy.types.Bone, points: np.ndarray) -> np.ndarray:
