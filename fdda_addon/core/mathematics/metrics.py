@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Errors between two deformations of one mesh, and the colors of the heat map."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
@@ -33,6 +33,11 @@ class ErrorStatistics:
     def to_json(self) -> dict:
         return asdict(self)
 
+    @staticmethod
+    def from_json(value: dict) -> "ErrorStatistics":
+        """Read the JSON of `to_json`, which may have further keys."""
+        return ErrorStatistics(*(value[field.name] for field in fields(ErrorStatistics)))
+
 
 def distances(first: np.ndarray, second: np.ndarray, metres_per_unit: float = 1.0) -> np.ndarray:
     """Compute the distance of each vertex between two deformations.
@@ -54,14 +59,9 @@ def error_statistics(errors: np.ndarray) -> ErrorStatistics:
         errors: distances in meters, any shape, not empty.
     """
     millimeters = np.asarray(errors, np.float64).ravel() * 1000
-    p99, p999 = np.percentile(millimeters, (99, 99.9))
-    return ErrorStatistics(
-        float(millimeters.mean()),
-        float(np.sqrt((millimeters**2).mean())),
-        float(p99),
-        float(p999),
-        float(millimeters.max()),
-    )
+    percentiles = np.percentile(millimeters, (99, 99.9))
+    values = (millimeters.mean(), np.sqrt((millimeters**2).mean()), *percentiles, millimeters.max())
+    return ErrorStatistics(*map(float, values))
 
 
 def heat_colors(errors: np.ndarray, max_error: float = HEAT_MAP_STOPS[-1][0]) -> np.ndarray:
@@ -74,11 +74,9 @@ def heat_colors(errors: np.ndarray, max_error: float = HEAT_MAP_STOPS[-1][0]) ->
     Returns:
         (V, 3) float32 sRGB, 0 to 1: green below 1e-4 cm, then from blue through violet (half of `max_error`) to red.
     """
-    stops = [error * max_error / HEAT_MAP_STOPS[-1][0] for error, _ in HEAT_MAP_STOPS]
-    colors = np.array([color for _, color in HEAT_MAP_STOPS])
-    vertex_colors = np.stack([np.interp(errors, stops, colors[:, channel]) for channel in range(3)], axis=-1)
+    vertex_colors = _interpolate_colors(np.asarray(errors) * (HEAT_MAP_STOPS[-1][0] / max_error), HEAT_MAP_STOPS)
     vertex_colors[np.asarray(errors) < NO_ERROR_METRES] = NO_ERROR_COLOR
-    return vertex_colors.astype(np.float32)
+    return vertex_colors
 
 
 def viewport_colors(errors: np.ndarray, max_error: float) -> np.ndarray:
@@ -91,9 +89,13 @@ def viewport_colors(errors: np.ndarray, max_error: float) -> np.ndarray:
     Returns:
         (V, 3) float32 sRGB, 0 to 1: blue without error, then cyan, green, yellow and red (`VIEWPORT_STOPS`).
     """
-    ratios = np.asarray(errors) / max_error
-    stops, colors = [stop for stop, _ in VIEWPORT_STOPS], np.array([color for _, color in VIEWPORT_STOPS])
-    return np.stack([np.interp(ratios, stops, colors[:, channel]) for channel in range(3)], axis=-1).astype(np.float32)
+    return _interpolate_colors(np.asarray(errors) / max_error, VIEWPORT_STOPS)
+
+
+def _interpolate_colors(values: np.ndarray, stops: tuple[tuple[float, tuple[float, float, float]], ...]) -> np.ndarray:
+    positions, colors = zip(*stops, strict=True)
+    channels = [np.interp(values, positions, channel) for channel in zip(*colors, strict=True)]
+    return np.stack(channels, axis=-1).astype(np.float32)
 
 
 def worst_poses(errors: np.ndarray, count: int, min_index_distance: int) -> list[int]:

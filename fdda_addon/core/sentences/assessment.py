@@ -38,14 +38,6 @@ LAST_EPOCHS = 5
 """Number of epochs whose mean is the last error; single epochs vary."""
 
 
-class HeldOutErrors(NamedTuple):
-    """Errors of a report, mm, with the names of `ErrorStatistics`."""
-
-    mean: float
-    p999: float
-    max: float
-
-
 @dataclass(frozen=True)
 class Assessment:
     """What errors mean.
@@ -87,7 +79,7 @@ def assess_training(report: Mapping) -> Assessment:
     Args:
         report: the content of `report.json`, as `core.formats.report.read_report` returns it.
     """
-    model, skinning = (_held_out_errors(report, method) for method in ("fdda", "linear"))
+    model, skinning = (ErrorStatistics.from_json(report[method]["held_out"]) for method in ("fdda", "linear"))
     parts = [
         PartErrors(p["joint"], p["held_out"]["mean"], p["linear"]["mean"], p["largest_errors"]["cause"])
         for p in report["partitions"]
@@ -111,8 +103,8 @@ def assess_training(report: Mapping) -> Assessment:
 
 
 def assess_evaluation(
-    model: "ErrorStatistics | HeldOutErrors",
-    skinning: "ErrorStatistics | HeldOutErrors",
+    model: ErrorStatistics,
+    skinning: ErrorStatistics,
     mesh_name: str,
     parts: Sequence[PartErrors] = (),
     recording_warnings: Sequence[Mapping] = (),
@@ -183,7 +175,7 @@ def _describe_part(part: PartErrors | None) -> str:
     )
 
 
-def describe_errors(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:
+def describe_errors(model: ErrorStatistics, skinning: ErrorStatistics) -> str:
     """Return a sentence that compares the errors of a model with those of skinning alone."""
     comparison = f"skinning alone {format_mm(skinning.mean)} mm"
     if model.mean > 0 and skinning.mean > model.mean:
@@ -255,12 +247,6 @@ def _last(errors: Sequence[float]) -> float:
     return sum(last) / len(last) if last else 0.0
 
 
-def _held_out_errors(report: Mapping, method: str) -> HeldOutErrors:
-    """Return the errors of a method, "fdda" or "linear", in unseen poses."""
-    values = report[method]["held_out"]
-    return HeldOutErrors(values["mean"], values["p999"], values["max"])
-
-
 def format_mm(value: float) -> str:
     """Return an error with the digits that matter: "0.024", "0.24", "2.4", "24"."""
     if value < 0.1:
@@ -270,7 +256,7 @@ def format_mm(value: float) -> str:
     return f"{value:.1f}" if value < 100 else f"{value:,.0f}"
 
 
-def _unimproved_tail(model: "ErrorStatistics | HeldOutErrors", skinning: "ErrorStatistics | HeldOutErrors") -> str:
+def _unimproved_tail(model: ErrorStatistics, skinning: ErrorStatistics) -> str:
     """Return a sentence without its end about largest errors that hardly beat skinning alone; empty if all beat it."""
     for label, name in (("99.9 % of the points are within", "p999"), ("The largest error is", "max")):
         model_mm, skinning_mm = getattr(model, name), getattr(skinning, name)
