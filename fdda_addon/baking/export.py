@@ -222,7 +222,6 @@ def _play_alembic(names: dict[bpy.types.Object, str], alembic: Path, stored: Pat
 
     Args:
         names: the meshes and their names in the file.
-        alembic: the file.
         stored: path that the file gets later. A saved .blend file stores it as a relative path.
         frames: the frames of the file.
     """

@@ -338,7 +338,6 @@ def rig_differences(
 
     Args:
         joints, rest_matrices, meshes: of the recording or model, as in `Rig`.
-        rig: the rig to compare.
 
     Returns:
         One clause per difference ("it has 1443 vertices, the mesh 1450"); empty when the rigs are the same.

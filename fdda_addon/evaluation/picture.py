@@ -91,7 +91,6 @@ def draw(
         rows: the cells, row by row.
         path: path of the file.
         title: a line of text above all cells.
-        view: the view direction.
         has_heat_scale: whether to add the color scale of the heat map at the bottom.
         is_sculpted: whether to light the meshes so that their shape shows best, instead of their colors.
     """

@@ -86,7 +86,6 @@ def draw_comparison(
         path: path of the PNG file.
         is_heat_map: whether to color each vertex by its distance from the rig.
         title: title of the picture; empty for a default.
-        view: the view direction.
         reference_label: label of the positions of the poses.
     """
     opened = open_model(scene_rig, model)

@@ -53,7 +53,6 @@ def evaluate_meshes(
     Args:
         rigs: the rigs of meshes of the model, on one armature.
         model: path of the model, or the loaded model.
-        settings: the poses to compare.
 
     Returns:
         The errors of each mesh, in the order of the rigs.

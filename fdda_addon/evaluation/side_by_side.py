@@ -45,7 +45,6 @@ def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> Non
     """Show the rig of a bound mesh object.
 
     Args:
-        mesh_object: the bound object.
         mode: `BESIDE`, `OVERLAY`, or `NONE` to hide the rig.
         distance: distance of `BESIDE` along the X axis of the world, Blender units; 0 for the default.
     """

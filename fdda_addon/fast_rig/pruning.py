@@ -50,7 +50,6 @@ def remove_drivers(
     Args:
         scene_rigs: the rigs of the models.
         graph_nodes: all nodes of the dependency graph.
-        kept: the kept nodes.
         straight: names of the bones whose segments are removed.
     """
     armature_object = scene_rigs[0].armature_object

@@ -50,7 +50,6 @@ def _bones_with_read_curves(
 
     Args:
         replaced: names of the modifiers that a model of the object replaces; None if it has no model.
-        kept: the kept nodes.
     """
     for modifier in scene_object.modifiers:
         if modifier.name not in (replaced or ()):

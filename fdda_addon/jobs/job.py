@@ -73,8 +73,6 @@ class JobRunner:
         """Register the job.
 
         Args:
-            state: of the job.
-            steps: the generator.
             finish: processes the result and returns the outcome. The text of an FDDAError is the outcome too.
             cancel_message: returns the outcome of a canceled job that has no result.
             ends_itself: whether `steps` checks `state.cancel_requested` and ends soon; if not, it is closed.

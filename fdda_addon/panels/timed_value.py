@@ -32,7 +32,6 @@ class TimedValues:
 
         Args:
             compute: returns the value. It is called outside of drawing, and not while a job changes the scene.
-            mesh_object: its argument.
             seconds: time between a `get` and the computation, and so the shortest time between two computations.
         """
         key, now = (compute, mesh_object.session_uid), time.monotonic()

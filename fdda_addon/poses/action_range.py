@@ -189,7 +189,6 @@ def computed_for_actions(
     Args:
         name: what is computed.
         datablocks: the armature object, and what else the value depends on.
-        actions: the actions.
         compute: returns the value.
     """
     bones, animation = datablocks[0].pose.bones, datablocks[0].animation_data

@@ -126,7 +126,6 @@ def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: fl
     Rotation constraint.
 
     Args:
-        bone: the pose bone.
         axis: 0, 1 or 2.
         low, high: radians.
 
@@ -171,7 +170,6 @@ def ensure_range_constraint(bone: bpy.types.PoseBone, constraint_type: str) -> b
     A new constraint becomes the first one of the bone, and gets the existing ranges.
 
     Args:
-        bone: the pose bone.
         constraint_type: "LIMIT_ROTATION", "LIMIT_LOCATION" or "LIMIT_SCALE".
     """
     existing_constraint = find_local_limit(bone, constraint_type)

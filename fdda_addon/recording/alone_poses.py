@@ -59,7 +59,6 @@ class JointOverride:
         """Prepare to read and set joints.
 
         Args:
-            scene_rig: the rig.
             joints: J joints, every parent before its children.
         """
         self._armature_object = scene_rig.armature_object
@@ -140,7 +139,6 @@ def override_joints(
     Clear the pose before (`armature.clear_pose`). The last pose that was set stays afterwards.
 
     Args:
-        scene_rig: the rig.
         joints: as for `JointOverride`.
         keep_other_bones: do not mute constraints and drivers of bones that are neither joints nor ancestors of joints.
     """
@@ -187,7 +185,6 @@ class AlonePosePlan:
         """Plan the poses.
 
         Args:
-            scene_rig, rig: the rig.
             channels: C channels.
             poses: (N, C) drawn poses.
             bases: number of base poses: the rest pose, then drawn poses.

@@ -42,7 +42,6 @@ class PosePlan:
         """Plan the poses.
 
         Args:
-            scene_rig: the rig.
             channels: channels of the random poses.
             settings: settings of the recording.
             clips: the clips whose frames follow the random poses.

@@ -60,7 +60,6 @@ def make_posed_action(
     controls; all else keeps its value in the file. The scene gets the frames of the action, without time stretching.
 
     Args:
-        scene_rig: the rig.
         settings: settings of the poses.
         info: the recording whose poses the settings give (`recorded_settings`); None for new poses.
 

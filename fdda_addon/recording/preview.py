@@ -30,7 +30,6 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
     suspends them.
 
     Args:
-        scene_rig: the rig.
         settings: settings of the recording.
         index: index of the random pose, from 0.
 
@@ -66,7 +65,6 @@ def show_rest_pose(scene_rig: SceneRig, settings: "RecordingSettings | None") ->
     """Set the rest pose, and the extra inputs of random poses to their defaults; inputs with drivers keep theirs.
 
     Args:
-        scene_rig: the rig.
         settings: settings of the recording; None to keep the extra inputs.
     """
     clear_pose(scene_rig.armature_object)

@@ -69,7 +69,6 @@ def check_recordable_rig(
     """Check a rig. While a model plays, the modifiers of the rig are off, so they are not checked.
 
     Args:
-        scene_rig: the rig.
         settings: settings of the recording.
         previous_check: the result of an earlier check, whose mesh is not read again: only modifiers, modes, ranges of
             motion and settings may have changed since.

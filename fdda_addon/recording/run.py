@@ -63,7 +63,6 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     The scene is restored when the generator ends, is closed, or raises.
 
     Args:
-        scene_rig: the rig.
         path: folder of the recording.
         settings: settings of the recording.
 

@@ -90,12 +90,7 @@ def read_b_bones(armature: bpy.types.Armature) -> dict:
 
 
 def b_bone_values(armature: bpy.types.Armature, bones: Iterable[bpy.types.Bone]) -> dict[str, tuple]:
-    """Read what `read_b_bones` reads, quickly and without rounding: a value for each of `_B_BONE_SETTINGS`.
-
-    Args:
-        armature: the armature.
-        bones: its bones to read.
-    """
+    """Read what `read_b_bones` reads, quickly and without rounding: a value for each of `_B_BONE_SETTINGS`."""
     # Rigify drives the easing: Blender writes the value of the current pose into the bone.
     animated: dict[str, set[str]] = {}
     for path in animated_paths(armature):

@@ -174,7 +174,6 @@ def read_dependencies(
     Numbers without a range are left out; a user can list them.
 
     Args:
-        scene_rig: the rig.
         actions: further actions that may be played.
         has_random_poses: random poses set the values of shape keys that have no driver. Without these, a value that no
             action keys never changes.

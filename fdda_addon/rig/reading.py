@@ -50,7 +50,6 @@ def choose_joints(
     deforming bones are children of other bones, each of which coincides with a deforming bone.
 
     Args:
-        scene_rig: the rig.
         weighted_bones: names of the bones that have weights, `STATIC_JOINT` among them; if there are no bones, all
             deforming bones.
         extra_joints: names of further joints; names that the armature lacks are ignored. If they include all joints,

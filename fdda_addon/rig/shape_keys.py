@@ -51,7 +51,6 @@ def find_unposed_keys(scene_rig: SceneRig, channels: Iterable[Channel]) -> set[s
     For example, a driver reads the location of a bone, and the channels only rotate the bone.
 
     Args:
-        scene_rig: the rig.
         channels: channels of random poses.
 
     Returns:
@@ -125,7 +124,6 @@ def muted_key_drivers(mesh_object: bpy.types.Object, paths: Container[str] | Non
     """Mute the drivers of values of shape keys, which keep their current values; restore drivers and values afterwards.
 
     Args:
-        mesh_object: the mesh object.
         paths: paths of the values; None for all.
     """
     shape_keys = mesh_object.data.shape_keys

@@ -24,7 +24,6 @@ def temporary_rig_state(
     In the block, time is not stretched, so frames of the scene are frames of the clips.
 
     Args:
-        scene_rig, rig: the rig.
         channels: the channels of the random poses that will be set.
         clips: the clips that the yielded player will show.
 

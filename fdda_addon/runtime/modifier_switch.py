@@ -41,7 +41,6 @@ def apply_visibility(mesh_object: bpy.types.Object, animated: frozenset[str]) ->
     """Set the mode from the visibility of the FDDA modifier, in case the user has changed it; hidden shows the rig.
 
     Args:
-        mesh_object: the bound object.
         animated: the result of `animated_settings`. Changes of these settings are not the user's.
     """
     binding, modifier = mesh_object.fdda, playback_modifier.find_modifier(mesh_object)

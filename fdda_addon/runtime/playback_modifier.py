@@ -105,7 +105,6 @@ def add_rest_position(mesh_object: bpy.types.Object, modifier: bpy.types.NodesMo
 
     Args:
         mesh_object: the bound object. If its mesh has this attribute of its own, Blender must not overwrite it.
-        modifier: its FDDA modifier.
         keep: whether the user has switched *Add Rest Position* on. Else the modifier removes the attribute again.
     """
     has_attribute = REST_POSITION in mesh_object.data.attributes

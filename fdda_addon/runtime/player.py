@@ -233,7 +233,6 @@ class Player:
         Args:
             inputs: the inputs for which the model was run.
             positions: (V, 3) float32, of all meshes, in the space of the model. They are not copied.
-            mesh_object: the evaluated object.
         """
         # After an exception nothing counts as shown, so the next evaluation tries again.
         self._shown, self.warning = None, inputs.warning

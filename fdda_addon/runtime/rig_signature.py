@@ -108,7 +108,6 @@ def check(scene_rig: SceneRig, network: Network, signature: dict[str, tuple]) ->
 
     Args:
         scene_rig: the rig. It is not checked while the user edits its mesh.
-        network: the model.
         signature: the signature of the rig.
 
     Raises:

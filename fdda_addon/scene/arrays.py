@@ -85,7 +85,6 @@ def write(collection: bpy.types.bpy_prop_collection, element: ElementProperty, v
 
     Args:
         collection: n elements.
-        element: the property to set.
         values: (n, *element.shape) of element.dtype, contiguous.
 
     Raises:
@@ -108,7 +107,6 @@ class PropertyReader:
         """Prepare to read a property.
 
         Args:
-            element: the property.
             values: the array to read into, (n, *element.shape) of element.dtype, contiguous.
 
         Raises:

@@ -90,7 +90,6 @@ def make_control(
     """Make a control of a rig.
 
     Args:
-        scene_rig: the rig.
         owner, path: as in `Control`.
         bounds: the range of the control; None for the range of its property.
         sampled_ranges: ranges of the numbers that random poses set, by the names of their controls. They take
@@ -119,7 +118,6 @@ def parse_controls(
     """Parse controls as a user lists them.
 
     Args:
-        scene_rig: the rig.
         texts: each is OWNER/PATH or the name of a shape key, with an optional =LOW:HIGH that overrides the range of the
             property.
         sampled_ranges: as for `make_control`.

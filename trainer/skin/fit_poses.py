@@ -78,7 +78,6 @@ def read_fit_poses(recording: Recording, has_key_joints: bool, vertices: np.ndar
     """Read the poses of a fit. Refined poses are none of them, so a recording that grows has the same fit.
 
     Args:
-        recording: the recording.
         has_key_joints: key joints are chosen, which takes random poses.
         vertices: (v,) indices of the vertices that are read; None for all.
 

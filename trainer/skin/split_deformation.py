@@ -34,7 +34,6 @@ def split_deformation(recording: Recording, config: TrainingConfig, sink: Messag
     """Split the deformation of a recording, with the settings `base_skinning`, `bones_to_read` and those of partitions.
 
     Args:
-        recording: the recording.
         config: settings of the training.
         sink: receives the progress and the results of the fit.
 

@@ -69,7 +69,6 @@ def merges_sentence(recording: SkinnedRecording, min_vertices: int) -> str:
     """Describe the merged partitions: "1 partition of fewer than 8 vertices is merged: …"; empty where none are merged.
 
     Args:
-        recording: the recording.
         min_vertices: smallest number of vertices of a partition in the settings of the training.
     """
     names = [joint_name(recording.rig, joint) for joint in range(len(recording.rig.joints))]

@@ -23,7 +23,6 @@ def open_input(path: Path, mode: str = "rb", follow_links: bool = True) -> Binar
     """Open a regular file.
 
     Args:
-        path: the file.
         mode: as for `open`; "x+b" creates a file that must not exist.
         follow_links: whether the path may be a symbolic link; pass False for files in untrusted folders.
 

@@ -84,7 +84,6 @@ def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
     """Check before a long job that files can be written into a folder, which may not exist yet.
 
     Args:
-        path: the folder.
         names: names of the files to write, relative to the folder.
 
     Raises:

@@ -123,7 +123,6 @@ def joints_with_indices(rig: Rig, indices: Iterable[int]) -> tuple[Joint, ...]:
     """Return some joints of a rig; the parent of each is its nearest ancestor among them.
 
     Args:
-        rig: the rig.
         indices: ascending indices of the joints.
     """
     new_indices = {joint: index for index, joint in enumerate(indices)}

@@ -76,7 +76,6 @@ def open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:
     """Memory-map an array after its header and size are checked against the index.
 
     Args:
-        path: the file.
         shape, dtype: expected shape and dtype; arrays in `STREAMED_ARRAY_NAMES` may have more rows.
 
     Raises:
@@ -161,7 +160,6 @@ def check_pose_values(
     """Check arrays of poses with `find_invalid_pose`.
 
     Args:
-        arrays: the arrays by name.
         first_pose: index of the first pose of the arrays.
         joint_names: names of the joints.
         alone_poses: indices of the poses in which one input moves alone.

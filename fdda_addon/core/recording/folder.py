@@ -32,7 +32,6 @@ def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
     """Check before a long job that a recording can be started or resumed.
 
     Args:
-        path: the folder.
         resume: continue the recording in the folder.
         overwrite: replace the recording in the folder.
 

@@ -115,7 +115,6 @@ class Repeatability:
         """Read a repeatability from a file; raise ValueError, TypeError or KeyError where it is damaged.
 
         Args:
-            value: the JSON.
             poses: number of poses of the recording.
         """
         repeatability = Repeatability(

@@ -94,7 +94,6 @@ class SkinnedRecording:
         """Compute the local residuals of one partition, a block of poses at a time.
 
         Args:
-            partition: the partition.
             poses: (n,) indices of poses; None for all.
             vertices: (v,) indices of some of its vertices; None for all.
 

@@ -289,7 +289,6 @@ class RecordingExtension(RecordingWriter):
         """Open the files of a recording.
 
         Args:
-            recording: a complete recording.
             poses: number of poses to append.
             model_name: file name of the model that the poses refine.
             added_count: number of poses at the end of the recording that were already added for this model.
