@@ -14,14 +14,13 @@ from ..scene.scene_rig import remaining_rig_note
 from .rig_operator import ModelFileOperator, RigOperator
 
 
-def _has_models(mesh_object: bpy.types.Object) -> bool:
-    return bool(mesh_object.fdda.models) or mesh_object.fdda.is_bound
-
-
 class ModelListOperator(RigOperator):
     """Mixin for an operator on one model of the Model Library."""
 
-    needs = (_has_models, "The model library is empty; train a model, or add a file")
+    needs = (
+        lambda mesh_object: bool(mesh_object.fdda.models) or mesh_object.fdda.is_bound,
+        "The model library is empty; train a model, or add a file",
+    )
 
     index: bpy.props.IntProperty(
         name="Index",

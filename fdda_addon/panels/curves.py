@@ -85,9 +85,20 @@ def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
     def to_row(log: "np.ndarray | float") -> "np.ndarray | float":
         return (log - log_min) / (log_max - log_min) * (height - 1)
 
-    _paint_grid(
-        pixels, {error: round(to_row(float(np.log10(error)))) for error in _tick_errors(10**log_min, 10**log_max)}
-    )
+    low, high = 10**log_min, 10**log_max
+    decades = range(math.floor(log_min), math.ceil(log_max) + 1)
+    ticks = [tick * 10.0**decade for decade in decades for tick in TICK_STEPS if low <= tick * 10.0**decade <= high]
+    powers_of_ten = [tick for tick in ticks if round(math.log10(tick), 6) % 1 == 0]
+    min_bottom = -1
+    for error in sorted(powers_of_ten if len(powers_of_ten) > 2 else ticks):
+        row = round(to_row(float(np.log10(error))))
+        pixels[MARGIN_BOTTOM + row, MARGIN_LEFT:] = GRID_COLOR
+        bottom = max(0, min(MARGIN_BOTTOM + row - 4, HEIGHT - 9))
+        # Leave out a number that would touch the number below it.
+        if bottom > min_bottom:
+            text = f"{error:.10f}".rstrip("0").rstrip(".")
+            _paint_number(pixels, text, max(0, MARGIN_LEFT - 4 - 8 * len(text)), bottom)
+            min_bottom = bottom + 11
     count = len(log_errors["training"])
     _paint_number(pixels, "1", MARGIN_LEFT, 3)
     _paint_number(pixels, str(count), WIDTH - 8 * len(str(count)), 3)
@@ -104,26 +115,6 @@ def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
         coverage = np.clip(np.minimum(rows - bottom, top - rows) + 0.5, 0, 1)[..., None]
         plot_pixels[..., :3] += coverage * (np.float32(color) - plot_pixels[..., :3])
     return pixels
-
-
-def _tick_errors(low: float, high: float) -> list[float]:
-    """Return the errors between `low` and `high` that get a grid line, mm."""
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks = [tick * 10.0**decade for decade in decades for tick in TICK_STEPS if low <= tick * 10.0**decade <= high]
-    powers_of_ten = [tick for tick in ticks if round(math.log10(tick), 6) % 1 == 0]
-    return powers_of_ten if len(powers_of_ten) > 2 else ticks
-
-
-def _paint_grid(pixels: "np.ndarray", tick_rows: dict[float, int]) -> None:
-    """Paint a grid line and a number for each error. Leave out a number that would touch the number below it."""
-    min_bottom = -1
-    for error, row in sorted(tick_rows.items()):
-        pixels[MARGIN_BOTTOM + row, MARGIN_LEFT:] = GRID_COLOR
-        bottom = max(0, min(MARGIN_BOTTOM + row - 4, HEIGHT - 9))
-        if bottom > min_bottom:
-            text = f"{error:.10f}".rstrip("0").rstrip(".")
-            _paint_number(pixels, text, max(0, MARGIN_LEFT - 4 - 8 * len(text)), bottom)
-            min_bottom = bottom + 11
 
 
 def _paint_number(pixels: "np.ndarray", text: str, left: int, bottom: int) -> None:

@@ -9,7 +9,6 @@ from ..jobs import job
 from ..scene.scene_rig import SceneRig
 from ..timing import measurements
 from ..timing.benchmark import BONES, FDDA, FLOOR, INFERENCE, LINEAR, RIG, WITHOUT_MESHES, Benchmark
-from ..timing.frame_profile import FrameProfile
 from .section import draw_job, draw_wrapped
 
 MIN_SHOWN_SHARE = 0.01
@@ -92,7 +91,11 @@ def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         for index, (part, share) in enumerate(shown):
             letter, percentage = letters[index : index + 1], f"{share:.0%}" if share >= 0.01 else "<1%"
             draw_wrapped(column, context, f"{letter}  {percentage}  {part.duration} ms  {part.title}")
-        _draw_groups(body, context, profile)
+        if profile.groups:
+            column = body.column(align=True)
+            column.label(text="Slowest Constraints and Drivers")
+            for group in profile.groups:
+                draw_wrapped(column, context, f"{group.duration.median:.2f} ms  {group.title}", "BONE_DATA")
         for sentence in profile.savings_sentences():
             draw_wrapped(body, context, sentence, "INFO")
     if state is None or not state.is_running:
@@ -109,12 +112,3 @@ def _draw_bar(layout: bpy.types.UILayout, segments: list[tuple[str, float]]) -> 
         if not is_last:
             rest = cell.row(align=True)
         remaining -= share
-
-
-def _draw_groups(layout: bpy.types.UILayout, context: bpy.types.Context, profile: "FrameProfile") -> None:
-    if not profile.groups:
-        return
-    column = layout.column(align=True)
-    column.label(text="Slowest Constraints and Drivers")
-    for group in profile.groups:
-        draw_wrapped(column, context, f"{group.duration.median:.2f} ms  {group.title}", "BONE_DATA")

@@ -9,7 +9,6 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, RecordingError, RigError
-from ..core.mathematics.poses import Channel
 from ..core.recording.estimate import format_poses
 from ..core.recording.folder import FolderContent, FolderState, read_folder
 from ..core.recording.index import INDEX_NAME
@@ -20,7 +19,6 @@ from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder
 from ..properties.recording_options import recorded_actions, recording_settings
 from ..recording.plan import (
-    RecordingSettings,
     find_recorded_character,
     keep_recorded_poses,
     make_sampling,
@@ -64,15 +62,12 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
             character, planned, recorded_rig, channels = rig, settings, check.rig, check.channels
         except RigError as error:
             return replace(read_folder(path), state=FolderState.OTHER, sentence=str(error))
-        return read_folder(path, recorded_rig, _current_sampling(character, planned, channels))
+        # Converted to JSON and back, so that it equals the one of a recording.
+        sampling = json.loads(json.dumps(make_sampling(character, planned, channels).to_json()))
+        return read_folder(path, recorded_rig, sampling)
 
     name = ("recording folder", rig.mesh_object.session_uid)
     return computed_once(name, (path, modified_ns, check, settings), read)
-
-
-def _current_sampling(rig: SceneRig, settings: "RecordingSettings", channels: tuple[Channel, ...]) -> dict:
-    """Return the sampling of the settings, converted to JSON and back, so that it equals the one of a recording."""
-    return json.loads(json.dumps(make_sampling(rig, settings, channels).to_json()))
 
 
 class FDDA_PT_recording(Section, bpy.types.Panel):
@@ -105,7 +100,15 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
         draw_job(layout, context, "record", ("ERROR",))
         draw_job(layout, context, "export_skinning")
         if (advanced := draw_advanced(layout, "fdda_recording_advanced")) is not None:
-            _draw_settings(advanced, context, rig.mesh_object.fdda.settings)
+            settings = rig.mesh_object.fdda.settings
+            # The label is above the field, because a narrow sidebar would cut it off beside the field.
+            field = advanced.column(align=True)
+            field.use_property_split = False
+            field.label(text=settings.bl_rna.properties["learn_from"].name)
+            field.prop_search(settings, "learn_from", context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
+            if settings.learn_from:
+                advanced.prop(settings, "pre_roll")
+                advanced.prop(settings, "settle_frames")
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
@@ -147,17 +150,6 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         layout.operator("fdda.export_skinning", text="Export Skinning…", icon="EXPORT").object = rig.mesh_object.name
     if content.is_recording:
         layout.operator("fdda.delete_recording", text="Delete Recording…", icon="TRASH").object = rig.mesh_object.name
-
-
-def _draw_settings(column: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
-    # The label is above the field, because a narrow sidebar would cut it off beside the field.
-    field = column.column(align=True)
-    field.use_property_split = False
-    field.label(text=settings.bl_rna.properties["learn_from"].name)
-    field.prop_search(settings, "learn_from", context.scene, "objects", text="", icon="OUTLINER_OB_MESH")
-    if settings.learn_from:
-        column.prop(settings, "pre_roll")
-        column.prop(settings, "settle_frames")
 
 
 def _draw_record(
