@@ -19,10 +19,15 @@ from ..core.progress import Job, Progress
 from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable
-from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest, make_pose_setter
+from ..rig.pose_setter import (
+    DIRECT_POSE_SETTER,
+    PoseSetter,
+    blend_from_rest,
+    make_pose_setter,
+    temporary_rig_state,
+)
 from ..rig.reading import PoseEvaluator
 from ..rig.shape_keys import set_keys_undriven
-from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model

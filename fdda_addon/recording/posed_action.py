@@ -14,7 +14,7 @@ from ..core.recording.index import ACTION, MIRRORED, RANDOM, STRIP, RecordingInf
 from ..poses.clip import find_clips
 from ..poses.clip_player import ClipPlayer
 from ..poses.remix import REMIX
-from ..rig.temporary_rig_state import temporary_rig_state
+from ..rig.pose_setter import temporary_rig_state
 from ..scene.animated_values import read_value
 from ..scene.armature import clear_pose, pose_values
 from ..scene.arrays import KEY_INTERPOLATION_ELEMENT, KEY_POSITION_ELEMENT, POSE_CHANNELS, write

@@ -22,9 +22,9 @@ from ..core.rig import rig_differences
 from ..core.settings import REFINEMENT_POSES, SPREAD
 from ..poses.sampling import model_channels, rig_allows_ranges
 from ..rig.modifier_stack import check_evaluable
+from ..rig.pose_setter import temporary_rig_state
 from ..rig.reading import PoseEvaluator, read_rig
 from ..rig.shape_keys import set_keys_undriven
-from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model

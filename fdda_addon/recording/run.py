@@ -24,9 +24,8 @@ from ..poses.clip_player import ClipPlayer
 from ..rig.deformation import describe_bones
 from ..rig.dependencies import deforming_mesh_objects, read_dependencies
 from ..rig.modifier_stack import check_evaluable, read_stack
-from ..rig.pose_setter import make_pose_setter
+from ..rig.pose_setter import make_pose_setter, temporary_rig_state
 from ..rig.reading import PoseEvaluator
-from ..rig.temporary_rig_state import temporary_rig_state
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig, check_full_rig
 from .alone_poses import plan_alone_poses
@@ -48,8 +47,7 @@ from .plan import (
     read_sample_selection,
     read_sampled_rig,
 )
-from .pose_plan import PosePlan
-from .reference_joints import find_fixed_joints, find_references
+from .pose_plan import PosePlan, find_fixed_joints, find_references
 
 MISSING_WEIGHTS = (
     "'{}' has no skin weights on deforming bones, so its training needs fitted ones: --base-skinning smooth, or Base "

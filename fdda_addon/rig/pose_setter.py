@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sets poses of a rig, or of a target, which may be simulated.
+"""Prepares a rig for posing, and sets poses of it, or of a target, which may be simulated.
 
 A simulation gets a pre-roll before actions, and random poses are held until it is at rest.
 """
 
 import time
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 
 import bpy
@@ -14,14 +14,19 @@ import numpy as np
 
 from ..core.controls import Control
 from ..core.errors import RigError
-from ..core.mathematics.poses import Channel
+from ..core.mathematics.poses import CONTROL, Channel
 from ..core.recording.index import FRAMES, SIMULATION, RecordedTarget
+from ..core.rig import Rig
 from ..core.settings import LEARN_FROM, PRE_ROLL, REPEATABILITY_POSES, REST_THRESHOLD_MM, SETTLE_FRAMES
 from ..poses.clip import Clip
-from ..poses.clip_player import ClipPlayer
+from ..poses.clip_player import ClipPlayer, clip_player
 from ..scene.arrays import POSE_CHANNELS, write
+from ..scene.comparison import hidden_comparison_objects
+from ..scene.controls import temporary_controls
 from ..scene.scene_rig import SceneRig
+from ..scene.time_stretching import unstretched_time
 from ..scene.unit import metres_per_unit
+from .modifier_stack import downstream_disabled
 from .target import Target, check_clips, find_target, temporary_frame_range
 
 PoseFunction = Callable[[float], None]
@@ -286,3 +291,35 @@ def make_pose_setter(
         )
     check_clips(target, clips, settings.pre_roll)
     return PoseSetter(target, settings)
+
+
+@contextmanager
+def temporary_rig_state(
+    scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...] = (), clips: tuple[Clip, ...] = ()
+) -> Iterator[ClipPlayer]:
+    """Set a rig to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
+
+    In the block, time is not stretched, so frames of the scene are frames of the clips.
+
+    Args:
+        channels: the channels of the random poses that will be set.
+        clips: the clips that the yielded player will show.
+
+    Yields:
+        The player of the clips.
+    """
+    names = control_names(rig, channels)
+    with ExitStack() as stack:
+        player = stack.enter_context(clip_player([(scene_rig, names)], clips))
+        stack.enter_context(hidden_comparison_objects())
+        for mesh_object in scene_rig.mesh_objects:
+            stack.enter_context(downstream_disabled(mesh_object))
+        stack.enter_context(unstretched_time())
+        stack.enter_context(temporary_controls(scene_rig, names))
+        yield player
+
+
+def control_names(rig: Rig, channels: tuple[Channel, ...]) -> list[str]:
+    """Return the names of the controls of a rig, and of further controls that random poses set."""
+    sampled_controls = [channel.name for channel in channels if channel.kind == CONTROL]
+    return list(dict.fromkeys([*(control.name for control in rig.controls), *sampled_controls]))

@@ -20,8 +20,8 @@ from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, MeshPart, Rig
 from trainer.config import TrainingConfig
-from trainer.skin.choice import choose_key_joints
 from trainer.skin.fit_poses import FitPoses
+from trainer.skin.key_joints import choose_key_joints
 from trainer.skin.split_deformation import split_deformation
 
 from ..recordings import alone_arrays, with_influences

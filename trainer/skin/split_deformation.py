@@ -22,8 +22,8 @@ from fdda_addon.core.wording import format_with_noun
 
 from ..config import TrainingConfig
 from ..progress import MessageSink
-from .choice import choose_key_joints
 from .fit_poses import FitPoses, read_fit_poses
+from .key_joints import choose_key_joints
 from .solver import fit_skin
 
 REFERENCE_POSES = 48
