@@ -224,18 +224,14 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     """
     modifiers = [m for m in mesh_object.modifiers if not is_fdda_modifier(m)]
     effects = [effect_of(m) for m in modifiers]
-    unknown_indices = [i for i, m in enumerate(modifiers) if effects[i] is ModifierEffect.UNKNOWN and m.show_viewport]
-    generating_modifiers = [
-        m
-        for m, effect in zip(modifiers, effects, strict=True)
-        if effect in {ModifierEffect.GENERATES, ModifierEffect.UNKNOWN}
-    ]
-    for i in unknown_indices:
-        with _modifiers_disabled(mesh_object, [m for m in generating_modifiers if m != modifiers[i]]):
-            effects[i] = ModifierEffect.DEFORMS if _keeps_topology(mesh_object) else ModifierEffect.GENERATES
-    deforming_indices = [
-        i for i, effect in enumerate(effects) if effect in {ModifierEffect.DEFORMS, ModifierEffect.UNKNOWN}
-    ]
+    generating = {ModifierEffect.GENERATES, ModifierEffect.UNKNOWN}
+    generating_modifiers = [m for m, effect in zip(modifiers, effects, strict=True) if effect in generating]
+    for i, modifier in enumerate(modifiers):
+        if effects[i] is ModifierEffect.UNKNOWN and modifier.show_viewport:
+            with _modifiers_disabled(mesh_object, [m for m in generating_modifiers if m != modifier]):
+                effects[i] = ModifierEffect.DEFORMS if _keeps_topology(mesh_object) else ModifierEffect.GENERATES
+    deforming = {ModifierEffect.DEFORMS, ModifierEffect.UNKNOWN}
+    deforming_indices = [i for i, effect in enumerate(effects) if effect in deforming]
     original_mesh_modifier_indices = [i for i, m in enumerate(modifiers) if m.type in ORIGINAL_MESH_TYPES]
     # If all deforming modifiers are off, all of them count, because the user may switch them on later.
     effective_indices = [i for i in deforming_indices if modifiers[i].show_viewport] or deforming_indices
