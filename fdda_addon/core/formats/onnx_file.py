@@ -10,8 +10,8 @@ graph whose values would fill the memory too. ONNX Runtime itself checks whether
 import hashlib
 import math
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,10 +37,8 @@ REFUSED_FIELD_LABELS = {
     ("ModelProto", 25): "functions of its own",
     ("GraphProto", 15): "sparse tensors",
     ("AttributeProto", 5): "tensors inside of nodes",
-    ("AttributeProto", 6): "graphs inside of nodes",
-    ("AttributeProto", 11): "graphs inside of nodes",
-    ("TensorProto", 13): "data in other files",
-    ("TensorProto", 14): "data in other files",
+    **dict.fromkeys((("AttributeProto", 6), ("AttributeProto", 11)), "graphs inside of nodes"),
+    **dict.fromkeys((("TensorProto", 13), ("TensorProto", 14)), "data in other files"),
 }
 ITEM_BYTES = {1: 4, 5: 2, 6: 4, 7: 8}
 """Bytes per element, by the number of the ONNX data type: float, int16, int32, int64."""
@@ -56,8 +54,7 @@ FREE_ELEMENTS = 1 << 20
 What depends on constants alone may have three times as many, because compact constants go through three nodes."""
 
 
-@dataclass(frozen=True)
-class OnnxConstant:
+class OnnxConstant(NamedTuple):
     """A constant of a graph: its ONNX data type, shape and bytes."""
 
     type: int
@@ -65,8 +62,7 @@ class OnnxConstant:
     data: memoryview
 
 
-@dataclass(frozen=True)
-class OnnxNode:
+class OnnxNode(NamedTuple):
     """A node of a graph. Attributes are integers or lists of integers; other numbers are None."""
 
     operator: str
@@ -82,9 +78,6 @@ class OnnxContents:
     Attributes:
         size: size of the file in bytes.
         inputs, outputs: shapes by name; a dimension is an int, or a str where it is dynamic.
-        metadata: the metadata properties.
-        nodes: nodes of the graph, in their order.
-        constants: constants of the graph, by name.
         checksum: SHA-256 of the graph, hexadecimal.
     """
 
@@ -135,21 +128,10 @@ def _read_fields(message: str, data: memoryview) -> defaultdict[int, list]:
 
     A value of fixed width is None, because only the float of an attribute has one.
     """
-    fields = defaultdict(list)
-    for number, value in _iterate_fields(data):
-        if number not in ALLOWED_FIELDS[message]:
-            label = REFUSED_FIELD_LABELS.get((message, number), f"a {message} with the field {number}")
-            is_onnx = message != "ModelProto" or (message, number) in REFUSED_FIELD_LABELS
-            raise ValueError(f"it has {label}, which train does not write" if is_onnx else "it is not an ONNX file")
-        fields[number].append(value)
-    return fields
-
-
-def _iterate_fields(data: memoryview) -> Iterator[tuple[int, memoryview | int | None]]:
-    position, end = 0, len(data)
-    while position < end:
+    fields, position = defaultdict(list), 0
+    while position < len(data):
         key, position = _read_varint(data, position)
-        wire_type, value = key & 7, None
+        wire_type, number, value = key & 7, key >> 3, None
         if wire_type == 0:
             value, position = _read_varint(data, position)
         elif wire_type in (1, 5):
@@ -158,9 +140,14 @@ def _iterate_fields(data: memoryview) -> Iterator[tuple[int, memoryview | int | 
             size, position = _read_varint(data, position)
             value, position = data[position : position + size], position + size
         # Other readers truncate a longer key to 32 bits. They would find a field that this reader does not.
-        if wire_type in (3, 4, 6, 7) or position > end or key >> 32:
+        if wire_type in (3, 4, 6, 7) or position > len(data) or key >> 32:
             raise ValueError("it is not an ONNX file")
-        yield key >> 3, value
+        if number not in ALLOWED_FIELDS[message]:
+            label = REFUSED_FIELD_LABELS.get((message, number), f"a {message} with the field {number}")
+            is_onnx = message != "ModelProto" or (message, number) in REFUSED_FIELD_LABELS
+            raise ValueError(f"it has {label}, which train does not write" if is_onnx else "it is not an ONNX file")
+        fields[number].append(value)
+    return fields
 
 
 def _read_varint(data: memoryview, position: int) -> tuple[int, int]:
