@@ -17,7 +17,7 @@ from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import SceneRig
 
-from ..conftest import run, train
+from ..conftest import evaluated_positions, run, train
 from ..figure import ARM_REACH, FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key_channel
 from ..refusals import file_contents
 from ..scene_state import assert_same_state, drain, scene_state
@@ -44,18 +44,12 @@ def positions_of(recording: Recording) -> np.ndarray:
     return np.delete(recording.positions, recording.info.alone_poses, axis=0)
 
 
-def evaluated_positions(rig: SceneRig) -> np.ndarray:
-    """Return the positions (V, 3) of the evaluated mesh."""
-    mesh_object = rig.mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    return np.array([vertex.co[:] for vertex in mesh_object.data.vertices], np.float32)
-
-
 def positions_in_frames(rig: SceneRig, frames) -> np.ndarray:
     """Return the positions (F, V, 3) of the rig in frames of its own animation."""
     positions_by_frame = []
     for frame in frames:
         bpy.context.scene.frame_set(frame)
-        positions_by_frame.append(evaluated_positions(rig))
+        positions_by_frame.append(evaluated_positions(rig.mesh_object))
     return np.array(positions_by_frame)
 
 
