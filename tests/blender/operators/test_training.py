@@ -16,6 +16,7 @@ from fdda_addon.properties.character import model_file
 from fdda_addon.runtime.model_files import model_path
 from fdda_addon.scene.scene_rig import SceneRig
 
+from .. import conftest
 from ..drawing import texts_of
 from ..panels.test_panel_drawing import draw_section
 from ..scene_state import assert_same_state, scene_state
@@ -84,7 +85,7 @@ def test_refining_adds_poses_and_training_continues_from_the_checkpoint(saved, e
     assert bpy.ops.fdda.record() == {"FINISHED"}
     with pytest.raises(RuntimeError, match="There is no checkpoint"):
         bpy.ops.fdda.train(warm_start=True)
-    assert bpy.ops.fdda.train() == {"FINISHED"}
+    conftest.train(recorded_folder(tmp_path), model_file(saved.mesh_object), "--passes", 2)
     before = scene_state(saved)
     assert bpy.ops.fdda.refine(poses=6) == {"FINISHED"}
     assert job.state_of("refine").outcome == "Added 6 poses to 'elbow_recording'; press Continue Training."
