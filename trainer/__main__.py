@@ -22,6 +22,7 @@ if __name__ == "__main__":
     exit_on_stop_signal()
 
 from .config import add_options, config_from_arguments
+from .outputs import check_training_outputs
 from .process import StopRequest, missing_package_error, run_with_messages
 from .progress import JsonMessageSink, MessageSink, TextMessageSink
 
@@ -41,7 +42,7 @@ def _train(options: argparse.Namespace, sink: MessageSink, stop_request: StopReq
     try:
         from fdda_addon.core.recording.folder import recordings_in
 
-        from .batch import check_batch, check_training_outputs, train_models
+        from .batch import check_batch, train_models
 
         # Files are checked first, because loading torch takes seconds.
         if recordings := recordings_in(options.recording):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The files that trainings write; trainings on several recordings, one model for each, one after the other."""
+"""Training on several recordings: one model for each recording, trained one after the other."""
 
 import time
 from collections.abc import Callable
@@ -7,29 +7,13 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.files.file_kind import CHECKPOINT, MODEL, PAGE, REPORT
-from fdda_addon.core.files.output import check_folder_writable, check_outputs
+from fdda_addon.core.files.output import check_folder_writable
 from fdda_addon.core.formats.messages import MessageType
-from fdda_addon.core.formats.report import checkpoint_path, page_path, report_path
 from fdda_addon.core.recording.reader import open_recording
 
 from .config import TrainingConfig
+from .outputs import check_training_outputs, training_outputs
 from .progress import MessageSink
-
-
-def training_outputs(model: Path) -> tuple[Path, Path, Path, Path]:
-    """Return the paths of the model, its checkpoint, and its report as JSON and as a page."""
-    return model, checkpoint_path(model), report_path(model), page_path(model)
-
-
-def check_training_outputs(model: Path, overwrite: bool) -> None:
-    """Check before a training that its files can be written.
-
-    Args:
-        model: path of the model file.
-        overwrite: as in `core.files.output.check_outputs`.
-    """
-    check_outputs(zip(training_outputs(model), (MODEL, CHECKPOINT, REPORT, PAGE), strict=True), overwrite=overwrite)
 
 
 def check_batch(recordings: list[Path], folder: Path, overwrite: bool = False) -> None:

@@ -23,7 +23,6 @@ from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 from fdda_addon.core.settings import automatic_passes
 
-from .batch import training_outputs
 from .compression import drop_components, dropped_components_sentence, factorize_partition
 from .config import TrainingConfig
 from .data.split import Split, holdout_fingerprint, split_recording
@@ -38,6 +37,7 @@ from .networks.checkpoint import Checkpoint, write_checkpoint
 from .networks.loop import train
 from .networks.networks import TrainedPartition
 from .networks.warm_start import checkpoint_parts, initial_networks, read_initial_checkpoint, warm_start_config
+from .outputs import training_outputs
 from .preparation import PartitionData, choose_details, make_parts, partition_data, prepare_partitions
 from .progress import MessageSink
 from .report.contents import make_report
