@@ -58,8 +58,7 @@ def _find(rig: SceneRig, check: RigCheck) -> list[Finding]:
         text = f"{count:,} of {check.rig.vertex_count:,} vertices lie on others along cuts, which come apart."
         findings.append(Finding(text, "fdda.merge_vertices"))
     names = unlimited_bones(rig.armature_object, check.rig)
-    controlled_count = limits.count_controlled_bones(rig)
-    if 2 * controlled_count > len(joint_names):
+    if controlled_count := limits.count_controlled_bones(rig):
         text = f"{controlled_count:,} of {len(joint_names):,} deforming bones follow control bones. "
         findings.append(Finding(f"{text}Check actions that move these, or choose them as Bones to Pose."))
     elif (

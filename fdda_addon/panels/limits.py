@@ -94,13 +94,15 @@ def lacks_limits(rig: SceneRig) -> bool:
 
 
 def count_controlled_bones(rig: SceneRig) -> int:
-    """Count the deforming bones that random poses cannot move, because constraints do; 0 if others are chosen."""
+    """Count the deforming bones that constraints move, not random poses; 0 if they are few, or others are chosen."""
     check, bones = checks.last_check(rig), rig.armature_object.pose.bones
     if check is None or check.rig is None or bones_to_pose(rig) != "WEIGHTS":
         return 0
 
     def count() -> int:
-        return sum(is_moved_by_constraints(bones[name]) for name in check.rig.joint_names if name in bones)
+        names = check.rig.joint_names
+        controlled = sum(is_moved_by_constraints(bones[name]) for name in names if name in bones)
+        return controlled if 2 * controlled > len(names) else 0
 
     return computed_once(("controlled bones", rig.mesh_object.session_uid), (check,), count)
 
