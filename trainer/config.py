@@ -5,17 +5,18 @@ import argparse
 from dataclasses import asdict, dataclass
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.joint_option import ALL, parse_joints
 from fdda_addon.core.mathematics.partition import INFLUENCE_TOLERANCE
 from fdda_addon.core.mathematics.skin_fit import FIT_KINDS
 from fdda_addon.core.settings import (
     ABOVE_ZERO,
+    ALL,
     DETAIL_MM,
     GOAL_MM,
     MIN_VERTICES_PER_PART,
     PASSES,
     TRAINING_SEED,
     Setting,
+    parse_joints,
     settings_of,
 )
 

@@ -13,13 +13,14 @@ from ..core.progress import Progress
 from ..core.recording.estimate import format_poses
 from ..core.recording.index import read_index, read_info
 from ..core.wording import format_count
-from ..recording.plan import RecordingSettings, find_recorded_character
+from ..poses.control_bones import describe_control_bones, split_control_bones
+from ..poses.remix import describe_bones
+from ..recording.plan import RecordingSettings, find_actions, find_recorded_character, listed_controls
 from ..recording.refinement import RefinementSettings, refine
 from ..recording.run import record
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, find_character, find_whole_character
 from .files import open_file
-from .pose_notes import print_bones_to_pose, print_control_bones
 from .progress import ProgressPrinter
 from .record_options import add_record_options, check_options
 from .target import pose_settings, target_settings
@@ -34,8 +35,8 @@ def run(options: argparse.Namespace) -> None:
     open_file(options.rig)
     scene_rig = _find_rig(options)
     if not options.refine:
-        print_control_bones(scene_rig, options)
-        print_bones_to_pose(scene_rig, options)
+        _print_control_bones(scene_rig, options)
+        _print_bones_to_pose(scene_rig, options)
     start = time.monotonic()
     with ProgressPrinter() as progress, model_disabled(*scene_rig.mesh_objects):
         for step in _make_job(scene_rig, options):
@@ -81,3 +82,17 @@ def _make_job(scene_rig: SceneRig, options: argparse.Namespace) -> Iterator[Prog
         **pose_settings(options, scene_rig),
     )
     return record(scene_rig, options.recording, settings)
+
+
+def _print_control_bones(scene_rig: SceneRig, options: argparse.Namespace) -> None:
+    """Print how many inputs the control bones are, and which locations and custom properties have no range."""
+    names, _ = split_control_bones(scene_rig, options.extra_input)
+    if names:
+        settings = RecordingSettings(**pose_settings(options, scene_rig))
+        print(describe_control_bones(scene_rig.armature_object, names, listed_controls(scene_rig, settings)))
+
+
+def _print_bones_to_pose(scene_rig: SceneRig, options: argparse.Namespace) -> None:
+    """Print what random poses move if no option chooses it."""
+    if not options.bones_to_pose and options.poses != 0:
+        print(describe_bones(scene_rig, find_actions(RecordingSettings(actions=tuple(options.action)))))

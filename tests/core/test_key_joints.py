@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdda_addon.core.joint_option import parse_joints
 from fdda_addon.core.mathematics.key_joints import KeyJointReport, select_joints
 from fdda_addon.core.mathematics.skin_fit import FitReport
 from fdda_addon.core.rig import Fingerprint, Joint, MeshPart, Rig, rig_differences
+from fdda_addon.core.settings import parse_joints
 
 REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
 ERRORS = FitReport({"rig": 2.0, "fitted": 1.0}, {"rig": 20.0, "fitted": 10.0})

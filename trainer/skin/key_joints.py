@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.joint_option import AUTO
 from fdda_addon.core.mathematics.key_joints import KeyJointReport
 from fdda_addon.core.mathematics.partition import joints_with_weight, make_partitions
 from fdda_addon.core.mathematics.skinning import are_invertible, skin_matrices
 from fdda_addon.core.rig import STATIC_JOINT, reference_order
+from fdda_addon.core.settings import AUTO
 
 from ..fits.joint_fit import solve_ridge
 from .fit_poses import FitPoses

@@ -8,7 +8,6 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.messages import FIT_STAGE, KEY_JOINTS_STAGE, MessageType
-from fdda_addon.core.joint_option import ALL
 from fdda_addon.core.mathematics.blocks import block_slices
 from fdda_addon.core.mathematics.key_joints import find_unread_bones, joints_with_indices, select_joints
 from fdda_addon.core.mathematics.metrics import distances
@@ -18,6 +17,7 @@ from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from fdda_addon.core.rig import Rig
+from fdda_addon.core.settings import ALL
 from fdda_addon.core.wording import format_with_noun
 
 from ..config import TrainingConfig

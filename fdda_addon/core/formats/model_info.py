@@ -11,8 +11,7 @@ from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import Partition, make_partitions
 from ..mathematics.poses import CONTROL, Channel
 from ..mathematics.skin_fit import SkinFit
-from ..rig import IDENTITY, STATIC_JOINT, Joint, MeshPart, Rig, read_joints, read_meshes
-from ..unit import read_unit, unit_to_json
+from ..rig import IDENTITY, STATIC_JOINT, Joint, MeshPart, Rig, read_joints, read_meshes, read_unit, unit_to_json
 
 VERSION = 1
 MAX_METADATA_LENGTH = 16 << 20

@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ..joint_option import AUTO, parse_joints
 from ..rig import KEY_JOINTS_PREFIX, STATIC_JOINT, Fingerprint, Joint, Rig
+from ..settings import AUTO, parse_joints
 from ..wording import format_list
 
 

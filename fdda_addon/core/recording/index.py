@@ -13,8 +13,7 @@ from ..files.input_file import read_input
 from ..files.output import atomic_write, to_json_text
 from ..mathematics.poses import CONTROL, Channel, Overshoot
 from ..mathematics.surface import MIN_CORNERS
-from ..rig import read_joints, read_meshes, read_name
-from ..unit import read_unit
+from ..rig import read_joints, read_meshes, read_name, read_unit
 from ..wording import format_count
 
 FORMAT = "fdda-recording"

@@ -14,8 +14,7 @@ from ..errors import RecordingError
 from ..mathematics.skin_fit import are_skin_weights
 from ..mathematics.skinning import are_invertible
 from ..mathematics.surface import are_faces
-from ..rig import Rig, read_joints, read_meshes
-from ..unit import read_unit
+from ..rig import Rig, read_joints, read_meshes, read_unit
 from .arrays import MAX_VALUE, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array
 from .index import RecordingInfo, read_index, read_info
 

@@ -15,8 +15,7 @@ import numpy as np
 from ..errors import BusyError, OutputError, RecordingError, os_error_text
 from ..files.input_file import open_input
 from ..files.open_files import remove_file
-from ..rig import Rig, rest_matrices_match
-from ..unit import read_unit, unit_to_json
+from ..rig import Rig, read_unit, rest_matrices_match, unit_to_json
 from ..wording import format_count
 from .arrays import (
     POSE_MATRICES,
