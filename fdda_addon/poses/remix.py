@@ -83,7 +83,11 @@ def remixed_actions(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Ac
         # An action that fits two objects equally is one of another rig.
         with suppress(RigError):
             slot = None if action in excluded else slots_of_action(action, datablocks).get(armature_object)
-            if slot and curves_by_bone(armature_object, {armature_object: unmuted_curves(action, slot)}):
+            users = slot.users() if slot else ()
+            # Another character whose bones have the same names may play it.
+            if slot is None or (users and not set(users) & set(datablocks)):
+                continue
+            if curves_by_bone(armature_object, {armature_object: unmuted_curves(action, slot)}):
                 frames += len(action_frames(action))
                 actions += [action] if frames <= MAX_FRAMES or not actions else []
     return tuple(actions)

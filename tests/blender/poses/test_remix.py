@@ -120,6 +120,12 @@ def test_without_recorded_actions_limbs_come_from_all_that_move_bones(waving):
     constraint.action = bpy.data.actions[WAVE].copy()
     constraint.action.use_fake_user = True
     assert remixed_actions(waving, []) == (bpy.data.actions[WAVE],)
+    # What another character of the file plays may not fit this one.
+    other = waving.armature_object.copy()
+    bpy.context.collection.objects.link(other)
+    other.animation_data_create().action = bpy.data.actions[WAVE].copy()
+    other.animation_data.action_slot = other.animation_data.action.slots[0]
+    assert remixed_actions(waving, []) == (bpy.data.actions[WAVE],)
     # Limits of the rig are no guess.
     assert choose_bones(waving, []) == ()
     remove_limits(waving)
