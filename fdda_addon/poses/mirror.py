@@ -45,14 +45,12 @@ class Mirror:
                 custom properties of bones.
         """
         self._armature_object = armature_object
-        bones = armature_object.pose.bones
-        indices = {bone.name: index for index, bone in enumerate(bones)}
+        indices = {bone.name: index for index, bone in enumerate(armature_object.pose.bones)}
         self._partner_indices = np.array(
             [indices.get(flipped_name(name), index) for name, index in indices.items()], int
         )
-        # Check that each bone is the mirror image of its partner, given by (B,) int indices.
-        partner_indices = self._partner_indices
-        bones = armature_object.data.bones
+        # Check that each bone is the mirror image of its partner.
+        partner_indices, bones = self._partner_indices, armature_object.data.bones
         matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
         tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)
         reflection = np.diag([-1.0, 1.0, 1.0, 1.0])
@@ -88,51 +86,34 @@ class Mirror:
             else:
                 problem = f"the bone '{name}' differs from its mirror image {difference}; bring it into the middle"
             raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
-        paths = {(armature_object, path) for path in _custom_property_paths(armature_object)} | set(animated_numbers)
-        self._mirrored_paths = [
-            (datablock, path, flipped_path)
-            for datablock, path in sorted(paths, key=lambda datablock_path: datablock_path[1])
-            if (flipped_path := _flipped_path(path)) != path
-            and _is_number(datablock, path)
-            and _is_number(datablock, flipped_path)
-        ]
+        escape = bpy.utils.escape_identifier
+        paths = {
+            (armature_object, f'{bone.path_from_id()}["{escape(key)}"]')
+            for bone in armature_object.pose.bones
+            for key in bone.keys()  # noqa: SIM118
+        }
+        self._partner_paths: dict[tuple[bpy.types.ID, str], str] = {}
+        for datablock, path in {*paths, *animated_numbers}:
+            flipped_path = _flipped_path(path)
+            if flipped_path != path and _is_number(datablock, path) and _is_number(datablock, flipped_path):
+                self._partner_paths |= {(datablock, path): flipped_path, (datablock, flipped_path): path}
 
     @property
     def numbers(self) -> list[tuple[bpy.types.ID, str]]:
         """Return the datablocks and RNA paths of the numbers that are exchanged."""
-        return [
-            (datablock, number)
-            for datablock, path, flipped_path in self._mirrored_paths
-            for number in (path, flipped_path)
-        ]
+        return list(self._partner_paths)
 
     def apply(self) -> None:
         """Mirror the current pose and numbers without evaluating them."""
         bones = self._armature_object.pose.bones
         for channel in POSE_CHANNELS:
             write(bones, channel, read(bones, channel)[self._partner_indices] * np.float32(_MIRROR_SIGNS[channel.name]))
-        values = {
-            (datablock, flipped_path): datablock.path_resolve(path)
-            for datablock, path, flipped_path in self._mirrored_paths
-        }
-        values |= {
-            (datablock, path): datablock.path_resolve(flipped_path)
-            for datablock, path, flipped_path in self._mirrored_paths
-        }
+        values = {number: number[0].path_resolve(partner) for number, partner in self._partner_paths.items()}
         for (datablock, path), value in values.items():
             set_value(datablock, path, value)
         for datablock in {datablock for datablock, _ in values} | {self._armature_object}:
             # Custom properties do not tag their datablock.
             datablock.update_tag()
-
-
-def _custom_property_paths(armature_object: bpy.types.Object) -> list[str]:
-    escape = bpy.utils.escape_identifier
-    return [
-        f'pose.bones["{escape(bone.name)}"]["{escape(key)}"]'
-        for bone in armature_object.pose.bones
-        for key in bone.keys()  # noqa: SIM118
-    ]
 
 
 def _flipped_path(path: str) -> str:
