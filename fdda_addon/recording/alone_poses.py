@@ -22,7 +22,7 @@ from ..core.rig import STATIC_JOINT, Joint, Rig, reference_order
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.motion_range import is_moved_by_constraints
-from ..rig.references import is_transform_channel, split_bone_path
+from ..rig.references import ik_chain, is_transform_channel, split_bone_path
 from ..rig.shape_keys import muted_key_drivers
 from ..scene.armature import PoseMatrixReader, Poser, clear_pose, rest_matrices
 from ..scene.bone_transform import controls_by_bone
@@ -40,10 +40,6 @@ MIN_CHANNEL_RANGE = 1e-12
 """Range of a channel that does not move, so that nothing is divided by zero; in the unit of the channel."""
 MIN_TRANSFORM_CHANGE = 1e-5
 """Smallest change of a joint's relative transform between poses that counts as motion (no unit, or meters)."""
-
-
-_CHAIN_CONSTRAINTS = {"IK", "SPLINE_IK"}
-"""Constraints that also move ancestors of their bone."""
 _PARENT_CONSTRAINTS = {"CHILD_OF", "ARMATURE"}
 """Constraints that move a bone as a parent does."""
 
@@ -155,7 +151,7 @@ def override_joints(
         constraint
         for bone in armature_object.pose.bones
         for constraint in bone.constraints
-        if not constraint.mute and (is_overridden(bone.name) or constraint.type in _CHAIN_CONSTRAINTS)
+        if not constraint.mute and (is_overridden(bone.name) or ik_chain(bone, constraint))
     ]
     drivers = [
         curve
