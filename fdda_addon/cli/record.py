@@ -13,8 +13,8 @@ from ..core.progress import Progress
 from ..core.recording.estimate import format_poses
 from ..core.recording.index import read_index, read_info
 from ..core.wording import format_count
-from ..poses.control_bones import describe_control_bones, split_control_bones
 from ..poses.remix import describe_bones
+from ..poses.sample_selection import describe_control_bones, split_control_bones
 from ..recording.plan import RecordingSettings, find_actions, find_recorded_character, listed_controls
 from ..recording.refinement import RefinementSettings, refine
 from ..recording.run import record

@@ -7,8 +7,8 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.wording import format_count
+from ..poses.clip_player import flipped_name
 from ..poses.human_ranges import human_ranges
-from ..poses.mirror import flipped_name
 from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
 from ..scene.compatibility import is_selected
 from .poses import LimitsOperator

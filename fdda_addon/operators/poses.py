@@ -13,8 +13,8 @@ from ..core.wording import format_count
 from ..poses.measured_limits import set_limits_from_actions
 from ..poses.motion_range import clear_rotation_range, set_rotation_range
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
+from ..recording.pose_plan import show_random_pose, show_rest_pose, shows_random_pose
 from ..recording.posed_action import make_posed_action
-from ..recording.preview import show_random_pose, show_rest_pose, shows_random_pose
 from ..runtime.binding import model_disabled
 from ..scene.compatibility import select_bone
 from ..scene.scene_rig import SceneRig

@@ -6,7 +6,7 @@ from dataclasses import replace
 import bpy
 
 from ..core.errors import RigError
-from ..poses.control_bones import describe_control_bones
+from ..poses.sample_selection import describe_control_bones
 from ..properties.recording_options import recorded_actions, recording_settings
 from ..recording.plan import RecordingSettings, listed_controls
 from ..scene.compatibility import is_selected

@@ -24,7 +24,6 @@ from ..core.rig import Rig
 from ..scene.controls import can_be_set, driven_numbers, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
 from .action_range import ChannelRanges, has_width
-from .control_bones import bone_controls
 from .motion_range import (
     DEFAULT,
     RotationRange,
@@ -35,7 +34,7 @@ from .motion_range import (
     rotation_ranges,
     scale_ranges,
 )
-from .sample_selection import DEFAULT_SELECTION, SampleSelection, select_bones
+from .sample_selection import DEFAULT_SELECTION, SampleSelection, bone_controls, select_bones
 
 ControlRanges = dict[str, tuple[float, float]]
 """Ranges by the names of controls."""

@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, 
 
 from ..core.errors import FDDAError
 from ..jobs.job import current
-from ..recording.preview import show_random_pose, show_rest_pose
+from ..recording.pose_plan import show_random_pose, show_rest_pose
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
 from .not_animatable import not_animatable

@@ -14,9 +14,8 @@ from ..core.recording.index import INDEX_NAME, POSE, RANDOM, Sampling, Source, r
 from ..core.rig import Rig
 from ..core.settings import AUTO_POSES, MAX_AUTO_POSES, MIRROR, OVERSHOOT, POSES, SEED, SPREAD
 from ..poses.clip import find_clips
-from ..poses.control_bones import split_control_bones
 from ..poses.remix import REMIX, read_remix
-from ..poses.sample_selection import SampleSelection, select_bones
+from ..poses.sample_selection import SampleSelection, select_bones, split_control_bones
 from ..poses.sampling import (
     ControlRanges,
     controls_of_bones,

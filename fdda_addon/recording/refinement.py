@@ -30,7 +30,7 @@ from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig, check_full_rig
-from .appender import PoseAppender
+from .run import PoseAppender
 
 PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
 """First indices of random probe poses and base poses, larger than any pose index of a recording or an evaluation."""

@@ -16,11 +16,7 @@ from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import skin_recording
-from fdda_addon.poses.control_bones import (
-    bones_without_location_range,
-    describe_control_bones,
-    rotation_elements,
-)
+from fdda_addon.poses.sample_selection import bones_without_location_range, describe_control_bones, rotation_elements
 from fdda_addon.recording.plan import RecordingSettings, listed_controls, read_sampled_rig
 from fdda_addon.runtime import driver
 from fdda_addon.scene.blend_file import save_copy

@@ -19,9 +19,8 @@ from fdda_addon.core.recording.skinned import skin_recording
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording import plan
 from fdda_addon.recording.alone_poses import follows_control_bones
-from fdda_addon.recording.appender import BATCH_POSES
 from fdda_addon.recording.plan import RecordingSettings, automatic_poses
-from fdda_addon.recording.run import record
+from fdda_addon.recording.run import BATCH_POSES, record
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.mesh import evaluated_positions

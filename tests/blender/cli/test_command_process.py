@@ -12,7 +12,7 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording.index import read_index
-from fdda_addon.recording.appender import BATCH_POSES
+from fdda_addon.recording.run import BATCH_POSES
 
 from ... import systems
 from ..conftest import run
