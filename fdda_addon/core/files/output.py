@@ -6,7 +6,6 @@ import json
 import os
 import re
 import secrets
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -77,7 +76,7 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"Cannot write '{path}': it is write-protected; give another name, or remove the protection.")
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write '{path}': the folder '{folder}' does not exist; create it first.")
-    _check_can_create_file(path, folder)
+    _check_can_create_file(path, folder, path.name)
 
 
 def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
@@ -95,7 +94,7 @@ def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
     folder = nearest_existing_folder(path)
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write into '{path}': '{folder}' is a file; choose another folder.")
-    _check_can_create_file(path, folder)
+    _check_can_create_file(path, folder, next(iter(path.relative_to(folder).parts), ""))
 
 
 def nearest_existing_folder(path: Path) -> Path:
@@ -112,16 +111,17 @@ def nearest_existing_folder(path: Path) -> Path:
     return folder
 
 
-def _check_can_create_file(path: Path, folder: Path) -> None:
+def _check_can_create_file(path: Path, folder: Path, name: str) -> None:
+    """Create and remove a file whose name has the length and the end of a name, so that the system judges it, too."""
+    probe = folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(2)}{name[len(TEMPORARY_PREFIX) + 4 :]}"
     try:
-        handle, probe_path = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, dir=folder)
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
     except OSError as error:
         raise OutputError(
-            f"Cannot write '{path}': {os_error_text(error)}; choose a folder that you may write."
+            f"Cannot write '{path}': {os_error_text(error)}; choose a folder that you may write, or another name."
         ) from error
-    os.close(handle)
     with suppress(OSError):
-        remove_file(Path(probe_path))
+        remove_file(probe)
 
 
 @contextmanager

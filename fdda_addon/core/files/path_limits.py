@@ -1,41 +1,38 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks for output paths that Windows or Blender would refuse, truncate or resolve to another file."""
+"""Checks for output paths that Windows or Blender would truncate or change without an error."""
 
 import os
-import re
 import sys
-from pathlib import Path, PurePath, PureWindowsPath
+from pathlib import Path
 
 from ..errors import OutputError
 
-MAX_NAME_BYTES = 255
 MAX_WINDOWS_PATH_LENGTH = 259
 MAX_BLENDER_PATH_BYTES = 1023
 """Blender silently truncates longer paths, which may name another file."""
 EXTENDED_PATH_PREFIX = "\\\\?\\"
 """Prefix of paths whose length Windows does not limit."""
-_DEVICE_NAME = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE | re.DOTALL)
-_FORBIDDEN_CHARACTER = re.compile(r'[<>:"|?*\x00-\x1f]')
 
 
 def check_path(path: Path, *files: Path) -> None:
-    """Check that paths are short enough and have valid names.
+    """Check that paths are short enough, and that Windows does not change their names.
 
     Args:
         path: file or folder that the user named.
         files: all files that are written there, including temporary files.
 
     Raises:
-        OutputError: a path is too long or has an invalid name.
+        OutputError: a path is too long, or would be changed.
     """
     if limit := path_length_problem(max((file.absolute() for file in files), key=lambda file: len(os.fsencode(file)))):
         raise OutputError(f"Cannot write '{path}': {limit}; choose a shorter folder.")
-    if (size := max(len(os.fsencode(name)) for name in path.absolute().parts)) > MAX_NAME_BYTES:
+    names = (name for name in path.absolute().parts[1:] if is_windows() and name != "..")
+    # Windows writes the first to a hidden stream of another file, and drops the others. What it refuses is tried.
+    if changed := next((name for name in names if ":" in name or name.rstrip(". ") != name), ""):
         raise OutputError(
-            f"Cannot write '{path}': a name in it has {size} bytes, and {MAX_NAME_BYTES} are the most; shorten it."
+            f"Cannot write '{path}': '{changed}' has a colon, or a dot or a blank at its end, which Windows changes; "
+            "give another name."
         )
-    if is_windows() and (problem := windows_name_problem(path.absolute())):
-        raise OutputError(f"Cannot write '{path}': {problem}; give another name.")
 
 
 def path_length_problem(path: Path) -> str:
@@ -46,18 +43,6 @@ def path_length_problem(path: Path) -> str:
     is_long = len(text) > MAX_WINDOWS_PATH_LENGTH and not text.startswith(EXTENDED_PATH_PREFIX)
     if is_windows() and is_long and not supports_long_windows_paths():
         return f"it needs a path of {len(text)} characters, and Windows takes {MAX_WINDOWS_PATH_LENGTH}"
-    return ""
-
-
-def windows_name_problem(path: PurePath) -> str:
-    """Describe the first name in an absolute path that is invalid on Windows; empty where all names are valid."""
-    for name in PureWindowsPath(path).parts[1:]:
-        if _DEVICE_NAME.fullmatch(name):
-            return f"'{name}' is the name of a device on Windows"
-        if match := _FORBIDDEN_CHARACTER.search(name):
-            return f"'{name}' has the character {match.group()!r}, which no name on Windows may have"
-        if name.rstrip(". ") != name and name != "..":
-            return f"'{name}' ends in a dot or a blank, which Windows drops"
     return ""
 
 

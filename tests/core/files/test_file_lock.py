@@ -5,12 +5,11 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
 
-from fdda_addon.core.files.file_lock import NoLocksError, has_ended, try_lock, wait_for_lock
+from fdda_addon.core.files.file_lock import NoLocksError, has_ended, try_lock
 
 from ... import systems
 
@@ -74,18 +73,6 @@ def test_shared_locks_exclude_only_exclusive_locks(path, hold_lock):
         assert try_lock(file.fileno(), is_shared=True)
     with path.open("r+b") as file:
         assert not try_lock(file.fileno())
-
-
-def test_a_waiting_process_gets_the_lock_when_its_holder_ends(path, hold_lock):
-    holder = hold_lock("exclusive")
-    with path.open("r+b") as file:
-        waiting_thread = threading.Thread(target=wait_for_lock, args=[file.fileno()])
-        waiting_thread.start()
-        waiting_thread.join(0.2)
-        assert waiting_thread.is_alive()
-        holder.stdin.close()
-        waiting_thread.join(20)
-        assert not waiting_thread.is_alive()
 
 
 @pytest.mark.parametrize("number", systems.NO_LOCKS_ERRNOS)
