@@ -57,7 +57,11 @@ def flipped_name(name: str) -> str:
 
 
 class Mirror:
-    """Mirrors the pose of an armature about its YZ plane, and numbers that have a left and a right side."""
+    """Mirrors the pose of an armature about its YZ plane, and numbers that have a left and a right side.
+
+    Attributes:
+        partner_paths: the RNA path on the other side, by datablock and RNA path of each number that is exchanged.
+    """
 
     def __init__(self, armature_object: bpy.types.Object, animated_numbers: Iterable[tuple[bpy.types.ID, str]] = ()):
         """Prepare to mirror poses.
@@ -114,23 +118,18 @@ class Mirror:
             for bone in armature_object.pose.bones
             for key in bone.keys()  # noqa: SIM118
         }
-        self._partner_paths: dict[tuple[bpy.types.ID, str], str] = {}
+        self.partner_paths: dict[tuple[bpy.types.ID, str], str] = {}
         for datablock, path in {*paths, *animated_numbers}:
             flipped_path = _flipped_path(path)
             if flipped_path != path and _is_number(datablock, path) and _is_number(datablock, flipped_path):
-                self._partner_paths |= {(datablock, path): flipped_path, (datablock, flipped_path): path}
-
-    @property
-    def numbers(self) -> list[tuple[bpy.types.ID, str]]:
-        """Return the datablocks and RNA paths of the numbers that are exchanged."""
-        return list(self._partner_paths)
+                self.partner_paths |= {(datablock, path): flipped_path, (datablock, flipped_path): path}
 
     def apply(self) -> None:
         """Mirror the current pose and numbers without evaluating them."""
         bones = self._armature_object.pose.bones
         for channel in POSE_CHANNELS:
             write(bones, channel, read(bones, channel)[self._partner_indices] * np.float32(_MIRROR_SIGNS[channel.name]))
-        values = {number: number[0].path_resolve(partner) for number, partner in self._partner_paths.items()}
+        values = {number: number[0].path_resolve(partner) for number, partner in self.partner_paths.items()}
         for (datablock, path), value in values.items():
             set_value(datablock, path, value)
         for datablock in {datablock for datablock, _ in values} | {self._armature_object}:
@@ -196,7 +195,8 @@ class ClipPlayer:
             (datablock, path): value
             for datablock in (*self.armature_objects, *self.other_datablocks)
             for path, value in animated_values(datablock, actions_of_clips(clips, datablock)).items()
-            if not _is_pose_channel(path)
+            # `clear_pose` resets the channels of a pose.
+            if not (path.startswith("pose.bones[") and path.rpartition(".")[2] in _MIRROR_SIGNS)
         }
         self._mirrors: list[Mirror] = []
         if any(clip.is_mirrored for clip in clips):
@@ -208,7 +208,7 @@ class ClipPlayer:
             animated_numbers |= {
                 (datablock, path): datablock.path_resolve(path)
                 for mirror in self._mirrors
-                for datablock, path in mirror.numbers
+                for datablock, path in mirror.partner_paths
             }
         self._numbers: PropertyValues = animated_numbers
         self._controls: list[tuple[SceneRig, str, float]] = []
@@ -326,14 +326,3 @@ def _animated_datablocks(
         return slots_of_action(bpy.data.actions[clip.name], datablocks)
     animations = [(datablock, getattr(datablock, "animation_data", None)) for datablock in datablocks]
     return {datablock: None for datablock, animation in animations if animation and len(animation.nla_tracks)}
-
-
-def _is_pose_channel(path: str) -> bool:
-    """Return whether a path is a channel of a pose, which `clear_pose` resets."""
-    return path.startswith("pose.bones[") and path.rpartition(".")[2] in {
-        "location",
-        "scale",
-        "rotation_euler",
-        "rotation_quaternion",
-        "rotation_axis_angle",
-    }
