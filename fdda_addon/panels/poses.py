@@ -89,11 +89,12 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
     box = layout.box().column()
     column = box.column()
     column.use_property_split, column.use_property_decorate = True, False
-    row = column.row(align=True, heading="Random Poses")
+    # A heading belongs to one field; the name of a number is drawn beside it anyway.
+    row = column.row(align=True, heading="Random Poses" if settings.auto_poses else "")
     if settings.auto_poses:
         row.prop(settings, "auto_poses", text=f"Auto ({POSES.default:,} to {MAX_AUTO_POSES:,})", toggle=1)
     else:
-        row.prop(settings, "poses", text="")
+        row.prop(settings, "poses")
         row.prop(settings, "auto_poses", toggle=1)
     actions = actions_of_rig(rig)
     if not actions:
