@@ -21,7 +21,7 @@ NPY_HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokeni
 """Errors that numpy raises for a damaged header of a `.npy` file, apart from ValueError."""
 MAX_VALUE = 1e12
 """Largest absolute value of an element; sums of squares of larger values may overflow."""
-CHECK_CHUNK_BYTES = 64 << 20
+CHECK_CHUNK_BYTES = 8 << 20
 """Size of the chunks in which arrays are checked for invalid values."""
 POSE_MATRICES, POSITIONS = "pose_matrices", "positions"
 SINGULAR_JOINTS = "joints that have shrunk to nothing"

@@ -15,7 +15,7 @@ from ..mathematics.skin_fit import are_skin_weights
 from ..mathematics.skinning import are_invertible
 from ..mathematics.surface import are_faces
 from ..rig import Rig, read_joints, read_meshes, read_unit
-from .arrays import MAX_VALUE, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array
+from .arrays import MAX_VALUE, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array, release_pages
 from .index import RecordingInfo, read_index, read_info
 
 CHECK_BLOCK_VERTICES = 1 << 16
@@ -113,7 +113,9 @@ def check_poses(path: Path, name: str, array: np.ndarray, alone_poses: range) ->
     Raises:
         RecordingError: a pose has invalid values.
     """
-    if (invalid := find_invalid_pose(name, array, alone_poses)) is not None:
+    invalid = find_invalid_pose(name, array, alone_poses)
+    release_pages(array)
+    if invalid is not None:
         pose, description = invalid
         raise RecordingError(f"The recording '{path}' holds {description} ({name}, pose {pose}); record again.")
 
