@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 import sidebar
 from arm import extension_module, make_empty_folder, show_preferences, wait_for_job
-from window import main_screen, park_mouse, redraw_window, require, save_screenshot, view_area, wait_until
+from window import park_mouse, redraw_window, require, save_screenshot, view_area, wait_until
 
 from blend_fixtures.elbow import build_elbow
 
@@ -105,6 +105,7 @@ def record_train_and_bind(folder: Path) -> Iterator[float]:
     for name in ("sleeve", "mirrored"):
         bpy.data.objects.remove(bpy.data.objects[name])
     body.fdda.settings.poses, body.fdda.settings.passes = 200, 30
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "choices" / "bound.blend"))
     job = extension_module("jobs.job")
     yield from sidebar.open_section("rig")
     yield from sidebar.press_button("fdda.build_model")
@@ -129,16 +130,19 @@ def measure_and_profile(folder: Path) -> Iterator[float]:
 
 
 def show_the_preferences(folder: Path) -> Iterator[float]:
-    """The preferences show one state of the training environment."""
-    yield from show_preferences(next(area for area in main_screen().areas if area.type == "PROPERTIES"))
+    """The preferences show one state of the training environment, at both sizes."""
+    yield from show_preferences(view_area())
     yield from save_screenshot(folder / "choices_preferences.png")
+    bpy.context.preferences.view.ui_scale = 2.0
+    yield 1.0
+    yield from save_screenshot(folder / "choices_preferences_200.png")
+    bpy.context.preferences.view.ui_scale = 1.0
+    yield 0.5
 
 
 def show_all_at_twice_the_size(folder: Path) -> Iterator[float]:
     """Repeat the pictures at 200 % resolution scale."""
     bpy.context.preferences.view.ui_scale = 2.0
-    yield 1.0
-    yield from save_screenshot(folder / "choices_preferences_200.png")
     bpy.ops.wm.open_mainfile(filepath=str(folder / "choices" / "character.blend"), load_ui=False)
     yield 1.0
     bpy.context.view_layer.objects.active = bpy.data.objects["elbow"]
@@ -156,6 +160,6 @@ STEPS = (
     show_a_rig_of_control_bones,
     record_train_and_bind,
     measure_and_profile,
-    show_the_preferences,
     show_all_at_twice_the_size,
+    show_the_preferences,
 )

@@ -105,8 +105,8 @@ def test_train_passes_its_options_to_the_trainer(elbow_files, tmp_path, capfd):
 def test_record_prints_plain_lines_without_a_terminal(elbow_files, tmp_path, capfd):
     assert run("record", elbow_files.rig, tmp_path / "r", "--poses", 20, "--seed", 4, "--action", "elbow_wave") == 0
     captured = capfd.readouterr()
-    hint, estimate, summary = captured.out.splitlines()
-    assert hint.startswith("Hint: ")
+    choice, estimate, summary = captured.out.splitlines()
+    assert choice == "Random poses combine limbs from 1 recorded action."
     assert estimate.startswith(
         "50 poses, and 12 to find what each bone and input moves, each of 300 vertices: less than 1 MB on the disk, "
         "about "

@@ -69,7 +69,8 @@ def run_to_end(*arguments: object, **environment: str) -> tuple[int, str, str]:
 def test_a_successful_verb(elbow_files, tmp_path):
     status, out, err = run_to_end("record", elbow_files.rig, tmp_path / "r", "--poses", 4)
     assert status == 0, err
-    estimate, recorded = out.splitlines()
+    choice, estimate, recorded = out.splitlines()
+    assert choice == "Random poses move the deforming bones within their limits."
     poses = "4 poses, and 12 to find what each bone and input moves"
     assert estimate.startswith(f"{poses}, each of 300 vertices: "), "Blender's output is hidden"
     assert recorded.startswith(f"{tmp_path / 'r'}: {poses}, in ")
@@ -111,7 +112,7 @@ def test_a_stopped_recording_resumes(elbow_files, tmp_path, is_killed):
     out, err = process.communicate(timeout=60)
     assert process.returncode == (systems.KILLED if is_killed else 130), err
     if not is_killed:
-        assert out.count("\n") == 1 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
+        assert out.count("\n") == 2 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
     assert 0 < recorded_pose_count(path) < POSE_COUNT
     assert run("record", elbow_files.rig, path, *options, "--resume") == 0
     assert run("record", elbow_files.rig, tmp_path / "whole", *options) == 0
