@@ -107,8 +107,9 @@ films: demo  ## render the films of the demo: rig beside model, and their errors
 map: .venv  ## draw the diagrams of the code's layers and of a character's states for docs/development.md again
 	.venv/bin/python docs/pictures/make_diagrams.py docs/development.md
 
-third-party: .venv  ## take characters that others made through the whole path, into out/third_party (FOLDER=/path/to/characters; half an hour)
+third-party: .venv  ## take characters that others made through the whole path, into out/third_party (FOLDER=/path/to/characters HEAVY=/path/to/clothed.blend; an hour)
 	.venv/bin/python benchmarks/third_party.py out/third_party $(FOLDER)
+	.venv/bin/python benchmarks/heavy_character.py out/heavy_character $(HEAVY)
 
 fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test
 	@$(MAKE) .venv-line LINE=4.5
