@@ -131,12 +131,13 @@ def measure_and_profile(folder: Path) -> Iterator[float]:
 
 def show_the_preferences(folder: Path) -> Iterator[float]:
     """The preferences show one state of the training environment, at both sizes."""
-    yield from show_preferences(view_area())
+    area = view_area()
+    yield from show_preferences(area)
     yield from save_screenshot(folder / "choices_preferences.png")
     bpy.context.preferences.view.ui_scale = 2.0
     yield 1.0
     yield from save_screenshot(folder / "choices_preferences_200.png")
-    bpy.context.preferences.view.ui_scale = 1.0
+    bpy.context.preferences.view.ui_scale, area.type = 1.0, "VIEW_3D"
     yield 0.5
 
 
