@@ -103,7 +103,9 @@ def check_recordable_rig(
             rig = previous_check.rig
         else:
             rig = read_rig(scene_rig, extra_joints, include_static_joint)
-        rig = replace(rig, controls=selection.controls)
+        # The same object shows that there is nothing to draw again.
+        if rig.controls != selection.controls:
+            rig = replace(rig, controls=selection.controls)
         user_controls = listed_controls(scene_rig, settings)
         automatic_controls = tuple(control for control in selection.controls if control not in user_controls)
         result = replace(
