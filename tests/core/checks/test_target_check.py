@@ -59,7 +59,7 @@ def test_a_cache_that_ends_before_the_action_is_reported(swinging_recording):
     positions = target_positions(swinging_recording)
     positions[35:] = positions[34]
     text = single_warning_text(with_positions(swinging_recording, positions), "frozen-frames")
-    assert text.startswith("The target stands still in 5 frames in which the rig moves: 'swing 40', 'swing 41', ")
+    assert "stands still in 5 frames in which the rig moves: 'swing 40', 'swing 41', " in text
 
 
 def test_jumps_in_a_frame_are_reported(swinging_recording):
