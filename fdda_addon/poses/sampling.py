@@ -157,13 +157,18 @@ def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Chan
     return info.limits or sampled_channels(scene_rig, rig)
 
 
-def rig_allows_ranges(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
+def rig_allows_ranges(scene_rig: SceneRig, channels: tuple[Channel, ...], is_remix: bool = False) -> bool:
     """Return whether the limits and locks of a rig still allow the ranges of channels.
 
-    The range of an action may be narrower than the limit of its bone.
+    The range of an action may be narrower than the limit of its bone. Limbs of actions are rotation vectors of bones
+    with limits, too (`is_remix`): Blender limits these when it evaluates them.
     """
     bones = scene_rig.armature_object.pose.bones
-    return all(_allows_range(bones[channel.name], channel) for channel in channels if channel.kind != CONTROL)
+    return all(
+        _allows_range(bones[channel.name], channel)
+        for channel in channels
+        if channel.kind != CONTROL and not (is_remix and channel.kind == ROTATION_VECTOR)
+    )
 
 
 def _allows_range(bone: bpy.types.PoseBone, channel: Channel) -> bool:
