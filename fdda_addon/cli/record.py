@@ -94,5 +94,5 @@ def _print_control_bones(scene_rig: SceneRig, options: argparse.Namespace) -> No
 
 def _print_bones_to_pose(scene_rig: SceneRig, options: argparse.Namespace) -> None:
     """Print what random poses move if no option chooses it."""
-    if not options.bones_to_pose and options.poses != 0:
+    if not options.bones_to_pose and options.poses != 0 and not options.learn_from:
         print(describe_bones(scene_rig, find_actions(RecordingSettings(actions=tuple(options.action)))))

@@ -50,6 +50,8 @@ def pose_settings(options: argparse.Namespace, scene_rig: SceneRig | None = None
     values |= {name: tuple(value) for name, value in lists.items()}
     if scene_rig and not options.bones_to_pose and options.poses != 0:
         values["bones_to_pose"] = choose_bones(scene_rig, find_actions(RecordingSettings(**values)))
-    elif options.bones_to_pose == [DEFORMING]:
+    elif DEFORMING in options.bones_to_pose:
+        if set(options.bones_to_pose) != {DEFORMING}:
+            raise WrongUsageError(f"--bones-to-pose {DEFORMING} stands alone; leave the others out.")
         values["bones_to_pose"] = ()
     return values

@@ -29,6 +29,7 @@ from ..rig.pose_setter import (
 from ..rig.reading import PoseEvaluator
 from ..rig.shape_keys import set_keys_undriven
 from ..rig.time_inputs import check_time_inputs
+from ..runtime.model_meshes import find_mesh
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
@@ -85,8 +86,11 @@ def evaluate_meshes(
     pose_setter = make_pose_setter(scene_rig, settings.target, clips, random_pose_count, info.controls)
     # A rig that is posed only by actions may have no channels to sample.
     channels = model_channels(scene_rig, skinning.rig, info) if settings.poses or settings.range_scales else ()
-    random_poses = partial(_random_poses, scene_rig, pose_setter, settings.seed)
-    character = replace(scene_rig, other_meshes=tuple((rig.mesh_object.name, rig.mesh_object) for rig in other_rigs))
+    # Channels name the shape keys of other meshes by the names of the meshes in the model.
+    other_objects = (rig.mesh_object for rig in other_rigs)
+    other_meshes = ((find_mesh(network.path, network.model.info, other), other) for other in other_objects)
+    character = replace(scene_rig, other_meshes=tuple(other_meshes))
+    random_poses = partial(_random_poses, character, pose_setter, settings.seed)
     with ExitStack() as stack:
         if pose_setter.target:
             stack.enter_context(pose_setter.target.prepared())
@@ -124,9 +128,10 @@ def evaluate_meshes(
             [errors[index] for errors in action_errors],
             [errors[index] for errors in scaled_range_errors],
             [errors[index] for errors in named_errors],
-            channels,
+            # A channel of a shape key is named as seen from its mesh.
+            (opened.network.info.limits or channels) if channels else (),
         )
-        for index, part_skinning in enumerate(skinnings)
+        for index, (opened, part_skinning) in enumerate(zip(opened_models, skinnings, strict=True))
     ]
 
 

@@ -31,7 +31,7 @@ def find(rig: SceneRig) -> tuple[Finding, ...]:
         *((m.show_viewport, getattr(m, "use_deform_preserve_volume", False)) for m in mesh_object.modifiers),
         settings.base_skinning,
         settings.bones_to_read,
-        bones_to_pose(rig),
+        settings.bones_to_pose,
         settings.auto_poses or settings.poses > 0,
         bool(settings.learn_from),
     )

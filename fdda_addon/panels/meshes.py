@@ -46,10 +46,11 @@ def draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
         name.alignment = "LEFT"
         icon = "RADIOBUT_ON" if is_shown else "RADIOBUT_OFF"
         name.operator("fdda.show_mesh", text=mesh_object.name, icon=icon, emboss=False).object = mesh_object.name
-        has_problem = not playback and bool(mesh_problem(listed_rig) or findings.find(listed_rig))
+        is_checked = not (playback or mesh_object.fdda.is_bound)
+        has_problem = is_checked and bool(mesh_problem(listed_rig) or findings.find(listed_rig))
         if not mesh_object.visible_get():
             name.label(text="", icon="HIDE_ON")
-        elif mesh_object.fdda.status or (has_problem and not mesh_object.fdda.is_bound):
+        elif mesh_object.fdda.status or has_problem:
             name.label(text="", icon="ERROR")
         elif mesh_object.fdda.is_bound:
             name.label(text="", icon="LINKED")
@@ -59,6 +60,7 @@ def draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
         column.label(text=f"and {len(rigs) - MAX_MESHES} more; select one to see it")
     if text := describe_left_out({o: reason for o, reason in reasons.items() if o.fdda.in_model}):
         draw_wrapped(column, context, text, "INFO")
-    for listed_rig in () if playback else rigs:
-        if listed_rig.mesh_object not in (rig.mesh_object, *reasons) and (problem := mesh_problem(listed_rig)):
+    others = (r for r in rigs if r.mesh_object not in (rig.mesh_object, *reasons) and not r.mesh_object.fdda.is_bound)
+    for listed_rig in () if playback else others:
+        if problem := mesh_problem(listed_rig):
             draw_wrapped(column, context, f"Left out: {problem}", "ERROR")

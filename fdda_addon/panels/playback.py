@@ -122,8 +122,8 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             box = layout.box()
             box.alert = True
             draw_wrapped(box, context, binding.status)
-        # A warning leaves the mode as it is.
-        if binding.status and binding.mode == "RIG":
+        # A warning leaves the model playing.
+        if binding.status and not binding.is_playing:
             row = layout.row(align=True)
             row.operator("fdda.relink", text="Find Model…", icon="FILEBROWSER")
             if any(map(is_playback_modifier, mesh_object.modifiers)):

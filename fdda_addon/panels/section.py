@@ -87,7 +87,8 @@ def mesh_problem(rig: SceneRig) -> str:
 
 
 def _is_recorded(rig: SceneRig) -> bool:
-    return not (left_out_reason(rig.mesh_object) or mesh_problem(rig))
+    # What is bound was recorded; a check while the user poses would cost time.
+    return not left_out_reason(rig.mesh_object) and (rig.mesh_object.fdda.is_bound or not mesh_problem(rig))
 
 
 def _is_bound(rig: SceneRig) -> bool:

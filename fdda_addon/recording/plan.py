@@ -104,11 +104,15 @@ def automatic_poses(seconds_per_pose: float, bytes_per_pose: int, free_bytes: in
 
 
 def keep_recorded_poses(settings: RecordingSettings, path: Path) -> RecordingSettings:
-    """Return settings with the number of random poses of the recording in a folder in place of an automatic one."""
+    """Return settings with the number of random poses of the recording in a folder in place of an automatic one.
+
+    Without random poses, such as of a simulation, no bones are chosen for them.
+    """
     if not settings.auto_poses or not (path / INDEX_NAME).exists():
         return settings
     sources = read_info(read_index(path)).sampling.sources
-    return replace(settings, poses=sum(s.poses for s in sources if s.kind == RANDOM), auto_poses=False)
+    poses = sum(s.poses for s in sources if s.kind == RANDOM)
+    return replace(settings, poses=poses, auto_poses=False, bones_to_pose=settings.bones_to_pose if poses else ())
 
 
 def random_pose_channels(scene_rig: SceneRig, rig: Rig, selection: SampleSelection) -> tuple[Channel, ...]:

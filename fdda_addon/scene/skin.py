@@ -128,7 +128,9 @@ def _envelope_weights(
 ) -> Entries:
     """Compute the weights of the envelopes of all bones for some vertices, given by their (n,) int64 indices."""
     points = _rest_points(mesh_object, armature_object, vertices)
-    weights = np.array([_envelope(bone, points) * bone.envelope_weight for bone in bones]).reshape(len(bones), -1)
+    weights = np.array([_envelope(bone, points) * bone.envelope_weight for bone in bones]).reshape(
+        len(bones), len(points)
+    )
     indices, rows = np.nonzero(weights > 0)
     return vertices[rows], indices, weights[indices, rows].astype(np.float32)
 

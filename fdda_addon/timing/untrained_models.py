@@ -40,15 +40,19 @@ def untrained_models(
             rigs_of_model.append(scene_rig)
     with temporary_folder() as folder:
         path = folder / "untrained.onnx"
-        if rigs_of_model:
-            character = join_rigs(rigs_of_model)
-            dependencies = read_dependencies(character)
-            rig = read_rig(character, dependencies.bones)
-            distances = {}
-            for mesh_object, vertices in zip(character.mesh_objects, rig.mesh_slices, strict=True):
-                for name, values in key_distances(character, mesh_object).items():
-                    distances[name] = np.zeros(rig.vertex_count, np.float32)
-                    distances[name][vertices] = values
-            controls = (c for c in dependencies.controls if c.name not in distances or distances[c.name].any())
-            path.write_bytes(build_untrained_model(replace(rig, controls=tuple(controls)), distances))
+        try:
+            if rigs_of_model:
+                character = join_rigs(rigs_of_model)
+                dependencies = read_dependencies(character)
+                rig = read_rig(character, dependencies.bones)
+                distances = {}
+                for mesh_object, vertices in zip(character.mesh_objects, rig.mesh_slices, strict=True):
+                    for name, values in key_distances(character, mesh_object).items():
+                        distances[name] = np.zeros(rig.vertex_count, np.float32)
+                        distances[name][vertices] = values
+                controls = (c for c in dependencies.controls if c.name not in distances or distances[c.name].any())
+                path.write_bytes(build_untrained_model(replace(rig, controls=tuple(controls)), distances))
+        except FDDAError as error:
+            reasons |= {scene_rig.mesh_object: str(error) for scene_rig in rigs_of_model}
+            rigs_of_model = []
         yield {scene_rig.mesh_object: path for scene_rig in rigs_of_model}, reasons

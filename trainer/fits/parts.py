@@ -26,8 +26,9 @@ BISECTION_STEPS = 10
 
 
 def mesh_of(rig: Rig, partition: Partition) -> int:
-    """Return the index of the mesh that has the first vertex of a partition."""
-    return int(np.searchsorted([part.stop for part in rig.mesh_slices], partition.vertices[0], side="right"))
+    """Return the index of the mesh that has the most vertices of a partition."""
+    stops = [part.stop for part in rig.mesh_slices]
+    return int(np.bincount(np.searchsorted(stops, partition.vertices, side="right")).argmax())
 
 
 def divide_by_mesh(rig: Rig, partitions: Sequence[Partition], min_vertices: int) -> list[Partition]:

@@ -23,12 +23,9 @@ class FileKind:
     signature: bytes
 
     def matches(self, path: Path) -> bool:
-        """Return whether a file is of this kind; an empty file is of every kind, one that cannot be read of none."""
-        try:
-            with open_input(path) as file:
-                first_bytes = file.read(SIGNATURE_BYTES)
-        except OSError:
-            return False
+        """Return whether a file is of this kind; an empty file is of every kind."""
+        with open_input(path) as file:
+            first_bytes = file.read(SIGNATURE_BYTES)
         return not first_bytes or re.match(self.signature, first_bytes, re.DOTALL) is not None
 
 

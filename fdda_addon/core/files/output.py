@@ -49,7 +49,13 @@ def check_outputs(
             continue
         if any(os.path.exists(input_path) and os.path.samefile(path, input_path) for input_path in inputs):
             raise OutputError(f"Cannot write '{path}': it is read for this; give another name, or --overwrite.")
-        if not kind.matches(path):
+        try:
+            has_kind = kind.matches(path)
+        except OSError as error:
+            raise OutputError(
+                f"Cannot write '{path}': another file is there, {os_error_text(error)}; give another name."
+            ) from error
+        if not has_kind:
             raise OutputError(
                 f"Cannot write '{path}': another file is there, which is not {kind.name}; give another name, or "
                 "--overwrite."
@@ -112,9 +118,11 @@ def nearest_existing_folder(path: Path) -> Path:
 
 
 def _check_can_create_file(path: Path, folder: Path, name: str) -> None:
-    """Create and remove a file whose name has the length and the end of a name, so that the system judges it, too."""
+    """Let the system judge a name, and create and remove a file with a name of the same length and end."""
     probe = folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(2)}{name[len(TEMPORARY_PREFIX) + 4 :]}"
     try:
+        with suppress(FileNotFoundError):
+            os.lstat(folder / name)
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
     except OSError as error:
         raise OutputError(
@@ -182,23 +190,31 @@ def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failur
         text = f"{_format_names(renamed)} was replaced, and no other" if renamed else "nothing was changed"
         if keep_on_failure:
             kept_paths = _keep_beside(temporaries[len(renamed) :], paths[len(renamed) :])
-            text += (
-                f", and the new content is in {_format_names(kept_paths)}; rename it when no program has '{path.name}' "
-                "open"
-            )
+            if kept_paths:
+                text += (
+                    f", and the new content is in {_format_names(kept_paths)}; rename it when no program has "
+                    f"'{path.name}' open"
+                )
         raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; {text}.") from error
 
 
 def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
-    """Rename temporary files that could not replace `paths` to new names beside these paths; return the new paths."""
+    """Rename temporary files that could not replace `paths` to new names beside these paths, where that is possible.
+
+    Returns:
+        The new paths.
+    """
     for attempt in count(1):
         prefix = "new-" if attempt == 1 else f"new-{attempt}-"
         new_paths = [path.with_name(prefix + path.name) for path in paths]
         if not any(map(os.path.lexists, new_paths)):
             break
+    kept_paths = []
     for temporary, new_path in zip(temporaries, new_paths, strict=True):
-        os.replace(temporary, new_path)
-    return new_paths
+        with suppress(OSError):
+            replace_file(temporary, new_path)
+            kept_paths.append(new_path)
+    return kept_paths
 
 
 def _format_names(paths: Iterable[Path]) -> str:

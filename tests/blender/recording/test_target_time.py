@@ -141,6 +141,22 @@ def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
     }
 
 
+def test_a_simulation_is_resumed_with_the_options_that_began_it(tmp_path):
+    def with_a_root() -> None:
+        targets.target_geometry_nodes()
+        rig = bpy.data.objects["elbow"].modifiers["Armature"].object
+        bpy.context.view_layer.objects.active = rig
+        bpy.ops.object.mode_set(mode="EDIT")
+        root = rig.data.edit_bones.new("root")
+        root.tail, root.use_deform, rig.data.edit_bones["upper"].parent = (0, 0, 0.1), False, root
+        bpy.ops.object.mode_set(mode="OBJECT")
+
+    rig = built(with_a_root, tmp_path / "rig.blend")
+    words = ("record", rig, tmp_path / "r", "--object", "elbow", "--learn-from", "flesh", "--action", ACTION)
+    assert run(*words) == 0
+    assert run(*words, "--resume") == 0
+
+
 @pytest.mark.slow
 def test_settling_resumes_where_it_was_killed(tmp_path):
     rig, killed = built(targets.target_cloth, tmp_path / "rig.blend"), tmp_path / "killed"

@@ -104,9 +104,15 @@ def a_bone_that_does_not_deform(mesh_object: bpy.types.Object) -> None:
     armature_of(mesh_object).bones["lower"].use_deform = False
 
 
+def envelopes_of_no_bone(mesh_object: bpy.types.Object) -> None:
+    envelopes(mesh_object)
+    for bone in armature_of(mesh_object).bones:
+        bone.use_deform = False
+
+
 CASES = (
     *(plain, unnormalized, missing, without_groups, mask, inverted_mask, envelopes, narrow_envelopes),
-    *(envelopes_where_groups_are_missing, multiplied, a_bone_that_does_not_deform),
+    *(envelopes_where_groups_are_missing, multiplied, a_bone_that_does_not_deform, envelopes_of_no_bone),
 )
 
 
@@ -125,7 +131,7 @@ def test_linear_skinning_equals_the_armature_modifier(smooth: bpy.types.Object, 
         assert np.array_equal(positions, evaluated_positions(smooth))
         moved = max(moved, np.abs(positions - rig.rest_positions).max())
         assert np.abs(skinning.positions(matrices[None])[0] - positions).max() < EXACT
-    assert moved > 0.01 or change is without_groups
+    assert moved > 0.01 or change in (without_groups, envelopes_of_no_bone)
 
 
 @pytest.mark.parametrize("change", [missing, mask, without_groups])
