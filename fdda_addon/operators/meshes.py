@@ -6,6 +6,7 @@ The menu makes Blender's search (F3) find the operators. It leaves out those tha
 
 import bpy
 
+from ..core.errors import RigError
 from ..jobs.job import redraw
 from ..scene.active_rig import cached_active_rig, cached_rigs_together
 from ..scene.scene_rig import rigs_of_armature
@@ -42,13 +43,19 @@ class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
     waits_for_jobs = False
 
     def apply(self, context: bpy.types.Context) -> str:
-        shown = self.rig(context)
-        context.window_manager.fdda.mesh = shown.mesh_object.name
+        shown, active = self.rig(context), context.view_layer.objects.active
+        name = shown.mesh_object.name
+        if active.type == "MESH" and active != shown.mesh_object:
+            if name not in context.view_layer.objects:
+                raise RigError(f"'{name}' is in a collection that the view layer excludes; include it.")
+            if active.mode != "OBJECT":
+                raise RigError(f"'{active.name}' is not in Object Mode; leave its mode first.")
+        context.window_manager.fdda.mesh = name
         # The sidebar prefers a mesh that is selected together with the armature.
         for rig in rigs_of_armature(shown.armature_object):
             if rig.mesh_object.select_get():
                 rig.mesh_object.select_set(False)
-        if context.view_layer.objects.active.type == "MESH":
+        if active.type == "MESH":
             shown.mesh_object.select_set(True)
             context.view_layer.objects.active = shown.mesh_object
         redraw()

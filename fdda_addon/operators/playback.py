@@ -146,7 +146,13 @@ class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
         messages, bound_objects = [], []
         for rig in rigs:
             if rig.mesh_object not in bound_objects:
-                message, mesh_objects = bind_model(rig, path, self.pack_large, is_alone=bool(self.object))
+                try:
+                    message, mesh_objects = bind_model(rig, path, self.pack_large, is_alone=bool(self.object))
+                except FDDAError as error:
+                    # What is bound already stays bound, as one undo step.
+                    if not bound_objects:
+                        raise
+                    message, mesh_objects = f"Left out '{rig.mesh_object.name}': {error}", []
                 messages.append(message)
                 bound_objects += mesh_objects
         return " ".join(messages)

@@ -16,6 +16,7 @@ from ..properties.recording_options import complete_settings, recorded_actions, 
 from ..recording.pose_plan import show_random_pose, show_rest_pose, shows_random_pose
 from ..recording.posed_action import make_posed_action
 from ..runtime.binding import model_disabled
+from ..scene import draw_cache
 from ..scene.compatibility import select_bone
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
@@ -95,6 +96,7 @@ class LimitsOperator(RigOperator):
         except FDDAError:
             is_preview = False
         result = super().execute(context)
+        draw_cache.clear()
         if is_preview and result == {"FINISHED"}:
             # If all axes are locked now, there is no random pose.
             with suppress(FDDAError):

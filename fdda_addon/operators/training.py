@@ -13,6 +13,7 @@ from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.progress import Job, Progress
 from ..core.recording.index import INDEX_NAME, read_index
+from ..core.rig import read_meshes
 from ..core.settings import (
     DETAIL_MM,
     GOAL_MM,
@@ -27,6 +28,7 @@ from ..jobs.plan import JobPlan, JobStep, training_steps
 from ..models.former_model import add_former_model, keep_former_model
 from ..models.model_list import add_model, check_matches_rig
 from ..properties.character import model_file, recording_folder
+from ..runtime.model_meshes import has_shape
 from ..scene.scene_rig import armature_of, describe_left_out
 from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
 from ..training.process import Training
@@ -236,7 +238,7 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
         shown_object, unrecorded = self.rig(context).mesh_object, {}
         for mesh_object in sorted((rig.mesh_object for rig in self.rigs(context)), key=lambda o: o != shown_object):
             files = self._files(mesh_object)
-            if mesh_object == shown_object or (files[0] / INDEX_NAME).exists() or is_detached(files[1]):
+            if mesh_object == shown_object or _is_recorded(mesh_object, files[0]) or is_detached(files[1]):
                 meshes_of_files.setdefault(files, []).append(mesh_object)
             else:
                 unrecorded[mesh_object] = "not recorded"
@@ -263,6 +265,16 @@ def _check_recording(path: Path) -> None:
         raise RecordingError(
             f"The recording '{path.name}' has {index['complete']} of {index['poses']} poses; resume it first."
         )
+
+
+def _is_recorded(mesh_object: bpy.types.Object, recording: Path) -> bool:
+    """Return whether a recording has a mesh, by its name or its shape."""
+    try:
+        meshes = read_meshes(read_index(recording)["meshes"])
+    except FDDAError:
+        # The training says what is wrong with a damaged recording.
+        return (recording / INDEX_NAME).exists()
+    return any(mesh.name == mesh_object.name or has_shape(mesh_object, mesh) for mesh in meshes)
 
 
 def _pose_count(recording: Path) -> int:

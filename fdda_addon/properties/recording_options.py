@@ -8,6 +8,7 @@ import bpy
 from ..core.errors import RigError
 from ..core.settings import MAX_AUTO_POSES, POSES, settings_of, values_from
 from ..poses.action_range import action_frames
+from ..poses.motion_range import limited_bones
 from ..poses.remix import REMIX, choose_bones, describe_bones
 from ..recording.plan import RecordingSettings
 from ..rig.pose_setter import TargetSettings
@@ -97,13 +98,20 @@ def bones_to_pose(scene_rig: SceneRig) -> str:
     if setting != "AUTO":
         return setting
     actions = recorded_actions(scene_rig)
-    inputs = actions_state(), actions, actions_of_rig(scene_rig)
+    # Limits do not count if there are recorded actions.
+    has_limits = not actions and _has_limits(scene_rig.armature_object)
+    inputs = actions_state(), actions, actions_of_rig(scene_rig), has_limits
     name = "bones to pose", scene_rig.mesh_object.session_uid
 
     def choose() -> str:
         return "REMIX" if choose_bones(scene_rig, [bpy.data.actions[name] for name in actions]) else "WEIGHTS"
 
     return computed_once(name, inputs, choose)
+
+
+@draw_cached
+def _has_limits(armature_object: bpy.types.Object) -> bool:
+    return bool(limited_bones(armature_object))
 
 
 @draw_cached

@@ -30,7 +30,7 @@ def find_mesh(path: Path, info: ModelInfo, mesh_object: bpy.types.Object) -> str
         return names[0]
     if mesh_object.fdda.model_mesh in names:
         return mesh_object.fdda.model_mesh
-    fitting_names = [mesh.name for mesh in info.meshes if _has_shape(mesh_object, mesh)]
+    fitting_names = [mesh.name for mesh in info.meshes if has_shape(mesh_object, mesh)]
     own_names = mesh_object.name, name_without_number(mesh_object)
     for candidates in (fitting_names, names):
         for name in own_names:
@@ -51,7 +51,8 @@ def info_of_mesh(path: Path, info: ModelInfo, mesh_object: bpy.types.Object) -> 
     return info.of_mesh(next(mesh for mesh in info.meshes if mesh.name == name))
 
 
-def _has_shape(mesh_object: bpy.types.Object, mesh: MeshPart) -> bool:
+def has_shape(mesh_object: bpy.types.Object, mesh: MeshPart) -> bool:
+    """Return whether a mesh object has the topology and the rest positions of a mesh of a recording or model."""
     data, fingerprint = mesh_object.data, mesh.fingerprint
     return (
         len(data.vertices) == mesh.vertices

@@ -126,6 +126,66 @@ def test_a_click_in_the_list_shows_another_mesh(two):
         assert active_rig(bpy.context).mesh_object == two[1]
 
 
+def test_a_click_on_a_mesh_that_cannot_be_selected_is_refused(two):
+    first, other = two
+    bpy.context.view_layer.objects.active = first
+    bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
+    with pytest.raises(RuntimeError, match="'elbow' is not in Object Mode; leave its mode first"):
+        bpy.ops.fdda.show_mesh(object=other.name)
+    assert bpy.context.view_layer.objects.active == first
+    bpy.ops.object.mode_set(mode="OBJECT")
+    collection = bpy.data.collections.new("excluded")
+    bpy.context.scene.collection.children.link(collection)
+    bpy.context.scene.collection.objects.unlink(other)
+    collection.objects.link(other)
+    bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
+    bpy.context.view_layer.objects.active = first
+    with pytest.raises(RuntimeError, match="is in a collection that the view layer excludes; include it"):
+        bpy.ops.fdda.show_mesh(object=other.name)
+    # The armature stays active, so nothing has to be selected.
+    bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW_RIG]
+    assert bpy.ops.fdda.show_mesh(object=other.name) == {"FINISHED"}
+
+
+@pytest.mark.parametrize("text", ["smile", 'mesh_object/["x"]', ""])
+def test_other_meshes_need_neither_the_extra_inputs_nor_a_sampled_bone(two, text):
+    """The head has an extra input, all weights of the eye are on a constrained bone, and no bone has limits."""
+    first, other = two
+    armature_object = bpy.context.view_layer.objects.active
+    bpy.ops.object.mode_set(mode="EDIT")
+    armature_object.data.edit_bones.new("eye").tail = (0.0, 0.0, 0.1)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    for bone in armature_object.pose.bones:
+        for constraint in list(bone.constraints):
+            bone.constraints.remove(constraint)
+    armature_object.pose.bones["eye"].constraints.new("COPY_ROTATION").target = armature_object
+    other.vertex_groups.clear()
+    other.vertex_groups.new(name="eye").add(range(len(other.data.vertices)), 1.0, "REPLACE")
+    first.shape_key_add(name="Basis")
+    first.shape_key_add(name="smile").data[0].co.x += 0.1
+    first["x"] = 0.5
+    first.fdda.settings.auto_poses, first.fdda.settings.bones_to_pose = False, "WEIGHTS"
+    control = first.fdda.settings.extra_inputs.add()
+    control.name, control.has_range, control.low, control.high = text, True, 0.0, 1.0
+    assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
+    assert [mesh["name"] for mesh in read_index(recording_folder(first))["meshes"]] == [o.name for o in two]
+
+
+def test_a_mesh_that_a_later_recording_lacks_is_left_out(two):
+    first, other = two
+    other.data.vertices[0].co.z += 0.01
+    bpy.ops.fdda.record(all_meshes=True)
+    other.hide_set(True)
+    bpy.ops.fdda.delete_recording()
+    bpy.ops.fdda.record(all_meshes=True)
+    assert [mesh["name"] for mesh in read_index(recording_folder(other))["meshes"]] == [first.name]
+    assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
+    assert job.state_of("train").outcome.endswith("Left out: the mesh 'elbow.001', which is not recorded.")
+    assert not other.fdda.models
+    assert bpy.ops.fdda.bind(all_meshes=True) == {"FINISHED"}
+    assert first.fdda.is_bound and not other.fdda.is_bound
+
+
 def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
     from fdda_addon.panels import checks
     from fdda_addon.panels.trained_file import find_trained_file

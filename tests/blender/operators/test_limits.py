@@ -9,6 +9,8 @@ from mathutils import Vector
 
 from fdda_addon.poses.human_ranges import body_part_of, human_ranges
 from fdda_addon.poses.motion_range import DEFAULT, rotation_ranges
+from fdda_addon.properties import recording_options
+from fdda_addon.scene.active_rig import active_rig
 from fdda_addon.scene.compatibility import is_selected, select_bone
 
 BONES = {
@@ -79,6 +81,24 @@ def test_limits_are_copied_mirrored_and_cleared(armature_object):
     select(armature_object, "tail")
     with pytest.raises(RuntimeError, match="No selected bone has a bone of the same name on the other side"):
         bpy.ops.fdda.mirror_limits()
+
+
+def test_the_automatic_choice_of_bones_follows_the_limits(armature_object, monkeypatch):
+    """As in a window, where an unchanged action is not read again."""
+    monkeypatch.setattr(recording_options, "actions_state", lambda: None)
+    rig = active_rig(bpy.context)
+    pose_bone = bone(armature_object, "tail")
+    for frame, angle in ((1, 0.0), (10, 0.5)):
+        pose_bone.rotation_mode, pose_bone.rotation_euler = "XYZ", (angle, 0, 0)
+        pose_bone.keyframe_insert("rotation_euler", frame=frame)
+    for each in bpy.data.actions:
+        each.fdda.record = False
+    assert recording_options.bones_to_pose(rig) == "REMIX"
+    select(armature_object, "tail")
+    bpy.ops.fdda.set_limits()
+    assert recording_options.bones_to_pose(rig) == "WEIGHTS"
+    bpy.ops.fdda.clear_limits()
+    assert recording_options.bones_to_pose(rig) == "REMIX"
 
 
 def test_operators_without_selected_bones_are_refused(armature_object):
