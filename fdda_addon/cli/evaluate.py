@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.checks.target import frozen_sentence
 from ..core.errors import WrongUsageError
 from ..core.files.file_kind import EVALUATION, PICTURE, VIDEO
 from ..core.files.output import atomic_write_all, check_outputs, to_json_text
@@ -170,8 +171,8 @@ def table(evaluation: Evaluation) -> str:
             for name in ("mean", "rms", "p99", "p999", "max")
         )
         lines.append(f"{'  FDDA / linear skinning':<24}{ratios}")
-        if text := farther_than_skinning_sentence(values["fdda"]["mean"], values["linear"]["mean"]):
-            lines.append(f"  {text}")
+        farther_sentence = farther_than_skinning_sentence(values["fdda"]["mean"], values["linear"]["mean"])
+        lines += [f"  {text}" for text in (farther_sentence, frozen_sentence(errors.frozen)) if text]
         if values["normals"]:
             lines += _surface_lines(values["normals"], values["edges"])
     return "\n".join(lines)

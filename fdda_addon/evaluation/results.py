@@ -33,6 +33,7 @@ class PoseErrors:
     linear: np.ndarray
     fdda_surface: SurfaceErrors | None = None
     linear_surface: SurfaceErrors | None = None
+    frozen: int = 0
 
     def to_json(self) -> dict:
         """Return the statistics of the errors as JSON, described in docs/formats.md."""

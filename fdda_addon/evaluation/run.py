@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core.checks.target import is_frozen
 from ..core.errors import FDDAError, RigError
 from ..core.mathematics.mask import Mask
 from ..core.mathematics.metrics import distances
@@ -194,6 +195,7 @@ class _MeshComparison:
             self._surface = SurfaceComparison(faces, rig.rest_positions, skinning.partitions)
         self._poses: list[tuple[np.ndarray, ...]] = []
         self._surfaces: list[tuple] = []
+        self._previous_linear_positions, self._frozen_count = np.empty(0), 0
 
     def add_pose(self, name: str) -> None:
         """Compare the current pose of the scene, of a set of poses with a name."""
@@ -206,6 +208,10 @@ class _MeshComparison:
                     "look for a scale of zero or a broken driver in the rig, else train again."
                 )
         linear_positions = self._skinning.positions(pose_matrices[None])[0]
+        if self._evaluator.target and self._poses:
+            positions = (rig_positions, self._poses[-1][1]), (linear_positions, self._previous_linear_positions)
+            self._frozen_count += is_frozen(*(distances(*pair).max() for pair in positions), self._skinning.rig.size)
+        self._previous_linear_positions = linear_positions
         if self._mask is not None:
             model_positions = self._mask.blend(linear_positions, model_positions)
         errors = (distances(p, rig_positions, self._metres_per_unit) for p in (model_positions, linear_positions))
@@ -217,7 +223,8 @@ class _MeshComparison:
         """Return the errors of the compared poses, and begin another set."""
         arrays = (np.stack(values) for values in zip(*self._poses, strict=True))
         errors = PoseErrors(name, *arrays, *(surface_errors(rows) for rows in zip(*self._surfaces, strict=True)))
-        self._poses, self._surfaces = [], []
+        errors.frozen = self._frozen_count
+        self._poses, self._surfaces, self._frozen_count = [], [], 0
         return errors
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import bpy
 
+from ..core.checks.target import frozen_sentence
 from ..core.errors import ModelError, RigError
 from ..core.formats.report import REPORT_HTML, page_path
 from ..core.progress import Job
@@ -95,6 +96,7 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
                 f"and {model_errors.max:.1f} mm at most; "
                 f"skinning alone {skinning_errors.mean:.2f} and {skinning_errors.max:.1f} mm."
             )
+            sentences += filter(None, [frozen_sentence(evaluation.held_out.frozen)])
         context.window_manager.fdda_view.pose = -1
         if self._action:
             show_graph(context.window_manager.fdda_view.graph)

@@ -334,15 +334,12 @@ class PoseEvaluator:
 
     Attributes:
         scene_rig, rig: the rig.
+        target: the target whose positions replace those of the rig; None without one.
     """
 
     def __init__(self, scene_rig: SceneRig, rig: Rig, target: Target | None = None):
-        """Prepare to read a rig.
-
-        Args:
-            target: the target whose positions replace those of the rig.
-        """
-        self.scene_rig, self.rig, self._target = scene_rig, rig, target
+        """Prepare to read a rig; arguments as in the class."""
+        self.scene_rig, self.rig, self.target = scene_rig, rig, target
         self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
         self._controls = ControlReader(scene_rig, rig.controls)
 
@@ -356,8 +353,8 @@ class PoseEvaluator:
         depsgraph = bpy.context.evaluated_depsgraph_get()
         mesh_object = self.scene_rig.mesh_object.evaluated_get(depsgraph)
         armature_object = self.scene_rig.armature_object.evaluated_get(depsgraph)
-        if self._target is not None:
-            positions = self._target.positions(depsgraph)
+        if self.target is not None:
+            positions = self.target.positions(depsgraph)
         else:
             mesh_objects = self.scene_rig.mesh_objects
             positions = join_positions(

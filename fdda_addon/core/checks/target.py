@@ -36,6 +36,26 @@ def check_target(recording: SkinnedRecording) -> list[RecordingWarning]:
     return [*_check_repeatability(recording), *_check_frames(recording), *_check_location(recording)]
 
 
+def is_frozen(target_motion: np.ndarray, linear_motion: np.ndarray, size: float) -> np.ndarray:
+    """Return whether a target is frozen between two frames.
+
+    Args:
+        target_motion, linear_motion: largest motion of a vertex of the target and of linear skinning, mesh units.
+        size: size of the rig, mesh units.
+    """
+    return (target_motion < MAX_FROZEN_RATIO * size) & (linear_motion > MIN_MOTION_RATIO * size)
+
+
+def frozen_sentence(count: int) -> str:
+    """Return a sentence about a number of compared poses in which a target is frozen; empty for 0."""
+    if not count:
+        return ""
+    return (
+        f"The target stands still in {format_count(count, 'pose')} in which the rig moves, and these count as errors: "
+        "its cache ends before, or begins after; compare frames that it has."
+    )
+
+
 def _check_repeatability(recording: SkinnedRecording) -> list[RecordingWarning]:
     repeatability = recording.info.repeatability
     if repeatability is None:
@@ -63,12 +83,7 @@ def _check_frames(recording: SkinnedRecording) -> list[RecordingWarning]:
                 recording, first_pose, min(source.poses, MAX_CHECKED_FRAMES)
             )
             size = recording.rig.size
-            frozen_frames = (
-                np.flatnonzero(
-                    (target_motions[:, 0] < MAX_FROZEN_RATIO * size) & (linear_motions > MIN_MOTION_RATIO * size)
-                )
-                + 1
-            )
+            frozen_frames = np.flatnonzero(is_frozen(target_motions[:, 0], linear_motions, size)) + 1
             frozen += [_frame_label(source, frame_index) for frame_index in frozen_frames.tolist()]
             # A target that is frozen while the rig moves does not jump.
             jump_sizes = target_motions.min(axis=1)
