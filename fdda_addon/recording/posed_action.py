@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from ..core.mathematics.poses import CONTROL
+from ..core.mathematics.poses import CONTROL, ROTATION_VECTOR, bones_with_changed_range
 from ..core.progress import Job, Progress
 from ..core.recording.index import ACTION, MIRRORED, RANDOM, STRIP, RecordingInfo
 from ..poses.clip import find_clips
@@ -22,7 +22,7 @@ from ..scene.bone_transform import bone_transform
 from ..scene.controls import can_be_set, is_driven, owner_of
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import assign_action
-from .plan import RecordingSettings, make_sampling, read_sampled_rig
+from .plan import RecordingSettings, make_pose_sampler, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
 
 ACTION_NAME = "Poses"
@@ -74,7 +74,13 @@ def make_posed_action(
         channels = info.sampling.channels
         kinds = {RANDOM, ACTION, STRIP, MIRRORED}
         recorded = replace(info.sampling, sources=tuple(s for s in info.sampling.sources if s.kind in kinds))
-        if make_sampling(scene_rig, settings, channels) != recorded:
+        remix = make_pose_sampler(scene_rig, settings).remix
+        recorded_limbs, limbs = (
+            tuple(channel for channel in each if channel.kind == ROTATION_VECTOR)
+            for each in (channels, remix.channels if remix else channels)
+        )
+        is_same = make_sampling(scene_rig, settings, channels) == recorded
+        if not is_same or bones_with_changed_range(recorded_limbs, limbs):
             raise RigError(
                 f"'{scene_rig.mesh_object.name}' does not give the recorded poses any more: its actions or locked "
                 "axes have changed; record again, or leave --recording out."

@@ -6,6 +6,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from mathutils import Vector
 
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.scene.animated_values import animated_values
@@ -110,15 +111,22 @@ def test_random_poses_are_exported_as_fbx_and_alembic(tmp_path):
 
 
 @pytest.mark.one_blender_version
-def test_poses_that_differ_from_the_recording_are_refused(refusal, tmp_path):
+@pytest.mark.parametrize(
+    ("options", "change"),
+    [(["--action", "elbow_wave"], (10, 0)), (["--bones-to-pose", "remix"], (0, 0.1))],
+    ids=["frames", "limbs"],
+)
+def test_poses_that_differ_from_the_recording_are_refused(refusal, tmp_path, options, change):
+    """Limbs may come from an action whose frames are not recorded."""
     rig, recording = save_elbow(tmp_path / "rig.blend"), tmp_path / "recording"
-    assert run("record", rig, recording, "--poses", 4, "--action", "elbow_wave") == 0
+    assert run("record", rig, recording, "--poses", 4, *options) == 0
     assert run("poses", rig, tmp_path / "a.blend", "--recording", recording, "--poses", 3) == 2
+    assert run("poses", rig, tmp_path / "a.blend", "--recording", recording) == 0
     bpy.ops.wm.open_mainfile(filepath=str(rig))
     for curve in bpy.data.actions["elbow_wave"].layers[0].strips[0].channelbags[0].fcurves:
-        curve.keyframe_points[-1].co[0] += 10
+        curve.keyframe_points[-1].co += Vector(change)
     bpy.ops.wm.save_mainfile()
-    text = refusal("poses", rig, tmp_path / "a.blend", "--recording", recording)
+    text = refusal("poses", rig, tmp_path / "b.blend", "--recording", recording)
     assert "'elbow' does not give the recorded poses any more: its actions or locked axes have changed" in text
 
 
