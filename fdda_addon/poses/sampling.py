@@ -13,7 +13,6 @@ from ..core.mathematics.poses import (
     CHANNEL_KINDS,
     CONTROL,
     LOCATION,
-    RANGE_TOLERANCE,
     ROTATION,
     ROTATION_VECTOR,
     SCALE,
@@ -155,40 +154,6 @@ def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Chan
                 "moved; name it as before, or record and train this rig."
             )
     return info.limits or sampled_channels(scene_rig, rig)
-
-
-def rig_allows_ranges(scene_rig: SceneRig, channels: tuple[Channel, ...], is_remix: bool = False) -> bool:
-    """Return whether the limits and locks of a rig still allow the ranges of channels.
-
-    The range of an action may be narrower than the limit of its bone. Limbs of actions are rotation vectors of bones
-    with limits, too (`is_remix`): Blender limits these when it evaluates them.
-    """
-    bones = scene_rig.armature_object.pose.bones
-    return all(
-        _allows_range(bones[channel.name], channel)
-        for channel in channels
-        if channel.kind != CONTROL and not (is_remix and channel.kind == ROTATION_VECTOR)
-    )
-
-
-def _allows_range(bone: bpy.types.PoseBone, channel: Channel) -> bool:
-    """Return whether the limits and locks of a bone allow the range of a channel."""
-    rotations = rotation_ranges(bone)
-    if channel.kind == ROTATION_VECTOR:
-        return _are_free(rotations)
-    if channel.kind == ROTATION:
-        rotation_range = rotations[channel.axis]
-        if rotation_range.is_locked:
-            return False
-        bounds = None if rotation_range.source == DEFAULT else (rotation_range.low, rotation_range.high)
-    else:
-        locks = {LOCATION: bone.lock_location, SCALE: bone.lock_scale}[channel.kind]
-        if locks[channel.axis]:
-            return False
-        bounds = _location_and_scale_ranges(bone).get((channel.kind, channel.axis))
-    if bounds is None:
-        return True
-    return bounds[0] - RANGE_TOLERANCE <= channel.low and channel.high <= bounds[1] + RANGE_TOLERANCE
 
 
 def _are_free(rotations: tuple[RotationRange, ...]) -> bool:

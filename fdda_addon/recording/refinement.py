@@ -15,13 +15,12 @@ from ..core.mathematics.partition import Partition
 from ..core.mathematics.poses import Channel, sample_pose
 from ..core.mathematics.refinement import Probes, choose_poses, nearest_recorded_distances
 from ..core.progress import Progress
-from ..core.recording.index import RANDOM, REFINED
+from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
 from ..core.recording.writer import RecordingExtension
 from ..core.rig import rig_differences
 from ..core.settings import REFINEMENT_POSES, SPREAD
-from ..poses.remix import REMIX
-from ..poses.sampling import model_channels, rig_allows_ranges
+from ..poses.sampling import model_channels
 from ..rig.modifier_stack import check_evaluable
 from ..rig.pose_setter import temporary_rig_state
 from ..rig.reading import PoseEvaluator, read_rig
@@ -176,17 +175,15 @@ def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[
         raise RecordingError(
             f"'{recording.path}' is a recording of another rig: {'; '.join(differences)}. Record this rig."
         )
-    sampling = recording.info.sampling
-    if not sampling.channels:
+    if not recording.info.sampling.channels:
         raise RecordingError(
             f"'{recording.path}' has no random poses, so there is no range of motion to choose from; record with "
             "--poses."
         )
-    is_remix = any(source.name == REMIX for source in sampling.sources if source.kind == RANDOM)
-    if sampling.channels != channels or not rig_allows_ranges(scene_rig, channels, is_remix):
+    if recording.info.sampling.channels != channels:
         raise RecordingError(
-            f"The range of motion of the rig is not that of '{recording.path}' any more; record anew into another "
-            "folder."
+            f"The range of motion of the model is not that of '{recording.path}'; give the recording that it was "
+            "trained on, or train a model on this one."
         )
 
 

@@ -14,14 +14,16 @@ from fdda_addon.core.mathematics.features import joint_features
 from fdda_addon.core.mathematics.metrics import distances
 from fdda_addon.core.recording.index import REFINED
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.refinement import RefinementSettings, refine
+from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, run, train
 from .refusals import file_contents
-from .scene_state import scene_state
+from .scene_state import drain, scene_state
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -98,11 +100,14 @@ def sentence(rig, recording, model) -> str:
     return str(error.value)
 
 
-def test_another_range_of_motion_is_refused(elbow_files, recording, rig):
+def test_another_range_of_motion_is_refused(elbow_files, recording, rig, tmp_path):
+    """A recording keeps its range of motion, whatever the rig limits or locks since."""
     for bone in bpy.data.objects[ELBOW_RIG].pose.bones:
         bone.lock_rotation[1] = not bone.lock_rotation[1]
-    assert "The range of motion of the rig is not that of" in sentence(rig, recording, elbow_files.model)
-    assert len(read_recording(recording).pose_matrices) == 162
+    drain(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2)))
+    assert len(read_recording(recording).pose_matrices) == 164
+    drain(record(rig, tmp_path / "locked", RecordingSettings(poses=4)))
+    assert "The range of motion of the model is not that of" in sentence(rig, tmp_path / "locked", elbow_files.model)
 
 
 def test_an_action_alone_has_no_range_of_motion(elbow_files, tmp_path, rig):
