@@ -320,18 +320,18 @@ class Rig:
     @property
     def has_weights(self) -> bool:
         """Whether vertices follow other joints than the static joint."""
-        return bool(self._follows_bones.any())
+        return bool(self.follows_bones.any())
 
     @property
     def unweighted_vertices(self) -> np.ndarray:
         """(n,) int64, vertices of the meshes without skin weights, which are fitted; none if no mesh has weights."""
-        parts = [part for part in self.mesh_slices if not self._follows_bones[part].any()]
+        parts = [part for part in self.mesh_slices if not self.follows_bones[part].any()]
         if len(parts) in (0, len(self.meshes)):
             return np.zeros(0, np.int64)
         return np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
     @property
-    def _follows_bones(self) -> np.ndarray:
+    def follows_bones(self) -> np.ndarray:
         """(V,) bool, whether vertices follow other joints than the static joint."""
         is_bone = np.array([name != STATIC_JOINT for name in self.joint_names])
         return (is_bone[self.skin_joints] & (self.skin_weights > 0)).any(axis=1)

@@ -18,6 +18,7 @@ from ..core.errors import RigError
 from ..core.mathematics.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.mathematics.rotations import euler_angles, rotation_vectors, total_range_width
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions
+from ..scene.armature import FOUR_COMPONENT_ROTATIONS
 from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_name, owner_of
 from ..scene.draw_cache import actions_state, computed_once
 from ..scene.scene_rig import SceneRig
@@ -72,8 +73,7 @@ def channel_values(
     for kind in (LOCATION, SCALE):
         for axis in curves.get(kind, {}):
             yield kind, axis, evaluate_curves(curves[kind], kind, frames)[:, axis]
-    channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}.get(bone.rotation_mode)
-    channel = channel or "rotation_euler"
+    channel = FOUR_COMPONENT_ROTATIONS.get(bone.rotation_mode, "rotation_euler")
     keyed_curves = curves.get(channel)
     if keyed_curves:
         values = evaluate_curves(keyed_curves, channel, frames)

@@ -15,7 +15,7 @@ from ..scene.action_slots import dependencies, slots_of_action
 from ..scene.animated_values import animated_values, driving_actions, read_value, set_value
 from ..scene.armature import clear_pose
 from ..scene.arrays import POSE_CHANNELS, read, write
-from ..scene.controls import can_be_set, owner_of, set_control
+from ..scene.controls import can_be_set, is_number, owner_of, set_control
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import (
     AnimationState,
@@ -121,7 +121,7 @@ class Mirror:
         self.partner_paths: dict[tuple[bpy.types.ID, str], str] = {}
         for datablock, path in {*paths, *animated_numbers}:
             flipped_path = _flipped_path(path)
-            if flipped_path != path and _is_number(datablock, path) and _is_number(datablock, flipped_path):
+            if flipped_path != path and is_number(datablock, path) and is_number(datablock, flipped_path):
                 self.partner_paths |= {(datablock, path): flipped_path, (datablock, flipped_path): path}
 
     def apply(self) -> None:
@@ -142,13 +142,6 @@ def _flipped_path(path: str) -> str:
         return f'["{bpy.utils.escape_identifier(flipped_name(bpy.utils.unescape_identifier(match[1])))}"]'
 
     return _QUOTED_NAME.sub(flip, path)
-
-
-def _is_number(datablock: bpy.types.ID, path: str) -> bool:
-    try:
-        return isinstance(datablock.path_resolve(path), int | float)
-    except ValueError:
-        return False
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from ..core.controls import ARMATURE_OBJECT
 from ..core.errors import RigError
 from ..core.mathematics.poses import DEFAULT_RANGE, LOCATION, ROTATION, SCALE, Channel
 from ..core.rig import Rig
+from ..scene.armature import FOUR_COMPONENT_ROTATIONS
 
 AXES = "xyz"
 RANGE_NAME = "FDDA Range"
@@ -225,7 +226,7 @@ def control_name(armature_object: bpy.types.Object, channel: Channel) -> str:
     bone = armature_object.pose.bones.get(channel.name)
     if channel.kind not in _PROPERTY_NAMES or bone is None:
         return ""
-    if channel.kind == ROTATION and bone.rotation_mode in {"QUATERNION", "AXIS_ANGLE"}:
+    if channel.kind == ROTATION and bone.rotation_mode in FOUR_COMPONENT_ROTATIONS:
         return ""
     escaped_name = bpy.utils.escape_identifier(channel.name)
     return f'{ARMATURE_OBJECT}/pose.bones["{escaped_name}"].{_PROPERTY_NAMES[channel.kind]}[{channel.axis}]'

@@ -16,7 +16,7 @@ from ..poses.clip_player import ClipPlayer
 from ..poses.remix import REMIX
 from ..rig.pose_setter import temporary_rig_state
 from ..scene.animated_values import read_value
-from ..scene.armature import clear_pose, pose_values
+from ..scene.armature import FOUR_COMPONENT_ROTATIONS, clear_pose, pose_values
 from ..scene.arrays import KEY_INTERPOLATION_ELEMENT, KEY_POSITION_ELEMENT, POSE_CHANNELS, write
 from ..scene.bone_transform import bone_transform
 from ..scene.controls import can_be_set, is_driven, owner_of
@@ -28,8 +28,6 @@ from .pose_plan import PosePlan
 ACTION_NAME = "Poses"
 CONSTANT = 0
 """Blender's number of the interpolation that keeps the value until the next key."""
-ROTATION_PROPERTIES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
-"""Property of the rotation of a pose bone, by rotation mode; of the others it is `rotation_euler`."""
 
 CurveValues = dict[tuple[bpy.types.ID, str], np.ndarray]
 """Values (F, n) in F frames, by datablock and RNA path of a property with n numbers."""
@@ -132,7 +130,7 @@ def _curve_values(values: CurveValues) -> CurveValues:
         ends = np.cumsum([element.shape[0] for element in POSE_CHANNELS])
         rows_by_property = dict(zip((e.name for e in POSE_CHANNELS), np.split(rows, ends[:-1], axis=2), strict=True))
         for index, bone in enumerate(datablock.pose.bones):
-            rotation = ROTATION_PROPERTIES.get(bone.rotation_mode, "rotation_euler")
+            rotation = FOUR_COMPONENT_ROTATIONS.get(bone.rotation_mode, "rotation_euler")
             for name in ("location", rotation, "scale"):
                 curves[datablock, f"{bone.path_from_id()}.{name}"] = rows_by_property[name][:, index]
     return {key: rows for key, rows in curves.items() if (rows != rows[0]).any()}

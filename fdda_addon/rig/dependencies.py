@@ -18,12 +18,12 @@ from ..core.mathematics.poses import LOCATION, ROTATION, SCALE
 from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions, is_overridden
 from ..scene.animation import changes_value, curves_with_actions
+from ..scene.armature import FOUR_COMPONENT_ROTATIONS
 from ..scene.controls import canonical_path, driven_numbers, fcurve_target, make_control, owner_name
 from ..scene.scene_rig import SceneRig
 from .references import is_transform_channel, split_bone_path
 from .sources import Sources
 
-_FOUR_COMPONENT_MODES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
 _VERBS = {ROTATION: "rotate", LOCATION: "move", SCALE: "scale"}
 
 AxisRanges = dict[int, tuple[float, float] | None]
@@ -88,7 +88,7 @@ def check_other_armatures(
 
 def _remedies(bone: bpy.types.PoseBone, free_kinds: list[str]) -> Iterator[str]:
     if ROTATION in free_kinds:
-        has_four_components = bone.rotation_mode in _FOUR_COMPONENT_MODES
+        has_four_components = bone.rotation_mode in FOUR_COMPONENT_ROTATIONS
         yield "set its rotation mode to XYZ Euler" if has_four_components else "name its rotation as controls"
     if other_kinds := [kind for kind in free_kinds if kind != ROTATION]:
         limits = " and ".join(f"Limit {kind.title()}" for kind in other_kinds)
@@ -120,7 +120,7 @@ def _channel_range(bone: bpy.types.PoseBone, path: str) -> tuple[float, float] |
         return (0.0, 0.0) if bone.lock_location[axis] else location_ranges(bone).get(axis)
     if channel == SCALE:
         return (0.0, 0.0) if bone.lock_scale[axis] else scale_ranges(bone).get(axis)
-    if channel == "rotation_euler" and bone.rotation_mode not in _FOUR_COMPONENT_MODES:
+    if channel == "rotation_euler" and bone.rotation_mode not in FOUR_COMPONENT_ROTATIONS:
         rotation_range = rotation_ranges(bone)[axis]
         return (rotation_range.low, rotation_range.high) if rotation_range.moves else (0.0, 0.0)
     return (0.0, 0.0) if all(bone.lock_rotation) else None
@@ -132,9 +132,9 @@ def _can_vary(bounds: tuple[float, float] | None) -> bool:
 
 def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, AxisRanges]]:
     """Yield kind, property and ranges of the channels that are free to move a bone."""
-    if bone.rotation_mode in _FOUR_COMPONENT_MODES:
+    if bone.rotation_mode in FOUR_COMPONENT_ROTATIONS:
         if not all(bone.lock_rotation) and not is_overridden(bone, ROTATION):
-            yield ROTATION, _FOUR_COMPONENT_MODES[bone.rotation_mode], dict.fromkeys(range(4))
+            yield ROTATION, FOUR_COMPONENT_ROTATIONS[bone.rotation_mode], dict.fromkeys(range(4))
     elif not is_overridden(bone, ROTATION):
         yield (
             ROTATION,

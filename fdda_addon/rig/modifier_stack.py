@@ -459,7 +459,6 @@ def _evaluated_object(mesh_object: bpy.types.Object) -> bpy.types.Object:
 
 
 def _keeps_topology(mesh_object: bpy.types.Object) -> bool:
-
     original_mesh, evaluated_mesh = mesh_object.data, _evaluated_object(mesh_object).data
     if any(
         len(getattr(original_mesh, name)) != len(getattr(evaluated_mesh, name))

@@ -23,6 +23,8 @@ def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.nd
     return np.array(matrices, np.float64).reshape(-1, 4, 4)
 
 
+FOUR_COMPONENT_ROTATIONS = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+"""Property of the rotation of a pose bone, by rotation mode; of a bone with Euler angles it is `rotation_euler`."""
 _REST_CHANNEL_VALUES = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
 """The values of `POSE_CHANNELS` in the rest pose."""
 _STORED_CHANNELS = {LOCATION: POSE_CHANNELS[0], ROTATION: POSE_CHANNELS[1], SCALE: POSE_CHANNELS[4]}
@@ -86,7 +88,7 @@ class Poser:
         self._scene_rig = scene_rig
         bones = scene_rig.armature_object.pose.bones
         bone_indices = {bone.name: bone_index for bone_index, bone in enumerate(bones)}
-        stored_as_euler = {bone.name for bone in bones if bone.rotation_mode not in {"QUATERNION", "AXIS_ANGLE"}}
+        stored_as_euler = {bone.name for bone in bones if bone.rotation_mode not in FOUR_COMPONENT_ROTATIONS}
         self._controls: list[tuple[str, int]] = []
         """Name and index of each channel of a control."""
         self._rotations: dict[tuple[str, str], list[tuple[int, int]]] = {}

@@ -14,7 +14,7 @@ from ..poses.clip_player import clip_player
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_rig
 from ..scene.action_slots import active_action
-from ..scene.armature import Poser, clear_pose
+from ..scene.armature import FOUR_COMPONENT_ROTATIONS, Poser, clear_pose
 from ..scene.comparison import hidden_comparison_objects
 from ..scene.scene_rig import SceneRig, armature_modifier
 from ..scene.time_stretching import unstretched_time
@@ -61,12 +61,11 @@ def key_random_poses(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) ->
     channels = [c for c in channels or sampled_channels(scene_rig, read_rig(scene_rig)) if c.kind != CONTROL]
     clear_pose(armature_object)
     poser = Poser(scene_rig, channels)
-    rotation_paths = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
     for index in range(RANDOM_POSE_COUNT):
         poser.set(sample_pose(channels, 0, index))
         for name, kind in {(channel.name, channel.kind) for channel in channels}:
             bone = armature_object.pose.bones[name]
             is_rotation = kind in {ROTATION, ROTATION_VECTOR}
-            path = rotation_paths.get(bone.rotation_mode, "rotation_euler") if is_rotation else kind
+            path = FOUR_COMPONENT_ROTATIONS.get(bone.rotation_mode, "rotation_euler") if is_rotation else kind
             bone.keyframe_insert(path, frame=1 + index * KEY_STEP_FRAMES)
     return armature_object.animation_data.action

@@ -73,10 +73,9 @@ def build_untrained_model(rig: Rig, key_distances: Mapping[str, np.ndarray]) -> 
 def _with_skin_weights(rig: Rig) -> Rig:
     """Return a rig in which the vertices of meshes without weights on bones follow the nearest joint."""
     is_bone = np.array([name != STATIC_JOINT for name in rig.joint_names], bool)
-    has_weight = (is_bone[rig.skin_joints] & (rig.skin_weights > 0)).any(axis=1)
     joints, weights, heads = rig.skin_joints.copy(), rig.skin_weights.copy(), rig.rest_matrices[is_bone][:, :3, 3]
     for mesh in rig.mesh_slices if is_bone.any() else ():
-        if has_weight[mesh].any():
+        if rig.follows_bones[mesh].any():
             continue
         for first in range(mesh.start, mesh.stop, 1000):
             part = slice(first, min(first + 1000, mesh.stop))
