@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fdda_addon.core.mathematics.partition import Partition
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from fdda_addon.core.settings import MAX_DETAIL_MM
+from fdda_addon.core.settings import MAX_DETAIL_MM, automatic_passes
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import split_poses
 from trainer.device import choose_device
@@ -131,7 +131,8 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
     data = PartitionData(
         features[:, inputs.columns[0]],
         lambda: residuals,
-        lambda: joint_regression(rig, partition, poses),
+        # The size of the character is not known: a meter replaces it.
+        lambda: replace(joint_regression(rig, partition, poses), size=1.0),
     )
     return ReferencePartition(name, data, partition.joint, poses)
 
@@ -168,7 +169,8 @@ def run(folder: Path, config: TrainingConfig, is_choosing: bool, only_listed: bo
     else:
         measured, trained_on = np.arange(TRAINING_POSES, pose_count), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
-    detail_mm, config = config.detail_mm or MAX_DETAIL_MM, replace(config, passes=config.passes or 200)
+    detail_mm = config.detail_mm or MAX_DETAIL_MM
+    config = replace(config, passes=config.passes or automatic_passes(len(trained_on)))
     prepared = [prepare_partition(partition.data, split, detail_mm, config.seed) for partition in partitions]
     rows = []
     for partition, trained in zip(partitions, train(prepared, split, config, choose_device().device), strict=True):

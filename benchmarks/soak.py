@@ -150,7 +150,7 @@ def play_model(folder: Path, random: Random) -> None:
     from fdda_addon.scene.scene_rig import find_rig
 
     path = folder / "damaged.onnx"
-    path.write_bytes(mutate_model(random, (folder / "elbow.onnx").read_bytes()))
+    path.write_bytes(mutate_model(random, (folder / "character.onnx").read_bytes()))
     rig = find_rig()
     mesh_object = rig.mesh_object
     try:
@@ -266,7 +266,7 @@ def kill_process(folder: Path, random: Random) -> None:
         return
     model = folder / "killed training" / "m.onnx"
     model.parent.mkdir(exist_ok=True)
-    shutil.copy(folder / "elbow.onnx", model)
+    shutil.copy(folder / "character.onnx", model)
     old = model.read_bytes()
     command = [sys.executable, "-m", "trainer", folder / "short recording", model, *TRAINING_OPTIONS]
     has_finished = not run_and_kill(command, float(random.uniform(0.2, 6)))
@@ -291,7 +291,7 @@ def fill_disk(folder: Path, random: Random) -> None:
     """Run a verb on a disk of random size: it leaves nothing, but for the complete poses of a recording."""
     verb = pick(random, list(DISK_BYTES))
     with small_disk(folder / "small disk", int(random.uniform(4096, DISK_BYTES[verb]))) as disk:
-        rig, model = folder / "elbow.blend", folder / "elbow.onnx"
+        rig, model = folder / "elbow.blend", folder / "character.onnx"
         arguments = {
             "record": (rig, disk / "r", "--poses", POSES),
             "train": (folder / "short recording", disk / "m.onnx", *TRAINING_OPTIONS),
