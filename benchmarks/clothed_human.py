@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Add clothes to a human with a Mixamo-style rig: `clothed_human.py IN.blend OUT.blend [NUMBER]`.
 
-Each of the NUMBER of garments (2, at most 10) is a copy of the faces of the body that follow the covered bones, moved
-outward along the normals and subdivided to at least 1,000 vertices. Their modifiers are copies of those of the body, so
-that all meshes follow one armature.
+NUMBER is the number of garments, 2 by default and at most 10. Each garment is a copy of the faces of the body that
+follow the covered bones, moved outward along the normals; a garment with few vertices is subdivided. It has copies of
+the body's modifiers, so that all meshes follow one armature.
 """
 
 import sys
@@ -28,10 +28,11 @@ COVERED_BONES = {
     "left boot": ("LeftFoot", "LeftToeBase", "LeftLeg"),
     "right boot": ("RightFoot", "RightToeBase", "RightLeg"),
 }
-"""The bones that each piece of clothing covers."""
+"""The bones that each garment covers."""
 DISTANCE_M = 0.012
 """Distance of the first garments from the body; each further pair lies farther outside."""
 MIN_VERTICES = 1000
+"""Garments with fewer vertices are subdivided once."""
 
 
 def main_bones(body: bpy.types.Object) -> list[str]:
