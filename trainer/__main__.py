@@ -21,8 +21,10 @@ if __name__ == "__main__":
     # Before the other imports: a signal during an import would otherwise end in a traceback.
     exit_on_stop_signal()
 
+from fdda_addon.core.recording.folder import recordings_in
+
 from .config import add_options, config_from_arguments
-from .outputs import check_training_outputs
+from .outputs import check_batch, check_training_outputs
 from .process import StopRequest, missing_package_error, run_with_messages
 from .progress import JsonMessageSink, MessageSink, TextMessageSink
 
@@ -39,18 +41,14 @@ def main(arguments: list[str] | None = None) -> int:
 def _train(options: argparse.Namespace, sink: MessageSink, stop_request: StopRequest) -> None:
     config = config_from_arguments(options)
     check_temporary_folder()  # torch fails without a temporary folder.
+    # Files are checked first, because loading torch takes seconds.
+    if recordings := recordings_in(options.recording):
+        check_batch(recordings, options.model, options.overwrite)
+    else:
+        check_training_outputs(options.model, options.overwrite)
     try:
-        from fdda_addon.core.recording.folder import recordings_in
-
-        from .batch import check_batch, train_models
-
-        # Files are checked first, because loading torch takes seconds.
-        if recordings := recordings_in(options.recording):
-            check_batch(recordings, options.model, options.overwrite)
-        else:
-            check_training_outputs(options.model, options.overwrite)
         with stop_request.exit_immediately():
-            from .train import train_model
+            from .train import train_model, train_models
     except ModuleNotFoundError as error:
         raise missing_package_error("Training", error) from error
     settings = (config, sink, stop_request.exit_immediately, options.warm_start, options.strict)

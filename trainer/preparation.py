@@ -119,7 +119,7 @@ def choose_details(recording: SkinnedRecording, split: Split) -> np.ndarray:
 
 
 def make_parts(
-    recording: SkinnedRecording, split: Split, tolerances: Sequence[float], min_vertices: int = 0
+    recording: SkinnedRecording, split: Split, tolerances: Sequence[float], min_vertices: int
 ) -> list[Partition]:
     """Divide the partitions of a recording into parts, by mesh and by the shape keys that they need.
 
@@ -135,11 +135,10 @@ def make_parts(
     matrices = regression_matrices(recording.pose_matrices, rig, use_half_rotations=False)
     parts = []
     for partition in _with_adjacent_keys(rig, divide_by_mesh(rig, recording.partitions, min_vertices)):
-        tolerance = tolerances[mesh_of(rig, partition)]
-        regression = joint_regression(rig, partition, matrices, recording.controls)
         groups = [np.arange(len(partition.vertices))]
-        if len(regression.controls) and len(partition.vertices) >= MIN_DIVIDED_VERTICES:
-            residuals = recording.compute_partition_residuals(partition)
+        if len(partition.vertices) >= MIN_DIVIDED_VERTICES and _shape_keys(rig, partition):
+            regression = joint_regression(rig, partition, matrices, recording.controls)
+            residuals, tolerance = recording.compute_partition_residuals(partition), tolerances[mesh_of(rig, partition)]
             fit, _ = regression.fit(residuals, split.training, tolerance / FINE_TOLERANCE_FACTOR)
             values = regression.control_values[split.training][:, np.searchsorted(regression.controls, fit.controls)]
             groups = divide_partition(fit, values.std(axis=0), tolerance)
@@ -147,9 +146,14 @@ def make_parts(
     return parts
 
 
+def _shape_keys(rig: Rig, partition: Partition) -> set[int]:
+    """Return the shape keys of a partition, as indices of controls."""
+    return {control for control in partition.controls if rig.controls[control].is_shape_key}
+
+
 def _with_adjacent_keys(rig: Rig, partitions: Sequence[Partition]) -> list[Partition]:
     """Return partitions with the shape keys of the partitions with which they share an edge."""
-    keys = [{control for control in p.controls if rig.controls[control].is_shape_key} for p in partitions]
+    keys = [_shape_keys(rig, partition) for partition in partitions]
     if not any(keys):
         return list(partitions)
     owner = np.empty(rig.vertex_count, np.int64)

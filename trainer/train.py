@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs a training: all steps from the recording to the written files."""
+"""Runs a training, or one for each of several recordings: all steps from the recording to the written files."""
 
 import time
 from collections.abc import Callable
@@ -37,7 +37,7 @@ from .networks.checkpoint import Checkpoint, write_checkpoint
 from .networks.loop import train
 from .networks.networks import TrainedPartition
 from .networks.warm_start import checkpoint_parts, initial_networks, read_initial_checkpoint, warm_start_config
-from .outputs import training_outputs
+from .outputs import batch_model_path, training_outputs
 from .preparation import PartitionData, choose_details, make_parts, partition_data, prepare_partitions
 from .progress import MessageSink
 from .report.contents import make_report
@@ -78,9 +78,8 @@ def train_model(
         recording = split_deformation(read_recording(recording_path), config, sink)
         split = split_recording(recording, config)
         config = replace(config, passes=config.passes or automatic_passes(len(recording.pose_matrices)))
-        details_mm = np.full(len(recording.rig.meshes), config.detail_mm)
-        if not config.detail_mm:
-            details_mm = choose_details(recording, split)
+        meshes = recording.rig.meshes
+        details_mm = np.full(len(meshes), config.detail_mm) if config.detail_mm else choose_details(recording, split)
         holdout = holdout_fingerprint(recording, split)
         checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
         job = _Job(config, details_mm, sink, recording, split, checkpoint)
@@ -110,6 +109,34 @@ def train_model(
         report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
     return _send_final_messages(sink, model_path, report, goal_text, start_time, last_message)
+
+
+def train_models(
+    recordings: list[Path],
+    folder: Path,
+    config: TrainingConfig,
+    sink: MessageSink,
+    stoppable: Callable[[], AbstractContextManager],
+    warm_start: bool,
+    strict: bool,
+) -> None:
+    """Train a model on each recording. Finished models are kept when a later training fails.
+
+    Args:
+        recordings: folders of complete recordings, which `check_batch` has checked.
+        folder: folder of the models; the model of recording NAME is FOLDER/NAME/NAME.onnx.
+        config, sink, stoppable, warm_start, strict: as in `train_model`.
+    """
+    start_time = time.perf_counter()
+    settings = (config, sink, stoppable, warm_start, strict, MessageType.MODEL_FINISHED)
+    results = [train_model(recording, batch_model_path(recording, folder), *settings) for recording in recordings]
+    sink.send(
+        MessageType.FINISHED,
+        model=str(folder),
+        models=len(recordings),
+        seconds=round(time.perf_counter() - start_time, 2),
+        **{key: max(values[key] for values in results) for key in ("held_out_mm", "held_out_p999_mm")},
+    )
 
 
 @dataclass

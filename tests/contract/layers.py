@@ -33,7 +33,6 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 
 TRAINER_LAYERS: tuple[tuple[str, ...], ...] = (
     ("__main__",),
-    ("batch",),
     ("train",),
     ("report",),
     ("export",),

@@ -19,6 +19,11 @@ BLOCK_SIZE = 16
 MIN_BLOCK_VERTICES = 20_000
 """Blocks are used from this number of vertices on, if most vertices lie in whole blocks. In smaller meshes the
 additional nodes take longer than they save: docs/experiments.md, What each mechanism brings."""
+LINEAR_PART_SIZE = 3 * VECTOR_SIZE
+"""Number of elements of a matrix's linear part, its first three columns. Matrices are stored column by column.
+
+The linear part is gathered as one slice, because gathering takes the same time for short and for long slices. For the
+same reason, translations are gathered in slices of three."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +92,6 @@ def _is_in_whole_block(partition_by_vertex: np.ndarray, block_size: int) -> np.n
     padding = np.full(-len(partition_by_vertex) % block_size, -1)
     blocks = np.append(partition_by_vertex, padding).reshape(-1, block_size)
     return np.repeat((blocks == blocks[:, :1]).all(axis=1), block_size)[: len(partition_by_vertex)]
-
-
-LINEAR_PART_SIZE = 3 * VECTOR_SIZE
-"""Number of elements of a matrix's linear part, its first three columns. Matrices are stored column by column.
-
-The linear part is gathered as one slice, because gathering takes the same time for short and for long slices. For the
-same reason, translations are gathered in slices of three."""
 
 
 class _PartitionRows:

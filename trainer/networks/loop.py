@@ -16,6 +16,16 @@ from ..data.split import Split
 from ..preparation import PreparedPartition
 from .networks import Curves, Network, PartitionNetworks, TrainedPartition
 
+WARM_UP_FRACTION = 0.15
+"""Part of the steps in which the learning rate rises."""
+RELEVANCE_EPOCH_FRACTIONS = (0.1, 0.2)
+"""Inputs are rescaled by relevance after these parts of the epochs (`_Loop.rescale_inputs_by_relevance`)."""
+RELEVANCE_POSES = 1000
+"""Approximate number of training poses on which relevance is measured."""
+MIN_RELEVANCE = 1e-3
+"""Minimum factor of an input. The root mean square of the factors of a partition's inputs is 1."""
+LOSS_EPSILON = 1e-6
+"""Added to squared relative errors, so that the loss, a distance, is smooth at zero."""
 BETA_2 = 0.999
 EPSILON = 1e-8
 MIN_BETA_1, MAX_BETA_1 = 0.85, 0.95
@@ -99,18 +109,6 @@ class OneCycleAdamW:
 def _interpolate_cosine(start: float, end: float, fraction: float) -> float:
     """Interpolate along half a period of a cosine; `fraction` 0 gives `start`, 1 gives `end`."""
     return end + (start - end) / 2.0 * (1 + math.cos(math.pi * fraction))
-
-
-WARM_UP_FRACTION = 0.15
-"""Part of the steps in which the learning rate rises."""
-RELEVANCE_EPOCH_FRACTIONS = (0.1, 0.2)
-"""Inputs are rescaled by relevance after these parts of the epochs (`_Loop.rescale_inputs_by_relevance`)."""
-RELEVANCE_POSES = 1000
-"""Approximate number of training poses on which relevance is measured."""
-MIN_RELEVANCE = 1e-3
-"""Minimum factor of an input. The root mean square of the factors of a partition's inputs is 1."""
-LOSS_EPSILON = 1e-6
-"""Added to squared relative errors, so that the loss, a distance, is smooth at zero."""
 
 
 def train(

@@ -4,7 +4,7 @@
 import pytest
 
 from fdda_addon.core.errors import OutputError
-from trainer.batch import check_batch
+from trainer.outputs import check_batch
 
 from ..core.limb import record_limb
 
