@@ -20,7 +20,7 @@ from ..scene.node_groups import (
     depends_on_shape,
     find_time_node,
     geometry_effect,
-    named_attributes,
+    read_texts,
     stored_attributes,
     tree_nodes,
 )
@@ -171,7 +171,7 @@ def read_names(modifier: bpy.types.Modifier) -> set[str]:
     if modifier.type == "ARMATURE" and modifier.use_vertex_groups:
         names |= set(modifier.id_data.vertex_groups.keys())
     if modifier.type == "NODES" and modifier.node_group is not None:
-        names |= named_attributes(modifier.node_group) | _node_input_texts(modifier)
+        names |= {*read_texts(modifier.node_group), *_node_input_texts(modifier)}
     return names - {""}
 
 

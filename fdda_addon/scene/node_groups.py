@@ -79,7 +79,7 @@ def read_bone_names(tree: bpy.types.NodeTree | None) -> Iterator[str]:
 def read_texts(tree: bpy.types.NodeTree | None) -> Iterator[str]:
     """Yield the texts in the nodes of a group and of nested groups, among them the names of attributes."""
     for node in tree_nodes(tree):
-        yield from (socket.default_value for socket in node.inputs if socket.type == "STRING")
+        yield from (socket.default_value for socket in node.inputs if socket.type == "STRING" and not socket.is_linked)
         if node.bl_idname == "FunctionNodeInputString":
             yield node.string
 
@@ -118,16 +118,6 @@ def _may_name_positions(node: bpy.types.Node) -> bool:
 def depends_on_shape(tree: bpy.types.NodeTree) -> bool:
     """Return whether the result of a node group may depend on the positions of the vertices."""
     return any(_depends_on_shape(node) for node in tree_nodes(tree))
-
-
-def named_attributes(tree: bpy.types.NodeTree) -> set[str]:
-    """Return the texts in the sockets of a node group and of nested groups: the attributes that it names."""
-    return {
-        socket.default_value
-        for node in tree_nodes(tree)
-        for socket in node.inputs
-        if socket.type == "STRING" and not socket.is_linked
-    }
 
 
 def stored_attributes(tree: bpy.types.NodeTree) -> set[str] | None:

@@ -72,6 +72,37 @@ def storing(mesh_object: bpy.types.Object, node: str = "GeometryNodeInputPositio
     group.links.new(group.nodes.new(node).outputs[0], store.inputs["Value"])
 
 
+def seen_by(group: bpy.types.NodeTree, is_text: bool = False) -> bpy.types.NodeSocket:
+    """Add a node that reads the attribute *seen*, by its name or by a node String; return its output."""
+    attribute, text = group.nodes.new("GeometryNodeInputNamedAttribute"), group.nodes.new("FunctionNodeInputString")
+    if is_text:
+        text.string = "seen"
+        group.links.new(text.outputs[0], attribute.inputs["Name"])
+    else:
+        attribute.inputs["Name"].default_value = "seen"
+    return attribute.outputs[0]
+
+
+def displace_seen(mesh_object: bpy.types.Object, is_text: bool = False) -> None:
+    """Only later nodes, which deform, read the attribute."""
+    storing(mesh_object)
+    group = stacks.build_node_chain("Displace", "GeometryNodeSetPosition")
+    vector = group.nodes.new("ShaderNodeCombineXYZ")
+    group.links.new(seen_by(group, is_text), vector.inputs["Z"])
+    group.links.new(vector.outputs[0], group.nodes["Set Position"].inputs["Offset"])
+    mesh_object.modifiers.new("Displace", "NODES").node_group = group
+
+
+def store_seen(mesh_object: bpy.types.Object) -> None:
+    """Nodes after the rig read the attribute, too."""
+    displace_seen(mesh_object)
+    group = stacks.build_node_chain("Copy", "GeometryNodeStoreNamedAttribute")
+    store = group.nodes["Store Named Attribute"]
+    store.data_type, store.inputs["Name"].default_value = "FLOAT", "copy"
+    group.links.new(seen_by(group, is_text=True), store.inputs["Value"])
+    mesh_object.modifiers.new("Copy", "NODES").node_group = group
+
+
 POSE = "so its result does not follow from the pose; switch it off in the viewport, or remove it."
 MIDDLE = (
     "changes the topology of the mesh before 'Mush', which a model replaces, so its vertices cannot be followed; move "
@@ -92,6 +123,7 @@ REFUSED = {
         for kind in ("PARTICLE_SYSTEM", "COLLISION", "WEIGHTED_NORMAL", "NORMAL_EDIT")
     },
     **{build.__name__: (build, SHAPE) for build in (near, projected, transferred, storing)},
+    "attribute that others read by a text": (store_seen, SHAPE.replace("Mush", "Displace")),
     **{kind: (add_modifier_at(2, kind), f"is a simulation, {POSE}") for kind in ("CLOTH", "SOFT_BODY")},
     **{kind: (add_modifier_at(2, kind), f"plays a cache, {POSE}") for kind in ("MESH_CACHE", "MESH_SEQUENCE_CACHE")},
     **{kind: (add_modifier_at(0, kind), f"changes with time, {POSE}") for kind in ("WAVE", "BUILD")},
@@ -131,23 +163,13 @@ def smooth_near(mesh_object: bpy.types.Object) -> None:
     mesh_object.modifiers["Mush"].vertex_group = "near"
 
 
-def displace_seen(mesh_object: bpy.types.Object) -> None:
-    """Only later nodes, which deform, read the attribute."""
-    storing(mesh_object)
-    group = stacks.build_node_chain("Displace", "GeometryNodeSetPosition")
-    attribute, vector = group.nodes.new("GeometryNodeInputNamedAttribute"), group.nodes.new("ShaderNodeCombineXYZ")
-    attribute.inputs["Name"].default_value = "seen"
-    group.links.new(attribute.outputs[0], vector.inputs["Z"])
-    group.links.new(vector.outputs[0], group.nodes["Set Position"].inputs["Offset"])
-    mesh_object.modifiers.new("Displace", "NODES").node_group = group
-
-
 ACCEPTED = {
     "hair before the rig": add_modifier_at(0, "PARTICLE_SYSTEM"),
     "hair after the rig": add_modifier_at(2, "PARTICLE_SYSTEM"),
     "constant weights": add_modifier_at(1, "VERTEX_WEIGHT_EDIT", vertex_group="lower"),
     "weights of the rig": smooth_near,
     "attribute of the rig": displace_seen,
+    "attribute of the rig, named by a text": lambda mesh_object: displace_seen(mesh_object, is_text=True),
     "constant attribute": lambda mesh_object: storing(mesh_object, "GeometryNodeInputIndex"),
 }
 
