@@ -7,11 +7,14 @@ With `--all`, or with several `--object`, one recording has several meshes of an
 import argparse
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 from ..core.checks.target import unsettled_sentence
+from ..core.errors import WrongUsageError
 from ..core.progress import Progress
 from ..core.recording.estimate import format_poses
 from ..core.recording.index import read_index, read_info
+from ..core.settings import MAX_AUTO_POSES, POSES, REFINEMENT_POSES, REPEATABILITY_POSES
 from ..core.wording import format_count
 from ..poses.remix import describe_bones
 from ..poses.sample_selection import describe_control_bones, split_control_bones
@@ -20,18 +23,42 @@ from ..recording.refinement import RefinementSettings, refine
 from ..recording.run import record
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, find_character, find_whole_character
-from .files import open_file
+from .files import add_rig_argument, open_file
+from .pose_options import add_pose_options
 from .progress import ProgressPrinter
-from .record_options import add_record_options, check_options
-from .target import pose_settings, target_settings
+from .target import add_target_options, pose_settings, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    add_record_options(parser)
+    add_rig_argument(parser)
+    parser.add_argument(
+        "--object",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="mesh object to record, if several have a rig; repeatable, for one recording of several meshes",
+    )
+    parser.add_argument(
+        "--all", action="store_true", help="record all meshes that follow the armature by their modifiers"
+    )
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
+    add_pose_options(
+        parser,
+        default=None,
+        help=f"number of random poses (default: {POSES.default:,} to {MAX_AUTO_POSES:,}, by the speed of the rig, so "
+        f"that they take about a minute; with --refine {REFINEMENT_POSES})",
+    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
+    add_target_options(parser)
+    REPEATABILITY_POSES.add_option(parser)
+    parser.add_argument(
+        "--refine", metavar="MODEL.onnx", type=Path, help="add poses at the worst errors of this model to the recording"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
-    check_options(options)
+    _check_options(options)
     open_file(options.rig)
     scene_rig = _find_rig(options)
     if not options.refine:
@@ -55,6 +82,32 @@ def run(options: argparse.Namespace) -> None:
     meshes = f", of {len(index['meshes'])} meshes" if len(index["meshes"]) > 1 else ""
     poses = format_poses(info.poses, len(info.alone_poses))
     print(f"{options.recording}: {poses}{meshes}, in {seconds:.1f} s")
+
+
+def _check_options(options: argparse.Namespace) -> None:
+    """Check the options, as far as they need no rig.
+
+    Raises:
+        WrongUsageError: two options contradict each other.
+    """
+    target_settings(options)
+    new_recording_options = (
+        options.action,
+        options.strip,
+        options.mirror,
+        options.bones_to_pose,
+        options.extra_input,
+        options.learn_from,
+    )
+    if options.refine and (any(new_recording_options) or options.poses == 0):
+        raise WrongUsageError(
+            "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --bones-to-pose, "
+            "--extra-input and --learn-from out."
+        )
+    if options.all and options.object:
+        raise WrongUsageError("--all records all meshes, and --object those that it names; give one of them.")
+    if options.overwrite and (options.resume or options.refine):
+        raise WrongUsageError("--overwrite makes a new recording; leave --resume and --refine out.")
 
 
 def _find_rig(options: argparse.Namespace) -> SceneRig:
