@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Chooses the control bones that a fast rig keeps, and the actions that animate them."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 
 import bpy
 
@@ -44,8 +45,8 @@ def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> 
         if choice == VISIBLE:
             names |= {bone.name for bone in bones if not is_bone_hidden(bone)}
         elif choice == KEYED:
-            actions = animating_actions(armature_object)
-            names |= {name for action in actions for name in keyed_bones(armature_object, action) if name in bones}
+            keyed = keyed_bones(armature_object, animating_actions(armature_object))
+            names |= {name for counts in keyed.values() for name in counts if name in bones}
         else:
             collection_name = choice.removeprefix(COLLECTION)
             collection = armature_object.data.collections_all.get(collection_name)
@@ -66,18 +67,14 @@ def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> 
 def animating_actions(armature_object: bpy.types.Object) -> list[bpy.types.Action]:
     """Return the actions of the file that key bones of an armature, except `constraint_actions`."""
     bones, excluded = armature_object.pose.bones, constraint_actions(armature_object)
-    return [
-        action
-        for action in bpy.data.actions
-        if action not in excluded and any(name in bones for name in keyed_bones(armature_object, action))
-    ]
+    keyed = keyed_bones(armature_object, [action for action in bpy.data.actions if action not in excluded])
+    return [action for action, counts in keyed.items() if any(name in bones for name in counts)]
 
 
-def keyed_bones(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, int]:
-    """Return how many channels of each bone an action keys, by the name of the bone, which may be missing."""
-    counts: dict[str, int] = {}
-    (curves,) = curves_of_actions([action], armature_object)
-    for curve in curves.get(armature_object, ()):
-        if name := split_bone_path(armature_object, curve.data_path)[0]:
-            counts[name] = counts.get(name, 0) + 1
-    return counts
+def keyed_bones(
+    armature_object: bpy.types.Object, actions: Sequence[bpy.types.Action]
+) -> dict[bpy.types.Action, Counter[str]]:
+    """Return how many channels of each bone actions key, by action and name of the bone, which may be missing."""
+    all_curves = (curves.get(armature_object, ()) for curves in curves_of_actions(actions, armature_object))
+    names = ((split_bone_path(armature_object, curve.data_path)[0] for curve in curves) for curves in all_curves)
+    return {action: Counter(filter(None, each)) for action, each in zip(actions, names, strict=True)}

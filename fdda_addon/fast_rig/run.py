@@ -107,7 +107,7 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
     poses = ComparedPoses(armature_object, bone_names, controls, actions, size, shown, driven)
     before, unrepeated = yield from _evaluate_full_rig(poses)
     bones_before = len(armature_object.data.bones)
-    keyed = {action.name: keyed_bones(armature_object, action) for action in actions}
+    keyed = {action.name: counts for action, counts in keyed_bones(armature_object, actions).items()}
     removed = remove_unneeded_parts(scene_rigs, joint_names, controls)
     after = yield from evaluate_poses(poses, "fast rig")
 

@@ -17,8 +17,6 @@ from .scene_rig import MIN_VOLUME, SceneRig
 
 MAX_HIDDEN_MOTION = 1e-3
 """Largest motion of a control bone along an axis that is no control, as a part of its length, without a warning."""
-
-
 ABSENT_INPUTS = "so its extra inputs count as 0"
 """A clause of the warning about a missing mesh, with which a model plays all the same."""
 

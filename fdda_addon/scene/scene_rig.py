@@ -126,8 +126,7 @@ def find_whole_character() -> tuple[SceneRig, str]:
     """Find the rig of all meshes of the scene that follow its armature by modifiers.
 
     Returns:
-        The rig, as of `join_rigs`; and a sentence about the meshes that are left out, or an empty
-        text.
+        The rig, as of `join_rigs`; and a sentence about the meshes that are left out, empty for none.
 
     Raises:
         RigError: there is no such mesh, or the meshes follow different armatures.
