@@ -135,4 +135,4 @@ requirements: .venv  ## pin the packages that pyproject.toml names, and their de
 clean:  ## remove all built files and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-core .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench soak study simulation characters pictures films map fixtures lint package release requirements clean
+.PHONY: help .venv .venv-core .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench soak study simulation characters pictures films map third-party fixtures lint package release requirements clean
