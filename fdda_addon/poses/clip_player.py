@@ -160,9 +160,9 @@ class ClipFrame:
 class ClipPlayer:
     """Shows frames of clips. Each frame looks the same, whatever frames were shown before.
 
-    A clip animates all datablocks on which the rigs depend and for which it has F-curves (`slots_of_action`), such as
-    another armature with the control rig, or shape keys. Bones that an action does not key are in the rest pose, and
-    other numbers have their values in the file.
+    A clip animates all datablocks on which the rigs depend and for which it has F-curves (`slots_of_action`).
+    Examples are shape keys, and another armature with the control rig. Bones that an action does not key are in the
+    rest pose, and other numbers have their values in the file.
 
     Attributes:
         armature_objects: the armature object of the rigs, then others that a clip animates.

@@ -22,8 +22,8 @@ from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_con
 from .pose_plan import PosePlan
 
 MAX_TARGET_POSES, MAX_SEAM_POSES, TIMED_POSES = 20, 10, 12
-"""Number of poses in which the motion of a target is compared, in which the gaps of a mesh with cuts are measured, and
-that are timed."""
+"""Numbers of poses: in which the motion of a target is compared, in which gaps at cuts are measured, and that are
+timed."""
 MIN_RIG_MOTION_RATIO, MAX_STILL_TARGET_RATIO = 0.02, 1e-5
 """Ratios of the rig's size. A target does not follow the rig if it moves by less than the second ratio while the rig
 moves by more than the first ratio."""

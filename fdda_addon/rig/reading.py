@@ -217,7 +217,7 @@ def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndar
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
     """Read a rig with the joints, controls and unit of a model, so that `formats.model.check_rig` can compare them.
 
-    A fast rig lacks modifiers and bones of the rig that the model was trained for, so skin weights and deformation
+    A fast rig lacks modifiers and bones of the rig that the model was trained for. So its skin weights and deformation
     count as those of the model. If the model reads key joints, the rig has these alone.
     """
     rig = read_rig(scene_rig, info.joint_names, are_joints_complete=True)

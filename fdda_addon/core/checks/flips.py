@@ -18,6 +18,7 @@ import numpy as np
 from ..mathematics.features import joint_features_in_metres
 from ..mathematics.partition import Partition
 from ..recording.skinned import SkinnedRecording
+from ..wording import format_count
 from .residual_scan import ResidualScan
 from .warning import RecordingWarning, format_length, joint_name
 
@@ -29,8 +30,8 @@ of two poses."""
 MIN_PAIRS = 10
 """Smallest number of pairs of poses from which the usual distance is estimated."""
 HALF_TURN_JUMP_RATIO, HALF_TURN_JUMP_PERCENTILE = 4.0, 95.0
-"""The mesh jumps at 180 degrees where the median distance of poses on two sides exceeds both this multiple of the
-median distance of poses on the same side, and this percentile of the distances on the same side."""
+"""The mesh jumps at 180 degrees where the median distance of poses on two sides exceeds both limits: this multiple of
+the median distance on the same side, and this percentile of the distances there."""
 JUMP_RATIO = 8.0
 """The mesh jumps between two poses that are similar in all inputs where their distance is above this multiple of the
 median distance of such pairs."""
@@ -70,7 +71,6 @@ def check_flips(recording: SkinnedRecording, scan: ResidualScan) -> list[Recordi
         return []
     worst_flip, rig = max(flips, key=lambda flip: flip.jump), recording.rig
     jump_text = format_length(rig, worst_flip.jump)
-    pairs_text = "1 pair" if worst_flip.pairs == 1 else f"{worst_flip.pairs} pairs"
     other_count = len(flips) - 1
     others_text = (
         f"; {other_count} more {'partition jumps' if other_count == 1 else 'partitions jump'} too"
@@ -83,8 +83,9 @@ def check_flips(recording: SkinnedRecording, scan: ResidualScan) -> list[Recordi
         advice = "keep its rotation below 180 degrees, where Preserve Volume flips"
     text = (
         f"Vertices of '{joint_name(rig, recording.partitions[worst_flip.partition].joint)}' jump up to {jump_text} "
-        f"between similar poses{joint_text} ({pairs_text}, such as poses {worst_flip.poses[0]} and "
-        f"{worst_flip.poses[1]}){others_text}, and no network can learn a jump: {advice}, and record again."
+        f"between similar poses{joint_text} ({format_count(worst_flip.pairs, 'pair')}, such as poses "
+        f"{worst_flip.poses[0]} and {worst_flip.poses[1]}){others_text}, and no network can learn a jump: {advice}, "
+        "and record again."
     )
     return [RecordingWarning("flips", text)]
 

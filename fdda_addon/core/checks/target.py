@@ -15,8 +15,8 @@ MAX_DISTANCE_RATIO = 0.2
 """Largest distance between the shapes of a target in a pose that is reached from two directions, as a ratio of the
 error of linear skinning."""
 JUMP_RATIO, MIN_JUMP_RATIO = 8.0, 0.01
-"""A target jumps in a frame where its motion relative to linear skinning exceeds both this multiple of the action's
-median motion, and this ratio of the rig's size."""
+"""A target jumps in a frame where its motion relative to linear skinning exceeds two limits: this multiple of the
+median motion in the action, and this ratio of the rig's size."""
 MAX_FROZEN_RATIO, MIN_MOTION_RATIO = 1e-6, 1e-3
 """Ratios of the rig's size: a target is frozen where it moves by less than the first between two frames while linear
 skinning moves by more than the second."""

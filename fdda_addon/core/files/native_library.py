@@ -9,7 +9,7 @@ from importlib import metadata
 from typing import NamedTuple
 
 OLD_CPP_LIBRARY, LAST_OLD_RUNTIME = (14, 40), (1, 20)
-"""Newer versions of ONNX Runtime than the second end the process with an older C++ library than the first.
+"""ONNX Runtime after the second version ends the process if the C++ library is older than the first.
 `setup/package.py` refuses wheels that need more than Blender brings, but another extension may have brought one."""
 _REINSTALL = "install the training environment again", "install the extension's zip for this platform again"
 """Replaces {again} in advice for the trainer's Python, and for Blender."""

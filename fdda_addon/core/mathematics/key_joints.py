@@ -16,7 +16,7 @@ class KeyJointReport:
     """How key joints were chosen.
 
     Attributes:
-        requested: the option `joints`.
+        requested: the setting `bones_to_read`.
         joints, rig_joints: number of key joints, and of all joints.
         unexplained_mm: largest motion of another joint that key joints and controls do not explain, mm: rms over poses
             and over the vertices of the joint, times skin weights.
@@ -34,7 +34,7 @@ class KeyJointReport:
     still: tuple[str, ...] = ()
 
     def to_json(self) -> dict:
-        """Return the JSON for `recording.json` and messages."""
+        """Return the JSON for the metadata of a model."""
         return asdict(self) | {"independent": list(self.independent), "still": list(self.still)}
 
     @staticmethod

@@ -95,9 +95,9 @@ def make_merged_partitions(rig: Rig, min_vertices: int = MIN_VERTICES_PER_PART.d
 def small_partition_merges(rig: Rig, min_vertices: int = MIN_VERTICES_PER_PART.default) -> dict[int, int]:
     """Choose the partitions into which small partitions are merged.
 
-    The smallest partition is merged first, into the partition whose joint has the most weight on its vertices, else
-    into the partition of its nearest ancestor or descendant. A small partition without any of these stays as it is, and
-    the last partition is never merged.
+    The smallest partition is merged first, into the partition whose joint has the most weight on its vertices. Without
+    such weight it is merged into the partition of its nearest ancestor or descendant. A small partition without any of
+    these stays as it is, and the last partition is never merged.
 
     Args:
         min_vertices: partitions with fewer vertices are small; 0 merges none.
@@ -164,8 +164,8 @@ def _count_generations(rig: Rig, ancestor: int, joint: int) -> int:
 def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
     """Set the influences of partitions to those that are likely, where influences cannot be detected by moving joints.
 
-    These are the main joint, the joints with a weight on a vertex of the partition or on a vertex that shares a face
-    with it, their reference joints, and every control. A surface that sags depends on the direction of gravity, so all
+    These are the main joint, the joints with a weight on the partition or on the faces around it, their reference
+    joints, and every control. A surface that sags depends on the direction of gravity, so all
     joints from the main joint up to mesh-object space are included.
 
     Args:

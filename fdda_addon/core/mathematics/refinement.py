@@ -65,9 +65,9 @@ def choose_poses(
 ) -> np.ndarray:
     """Choose poses that improve a model.
 
-    Each pose combines probes for several partitions. In a random order that prefers large errors, each partition copies
-    the values of its channels from a probe, unless another partition has already set one of these channels. A channel
-    that no partition sets keeps its value in `base_poses`.
+    Each pose combines probes for several partitions, in a random order that prefers large errors. A partition copies
+    the values of its channels from a probe, unless another one has already set one of these channels. A channel that no
+    partition sets keeps its value in `base_poses`.
 
     Args:
         probes: compared poses and their errors.

@@ -58,7 +58,7 @@ class SkinFit:
     key_joints: KeyJointReport | None = None
 
     def to_json(self) -> dict:
-        """Return the JSON for `recording.json` and messages."""
+        """Return the JSON for the metadata of a model."""
         value = {"kind": self.kind, "poses": self.poses, **asdict(self.held_out), "training": asdict(self.training)}
         return value | ({"key_joints": self.key_joints.to_json()} if self.key_joints else {})
 
