@@ -134,7 +134,7 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
     assert_plays(bpy.data.objects["elbow"], model)
 
 
-def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
+def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path, capfd):
     built(targets.target_pc2, tmp_path / "rig.blend")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
     mesh_object = bpy.data.objects["elbow"]
@@ -163,3 +163,7 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     assert bpy.ops.fdda.evaluate(source="ACTION", action=ACTION) == {"FINISHED"}
     linear = last_evaluation.get(mesh_object).total["linear"]
     assert linear.mean > 0.5  # The rig itself is its linear skinning.
+    bpy.data.objects["flesh"].modifiers["Cache"].frame_start += 5
+    capfd.readouterr()
+    assert bpy.ops.fdda.evaluate(source="ACTION", action=ACTION) == {"FINISHED"}
+    assert "The target stands still in 5 poses in which the rig moves" in capfd.readouterr().out
