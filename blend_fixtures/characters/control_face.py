@@ -90,10 +90,10 @@ def add_speech() -> bpy.types.Action:
     return armature_object.animation_data.action
 
 
-def many_control_bones(count: int) -> None:
-    """Add control bones with free rotations and limited locations to the tube, in the collection `Face`."""
+def many_control_bones() -> None:
+    """Add 60 control bones with free rotations and limited locations to the tube, in the collection `Face`."""
     _, armature_object = tube()
-    names = [f"control.{n:02}" for n in range(count)]
+    names = [f"control.{n:02}" for n in range(60)]
     add_bones(armature_object, *(NewBone(name, (0, 0.3, 0), (0, 0.3, 0.05), "", False) for name in names))
     add_bone_collection(armature_object, COLLECTION, *names)
     for bone in (armature_object.pose.bones[name] for name in names):

@@ -4,8 +4,6 @@
 The control bones are in the bone collection `Controls`.
 """
 
-from collections.abc import Callable
-
 from .base import bulge, tube
 from .bones import NewBone, add_bone_collection, add_bones, add_delta_mush, limit, remove_constraints
 from .controls import add_key, add_property, drive_by_property
@@ -75,6 +73,3 @@ def face_slider() -> None:
     driver.expression = "10 * slider_y"
     add_bone_collection(armature_object, CONTROLS, "slider", "jaw")
     add_delta_mush(mesh_object)
-
-
-CONTROL_RIGS: tuple[Callable[[], None], ...] = (ik_fk, face_slider)

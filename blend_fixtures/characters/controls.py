@@ -77,12 +77,6 @@ def dial() -> None:
     add_delta_mush(mesh_object)
 
 
-CONTROLS: tuple[Callable[[], None], ...] = (
-    custom_property, free_shape_keys, constraint_influence, modifier_strength, undriven_strength, lattice_shape_key,
-    dial,
-)  # fmt: skip
-
-
 def add_cast(mesh_object: bpy.types.Object) -> bpy.types.CastModifier:
     """Add a Cast modifier with strength 0."""
     modifier = mesh_object.modifiers.new("Cast", "CAST")

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Build characters that depend on time; each function builds one in the current scene.
 
-The surfaces of `REFUSED` change with the frame, and no input of a model gives the change. In `TOLD` the keyed property
-is a control. In `HARMLESS` something is keyed, but the surface depends only on the pose.
+Something of each is keyed or driven. The surfaces of the characters in `HARMLESS` still depend only on the pose.
 """
 
 from collections.abc import Callable
@@ -222,15 +221,6 @@ def bones_that_move_with_time() -> None:
     insert_keys(copy, "influence", 0.0, 1.0)
 
 
-REFUSED: tuple[Callable[[], None], ...] = (
-    keyed_strength, strength_in_the_nla, driven_by_frame, driven_by_the_scene, driven_by_the_context,
-    through_a_property, keyed_property_without_a_range, property_of_the_scene,
-    keyed_lattice, hook_on_a_moving_parent, hook_that_copies_what_moves, waving_cage,
-    keyed_texture, keyed_nodes, nodes_that_read_a_mover, second_armature_whose_rotation_is_driven,
-)  # fmt: skip
-TOLD: tuple[Callable[[], None], ...] = (
-    keyed_shape, keyed_shape_of_a_lattice, keyed_property, second_armature_with_an_action,
-)  # fmt: skip
 HARMLESS: tuple[Callable[[], None], ...] = (
     one_value_in_all_frames, a_hidden_modifier_with_keys, a_live_modifier_with_keys, what_moves_nothing,
     a_muted_shape_with_keys, a_lattice_that_is_carried, bones_that_move_with_time,

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Build characters with several meshes, with many bones or without weights; each function builds one."""
 
-from collections.abc import Callable
-
 import bpy
 import numpy as np
 
@@ -103,9 +101,6 @@ def five_hundred_bones() -> None:
             group.add(range(first_vertex + 4, first_vertex + 8), 0.5 if index + 1 < BONES_PER_CHAIN else 1.0, "REPLACE")
     mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
     add_delta_mush(mesh_object, 3)
-
-
-MESHES: tuple[Callable[[], None], ...] = (body_and_sleeve, through_a_lattice, five_hundred_bones)
 
 
 def _bone_name(chain: int, index: int) -> str:

@@ -136,12 +136,7 @@ ROWS: tuple[Row, ...] = (
         recording=_recording_settings(bones_to_pose=("collection:Controls",)),
     ),
     _tube_row(INPUTS, controls.custom_property, "a custom property that drives a shape key"),
-    _tube_row(
-        INPUTS,
-        controls.free_shape_keys,
-        "shape keys set by hand",
-        recording=_recording_settings(),
-    ),
+    _tube_row(INPUTS, controls.free_shape_keys, "shape keys set by hand"),
     _tube_row(INPUTS, controls.constraint_influence, "a constraint's influence, which also drives a shape key"),
     _tube_row(INPUTS, controls.modifier_strength, "a custom property that drives a modifier's strength"),
     _tube_row(

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Build characters that bones of a second armature deform; each function builds one in the current scene.
-
-In `REFUSED`, the second armature moves the surface by properties that are not controls. In `TOLD`, the motion of the
-second armature is a control, or it depends only on the first armature.
-"""
-
-from collections.abc import Callable
+"""Build characters that bones of a second armature deform; each function builds one in the current scene."""
 
 import bpy
 
@@ -60,7 +54,7 @@ def hook_on_a_bone() -> None:
     stacks.hook()
     handle = bpy.data.objects["handle"]
     matrix = handle.matrix_world.copy()
-    handle.parent, handle.parent_type, handle.parent_bone = _add_unlocked_armature(), "BONE", BONE
+    handle.parent, handle.parent_type, handle.parent_bone = add_unlocked_armature(), "BONE", BONE
     bpy.context.view_layer.update()
     handle.matrix_world = matrix
 
@@ -70,14 +64,14 @@ def hook_that_copies_a_bone() -> None:
     handle = bpy.data.objects["handle"]
     handle.parent = None
     copy = handle.constraints.new("COPY_TRANSFORMS")
-    copy.target, copy.subtarget = _add_unlocked_armature(), BONE
+    copy.target, copy.subtarget = add_unlocked_armature(), BONE
 
 
 def lattice_on_a_bone() -> None:
     stacks.lattice()
     lattice_object = bpy.data.objects["lattice"]
     lattice_object.vertex_groups.new(name=BONE).add(range(54), 1.0, "REPLACE")
-    lattice_object.modifiers.new("Muscles", "ARMATURE").object = _add_unlocked_armature()
+    lattice_object.modifiers.new("Muscles", "ARMATURE").object = add_unlocked_armature()
 
 
 def driver_of_a_bone() -> None:
@@ -88,7 +82,7 @@ def driver_of_a_bone() -> None:
 def driver_of_a_channel() -> None:
     """A driver of a modifier reads a component of a bone's quaternion."""
     mesh_object, _ = tube()
-    armature_object = _add_unlocked_armature()
+    armature_object = add_unlocked_armature()
     driver = add_cast(mesh_object).driver_add("factor").driver
     variable = driver.variables.new()
     variable.name, variable.targets[0].id = "x", armature_object
@@ -112,14 +106,7 @@ def copied_from_the_first() -> None:
     copy.target, copy.subtarget = armature_object, "handle"
 
 
-REFUSED: tuple[Callable[[], None], ...] = (
-    quaternion, axis_angle, free_location, free_scale, free_root, hook_on_a_bone, hook_that_copies_a_bone,
-    lattice_on_a_bone, driver_of_a_bone, driver_of_a_channel,
-)  # fmt: skip
-TOLD: tuple[Callable[[], None], ...] = (two_armatures, limited_location, copied_from_the_first)
-
-
-def _add_unlocked_armature() -> bpy.types.Object:
+def add_unlocked_armature() -> bpy.types.Object:
     """Add a second armature with Blender's defaults: quaternion rotation and no locks."""
     armature_object = link(bpy.data.objects.new(ARMATURE, bpy.data.armatures.new(ARMATURE)))
     add_bones(armature_object, NewBone(BONE, (0.1, 0.0, 0.0), (0.1, 0.0, 0.1)))
@@ -138,6 +125,6 @@ def _drive_by_bone_transform(channel: str) -> None:
     variable = driver.variables.new()
     variable.name, variable.type = "transform", "TRANSFORMS"
     target = variable.targets[0]
-    target.id, target.bone_target, target.transform_type = _add_unlocked_armature(), BONE, channel
+    target.id, target.bone_target, target.transform_type = add_unlocked_armature(), BONE, channel
     target.transform_space = "LOCAL_SPACE"
     driver.expression = "transform"

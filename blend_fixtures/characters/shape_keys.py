@@ -43,10 +43,10 @@ def arkit_face() -> None:
     _build_head(ARKIT_PARTS)
 
 
-def many_keys(count: int = 300) -> None:
-    """Build the head with many shape keys, each near a part of the face."""
+def many_keys() -> None:
+    """Build the head with 300 shape keys, each near a part of the face."""
     parts = list(PART_ANGLES)
-    _build_head({f"key.{index:03}": parts[index % len(parts)] for index in range(count)})
+    _build_head({f"key.{index:03}": parts[index % len(parts)] for index in range(300)})
 
 
 def _build_head(parts: dict[str, str]) -> None:
@@ -75,13 +75,13 @@ def _build_head(parts: dict[str, str]) -> None:
     _add_performance(mesh_object, armature_object)
 
 
-def corrected_arm(count: int = 60) -> None:
-    """Build the sample arm with corrective shape keys that angles of joints drive, clamped to 0 and 1."""
+def corrected_arm() -> None:
+    """Build the sample arm with 60 corrective shape keys that angles of joints drive, clamped to 0 and 1."""
     mesh_object, armature_object = build_arm()
     points = np.array([vertex.co for vertex in mesh_object.data.vertices])
     axes = [(bone, axis) for axis in range(3) for bone in armature_object.pose.bones if not bone.lock_rotation[axis]]
     random = np.random.default_rng(0)
-    for index in range(count):
+    for index in range(60):
         bone, axis = axes[index % len(axes)]
         center = points[np.argmin(np.linalg.norm(points - bone.bone.head_local, axis=1))]
         offset, radius = random.uniform(-0.004, 0.004, 3), random.uniform(0.02, 0.06)

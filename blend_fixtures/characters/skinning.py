@@ -4,8 +4,6 @@
 All functions build in the current scene. Tubes have the object names of `base`, limbs the object names of `bones`.
 """
 
-from collections.abc import Callable
-
 import bpy
 import numpy as np
 
@@ -159,10 +157,3 @@ def stretched() -> None:
         0.25,
     )
     add_delta_mush(mesh_object)
-
-
-SKINNINGS: tuple[Callable[[], None], ...] = (
-    smooth_weights, many_influences, unnormalized, partly_missing, preserve_volume, envelopes,
-    envelopes_where_groups_are_missing, b_bones, masked, multi_modifier, two_armatures, non_deforming_bones,
-    scaled_bones, stretched,
-)  # fmt: skip

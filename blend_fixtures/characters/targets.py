@@ -116,12 +116,6 @@ def target_geometry_nodes() -> bpy.types.Object:
     return flesh
 
 
-TARGETS: tuple[Callable[[], object], ...] = (
-    target_copy, target_alembic, target_usd, target_pc2, target_mdd, target_shape_keys, target_soft_body, target_cloth,
-    target_geometry_nodes,
-)  # fmt: skip
-
-
 def lagging_group() -> bpy.types.NodeTree:
     """Build a node group that moves the vertices of the previous frame halfway to their input positions."""
     group = build_node_chain(

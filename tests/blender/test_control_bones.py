@@ -251,7 +251,7 @@ def test_a_constraint_along_an_axis_that_is_no_input_warns(bound_face):
 
 
 def test_sixty_control_bones_are_read_through_sixty_dependencies():
-    control_face.many_control_bones(60)
+    control_face.many_control_bones()
     rig = find_rig("elbow")
     controls = listed_controls(rig, RecordingSettings(extra_inputs=(FACE,)))
     reader = ControlReader(rig, controls)

@@ -30,13 +30,13 @@ def free_hook() -> bpy.types.Object:
 
 
 def hook_of_another_armature() -> bpy.types.Object:
-    free_hook().parent = armature_object = second_armature._add_unlocked_armature()
+    free_hook().parent = armature_object = second_armature.add_unlocked_armature()
     return armature_object
 
 
 def hook_on_another_armature() -> bpy.types.Object:
     stacks.hook()
-    armature_object = second_armature._add_unlocked_armature()
+    armature_object = second_armature.add_unlocked_armature()
     bpy.data.objects["elbow"].modifiers["Hook"].object = armature_object
     return armature_object
 
