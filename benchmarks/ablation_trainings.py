@@ -135,23 +135,20 @@ def measure_errors(model: Path, held_out: SkinnedRecording) -> dict[str, list[fl
     return result
 
 
-def frame_ratio(model: Path, reference: Path, held_out: SkinnedRecording, poses: int = TIMED_POSES) -> float:
+def frame_ratio(model: Path, reference: Path, held_out: SkinnedRecording) -> float:
     """Return the median time of a pose of a model, as a multiple of that of another; both run in turns.
 
     The model that is loaded first takes 5 to 12 % longer, so each is first once.
     """
-    first, second = (
-        _median_times((model, reference), held_out, poses),
-        _median_times((reference, model), held_out, poses),
-    )
+    first, second = (_median_times(pair, held_out) for pair in ((model, reference), (reference, model)))
     return math.sqrt(first[0] / first[1] * second[1] / second[0])
 
 
-def _median_times(models: tuple[Path, Path], held_out: SkinnedRecording, poses: int) -> tuple[float, float]:
+def _median_times(models: tuple[Path, Path], held_out: SkinnedRecording) -> tuple[float, float]:
     """Return the median seconds of a pose of two models that run in turns."""
     networks, other_memory = [Network(model) for model in models], np.ones(CACHE_FLUSH_BYTES // 4, np.float32)
     times: tuple[list[float], list[float]] = ([], [])
-    for index in range(poses):
+    for index in range(TIMED_POSES):
         row = slice(index % len(held_out.pose_matrices), index % len(held_out.pose_matrices) + 1)
         matrices, controls = np.array(held_out.pose_matrices[row]), np.array(held_out.controls[row])
         # Each is first in half of the turns.

@@ -34,6 +34,7 @@ from fdda_addon.timing.animation import key_random_poses
 from fdda_addon.timing.benchmark import benchmark
 
 ROUNDS = 5
+TIMED_FRAMES = 60
 CROWD_SIZE = 20
 
 
@@ -82,7 +83,7 @@ def crowd(bound: str) -> dict:
     armature_object = armature_modifier(first).object
     if armature_object.animation_data is None or armature_object.animation_data.action is None:
         key_random_poses(SceneRig(first, armature_object))
-    single_ms = _median_frame_ms(60)
+    single_ms = _median_frame_ms()
     hidden_ms = _median_hidden_frame_ms(first)
     for number in range(1, CROWD_SIZE):
         mesh_copy, armature_copy = first.copy(), armature_object.copy()
@@ -93,7 +94,7 @@ def crowd(bound: str) -> dict:
         mesh_copy.parent = armature_copy if first.parent else None
         armature_modifier(mesh_copy).object = armature_copy
         _shift_action(armature_copy, number * 7)
-    crowd_ms = _median_frame_ms(60)
+    crowd_ms = _median_frame_ms()
     return {
         "one_ms": single_ms,
         "switched_off_ms": hidden_ms,
@@ -117,7 +118,7 @@ def _redirect_drivers(
 def _median_hidden_frame_ms(mesh_object: bpy.types.Object) -> float:
     mesh_object.hide_viewport = True
     try:
-        return _median_frame_ms(60)
+        return _median_frame_ms()
     finally:
         mesh_object.hide_viewport = False
 
@@ -132,9 +133,9 @@ def _shift_action(armature_object: bpy.types.Object, delay_frames: int) -> None:
     strip.repeat = 3
 
 
-def _median_frame_ms(count: int) -> float:
+def _median_frame_ms() -> float:
     scene = bpy.context.scene
-    times = [_time_call(lambda frame=frame: scene.frame_set(frame)) for frame in range(1, count + 1)]
+    times = [_time_call(lambda frame=frame: scene.frame_set(frame)) for frame in range(1, TIMED_FRAMES + 1)]
     return statistics.median(times[5:]) * 1000
 
 

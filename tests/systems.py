@@ -40,7 +40,6 @@ def refuse_locks(monkeypatch: pytest.MonkeyPatch, number: int = errno.ENOLCK) ->
 
 symbolic_links = pytest.mark.skipif(WINDOWS, reason="Windows lets only administrators make symbolic links.")
 named_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders.")
-devices = pytest.mark.skipif(WINDOWS, reason="Windows has no devices in folders.")
 forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows does not fork processes.")
 sparse_files = pytest.mark.skipif(WINDOWS, reason="On Windows, Python writes all zeros of a sparse file to the disk.")
 drives = pytest.mark.skipif(not WINDOWS, reason="Only Windows has drives in paths.")

@@ -88,26 +88,16 @@ def chain_residuals(rig: Rig, angles: np.ndarray) -> np.ndarray:
     return residuals
 
 
-def write_chain(
-    path: Path, pose_count: int = 120, complete_count: int | None = None, joint_count: int = 3, seed: int = 0
-) -> Rig:
-    """Write a recording of the chain with its last joint locked about z; `complete_count` of its poses are complete."""
+def write_chain(path: Path, pose_count: int = 120, joint_count: int = 3, seed: int = 0) -> Rig:
+    """Write a recording of the chain with its last joint locked about z."""
     rig = chain_rig(joint_count)
     angles = chain_angles(pose_count, joint_count, seed)
     angles[:, joint_count - 1, 1] = 0
     influencing = {
         joint: tuple(other for other in (joint, joint + 1) if 0 < other < joint_count) for joint in range(joint_count)
     }
-    info = chain_info(pose_count, seed)
-    written_angles = angles[: pose_count if complete_count is None else complete_count]
-    write_recording(
-        path,
-        rig,
-        make_partitions(rig, influencing),
-        info,
-        pose_chain(rig, written_angles),
-        chain_residuals(rig, written_angles),
-    )
+    partitions, info = make_partitions(rig, influencing), chain_info(pose_count, seed)
+    write_recording(path, rig, partitions, info, pose_chain(rig, angles), chain_residuals(rig, angles))
     return rig
 
 

@@ -8,8 +8,8 @@ from trainer.fits import basis as basis_module
 from trainer.fits.basis import allocate_components, make_basis
 
 
-def random_residuals(poses: int, vertices: int, rank: int, seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
+def random_residuals(poses: int, vertices: int, rank: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
     sizes = 0.01 * 0.5 ** np.arange(rank)
     components = np.linalg.qr(rng.normal(size=(3 * vertices, rank)))[0].T
     return (rng.normal(size=(poses, rank)) * sizes @ components + rng.normal(size=3 * vertices) * 0.01).astype(

@@ -34,12 +34,12 @@ CONFIG = TrainingConfig(passes=60, hidden=(16, 16), batch_size=16)
 VERTEX_COUNT = 40
 
 
-def make_data(noise: float, signal: float = 0.01, poses: int = 200) -> PartitionData:
+def make_data(noise: float, signal: float = 0.01) -> PartitionData:
     """Create residuals of two fixed patterns: one follows the only feature, the other is random in each pose."""
     rng = np.random.default_rng(0)
-    features = rng.uniform(-1, 1, (poses, 1)).astype(np.float32)
+    features = rng.uniform(-1, 1, (200, 1)).astype(np.float32)
     patterns = rng.normal(size=(2, VERTEX_COUNT, 3))
-    amplitudes = np.stack([signal * np.sin(2 * features[:, 0]), noise * rng.normal(size=poses)], axis=1)
+    amplitudes = np.stack([signal * np.sin(2 * features[:, 0]), noise * rng.normal(size=200)], axis=1)
     residuals = np.einsum("np,pvc->nvc", amplitudes, patterns).astype(np.float32)
     return PartitionData(features, lambda: residuals)
 

@@ -22,14 +22,10 @@ PARENTS = np.array([-1, 0, 1, 1, 3])
 """Joint 0 is the parent of joint 1, joint 1 of joints 2 and 3, and joint 3 of joint 4."""
 
 
-def inputs_of(partitions: list[Partition], control_count: int = 0) -> NetworkInputs:
-    joints = JointFeatures(PARENTS, np.tile(np.eye(4, dtype=np.float32), (5, 1, 1)))
-    return NetworkInputs.of([joints, ControlFeatures(control_count)], partitions)
-
-
 def test_networks_take_the_features_of_influencing_joints_and_controls():
     partitions = [Partition(2, (2, 3), np.zeros(0, np.int32), (0, 2)), Partition(1, (), np.zeros(0, np.int32), (1,))]
-    inputs = inputs_of(partitions, control_count=3)
+    joints = JointFeatures(PARENTS, np.tile(np.eye(4, dtype=np.float32), (5, 1, 1)))
+    inputs = NetworkInputs.of([joints, ControlFeatures(3)], partitions)
     assert inputs.columns[0].tolist() == [*range(24, 48), 60, 62]
     assert inputs.columns[1].tolist() == [61]
     poses = np.tile(np.eye(4), (2, 5, 1, 1))

@@ -41,13 +41,13 @@ class Sink:
         self.messages.append((message_type, values))
 
 
-def chain_poses(pose_count: int = 160, followers: tuple[str, ...] = (), seed: int = 0) -> FitPoses:
+def chain_poses(pose_count: int = 160, followers: tuple[str, ...] = ()) -> FitPoses:
     """Create random poses of a chain of main joints, each with one more joint below it for each kind of follower.
 
     Kinds: "half" rotates half as far as the next main joint, "slide" moves with a control, "free" rotates by itself,
     "still" does not move relative to its main joint.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     vectors = rng.uniform(-0.4, 0.4, (pose_count, BONES, 3))
     slider = rng.uniform(-1, 1, pose_count)
     joints, local_matrices = [], []

@@ -29,9 +29,9 @@ def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES
     return matrices.astype(np.float32)
 
 
-def random_rig(influences: int, seed: int = 0, origin_distance: float = 0.0) -> Rig:
+def random_rig(influences: int, origin_distance: float = 0.0) -> Rig:
     """Create a cloud of vertices, `origin_distance` from the origin, skinned to joints at random positions in it."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     heads = rng.uniform(-1, 1, (JOINTS, 3)) + origin_distance
     rest_matrices = np.stack([np.eye(4)] * JOINTS)
     rest_matrices[:, :3, 3] = heads
@@ -55,17 +55,17 @@ def with_one_joint(rig: Rig, joints: np.ndarray) -> Rig:
     return replace(rig, skin_joints=joint_indices, skin_weights=weights)
 
 
-def make_fit_poses(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> FitPoses:
+def make_fit_poses(rig: Rig, noise: float = 0.0) -> FitPoses:
     """Create poses of the rig for a fit that starts with all weights on the first joint."""
-    rng = np.random.default_rng(seed)
-    matrices = random_poses(rng, rig.rest_matrices[:, :3, 3], poses)
+    rng = np.random.default_rng(1)
+    matrices = random_poses(rng, rig.rest_matrices[:, :3, 3], POSES)
     positions = LinearSkinning(rig).positions(matrices)
     positions += rng.normal(0, 1, positions.shape).astype(np.float32) * np.float32(noise)
     return FitPoses(
         with_one_joint(rig, np.zeros(rig.vertex_count)),
         matrices,
         positions,
-        np.zeros((poses, 1), np.float32),
+        np.zeros((POSES, 1), np.float32),
         np.zeros(len(rig.joints), bool),
         np.zeros(len(rig.joints), bool),
     )

@@ -83,8 +83,8 @@ runpy.run_path("setup/environment.py", run_name="__main__")
 # Tests that fail because of Wine, with the reason. They should pass on Windows.
 _CTRL_BREAK = "Wine does not send Ctrl-Break to the group of another process."
 FAILURES_OF_WINE: dict[str, str] = {
-    f"tests/blender/cli/test_command_process.py::test_an_interrupted_{test}": _CTRL_BREAK
-    for test in ("recording_resumes", "training_leaves_neither_model_nor_trainer")
+    f"tests/blender/cli/test_command_process.py::test_{test}": _CTRL_BREAK
+    for test in ("a_stopped_recording_resumes[False]", "an_interrupted_training_leaves_neither_model_nor_trainer")
 }
 
 
