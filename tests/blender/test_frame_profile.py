@@ -50,7 +50,7 @@ def slow_rig(saved: SceneRig) -> SceneRig:
             constraint = armature_object.pose.bones[f"extra.{index}"].constraints.new("COPY_ROTATION")
             constraint.target, constraint.subtarget = armature_object, "lower"
     armature_object.pose.bones["extra.2"].constraints[0].mute = True
-    saved.mesh_object.modifiers["CorrectiveSmooth"].iterations = 200
+    saved.mesh_object.modifiers["CorrectiveSmooth"].iterations = 1000
     bpy.context.view_layer.objects.active = saved.mesh_object
     bpy.context.view_layer.update()
     return saved
