@@ -16,7 +16,7 @@ from ..core.recording.estimate import format_poses
 from ..core.recording.index import read_index, read_info
 from ..core.settings import MAX_AUTO_POSES, POSES, REFINEMENT_POSES, REPEATABILITY_POSES
 from ..core.wording import format_count
-from ..poses.remix import describe_bones
+from ..poses.remix import choose_bones, describe_bones
 from ..poses.sample_selection import describe_control_bones, split_control_bones
 from ..recording.plan import RecordingSettings, find_actions, find_recorded_character, listed_controls
 from ..recording.refinement import RefinementSettings, refine
@@ -148,4 +148,5 @@ def _print_control_bones(scene_rig: SceneRig, options: argparse.Namespace) -> No
 def _print_bones_to_pose(scene_rig: SceneRig, options: argparse.Namespace) -> None:
     """Print what random poses move if no option chooses it."""
     if not options.bones_to_pose and options.poses != 0 and not options.learn_from:
-        print(describe_bones(scene_rig, find_actions(RecordingSettings(actions=tuple(options.action)))))
+        actions = find_actions(RecordingSettings(actions=tuple(options.action)))
+        print(describe_bones(scene_rig, choose_bones(scene_rig, actions), actions))

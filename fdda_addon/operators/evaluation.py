@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section "Compare with Rig": evaluate the model, color the mesh, show the rig, open the report."""
 
-from contextlib import ExitStack
 from dataclasses import replace
 
 import bpy
@@ -63,9 +62,7 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
             learn_from = rig.mesh_object.fdda.settings.learn_from
             passes.setdefault((network_of(rig.mesh_object).model, learn_from and rig.mesh_object), []).append(rig)
         evaluations: list[tuple[int, Evaluation]] = []
-        with ExitStack() as stack:
-            for rig in rigs:
-                stack.enter_context(model_disabled(rig.mesh_object))
+        with model_disabled(*(rig.mesh_object for rig in rigs)):
             for (network, _), group in passes.items():
                 self.state.begin_object(group[0].mesh_object.name if len(passes) > 1 else "")
                 target = target_settings(group[0].mesh_object.fdda.settings)

@@ -45,7 +45,9 @@ class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
     def apply(self, context: bpy.types.Context) -> str:
         shown, active = self.rig(context), context.view_layer.objects.active
         name = shown.mesh_object.name
-        if active.type == "MESH" and active != shown.mesh_object:
+        # A script may name the mesh while nothing is active.
+        is_mesh_active = active is not None and active.type == "MESH"
+        if is_mesh_active and active != shown.mesh_object:
             if name not in context.view_layer.objects:
                 raise RigError(f"'{name}' is in a collection that the view layer excludes; include it.")
             if active.mode != "OBJECT":
@@ -55,7 +57,7 @@ class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
         for rig in rigs_of_armature(shown.armature_object):
             if rig.mesh_object.select_get():
                 rig.mesh_object.select_set(False)
-        if active.type == "MESH":
+        if is_mesh_active:
             shown.mesh_object.select_set(True)
             context.view_layer.objects.active = shown.mesh_object
         redraw()

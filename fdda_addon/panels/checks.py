@@ -121,6 +121,8 @@ def _sampling_settings(scene_rig: SceneRig) -> tuple:
 @persistent
 def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     draw_cache.clear()
+    if depsgraph.id_type_updated("ACTION"):
+        draw_cache.forget_actions()
     if not _changes.signatures:
         return
     _changes.outdated.update(_changes.signatures)
@@ -128,8 +130,6 @@ def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
         # Armatures are left out: Blender reports them as changed with every pose.
         if isinstance(update.id, bpy.types.Mesh):
             _changes.meshes.add(update.id.name)
-        elif isinstance(update.id, bpy.types.Action):
-            draw_cache.forget_actions()
 
 
 @persistent

@@ -8,9 +8,10 @@ from ..core.wording import format_count
 from ..evaluation import heat_map, last_evaluation, markers, side_by_side
 from ..jobs import job
 from ..models.entries import bound_model_name
+from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
 from .bone_names import short_bone_name
-from .section import Section, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
+from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
 from .training import recording_warnings
 
 SHOWN_PARTITIONS = 5
@@ -51,8 +52,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             for placement, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
                 button = row.operator("fdda.show_rig", text=text, depress=current_placement == placement)
                 button.placement = placement
-                if mesh_count(context):
-                    button.all_meshes = True
+                button.all_meshes = bool(cached_rigs_together(context))
             self._draw_evaluate(context, scene_rig)
         last = last_evaluation.get(scene_rig.mesh_object)
         if last is not None:

@@ -32,7 +32,7 @@ def find(rig: SceneRig) -> tuple[Finding, ...]:
         settings.base_skinning,
         settings.bones_to_read,
         settings.bones_to_pose,
-        settings.auto_poses or settings.poses > 0,
+        settings.has_random_poses,
         bool(settings.learn_from),
     )
     return computed_once(("findings", mesh_object.session_uid), inputs, lambda: tuple(_find(rig, check)))
@@ -61,12 +61,7 @@ def _find(rig: SceneRig, check: RigCheck) -> list[Finding]:
     if controlled_count := limits.count_controlled_bones(rig):
         text = f"{controlled_count:,} of {len(joint_names):,} deforming bones follow control bones. "
         findings.append(Finding(f"{text}Check actions that move these, or choose them as Bones to Pose."))
-    elif (
-        names
-        and bones_to_pose(rig) == "WEIGHTS"
-        and (settings.auto_poses or settings.poses)
-        and limits.has_any_limits(rig)
-    ):
+    elif names and bones_to_pose(rig) == "WEIGHTS" and settings.has_random_poses and limits.has_any_limits(rig):
         text = f"{len(names):,} of {len(joint_names):,} bones have no rotation limits, and turn by ±45°."
         findings.append(Finding(text, "fdda.select_unlimited"))
     return findings

@@ -9,16 +9,7 @@ from . import findings
 from .section import draw_wrapped, mesh_problem
 
 MAX_MESHES = 24
-
-
-@draw_cached
-def _rigs_of(armature_object: bpy.types.Object) -> tuple[SceneRig, ...]:
-    return tuple(rigs_of_armature(armature_object))
-
-
-@draw_cached
-def _left_out(armature_object: bpy.types.Object) -> dict[bpy.types.Object, str]:
-    return left_out_meshes(armature_object)
+_rigs_of_armature, _left_out_meshes = draw_cached(rigs_of_armature), draw_cached(left_out_meshes)
 
 
 def draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, playback: bool = False) -> None:
@@ -28,7 +19,7 @@ def draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
         rig: the rig that the sidebar shows.
         playback: whether the lines have what deforms the meshes, instead of what is wrong with them.
     """
-    rigs, reasons = _rigs_of(rig.armature_object), _left_out(rig.armature_object)
+    rigs, reasons = _rigs_of_armature(rig.armature_object), _left_out_meshes(rig.armature_object)
     if len(rigs) < 2:
         return
     checked_count = sum(listed_rig.mesh_object.fdda.in_model for listed_rig in rigs)

@@ -8,6 +8,7 @@ import bpy
 from ..models.entries import active_entry, bound_model_name
 from ..rig.modifier_stack import is_playback_modifier
 from ..runtime.confidence import partition_confidence
+from ..scene.active_rig import cached_rigs_together
 from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of, remaining_rig_note
@@ -17,7 +18,7 @@ from ..timing.benchmark import FDDA, RIG
 from .bone_names import short_bone_name
 from .frame_profile import draw_model_times
 from .meshes import draw_meshes
-from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, panel_rig
 from .timed_value import timed_values
 from .trained_file import find_trained_file
 
@@ -134,7 +135,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         row = layout.row(align=True)
         row.scale_y = 1.4
         modes = [(mode, text) for mode, text in MODES if mode != "RIG" or not mesh_object.fdda.is_fast_rig]
-        if mesh_count(context):
+        if cached_rigs_together(context):
             for mode, text in modes:
                 properties = row.operator("fdda.set_mode", text=text, depress=binding.mode == mode)
                 properties.mode, properties.all_meshes = mode, True

@@ -5,7 +5,7 @@ import bpy
 
 from ..core.settings import MAX_AUTO_POSES, POSES
 from ..core.wording import format_list
-from ..properties.recording_options import actions_of_rig, meshes_with_other_settings
+from ..properties.recording_options import actions_of_rig, meshes_with_other_settings, recorded_actions
 from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
 from . import limits, sampling
@@ -109,8 +109,7 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
 
 def _has_poses(rig: SceneRig) -> bool:
     """Return whether there is something to record."""
-    settings = rig.mesh_object.fdda.settings
-    return settings.auto_poses or settings.poses > 0 or any(action.fdda.record for action in actions_of_rig(rig))
+    return rig.mesh_object.fdda.settings.has_random_poses or bool(recorded_actions(rig))
 
 
 CLASSES = (limits.FDDA_UL_bones, sampling.FDDA_UL_controls, FDDA_UL_actions, FDDA_PT_poses)

@@ -105,7 +105,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
     draw_button(row, context, "fdda.build_model", label, "PLAY")
     if problem:
         draw_wrapped(layout, context, problem, "INFO")
-    elif limits.lacks_limits(rig) and (settings.auto_poses or settings.poses):
+    elif limits.lacks_limits(rig) and settings.has_random_poses:
         draw_wrapped(layout, context, "No rotation limits yet: set them in Training Poses first.", "ERROR")
 
 

@@ -64,11 +64,6 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
         return None, str(error)
 
 
-def mesh_count(context: bpy.types.Context) -> int:
-    """Return the number of meshes that buttons apply to; 0 if they apply to the shown mesh only."""
-    return len(cached_rigs_together(context))
-
-
 def draw_button(
     layout: bpy.types.UILayout, context: bpy.types.Context, name: str, text: str, icon: str
 ) -> bpy.types.OperatorProperties:
@@ -86,7 +81,7 @@ def mesh_problem(rig: SceneRig) -> str:
     return check.problems[0] if check is not None and check.problems else ""
 
 
-def _is_recorded(rig: SceneRig) -> bool:
+def _is_recordable(rig: SceneRig) -> bool:
     # What is bound was recorded; a check while the user poses would cost time.
     return not left_out_reason(rig.mesh_object) and (rig.mesh_object.fdda.is_bound or not mesh_problem(rig))
 
@@ -95,10 +90,10 @@ def _is_bound(rig: SceneRig) -> bool:
     return rig.mesh_object.fdda.is_bound
 
 
-COUNTED_MESHES = dict.fromkeys(("fdda.record", "fdda.build_model"), _is_recorded) | dict.fromkeys(
+COUNTED_MESHES = dict.fromkeys(("fdda.record", "fdda.build_model"), _is_recordable) | dict.fromkeys(
     ("fdda.unbind", "fdda.evaluate", "fdda.bake"), _is_bound
 )
-"""The meshes to which a button applies, of the checked ones; all of them if it is not named."""
+"""Which of the checked meshes the button of an operator applies to; all of them for other operators."""
 
 
 def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:

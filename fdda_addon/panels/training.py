@@ -193,7 +193,7 @@ def _draw_assessment(
         draw_wrapped(box, context, warning, "BLANK1")
     if assessment.next_step:
         is_bound = rig.mesh_object.fdda.is_bound
-        text = assessment.next_step.replace("bind the model, then ", "") if is_bound else assessment.next_step
+        text = "Next: compare it with the rig on an action." if is_bound else assessment.next_step
         draw_wrapped(box, context, text, "BLANK1")
     if trained.skin_sentence:
         draw_wrapped(box, context, trained.skin_sentence, "BLANK1")

@@ -58,9 +58,11 @@ def choose_bones(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Actio
     return (REMIX,) if moving_ranges(keyed_ranges(scene_rig.armature_object, actions)) else ()
 
 
-def describe_bones(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Action]) -> str:
-    """Return a sentence about what `choose_bones` chooses."""
-    if not choose_bones(scene_rig, recorded_actions):
+def describe_bones(
+    scene_rig: SceneRig, bones_to_pose: tuple[str, ...], recorded_actions: Sequence[bpy.types.Action]
+) -> str:
+    """Return a sentence about what random poses move; `bones_to_pose` is a result of `choose_bones`."""
+    if not bones_to_pose:
         return "Random poses move the deforming bones within their limits."
     count = len(remixed_actions(scene_rig, recorded_actions))
     if recorded_actions:
@@ -87,7 +89,8 @@ def remixed_actions(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Ac
             # Another character whose bones have the same names may play it.
             if slot is None or (users and not set(users) & set(datablocks)):
                 continue
-            if curves_by_bone(armature_object, {armature_object: unmuted_curves(action, slot)}):
+            curves = unmuted_curves(action, slot)
+            if any(curves_by_bone(armature_object, {armature_object: [curve]}) for curve in curves):
                 frames += len(action_frames(action))
                 actions += [action] if frames <= MAX_FRAMES or not actions else []
     return tuple(actions)

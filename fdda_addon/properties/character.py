@@ -184,6 +184,11 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     passes: make_property(PASSES)
     training_seed: make_property(TRAINING_SEED)
 
+    @property
+    def has_random_poses(self) -> bool:
+        """Return whether random poses are recorded."""
+        return self.auto_poses or self.poses > 0
+
 
 @not_animatable
 class FDDA_PG_action(bpy.types.PropertyGroup):

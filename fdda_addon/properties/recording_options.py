@@ -114,27 +114,30 @@ def _has_limits(armature_object: bpy.types.Object) -> bool:
     return bool(limited_bones(armature_object))
 
 
-@draw_cached
 def describe_chosen_bones(scene_rig: SceneRig) -> str:
     """Return a sentence about the actions from which random poses combine limbs, or about the deforming bones."""
-    return describe_bones(scene_rig, [bpy.data.actions[name] for name in recorded_actions(scene_rig)])
+    actions = recorded_actions(scene_rig)
+    bones = (REMIX,) if bones_to_pose(scene_rig) == "REMIX" else ()
+    inputs = actions_state(), bones, actions, actions_of_rig(scene_rig)
+    key = "description of bones to pose", scene_rig.mesh_object.session_uid
+    return computed_once(
+        key, inputs, lambda: describe_bones(scene_rig, bones, [bpy.data.actions[name] for name in actions])
+    )
 
 
 def _sample_options(scene_rig: SceneRig, actions: tuple[str, ...]) -> tuple[str, ...]:
     """Return the bones that random poses move, in the syntax of `poses.sampling.parse_sample_selection`."""
     settings = scene_rig.mesh_object.fdda.settings
-    if settings.bones_to_pose == "AUTO":
-        if not (settings.auto_poses or settings.poses):
-            return ()
-        return (REMIX,) if bones_to_pose(scene_rig) == "REMIX" else ()
+    if settings.bones_to_pose == "AUTO" and not settings.has_random_poses:
+        return ()
+    if bones_to_pose(scene_rig) == "REMIX":
+        return (REMIX,)
     if settings.bones_to_pose == "COLLECTION":
         if not settings.bone_collection:
             raise RigError(
                 "Bones to Pose is set to Bone Collection, but no collection is chosen; choose one in Training Poses."
             )
         return (f"collection:{settings.bone_collection}",)
-    if settings.bones_to_pose == "REMIX":
-        return (REMIX,)
     if settings.bones_to_pose == "ACTIONS":
         if not actions:
             label = settings.bl_rna.properties["bones_to_pose"].enum_items["ACTIONS"].name

@@ -124,6 +124,8 @@ def test_a_click_in_the_list_shows_another_mesh(two):
         bpy.context.view_layer.objects.active = active
         bpy.ops.fdda.show_mesh(object=two[1].name)
         assert active_rig(bpy.context).mesh_object == two[1]
+    bpy.context.view_layer.objects.active = None
+    assert bpy.ops.fdda.show_mesh(object=two[0].name) == {"FINISHED"}
 
 
 def test_a_click_on_a_mesh_that_cannot_be_selected_is_refused(two):

@@ -29,8 +29,8 @@ def saved(bound_elbow, tmp_path):
 
 
 def test_a_fast_rig_is_written_and_the_open_file_stays(saved, elbow_files):
-    content = (saved / "elbow.blend").read_bytes()
     """A point in the name is kept."""
+    content = (saved / "elbow.blend").read_bytes()
     assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.v2")) == {"FINISHED"}
     assert "fast.v2.blend: 'elbow_rig' has 2 of 2 bones; the model reads 2" in job.state_of("fast_rig").outcome
     assert "times as fast" in job.state_of("fast_rig").outcome

@@ -10,7 +10,7 @@ from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION_VECTOR
 from fdda_addon.core.recording.index import read_index, read_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.panels import checks
-from fdda_addon.poses.motion_range import clear_rotation_range
+from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
 from fdda_addon.poses.remix import choose_bones, read_remix, remixed_actions
 from fdda_addon.properties.recording_options import describe_chosen_bones, recording_settings
 from fdda_addon.recording.plan import RecordingSettings, make_pose_sampler, read_sampled_rig
@@ -195,6 +195,11 @@ def test_the_sidebar_chooses_limbs_from_actions(waving, tmp_path):
     assert describe_chosen_bones(waving) == "Random poses combine limbs from 1 action, which is not recorded itself."
     settings.bones_to_pose = "WEIGHTS"
     assert recording_settings(waving).bones_to_pose == ()
+    # What the user chooses holds for a rig with limits too.
+    set_rotation_range(waving.armature_object.pose.bones["lower"], 0, 0.0, 2.0)
+    settings.bones_to_pose = "REMIX"
+    assert recording_settings(waving).bones_to_pose == ("remix",)
+    assert describe_chosen_bones(waving) == "Random poses combine limbs from 1 action, which is not recorded itself."
 
 
 @pytest.mark.parametrize(
