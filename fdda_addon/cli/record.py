@@ -30,31 +30,39 @@ from .target import add_target_options, pose_settings, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
+    add_recording_options(parser, "if several have a rig")
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
+    parser.add_argument(
+        "--all", action="store_true", help="record all meshes that follow the armature by their modifiers"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
+    parser.add_argument(
+        "--refine",
+        metavar="MODEL.onnx",
+        type=Path,
+        help=f"add poses at the worst errors of this model to the recording ({REFINEMENT_POSES} without --poses)",
+    )
+
+
+def add_recording_options(parser: argparse.ArgumentParser, object_help: str) -> None:
+    """Add the argument RIG.blend, and the options that choose meshes and poses; --object with when to give it."""
     add_rig_argument(parser)
     parser.add_argument(
         "--object",
         action="append",
         default=[],
         metavar="NAME",
-        help="mesh object to record, if several have a rig; repeatable, for one recording of several meshes",
+        help=f"mesh object to record, {object_help}; repeatable, for one recording of several meshes",
     )
-    parser.add_argument(
-        "--all", action="store_true", help="record all meshes that follow the armature by their modifiers"
-    )
-    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
     add_pose_options(
         parser,
         default=None,
         help=f"number of random poses (default: {POSES.default:,} to {MAX_AUTO_POSES:,}, by the speed of the rig, so "
-        f"that they take about a minute; with --refine {REFINEMENT_POSES})",
+        "that they take about a minute)",
     )
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
     add_target_options(parser)
     REPEATABILITY_POSES.add_option(parser)
-    parser.add_argument(
-        "--refine", metavar="MODEL.onnx", type=Path, help="add poses at the worst errors of this model to the recording"
-    )
 
 
 def run(options: argparse.Namespace) -> None:

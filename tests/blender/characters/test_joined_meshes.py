@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """One recording and one model of a body, a sleeve, and a cuff without weights whose object is elsewhere."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_whole_character
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
 from ..command_output import CommandOutput, output_of
 from ..conftest import run
@@ -131,6 +133,21 @@ def test_an_interrupted_recording_resumes_with_the_same_bytes(dressed, tmp_path)
     assert read_index(tmp_path / "r")["complete"] == 7
     assert run("record", dressed.rig, tmp_path / "r", "--all", *OPTIONS, "--resume") == 0
     assert file_contents(tmp_path / "r") == file_contents(dressed.recording)
+
+
+def test_one_command_records_trains_and_binds_all_meshes(dressed, tmp_path, capfd, monkeypatch):
+    command, recording = ("build-model", dressed.rig, tmp_path), tmp_path / "recording"
+    shutil.copytree(dressed.recording, recording)
+    (tmp_path / "bound.blend").write_text("mine")
+    refusal = Refusal(tmp_path, capfd)
+    assert "another file is there" in refusal(*command)
+    with monkeypatch.context() as context:
+        context.setenv(PYTHON_VARIABLE, str(tmp_path / "nothing"))
+        assert "cannot be started" in refusal(*command, "--overwrite")
+    (tmp_path / "bound.blend").unlink()
+    lines = output_of(*command, *OPTIONS).out
+    assert lines[-3:] == [f"{tmp_path / 'bound.blend'}: '{name}' plays model.onnx" for name in NAMES]
+    assert file_contents(recording) == file_contents(dressed.recording)
 
 
 def test_a_model_has_all_meshes_and_its_report_a_line_for_each(dressed):

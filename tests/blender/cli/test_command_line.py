@@ -51,6 +51,7 @@ def test_help_prints_the_usage(arguments, capfd):
         ["record", "a.blend", "b", "--learn-from", "flesh", "--rest-threshold-mm", "nan"],
         ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--settle-frames", "3"],
         ["build-arm", "a.blend", "--density", "4"],
+        ["build-model", "a.blend"],
         ["bind", "a.blend", "m.onnx"],
         ["evaluate", "a.blend", "m.onnx"],
         ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--poses", "0"],
