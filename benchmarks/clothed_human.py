@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Add clothes to a human with a Mixamo-style rig: `clothed_human.py IN.blend OUT.blend [NUMBER]`.
 
-NUMBER is the number of garments, 2 by default and at most 10. Each garment is a copy of the faces of the body that
-follow the covered bones, moved outward along the normals; a garment with few vertices is subdivided. It has copies of
-the body's modifiers, so that all meshes follow one armature.
+NUMBER is the number of garments, 2 by default and at most 10. Each is a copy of the faces of the body that follow the
+covered bones. It is moved outward along the normals. A garment with few vertices is subdivided. It has copies of the
+body's modifiers, so that all meshes follow one armature.
 """
 
 import sys
