@@ -120,9 +120,9 @@ class Mirror:
         }
         self.partner_paths: dict[tuple[bpy.types.ID, str], str] = {}
         for datablock, path in {*paths, *animated_numbers}:
-            flipped_path = _flipped_path(path)
-            if flipped_path != path and is_number(datablock, path) and is_number(datablock, flipped_path):
-                self.partner_paths |= {(datablock, path): flipped_path, (datablock, flipped_path): path}
+            partner_path = flipped_path(path)
+            if partner_path != path and is_number(datablock, path) and is_number(datablock, partner_path):
+                self.partner_paths |= {(datablock, path): partner_path, (datablock, partner_path): path}
 
     def apply(self) -> None:
         """Mirror the current pose and numbers without evaluating them."""
@@ -137,7 +137,9 @@ class Mirror:
             datablock.update_tag()
 
 
-def _flipped_path(path: str) -> str:
+def flipped_path(path: str) -> str:
+    """Return an RNA path for the other side."""
+
     def flip(match: re.Match) -> str:
         return f'["{bpy.utils.escape_identifier(flipped_name(bpy.utils.unescape_identifier(match[1])))}"]'
 

@@ -34,12 +34,15 @@ from .action_range import (
     keyed_ranges,
     moving_ranges,
 )
+from .clip_player import flipped_name, flipped_path
 from .motion_range import limited_bones
 
 REMIX = "remix"
 """Entry for the bones of actions whose limbs are combined from different frames (`mathematics.remix`)."""
 MAX_FRAMES = 3000
 """Largest number of frames of actions that are read without being recorded."""
+HEAD_TOLERANCE = 0.01
+"""Largest distance between the head of a bone and its mirror image, relative to the size of the armature."""
 _REST_VALUES = {ROTATION_VECTOR: 0.0, LOCATION: 0.0, SCALE: 1.0}
 
 
@@ -99,9 +102,10 @@ def remixed_actions(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Ac
 def read_remix(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Action]) -> Remix:
     """Read the frames of the actions whose limbs are combined (`remixed_actions`).
 
-    A bone that an action does not key is in its rest pose in the frames of this action. Locations, scales and custom
-    properties of a bone come from the same frame as its rotation, without noise; numbers that belong to no bone, such
-    as shape keys, all come from another frame.
+    Where the bones have two sides, the mirror images of all frames follow the frames: what one leg does, the other may
+    do. A bone that an action does not key is in its rest pose in the frames of this action. Locations, scales and
+    custom properties of a bone come from the same frame as its rotation, without noise; numbers that belong to no
+    bone, such as shape keys, all come from another frame.
 
     Raises:
         RigError: the actions move no bone, or have one pose.
@@ -118,11 +122,13 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
         (action_frames(action), curves_by_bone(armature_object, curves))
         for action, curves in zip(actions, curves_by_action, strict=True)
     ]
-    bones = [bone for bone in armature_object.pose.bones if any(bone.name in curves for _, curves in clips)]
+    keyed_names = {name for _, curves in clips for name in curves}
+    mirror = _mirror_images(armature_object, keyed_names)
+    bones = [bone for bone in armature_object.pose.bones if bone.name in (mirror or keyed_names)]
     limbs = dict(zip((bone.name for bone in bones), find_limbs(_parents(bones)).tolist(), strict=True))
     columns: list[tuple[Channel, np.ndarray, int, bool]] = []
     for bone in bones:
-        for kind, values in _bone_values(bone, clips).items():
+        for kind, values in _bone_values(bone, clips, mirror.get(bone.name)).items():
             is_used = np.abs(values - _REST_VALUES[kind]).max(axis=0) > RANGE_TOLERANCE
             for axis in range(3):
                 if is_used[axis] or (kind == ROTATION_VECTOR and is_used.any()):
@@ -134,8 +140,11 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
         moves = f"{names} moves no bone" if names else "no action moves a bone"
         raise RigError(f"There is no pose to remix: {moves} of '{armature_object.name}'.")
     limbs_by_path = {bone.path_from_id(): limbs[bone.name] for bone in bones}
-    for (owner, path), values in _number_values(scene_rig, actions).items():
+    numbers = _number_values(scene_rig, actions)
+    for (owner, path), values in numbers.items():
         limb = limbs_by_path.get(path[: path.find('"]') + 2], len(bones))
+        if mirror:
+            values = np.concatenate([values, numbers.get((owner, flipped_path(path)), values)])
         columns.append((Channel(f"{owner}/{path}", CONTROL, 0, *_bounds(values)), values, limb, False))
     if not any(has_width(_bounds(values)) for _, values, _, _ in columns):
         raise RigError(
@@ -159,21 +168,61 @@ def _bounds(values: np.ndarray) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
+def _mirror_images(
+    armature_object: bpy.types.Object, keyed_names: set[str]
+) -> dict[str, tuple[bpy.types.PoseBone, np.ndarray]]:
+    """Return the bone on the other side of each bone, and the (3, 3) reflection of its axes to those of the bone.
+
+    A bone without a side is its own mirror image. Empty if no keyed bone has another side, or if their heads in the
+    rest pose are not mirror images about the YZ plane of the armature.
+    """
+    bones, reflection = armature_object.pose.bones, np.diag([-1.0, 1.0, 1.0])
+    pairs = [(bone, bones.get(flipped_name(bone.name), bone)) for bone in bones]
+    pairs = [(bone, partner) for bone, partner in pairs if keyed_names & {bone.name, partner.name}]
+    heads = np.array([[bone.bone.head_local, partner.bone.head_local] for bone, partner in pairs]).reshape(-1, 2, 3)
+    distances = np.linalg.norm(heads[:, 0] - heads[:, 1] @ reflection, axis=1)
+    if (
+        all(bone == partner for bone, partner in pairs)
+        or distances.max() > HEAD_TOLERANCE * np.ptp(heads, axis=(0, 1)).max()
+    ):
+        return {}
+    axes = {bone: np.array(bone.bone.matrix_local.to_3x3()) for pair in pairs for bone in pair}
+    return {bone.name: (partner, axes[bone].T @ reflection @ axes[partner]) for bone, partner in pairs}
+
+
 def _bone_values(
-    bone: bpy.types.PoseBone, clips: Iterable[tuple[range, dict[str, CurvesByChannel]]]
+    bone: bpy.types.PoseBone,
+    clips: Iterable[tuple[range, dict[str, CurvesByChannel]]],
+    image: tuple[bpy.types.PoseBone, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return (F, 3) values of a bone in all frames, by kind; `clips` has the frames and F-curves of each action."""
+    """Return (F, 3) values of a bone in all frames, by kind, or (2 F, 3) with the frames of its mirror image.
+
+    Args:
+        clips: the frames and F-curves of each action.
+        image: the mirror image of the bone (`_mirror_images`).
+    """
+    quaternions, locations, scales = _read_channels(bone, clips)
+    if image is not None:
+        partner, axes = image
+        other_quaternions, other_locations, other_scales = _read_channels(partner, clips)
+        # A reflection turns the axis of a rotation, and reverses its direction.
+        vectors = -other_quaternions[:, 1:] @ axes.T
+        quaternions = np.concatenate([quaternions, np.column_stack([other_quaternions[:, 0], vectors])])
+        locations = np.concatenate([locations, other_locations @ axes.T])
+        scales = np.concatenate([scales, other_scales @ (axes.T**2)])
+    return {ROTATION_VECTOR: rotation_vectors(quaternions), LOCATION: locations, SCALE: scales}
+
+
+def _read_channels(
+    bone: bpy.types.PoseBone, clips: Iterable[tuple[range, dict[str, CurvesByChannel]]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     quaternions, locations, scales = [], [], []
     for frames, curves_of_bones in clips:
         curves = curves_of_bones.get(bone.name, {})
         quaternions.append(_quaternions(bone, curves, frames))
         locations.append(evaluate_curves(curves.get(LOCATION, {}), LOCATION, frames))
         scales.append(evaluate_curves(curves.get(SCALE, {}), SCALE, frames))
-    return {
-        ROTATION_VECTOR: rotation_vectors(np.concatenate(quaternions)),
-        LOCATION: np.concatenate(locations),
-        SCALE: np.concatenate(scales),
-    }
+    return np.concatenate(quaternions), np.concatenate(locations), np.concatenate(scales)
 
 
 def _quaternions(bone: bpy.types.PoseBone, curves: CurvesByChannel, frames: range) -> np.ndarray:

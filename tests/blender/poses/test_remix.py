@@ -20,7 +20,9 @@ from fdda_addon.scene.compatibility import curves_of_slot
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from ..conftest import run
+from ..figure import FRAMES, add_wave, build_figure, edit_bones
 
+SIDES = ("spine", "arm.L", "arm.R")
 WAVE, STILL, TURN = "wave", "one frame", "turn the dial"
 
 
@@ -78,6 +80,30 @@ def test_remixed_frames_show_the_pose_of_the_action(waving):
         for matrix, name in zip(expected, ("upper", "lower"), strict=True):
             assert np.array(bones[name].matrix_basis) == pytest.approx(matrix, abs=1e-5)
         assert armature_object["dial"] == pytest.approx(dial)
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.7])
+def test_mirror_images_of_the_frames_follow_where_bones_have_two_sides(roll):
+    """Whatever the roll of the bones; the property of one side is keyed alone."""
+    figure = build_figure()
+    armature_object = figure.armature_object
+    edit_bones(figure, lambda bones: setattr(bones["arm.L"], "roll", bones["arm.L"].roll + roll))
+    action = add_wave(figure)
+    remix = read_remix(figure, [action])
+    assert len(remix.values) == 2 * FRAMES
+    heads_and_tails = []
+    for index in (9, FRAMES + 9):
+        armature_object.animation_data.action = None
+        clear_pose(armature_object)
+        Poser(figure, remix.channels).set(remix.values[index])
+        bpy.context.view_layer.update()
+        ends = [(armature_object.pose.bones[name].head, armature_object.pose.bones[name].tail) for name in SIDES]
+        heads_and_tails.append(np.array(ends))
+    frame, image = heads_and_tails
+    assert np.abs(frame[1] - frame[2] * [-1, 1, 1]).max() > 0.1
+    np.testing.assert_allclose(image, frame[[0, 2, 1]] * [-1, 1, 1], atol=1e-6)
+    edit_bones(figure, lambda bones: setattr(bones["arm.L"], "head", (0.2, 0.1, 0.9)))
+    assert len(read_remix(figure, [action]).values) == FRAMES, "the bones are no mirror images"
 
 
 def test_frames_of_an_action_that_does_not_key_a_bone_have_its_rest_pose(waving):
