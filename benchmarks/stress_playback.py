@@ -234,6 +234,8 @@ class PlaybackStress:
         moved.location = self._random_generator.uniform(-0.2, 0.2, 3)
         if self._random_generator.integers(2):
             moved.location = moved.get("place", (0.0, 0.0, 0.0))
+        # Without a step, undo would restore the location, and Blender would keep the matrix of this place.
+        self._push_undo_step("move")
 
     def _unbind(self) -> None:
         mesh_object = self._random_character(may_be_override=False)
