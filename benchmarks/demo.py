@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+import bpy
+
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from fdda_addon import register, unregister
@@ -19,7 +21,7 @@ from fdda_addon.core.files.output import write_json
 from fdda_addon.evaluation.picture import View
 from fdda_addon.evaluation.pictures import draw_comparison, draw_partitions, make_pictured_pose
 from fdda_addon.evaluation.results import Evaluation
-from fdda_addon.evaluation.settings import EvaluationSettings, NamedPose
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.training.process import trainer_command
 
@@ -45,10 +47,11 @@ def _metacarpal_rotations(factor: float) -> dict[str, tuple[float, float, float]
     return {f"{finger}_0": _radians(angle * (-1) ** i, 0, angle * (-1) ** i) for i, finger in enumerate(FINGERS)}
 
 
-EXTREME_POSES = (
-    NamedPose("elbow 3x its range, off its axis", {"elbow": _radians(70, 0, 3 * ELBOW_FLEXION)}),
-    NamedPose("metacarpals 2.5x their range", _metacarpal_rotations(2.5)),
-)
+EXTREME_POSES = {
+    "elbow 3x its range, off its axis": {"elbow": _radians(70, 0, 3 * ELBOW_FLEXION)},
+    "metacarpals 2.5x their range": _metacarpal_rotations(2.5),
+}
+"""Rotations of bones by name, in actions of one frame."""
 
 
 def main(folder: Path) -> int:
@@ -107,9 +110,15 @@ def main(folder: Path) -> int:
 def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
     open_file(rig)
     scene_rig = find_rig()
-    settings = EvaluationSettings(
-        HELD_OUT_POSES, actions=(ACTION_NAME,), range_scales=(1.5, 2.0, 3.0), named=EXTREME_POSES
-    )
+    animation = scene_rig.armature_object.animation_data
+    for name, rotations in EXTREME_POSES.items():
+        animation.action = bpy.data.actions.new(name)
+        for bone in scene_rig.armature_object.pose.bones:
+            bone.rotation_euler = rotations.get(bone.name, (0, 0, 0))
+            bone.keyframe_insert("rotation_euler", frame=1)
+    animation.action = bpy.data.actions[ACTION_NAME]
+    actions = (ACTION_NAME, *EXTREME_POSES)
+    settings = EvaluationSettings(HELD_OUT_POSES, actions=actions, range_scales=(1.5, 2.0, 3.0))
     evaluation = run_evaluations({"": (scene_rig, model)}, settings)[""]
     write_json(out, evaluation.to_json())
 
@@ -119,7 +128,7 @@ def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
         make_pictured_pose(action_errors, frame - 1, f"{name}, frame {frame}")
         for frame, name in PICTURED_FRAMES.items()
     ]
-    outside_poses = [make_pictured_pose(errors, 0, errors.name) for errors in evaluation.named]
+    outside_poses = [make_pictured_pose(errors, 0, errors.name) for errors in evaluation.actions[1:]]
     draw_partitions(scene_rig, pictures / "1_partitions.png", VIEW)
     for is_heat_map, prefix, kind in ((False, 2, "comparison"), (True, 3, "heat_map")):
         draw_comparison(scene_rig, model, action_poses, pictures / f"{prefix}_{kind}.png", is_heat_map, view=VIEW)

@@ -2,6 +2,8 @@
 """Builds the arm as Blender objects: mesh, armature, range of motion and three deformers."""
 
 import math
+from dataclasses import dataclass
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -9,13 +11,47 @@ import numpy as np
 from ..scene.arrays import COORDINATE_ELEMENT, MATERIAL_INDEX_ELEMENT, write
 from .action import assign_drive_action
 from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED_RANGE, RIG_OBJECT, ROTATION_MODE
-from .surface import Surface, read_surface
 
 # Iterations and factor of Corrective Smooth, by density. On finer quads, each iteration smooths a smaller distance.
 SMOOTHING_SETTINGS = {1: (10, 0.5), 2: (20, 0.8), 3: (30, 1.0)}
 # Color (linear RGBA) and roughness of a material.
 _SKIN_MATERIAL = ((0.72, 0.42, 0.31, 1.0), 0.50)
 _NAIL_MATERIAL = ((0.82, 0.50, 0.40, 1.0), 0.35)
+DENSITIES = (1, 2, 3)
+"""Densities of the mesh, with about 1,450, 10,000 and 50,000 vertices."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The surface of the arm, one closed surface of quads.
+
+    Attributes:
+        points: (v, 3) float32, rest positions, meters, arm space (see `joints`).
+        contracted: (v, 3) float32, the same with a contracted biceps.
+        faces: (f, 4) int32, oriented outwards.
+        joints: (v,) int32, index into `joints.JOINTS` of the bone of each vertex.
+        nails: (f,) bool, whether a face is part of a nail.
+    """
+
+    points: np.ndarray
+    contracted: np.ndarray
+    faces: np.ndarray
+    joints: np.ndarray
+    nails: np.ndarray
+
+
+def read_surface(density: int) -> Surface:
+    """Read the surface of a density in `DENSITIES`."""
+    if density not in DENSITIES:
+        raise ValueError(f"The arm has densities 1, 2 and 3; {density!r} is none of them.")
+    with np.load(Path(__file__).with_name("surface.npz"), allow_pickle=False) as arrays:
+        names = ("points", "face_steps", "joints", "nails", "biceps_vertices", "biceps_points")
+        points, face_steps, joints, nails, biceps_vertices, biceps_points = (arrays[f"{n}_{density}"] for n in names)
+    contracted = points.copy()
+    contracted[biceps_vertices] = biceps_points
+    # The file has the differences between faces, which compress well.
+    faces = face_steps.cumsum(axis=0, dtype=face_steps.dtype).astype(np.int32)
+    return Surface(points, contracted, faces, joints.astype(np.int32), nails)
 
 
 def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:

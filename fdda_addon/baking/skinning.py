@@ -13,9 +13,10 @@ import numpy as np
 
 from ..core.errors import ModelError, RigError
 from ..core.files.temporary import temporary_folder
+from ..core.formats.messages import MessageType
 from ..core.mathematics.metrics import ErrorStatistics, distances, error_statistics
 from ..core.mathematics.skinning import LinearSkinning
-from ..core.progress import Job
+from ..core.progress import Job, Progress
 from ..core.recording.reader import Recording, read_recording
 from ..core.rig import STATIC_JOINT, Rig, join_positions
 from ..runtime.binding import unbind
@@ -23,7 +24,7 @@ from ..runtime.network import Network
 from ..scene.arrays import COORDINATE_ELEMENT, write
 from ..scene.mesh import rest_positions
 from ..scene.scene_rig import SceneRig
-from ..training.skin_fit import fit_skin
+from ..training.process import TrainerProcess
 
 MAX_BLOCK_POSES = 16
 """Number of poses that are compared at once."""
@@ -32,6 +33,12 @@ MAX_REST_DIFFERENCE = 1e-4
 PositionsFunction = Callable[[np.ndarray], np.ndarray]
 """Returns positions (n, V, 3), given the indices (n,) of poses."""
 OWN_WEIGHTS, FITTED_WEIGHTS, MODEL = "own weights", "fitted weights", "model"
+
+
+class _SkinFitProcess(TrainerProcess):
+    module = "trainer.skin"
+    failure_message = "The fit of skin weights failed."
+    loss_advice = "no weights were fitted, try again"
 
 
 @dataclass(frozen=True)
@@ -82,7 +89,12 @@ def export_skinning(
     _check_rig(scene_rig, recording)
     model_positions = _model_positions(recording, Network(model)) if model else None
     with temporary_folder() as folder:
-        yield from fit_skin(recording_path, folder / "skin.npz", influences, held_out_actions)
+        # `trainer/skin/__main__.py` describes the content of the file.
+        options = [f"--influences={influences}", *(f"--hold-out={name}" for name in held_out_actions)]
+        with _SkinFitProcess([str(recording_path), str(folder / "skin.npz"), *options]) as process:
+            for message in process.messages(wait=False):
+                is_progress = message is not None and message.type is MessageType.PREPARING
+                yield Progress(*map(message.values.get, ("stage", "done", "total"))) if is_progress else None
         with np.load(folder / "skin.npz") as arrays:
             fit = dict(arrays)
     fitted_rig = replace(recording.rig, skin_joints=fit["joints"].astype(np.int32), skin_weights=fit["weights"])

@@ -41,7 +41,12 @@ def run(options: argparse.Namespace) -> None:
         missing = describe_missing_meshes(info, {find_mesh(model, info, rig.mesh_object) for rig, model in found})
     for scene_rig, model in found:
         try:
-            _bind(scene_rig, model, options.use_in_render)
+            if note := bind(scene_rig, model, options.use_in_render):
+                print(note)
+            # Evaluate now, so that a model that cannot play raises an error here.
+            check_plays(scene_rig.mesh_object)
+            if warning := scene_rig.mesh_object.fdda.status:
+                print(warning)
             rigs_and_models.append((scene_rig, model))
         except FDDAError as error:
             # Of a character, the meshes that have not changed play.
@@ -71,15 +76,6 @@ def run(options: argparse.Namespace) -> None:
         print(f"Left out '{name}': {error}")
     if missing:
         print(missing)
-
-
-def _bind(scene_rig: SceneRig, model: Path, use_in_render: bool) -> None:
-    if note := bind(scene_rig, model, use_in_render):
-        print(note)
-    # Evaluate now, so that a model that cannot play raises an error here.
-    check_plays(scene_rig.mesh_object)
-    if warning := scene_rig.mesh_object.fdda.status:
-        print(warning)
 
 
 def _copy_model_beside(scene_rig: SceneRig, model: Path, out: Path) -> Path:

@@ -159,7 +159,7 @@ def table(evaluation: Evaluation) -> str:
     heading = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
     lines = [heading, "-" * len(heading)]
     random_errors = [] if any(errors is evaluation.held_out for errors in evaluation.actions) else [evaluation.held_out]
-    for errors in (*random_errors, *evaluation.scaled_ranges, *evaluation.named, *evaluation.actions):
+    for errors in (*random_errors, *evaluation.scaled_ranges, *evaluation.actions):
         values = errors.to_json()
         lines.append(f"{errors.name}, {format_count(values['poses'], 'pose')}")
         for key, label in (("linear", "  linear skinning"), ("fdda", "  FDDA")):

@@ -70,8 +70,12 @@ def run(options: argparse.Namespace) -> None:
     open_file(options.rig)
     scene_rig = _find_rig(options)
     if not options.refine:
-        _print_control_bones(scene_rig, options)
-        _print_bones_to_pose(scene_rig, options)
+        if names := split_control_bones(scene_rig, options.extra_input)[0]:
+            controls = listed_controls(scene_rig, RecordingSettings(**pose_settings(options, scene_rig)))
+            print(describe_control_bones(scene_rig.armature_object, names, controls))
+        if not options.bones_to_pose and options.poses != 0 and not options.learn_from:
+            actions = find_actions(RecordingSettings(actions=tuple(options.action)))
+            print(describe_bones(scene_rig, choose_bones(scene_rig, actions), actions))
     start = time.monotonic()
     with ProgressPrinter() as progress, model_disabled(*scene_rig.mesh_objects):
         for step in _make_job(scene_rig, options):
@@ -143,18 +147,3 @@ def _make_job(scene_rig: SceneRig, options: argparse.Namespace) -> Iterator[Prog
         **pose_settings(options, scene_rig),
     )
     return record(scene_rig, options.recording, settings)
-
-
-def _print_control_bones(scene_rig: SceneRig, options: argparse.Namespace) -> None:
-    """Print how many inputs the control bones are, and which locations and custom properties have no range."""
-    names, _ = split_control_bones(scene_rig, options.extra_input)
-    if names:
-        settings = RecordingSettings(**pose_settings(options, scene_rig))
-        print(describe_control_bones(scene_rig.armature_object, names, listed_controls(scene_rig, settings)))
-
-
-def _print_bones_to_pose(scene_rig: SceneRig, options: argparse.Namespace) -> None:
-    """Print what random poses move if no option chooses it."""
-    if not options.bones_to_pose and options.poses != 0 and not options.learn_from:
-        actions = find_actions(RecordingSettings(actions=tuple(options.action)))
-        print(describe_bones(scene_rig, choose_bones(scene_rig, actions), actions))

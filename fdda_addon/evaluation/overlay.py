@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Draws meshes with vertex colors, bones, and a legend over the 3D viewports."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import blf
@@ -140,7 +139,11 @@ class Overlay:
         try:
             for mesh in self.meshes(context):
                 attributes = {"position": mesh.positions, "normal": mesh.normals, "color": mesh.colors}
-                vertices = gpu.types.GPUVertBuf(_vertex_format(attributes), len(mesh.positions))
+                # Blender 5.2 does not derive the format from the shader.
+                vertex_format = gpu.types.GPUVertFormat()
+                for name in attributes:
+                    vertex_format.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
+                vertices = gpu.types.GPUVertBuf(vertex_format, len(mesh.positions))
                 for name, values in attributes.items():
                     vertices.attr_fill(name, values)
                 batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=mesh.triangles)
@@ -214,17 +217,6 @@ class Overlay:
             info.fragment_source(FRAGMENT_SHADER)
             self._shader = gpu.shader.create_from_info(info)
         return self._shader
-
-
-def _vertex_format(names: Iterable[str]) -> gpu.types.GPUVertFormat:
-    """Create a vertex format with three floats for each attribute name.
-
-    Blender 5.2 does not derive the format from the shader.
-    """
-    vertex_format = gpu.types.GPUVertFormat()
-    for name in names:
-        vertex_format.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
-    return vertex_format
 
 
 def _draw_text(text: str, x: float, y: float) -> None:

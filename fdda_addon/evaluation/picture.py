@@ -154,7 +154,9 @@ class Picture:
                 left, cell_top = gap + column_index * cell_step[0], top + row_index * cell_step[1]
                 self.add_text(cell.label, (left, -(cell_top + 1.4 * text_size)), text_size)
                 center = (left + cell_size[0] / 2, -(cell_top + 2.4 * text_size + cell_size[1] / 2))
-                self._add_cell(factory, cell, center)
+                projected = (cell.positions @ self.projection.T).astype(np.float32)
+                centered = projected - (projected.max(axis=0) + projected.min(axis=0)) / 2
+                self.move(self.add_object("cell", factory.create(centered, cell.colors)), *center)
         bottom = top + len(rows) * cell_step[1]
         if has_heat_scale:
             # Add the colors of the heat map: a box for no error, and a strip from the first to the last stop.
@@ -183,11 +185,6 @@ class Picture:
         self.scene.collection.objects.link(scene_object)
         self._datablocks += [scene_object, *([data] if data is not None else [])]
         return scene_object
-
-    def _add_cell(self, factory: MeshFactory, cell: Cell, center: tuple[float, float]) -> None:
-        projected = (cell.positions @ self.projection.T).astype(np.float32)
-        center_of_bounds = (projected.max(axis=0) + projected.min(axis=0)) / 2
-        self.move(self.add_object("cell", factory.create(projected - center_of_bounds, cell.colors)), *center)
 
     def add_text(self, text: str, position: tuple[float, float], size: float) -> bpy.types.TextCurve:
         """Add a line of text at the position of its left end, with its height; return its curve."""

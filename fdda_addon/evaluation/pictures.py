@@ -97,21 +97,13 @@ def draw_comparison(
         if mask is not None:
             fdda = mask.blend(linear, fdda)
         cells = [(pose.positions, f"{pose.name}: {reference_label}"), (linear, "linear skinning"), (fdda, "FDDA")]
-        rows.append(
-            [
-                _cell(positions, pose.positions, label, is_heat_map, network.info.metres_per_unit)
-                for positions, label in cells
-            ]
-        )
+        rows.append([])
+        for positions, label in cells:
+            errors = distances(positions, pose.positions, network.info.metres_per_unit)
+            figures = f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm" if errors.any() else ""
+            colors = heat_colors(errors) if is_heat_map else np.tile(np.float32(SURFACE_COLOR), (len(positions), 1))
+            rows[-1].append(Cell(positions, colors, label + figures))
     if not title:
         capitalized = f"{reference_label[0].upper()}{reference_label[1:]}"
         title = f"Distance from the {reference_label}" if is_heat_map else f"{capitalized}, linear skinning and FDDA"
     draw(scene_rig.mesh_object, rows, path, title, view, has_heat_scale=is_heat_map, is_sculpted=not is_heat_map)
-
-
-def _cell(positions: np.ndarray, reference: np.ndarray, label: str, is_heat_map: bool, metres_per_unit: float) -> Cell:
-    errors = distances(positions, reference, metres_per_unit)
-    if errors.any():
-        label += f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm"
-    colors = heat_colors(errors) if is_heat_map else np.tile(np.float32(SURFACE_COLOR), (len(positions), 1))
-    return Cell(positions, colors, label)

@@ -56,7 +56,6 @@ class Evaluation:
         held_out: errors on the random poses; without random poses, on the first action or strip.
         actions: errors on each action and strip.
         scaled_ranges: errors on the random poses of each scaled range of motion.
-        named: errors on each named pose.
         channels: channels of the random poses.
     """
 
@@ -65,7 +64,6 @@ class Evaluation:
     held_out: PoseErrors
     actions: list[PoseErrors] = field(default_factory=list)
     scaled_ranges: list[PoseErrors] = field(default_factory=list)
-    named: list[PoseErrors] = field(default_factory=list)
     channels: tuple[Channel, ...] = ()
 
     @property
@@ -97,6 +95,5 @@ class Evaluation:
             ],
             "actions": [errors.to_json() for errors in self.actions],
             "scaled_ranges": [errors.to_json() for errors in self.scaled_ranges],
-            "named": [errors.to_json() for errors in self.named],
             **surface_json(self.held_out.fdda_surface, self.held_out.linear_surface),
         }

@@ -37,7 +37,7 @@ from ..scene.armature import Poser, clear_pose
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig, check_full_rig
 from .results import Evaluation, PoseErrors
-from .settings import EvaluationSettings, NamedPose
+from .settings import EvaluationSettings
 
 FIRST_HELD_OUT_INDEX = 1 << 33
 """Index of the first held-out random pose. It is larger than the number of poses of any recording, so the held-out
@@ -72,7 +72,7 @@ def evaluate_meshes(
     clips = find_clips([scene_rig], settings.actions, settings.strips)
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
-    random_pose_count = settings.poses or len(settings.range_scales) or len(settings.named)
+    random_pose_count = settings.poses or len(settings.range_scales)
     network = model if isinstance(model, Network) else Network(model)
     opened_models, skinnings = [], []
     for rig in rigs:
@@ -111,13 +111,11 @@ def evaluate_meshes(
         if settings.poses:
             poses = random_poses(channels, FIRST_HELD_OUT_INDEX, settings.poses)
             held_out = yield from comparison.compare("held-out poses", poses)
-        scaled_range_errors, named_errors, action_errors = [], [], []
+        scaled_range_errors, action_errors = [], []
         for scale_index, factor in enumerate(settings.range_scales, 1):
             wide_channels, first_index = widen_ranges(channels, factor), FIRST_HELD_OUT_INDEX * (1 + scale_index)
             poses = random_poses(wide_channels, first_index, settings.scaled_poses)
             scaled_range_errors.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
-        for pose in settings.named:
-            named_errors.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, pose_setter))))
         for clip in clips:
             poses = pose_setter.show_frames(player, clip, range(len(clip.frames)))
             action_errors.append((yield from comparison.compare(clip.title, poses)))
@@ -128,7 +126,6 @@ def evaluate_meshes(
             (held_out or action_errors[0])[index],
             [errors[index] for errors in action_errors],
             [errors[index] for errors in scaled_range_errors],
-            [errors[index] for errors in named_errors],
             # A channel of a shape key is named as seen from its mesh.
             (opened.network.info.limits or channels) if channels else (),
         )
@@ -169,15 +166,6 @@ def _random_poses(
             values = sample_pose(channels, seed, index)
             pose_setter.set_pose(blend_from_rest(poser.set, channels, values))
             yield
-
-
-def _named_pose(scene_rig: SceneRig, pose: NamedPose, pose_setter: PoseSetter) -> Iterator[None]:
-    clear_pose(scene_rig.armature_object)
-    channels = tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3))
-    values = np.array([angle for angles in pose.rotations.values() for angle in angles])
-    with pose_setter.prepared():
-        pose_setter.set_pose(blend_from_rest(Poser(scene_rig, channels).set, channels, values))
-        yield
 
 
 class _MeshComparison:

@@ -10,19 +10,6 @@ from ..rig.pose_setter import NO_TARGET, TargetSettings
 
 
 @dataclass(frozen=True)
-class NamedPose:
-    """A pose that is defined by the rotations of some bones; the other bones are at rest.
-
-    Attributes:
-        name: name of the pose.
-        rotations: Euler angles by bone name, in the rotation order of the bone, radians.
-    """
-
-    name: str
-    rotations: dict[str, tuple[float, float, float]]
-
-
-@dataclass(frozen=True)
 class EvaluationSettings:
     """The poses of an evaluation.
 
@@ -32,7 +19,6 @@ class EvaluationSettings:
         actions, strips: names of actions and of NLA strips whose frames are compared too.
         range_scales: factors that widen the range of motion for further random poses. Each factor has a quarter as many
             poses as `poses`.
-        named: further poses, whose errors are listed separately.
         surface: whether to compare normals and edges too, which takes longer than the rest of the evaluation.
         target: settings of the target to compare with; by default the rig itself.
     """
@@ -41,7 +27,6 @@ class EvaluationSettings:
     seed: int = EVALUATION_SEED
     actions: tuple[str, ...] = ()
     range_scales: tuple[float, ...] = ()
-    named: tuple[NamedPose, ...] = ()
     surface: bool = True
     strips: tuple[str, ...] = ()
     target: TargetSettings = NO_TARGET
@@ -54,4 +39,4 @@ class EvaluationSettings:
     def total_poses(self, clips: Iterable[Clip]) -> int:
         """Return the number of poses, with the frames of the clips."""
         of_clips = sum(len(clip.frames) for clip in clips)
-        return self.poses + self.scaled_poses * len(self.range_scales) + len(self.named) + of_clips
+        return self.poses + self.scaled_poses * len(self.range_scales) + of_clips

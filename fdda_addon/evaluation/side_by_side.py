@@ -62,8 +62,17 @@ def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> Non
     bpy.context.scene.collection.objects.link(comparison_object)
     if mode == OVERLAY:
         comparison_object.display_type, comparison_object.show_in_front = "WIRE", True
-    else:
-        _move_aside(comparison_object, mesh_object, distance or DISTANCE_IN_WIDTHS * _width(mesh_object))
+        return
+    if not distance:
+        evaluated = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        x_values = [(evaluated.matrix_world @ Vector(corner)).x for corner in evaluated.bound_box]
+        distance = DISTANCE_IN_WIDTHS * (max(x_values) - min(x_values))
+    # Move it by modifiers, because a transform would change how its armature deforms it.
+    offset = mesh_object.matrix_world.to_3x3().inverted_safe() @ Vector((distance, 0, 0))
+    for axis, component in zip("XYZ", offset, strict=True):
+        if abs(component) > 1e-6 * offset.length:
+            modifier = comparison_object.modifiers.new(f"Aside {axis}", "DISPLACE")
+            modifier.direction, modifier.space, modifier.mid_level, modifier.strength = axis, "LOCAL", 0.0, component
 
 
 def hide(mesh_object: bpy.types.Object) -> None:
@@ -81,22 +90,6 @@ def _remove(comparison_object: bpy.types.Object | None) -> None:
     if comparison_object is not None:
         # Remove only the object, because its mesh belongs to the character.
         bpy.data.objects.remove(comparison_object)
-
-
-def _width(mesh_object: bpy.types.Object) -> float:
-    """Return the evaluated width of an object along the X axis of the world."""
-    evaluated = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    x_values = [(evaluated.matrix_world @ Vector(corner)).x for corner in evaluated.bound_box]
-    return max(x_values) - min(x_values)
-
-
-def _move_aside(comparison_object: bpy.types.Object, mesh_object: bpy.types.Object, distance: float) -> None:
-    """Move an object to the side by modifiers, because a transform would change how its armature deforms it."""
-    offset = mesh_object.matrix_world.to_3x3().inverted_safe() @ Vector((distance, 0, 0))
-    for axis, component in zip("XYZ", offset, strict=True):
-        if abs(component) > 1e-6 * offset.length:
-            modifier = comparison_object.modifiers.new(f"Aside {axis}", "DISPLACE")
-            modifier.direction, modifier.space, modifier.mid_level, modifier.strength = axis, "LOCAL", 0.0, component
 
 
 @persistent

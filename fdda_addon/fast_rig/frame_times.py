@@ -78,33 +78,23 @@ def measure_frames(
     for round_index in range(rounds):
         # The fast rig first: the full rig may have further actions, which key only removed bones.
         for index, path in enumerate((fast, full)):
-            armature_object = _open_rig(path, object_name)
+            try:
+                with silenced_stdout():
+                    bpy.ops.wm.open_mainfile(filepath=blender_path(path), load_ui=False)
+            except RuntimeError as error:
+                raise FDDAError(f"Blender cannot open '{path}' ({report_message(error)}).") from error
+            armature_object = find_rig(object_name).armature_object
             if action_name is None:
-                action_name = _action_name(armature_object)
+                # The assigned action, or the first that keys bones.
+                animation, actions = armature_object.animation_data, animating_actions(armature_object)
+                action = animation.action if animation and animation.action in actions else next(iter(actions), None)
+                action_name = action.name if action else ""
             indices = range(round_index * frames_per_round - WARM_UP_FRAMES, (round_index + 1) * frames_per_round)
             meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and o.fdda.is_bound and path == full]
             with unstretched_time(), model_disabled(*meshes):
                 times[path] += time_calls(_frame_calls(armature_object, action_name, controls, size, indices))
             yield Progress("frames", 2 * round_index + index + 1, 2 * rounds)
     return RigTimes(tuple(times[full]), tuple(times[fast]))
-
-
-def _open_rig(path: Path, object_name: str) -> bpy.types.Object:
-    """Open a file, and return the armature object of its rig."""
-    try:
-        with silenced_stdout():
-            bpy.ops.wm.open_mainfile(filepath=blender_path(path), load_ui=False)
-    except RuntimeError as error:
-        raise FDDAError(f"Blender cannot open '{path}' ({report_message(error)}).") from error
-    return find_rig(object_name).armature_object
-
-
-def _action_name(armature_object: bpy.types.Object) -> str:
-    """Return the name of the action to play: the assigned one, or the first that keys bones; empty if there is none."""
-    animation = armature_object.animation_data
-    actions = animating_actions(armature_object)
-    action = animation.action if animation and animation.action in actions else next(iter(actions), None)
-    return action.name if action else ""
 
 
 def _frame_calls(

@@ -4,8 +4,6 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import bpy
-
 from ..core.errors import RigError
 from ..core.formats.model import read_model
 from ..core.progress import Job
@@ -93,7 +91,13 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
             without what is removed, or the file cannot be written. Nothing is written.
     """
     scene_rigs = [scene_rig for scene_rig, _ in rigs_and_models]
-    armature_object = _shared_armature(scene_rigs)
+    armature_object, *others = dict.fromkeys(rig.armature_object for rig in scene_rigs)
+    if others:
+        names = " and ".join(f"'{each.name}'" for each in (armature_object, *others))
+        raise RigError(f"The models play on several armatures, {names}; make a fast rig of one armature at a time.")
+    for mesh_object in (rig.mesh_object for rig in scene_rigs):
+        if mesh_object.fdda.is_fast_rig:
+            raise RigError(f"'{mesh_object.name}' is a fast rig already; give the file of the full rig.")
     joint_names = bind_packed_models(rigs_and_models)
     controls = tuple(sorted(control_bones(armature_object, choices)))
     if not controls:
@@ -129,6 +133,9 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
             "--controls collection:NAME."
         )
     save_copy(out)
+    lost_channels = {
+        action: {bone: n for bone, n in counts.items() if bone in removed.bones} for action, counts in keyed.items()
+    }
     return FastRig(
         armature_object.name,
         poses.size,
@@ -139,7 +146,7 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
         removed.objects,
         removed.modifiers,
         removed.drivers,
-        _lost_channels(keyed, removed.bones),
+        {action: counts for action, counts in lost_channels.items() if counts},
         len(shown),
         len(before.matrices),
         max((*differing_bones(poses, before.matrices, after.matrices, -1.0).values(), *compared.values()), default=0.0),
@@ -147,17 +154,6 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
         infinite_bones(poses, before.matrices),
         tuple(unrepeated),
     )
-
-
-def _shared_armature(scene_rigs: list[SceneRig]) -> bpy.types.Object:
-    armature_objects = {rig.armature_object.name: rig.armature_object for rig in scene_rigs}
-    if len(armature_objects) > 1:
-        names = " and ".join(f"'{name}'" for name in armature_objects)
-        raise RigError(f"The models play on several armatures, {names}; make a fast rig of one armature at a time.")
-    for scene_rig in scene_rigs:
-        if scene_rig.mesh_object.fdda.is_fast_rig:
-            raise RigError(f"'{scene_rig.mesh_object.name}' is a fast rig already; give the file of the full rig.")
-    return scene_rigs[0].armature_object
 
 
 def bind_packed_models(rigs_and_models: list[tuple[SceneRig, Path]]) -> tuple[str, ...]:
@@ -246,11 +242,3 @@ def _listed(texts: list[str]) -> str:
     """Return the first of some texts, and the number of others."""
     more = f" and {len(texts) - MAX_NAMED} more" if len(texts) > MAX_NAMED else ""
     return ", ".join(texts[:MAX_NAMED]) + more
-
-
-def _lost_channels(keyed: dict[str, dict[str, int]], removed_bones: set[str]) -> dict[str, dict[str, int]]:
-    """Select from the numbers of keyed channels, by action and bone, those of removed bones."""
-    lost = {
-        action: {bone: n for bone, n in counts.items() if bone in removed_bones} for action, counts in keyed.items()
-    }
-    return {action: counts for action, counts in lost.items() if counts}

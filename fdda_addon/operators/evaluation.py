@@ -55,7 +55,12 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Job[list[tuple[int, Evaluation]]]:
         rigs = self.bound_rigs(context)
-        self._action = self._action_name(rigs[0]) if self.source == "ACTION" else ""
+        self._action = (self.action or active_action_name(rigs[0])) if self.source == "ACTION" else ""
+        if self.source == "ACTION" and not self._action:
+            raise RigError(
+                f"'{rigs[0].armature_object.name}' has no active action; choose one under Compare On, or compare on "
+                "random poses."
+            )
         # Meshes of one model are compared in one pass; one that learned from another object is compared alone.
         passes: dict[tuple, list[SceneRig]] = {}
         for rig in rigs:
@@ -99,15 +104,6 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
             show_graph(context.window_manager.fdda_view.graph)
         redraw_views()
         return " ".join(sentences)
-
-    def _action_name(self, scene_rig: SceneRig) -> str:
-        name = self.action or active_action_name(scene_rig)
-        if not name:
-            raise RigError(
-                f"'{scene_rig.armature_object.name}' has no active action; choose one under Compare On, or compare on "
-                "random poses."
-            )
-        return name
 
 
 class EvaluationOperator(RigOperator):

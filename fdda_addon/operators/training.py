@@ -106,7 +106,11 @@ class TrainingOperator(JobOperator):
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
         if not bpy.app.background and is_detached(model):
             return AttachedTraining(model)
-        _check_recording(recording)
+        index = read_index(recording)
+        if index["complete"] < index["poses"]:
+            raise RecordingError(
+                f"The recording '{recording.name}' has {index['complete']} of {index['poses']} poses; resume it first."
+            )
         try:
             model.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -256,15 +260,6 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
     def cancel_message(self, _context: bpy.types.Context) -> str:
         self.add_trained_models_to_list()
         return "Training canceled; no model was written."
-
-
-def _check_recording(path: Path) -> None:
-    """Raise an error before the trainer starts if the recording is missing or incomplete."""
-    index = read_index(path)
-    if index["complete"] < index["poses"]:
-        raise RecordingError(
-            f"The recording '{path.name}' has {index['complete']} of {index['poses']} poses; resume it first."
-        )
 
 
 def _is_recorded(mesh_object: bpy.types.Object, recording: Path) -> bool:

@@ -67,9 +67,11 @@ def read_modifiers_and_drivers(scene_rig: SceneRig) -> dict:
     modifiers = [_read_modifier(scene_rig, modifier) for modifier in recorded_modifiers(scene_rig.mesh_object)]
     # A model reads the values of shape keys, so whatever drives these may change.
     mesh_object, drivers = scene_rig.mesh_object, {}
+    fdda_paths = tuple(m.path_from_id() for m in mesh_object.modifiers if is_fdda_modifier(m))
     for owner in (mesh_object, mesh_object.data, mesh_object.data.shape_keys):
         for curve in owner.animation_data.drivers if owner is not None and owner.animation_data else ():
-            is_rig = owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path)
+            path = curve.data_path
+            is_rig = owner is not mesh_object or (path.startswith("modifiers[") and not path.startswith(fdda_paths))
             if is_rig and not curve.mute and not is_shape_key_value(mesh_object, owner, curve.data_path):
                 name = (
                     f"{owner_name(scene_rig, owner) or 'mesh'}/{versionless_path(curve.data_path)}[{curve.array_index}]"
@@ -167,12 +169,6 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
             settings["value"] = float(block == mesh_object.active_shape_key)
         shape_keys[block.name] = settings | {"shape": Fingerprint.digest(positions)}
     return shape_keys
-
-
-def _is_rig_modifier_path(mesh_object: bpy.types.Object, path: str) -> bool:
-    """Return whether a path of a mesh object leads into a modifier of its rig, not into the FDDA modifier."""
-    fdda_paths = [modifier.path_from_id() for modifier in mesh_object.modifiers if is_fdda_modifier(modifier)]
-    return path.startswith("modifiers[") and not path.startswith(tuple(fdda_paths))
 
 
 def read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:

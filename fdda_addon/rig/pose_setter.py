@@ -225,7 +225,10 @@ class PoseSetter:
                     for armature_object in player.armature_objects:
                         ends = rest_channels[armature_object], end_channels[armature_object]
                         for channel, start, end in zip(POSE_CHANNELS, *ends, strict=True):
-                            values = _interpolate_channel(channel.name, start, end, np.float32(fraction))
+                            if channel.name == "rotation_quaternion":
+                                # q and -q are the same rotation; take the nearer one. Blender normalizes quaternions.
+                                end = np.where((start * end).sum(axis=1, keepdims=True) < 0, -end, end)
+                            values = start + np.float32(fraction) * (end - start)
                             write(armature_object.pose.bones, channel, values)
                         armature_object.update_tag(refresh={"DATA"})
                     bpy.context.scene.frame_set(frame)
@@ -238,13 +241,6 @@ class PoseSetter:
 
 DIRECT_POSE_SETTER = PoseSetter()
 """Sets poses of a rig, whose surface follows from the pose at once."""
-
-
-def _interpolate_channel(name: str, start: np.ndarray, end: np.ndarray, fraction: np.float32) -> np.ndarray:
-    if name == "rotation_quaternion":
-        # q and -q are the same rotation; take the nearer one. Blender normalizes quaternions.
-        end = np.where((start * end).sum(axis=1, keepdims=True) < 0, -end, end)
-    return start + fraction * (end - start)
 
 
 def make_pose_setter(

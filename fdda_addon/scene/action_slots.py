@@ -190,9 +190,14 @@ def _fitting_slots(
     """Choose for each slot the datablock, besides those in `chosen`, where most of its F-curves have an effect."""
     slots: ActionSlots = {}
     for slot in candidates:
+        # F-curves for bones, shape keys and other named items; only armature objects have bones.
+        named_curves = [curve for curve in curves[slot] if "[" in curve.data_path]
+        other_curves = [curve for curve in named_curves if not curve.data_path.startswith("pose.")]
         counts = {
-            datablock: len(list(_curves_with_effect(datablock, named_curves)))
-            for datablock, named_curves in _named_curves(curves[slot], datablocks)
+            datablock: len(
+                list(_curves_with_effect(datablock, other_curves if _is_not_armature(datablock) else named_curves))
+            )
+            for datablock in datablocks
             if datablock not in chosen and accepts_slot(datablock, slot)
         }
         largest_count = max(counts.values(), default=0)
@@ -211,16 +216,6 @@ def _fitting_slots(
                 )
             slots[datablock] = slot
     return slots
-
-
-def _named_curves(
-    curves: Iterable[bpy.types.FCurve], datablocks: Iterable[bpy.types.ID]
-) -> list[tuple[bpy.types.ID, list[bpy.types.FCurve]]]:
-    """Return the F-curves for bones, shape keys and other named items, with each datablock that may have such items."""
-    named_curves = [curve for curve in curves if "[" in curve.data_path]
-    other_curves = [curve for curve in named_curves if not curve.data_path.startswith("pose.")]
-    pairs = [(d, other_curves if _is_not_armature(d) else named_curves) for d in datablocks]
-    return [(datablock, datablock_curves) for datablock, datablock_curves in pairs if datablock_curves]
 
 
 def _curves_with_effect(datablock: bpy.types.ID, curves: Iterable[bpy.types.FCurve]) -> Iterator[bpy.types.FCurve]:

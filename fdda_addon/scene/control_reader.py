@@ -47,7 +47,9 @@ class ControlReader:
         def is_constrained(control: Control, transform: BoneTransform) -> bool:
             owner = owner_of(scene_rig, control.owner)
             bone = owner and owner.type == "ARMATURE" and owner.data.bones.get(transform.bone_name)
-            return bool(bone) and (owner.name, bone.name) not in channel_bones and _inherits_all(bone)
+            if not bone or (owner.name, bone.name) in channel_bones:
+                return False
+            return bone.use_inherit_rotation and bone.use_local_location and bone.inherit_scale == "FULL"
 
         bone_elements: dict[tuple[str, str], list[tuple[int, BoneTransform]]] = {}
         self._single_controls: list[int] = []
@@ -228,11 +230,6 @@ class ConstrainedBones:
             f"A constraint moves the control bone '{self._names[hidden[0]]}' along an axis that is no extra input, so "
             "the model does not follow it; mute it, or record and train this rig."
         )
-
-
-def _inherits_all(bone: bpy.types.Bone) -> bool:
-    """Return whether a bone inherits the whole transform of its parent."""
-    return bone.use_inherit_rotation and bone.use_local_location and bone.inherit_scale == "FULL"
 
 
 def _read_channel_bones() -> Iterator[tuple[str, str]]:

@@ -49,7 +49,7 @@ def draw_cached(function: Callable[..., Value]) -> Callable[..., Value]:
     def cached_function(*arguments: object) -> Value:
         now = time.monotonic()
         if now > _cache.expires_at or bpy.app.background:
-            if bpy.app.background or not _is_animation_playing():
+            if bpy.app.background or not any(w.screen.is_animation_playing for w in bpy.context.window_manager.windows):
                 clear()
             _cache.expires_at = now + MAX_AGE_SECONDS
         key = (function, *arguments)
@@ -88,11 +88,6 @@ def actions_state() -> object:
 def forget_actions() -> None:
     """Let what follows from actions be computed again, because one of them may have changed."""
     _cache.actions = object()
-
-
-def _is_animation_playing() -> bool:
-    """Return whether an animation plays in some window."""
-    return any(window.screen.is_animation_playing for window in bpy.context.window_manager.windows)
 
 
 def clear() -> None:

@@ -6,15 +6,15 @@ single bones or too small to measure.
 """
 
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import bpy
 
 from ..core.progress import Job, Progress
 from ..rig.references import split_bone_path
-from .armature_copy import RemovablePart, armature_copy
-from .durations import Duration, frame_ms
+from .durations import TEMPORARY_SCENE_NAME, Duration, frame_ms, temporary_scene
 
 MAX_GROUPS = 10
 MAX_MEASUREMENTS = 40
@@ -24,6 +24,7 @@ MIN_GROUP_MS = 0.02
 """A group that takes less time is not divided."""
 NO_BONE = ""
 """Key of the drivers of the armature object and its data that belong to no bone."""
+RemovablePart = bpy.types.Constraint | bpy.types.FCurve
 
 
 @dataclass(frozen=True)
@@ -150,3 +151,70 @@ def _measure_group(
     return BoneGroup(
         tuple(names), len(group) - driver_count, driver_count, Duration.of([ratio * full_ms for ratio in ratios])
     )
+
+
+@contextmanager
+def armature_copy(
+    armature_object: bpy.types.Object, removed: Iterable[RemovablePart] = ()
+) -> Iterator[bpy.types.Scene]:
+    """Create a scene with a copy of an armature object alone, and what its bones depend on; remove both afterwards.
+
+    The copy depends on itself where the original depends on itself, and plays the same action.
+
+    Args:
+        removed: constraints of its bones, and drivers of it and of its armature, that the copy lacks.
+    """
+    constraint_names: dict[str, set[str]] = {}
+    driver_keys: set[tuple[bpy.types.ID, str, int]] = set()
+    for part in removed:
+        if isinstance(part, bpy.types.FCurve):
+            driver_keys.add((part.id_data, part.data_path, part.array_index))
+        else:
+            bone_name = part.path_from_id().partition(".constraints[")[0]
+            constraint_names.setdefault(bone_name, set()).add(part.name)
+    copies: list[bpy.types.ID] = []
+    try:
+        copy = _local_copy(armature_object, copies)
+        copy.data = _local_copy(armature_object.data, copies)
+        copy.hide_viewport = False
+        for original, copied in ((armature_object, copy), (armature_object.data, copy.data)):
+            drivers = copied.animation_data.drivers if copied.animation_data else ()
+            for curve in list(drivers):
+                if (original, curve.data_path, curve.array_index) in driver_keys:
+                    drivers.remove(curve)
+        for bone_path, names in constraint_names.items():
+            constraints = copy.path_resolve(bone_path).constraints
+            for name in names:
+                constraints.remove(constraints[name])
+        _point_to_copies(copy, {armature_object: copy, armature_object.data: copy.data})
+        with temporary_scene([copy]) as scene:
+            yield scene
+    finally:
+        bpy.data.batch_remove(copies)
+
+
+def _local_copy(datablock: bpy.types.ID, copies: list[bpy.types.ID]) -> bpy.types.ID:
+    """Copy a datablock, which may be linked or a library override, and append the copy to `copies`."""
+    copy = datablock.copy()
+    copies.append(copy)
+    copy.name = TEMPORARY_SCENE_NAME
+    if copy.override_library is not None:
+        copy.make_local(clear_liboverride=True)
+    return copy
+
+
+def _point_to_copies(copy: bpy.types.Object, copies: dict[bpy.types.ID, bpy.types.ID]) -> None:
+    """Replace the originals by the copies in all constraints and drivers of the copies."""
+    for bone in copy.pose.bones:
+        for constraint in bone.constraints:
+            for struct in (constraint, *getattr(constraint, "targets", ())):
+                for name in ("target", "pole_target", "space_object"):
+                    value = getattr(struct, name, None)
+                    if value in copies:
+                        setattr(struct, name, copies[value])
+    for owner in copies.values():
+        for curve in owner.animation_data.drivers if owner.animation_data else ():
+            for variable in curve.driver.variables:
+                for target in variable.targets:
+                    if target.id in copies:
+                        target.id = copies[target.id]

@@ -16,7 +16,7 @@ from ..scene.temporary_state import temporary_attributes
 WARM_UP_FRAMES = 3
 """Number of frames before each measurement that are not timed."""
 TEMPORARY_SCENE_NAME = "FDDA Profile"
-"""Name of temporary scenes."""
+"""Name of temporary scenes, and of the copies in them."""
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,14 @@ class _Measurement:
         self._mesh_objects = {rig.mesh_object for rig in rigs}
         self.frame_rounds: list[float] = []
         self._bone_ratios: list[float] = []
-        self._object_ratios: dict[bpy.types.Object, list[float]] = {o: [] for o in _objects_with_modifiers()}
+        # The objects that Blender evaluates and that have modifiers or shape keys.
+        objects = [
+            datablock.original
+            for datablock in bpy.context.evaluated_depsgraph_get().ids
+            if isinstance(datablock, bpy.types.Object) and datablock.original.type != "ARMATURE"
+        ]
+        names = sorted({o.name: o for o in objects if _removable_parts(o)}.items())
+        self._object_ratios: dict[bpy.types.Object, list[float]] = {scene_object: [] for _, scene_object in names}
         self._part_ratios: dict[tuple[str, str, str], list[float]] = {}
 
     def _frame_ms(self, round_index: int, scene: bpy.types.Scene | None = None) -> float:
@@ -141,16 +148,6 @@ class _Measurement:
             for key, ratios in ratios_by_part.items()
         ]
         return sorted(parts, key=lambda part: -part.duration.median)
-
-
-def _objects_with_modifiers() -> list[bpy.types.Object]:
-    """Return the objects of the scene that Blender evaluates and that have modifiers or shape keys."""
-    objects = [
-        datablock.original
-        for datablock in bpy.context.evaluated_depsgraph_get().ids
-        if isinstance(datablock, bpy.types.Object) and datablock.original.type != "ARMATURE"
-    ]
-    return sorted({o.name: o for o in objects if _removable_parts(o)}.values(), key=lambda o: o.name)
 
 
 def _removable_parts(scene_object: bpy.types.Object) -> list[tuple[str, str]]:

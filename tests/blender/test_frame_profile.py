@@ -19,8 +19,7 @@ from fdda_addon.panels.frame_profile import draw_profile
 from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing import measurements
-from fdda_addon.timing.armature_copy import armature_copy
-from fdda_addon.timing.bone_groups import BoneGroup, find_expensive_groups, parts_by_bone
+from fdda_addon.timing.bone_groups import BoneGroup, armature_copy, find_expensive_groups, parts_by_bone
 from fdda_addon.timing.durations import TEMPORARY_SCENE_NAME, Duration
 from fdda_addon.timing.fast_rig_saving import FastRigSaving
 from fdda_addon.timing.frame_profile import (

@@ -101,22 +101,22 @@ def find_flips(recording: SkinnedRecording, scan: ResidualScan) -> list[Flip]:
         if spread < MIN_SIZE_RATIO * rig.size:
             continue
         min_jump = max(MIN_SPREAD_RATIO * spread, MIN_SIZE_RATIO * rig.size)
-        flips = [
-            _make_flip(partition_index, joint, scan.poses, opposite_pairs, jumps)
-            for joint in partition.influencing
-            if joint in pairs_by_joint
-            for opposite_pairs, same_side_pairs in [pairs_by_joint[joint]]
-            for jumps in [_max_distances(residuals, opposite_pairs)]
-            if np.median(jumps) > max(min_jump, *_largest_usual_jumps(_max_distances(residuals, same_side_pairs)))
-        ]
-        if not flips and (similar_pairs := _find_similar_in_all_inputs(partition, features, controls)) is not None:
-            jumps = _max_distances(residuals, similar_pairs)
-            is_jump = jumps > max(JUMP_RATIO * float(np.median(jumps)), min_jump)
-            flips = (
-                [_make_flip(partition_index, -1, scan.poses, similar_pairs[is_jump], jumps[is_jump])]
-                if is_jump.any()
-                else []
+        flips = []
+        for joint in (joint for joint in partition.influencing if joint in pairs_by_joint):
+            opposite_pairs, same_side_pairs = pairs_by_joint[joint]
+            jumps, usual_jumps = (_max_distances(residuals, pairs) for pairs in (opposite_pairs, same_side_pairs))
+            usual_limit = max(
+                HALF_TURN_JUMP_RATIO * np.median(usual_jumps), np.percentile(usual_jumps, HALF_TURN_JUMP_PERCENTILE)
             )
+            if np.median(jumps) > max(min_jump, usual_limit):
+                flips.append(_make_flip(partition_index, joint, scan.poses, opposite_pairs, jumps))
+        joint_inputs = features[:, list(partition.influencing)].reshape(len(features), -1)
+        inputs = np.concatenate([joint_inputs, controls[:, list(partition.controls)]], axis=1)
+        if not flips and len(pairs := find_similar_poses(inputs, INPUT_DISTANCE_RATIO)) >= MIN_PAIRS:
+            jumps = _max_distances(residuals, pairs)
+            is_jump = jumps > max(JUMP_RATIO * float(np.median(jumps)), min_jump)
+            if is_jump.any():
+                flips.append(_make_flip(partition_index, -1, scan.poses, pairs[is_jump], jumps[is_jump]))
         flips_found += sorted(flips, key=lambda flip: -flip.jump)[:1]
     return flips_found
 
@@ -124,11 +124,6 @@ def find_flips(recording: SkinnedRecording, scan: ResidualScan) -> list[Flip]:
 def _make_flip(partition: int, joint: int, poses: np.ndarray, pairs: np.ndarray, jumps: np.ndarray) -> Flip:
     first, second = sorted(poses[pairs[jumps.argmax()]].tolist())
     return Flip(partition, joint, len(pairs), (first, second), float(jumps.max()))
-
-
-def _largest_usual_jumps(jumps: np.ndarray) -> tuple[float, float]:
-    """Return two upper limits for the usual distances of poses on the same side of 180 degrees."""
-    return HALF_TURN_JUMP_RATIO * float(np.median(jumps)), float(np.percentile(jumps, HALF_TURN_JUMP_PERCENTILE))
 
 
 def _find_half_turn_pairs(
@@ -167,14 +162,6 @@ def _to_quaternions(features: np.ndarray) -> np.ndarray:
         bar_itzhack[:, 0, i] = bar_itzhack[:, i, 0] = rotations[:, x, y] - rotations[:, y, x]
     quaternions = np.linalg.eigh(bar_itzhack)[1][:, :, -1]
     return quaternions * np.where(quaternions[:, :1] < 0, -1, 1)
-
-
-def _find_similar_in_all_inputs(partition: Partition, features: np.ndarray, controls: np.ndarray) -> np.ndarray | None:
-    """Find pairs of poses that are similar in all inputs of a partition; None where there are too few."""
-    joints = features[:, list(partition.influencing)].reshape(len(features), -1)
-    inputs = np.concatenate([joints, controls[:, list(partition.controls)]], axis=1)
-    pairs = find_similar_poses(inputs, INPUT_DISTANCE_RATIO)
-    return pairs if len(pairs) >= MIN_PAIRS else None
 
 
 def find_similar_poses(values: np.ndarray, max_ratio: float) -> np.ndarray:

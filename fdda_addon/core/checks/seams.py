@@ -127,14 +127,9 @@ def _coincident_groups(rig: Rig) -> np.ndarray:
             weights.round(WEIGHT_DIGITS),
             main[:, None],
         )
-        indices, counts = _equal_rows(np.concatenate(columns, axis=1, dtype=np.float64))
-        groups[vertices] = np.where(counts > 1, indices, -1)
+        # Adding zero turns -0 into 0.
+        rows = np.concatenate(columns, axis=1, dtype=np.float64) + 0.0
+        _, indices, counts = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+        indices = indices.ravel()
+        groups[vertices] = np.where(counts[indices] > 1, indices, -1)
     return groups
-
-
-def _equal_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each of n rows, the index of its value among the different rows, and the number of equal rows."""
-    # Adding zero turns -0 into 0.
-    _, indices, counts = np.unique(rows + 0.0, axis=0, return_inverse=True, return_counts=True)
-    indices = indices.ravel()
-    return indices, counts[indices]

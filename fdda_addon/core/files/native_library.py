@@ -42,20 +42,9 @@ _CAUSES = (
         "another extension may have brought a newer ONNX Runtime: remove that extension, or use a newer Blender",
     ),
     _Cause(
-        "",
-        (182,),
-        "a DLL of another program is loaded in its place: remove that program's folder from the variable PATH, or "
-        "{again}",
-    ),
-    _Cause(
         r"shared object.*: Cannot allocate memory",
         (8, 14, 1455),
         "enlarge the paging file of Windows, or end other programs",
-    ),
-    _Cause(
-        r"code signature|disallowed by system policy",
-        (225, 577, 1260, 4551),
-        "the security settings of this system block the file: allow it there, or ask your administrator",
     ),
     _Cause(
         r"ELF (?:class|header|load)|file too short|cannot read file data|/[^\s:]+: cannot open shared object|mach-o",
@@ -69,17 +58,10 @@ _CAUSES = (
         (),
         "an older C++ library is loaded: unset LD_LIBRARY_PATH, or use a Linux whose libstdc++ has {0}",
     ),
-    _Cause(r"built for macOS ([\d.]+)", (), "update macOS to version {0} or later"),
-    _Cause(r"(?s)Symbol not found.*Expected in: \S*/(?:usr/lib|System)/", (), "update macOS to version 14 or later"),
     _Cause(
         r"([^\s:('\"/]+): cannot open shared object file",
         (),
         "install the package of this Linux that has '{0}', or {again}",
-    ),
-    _Cause(
-        r"failed to map segment from shared object",
-        (),
-        "its drive is mounted with the option noexec: mount it without",
     ),
     _Cause(r'Error loading "|DLL load failed|dlopen\(|shared object|undefined symbol', (), "{again}", ""),
 )
@@ -87,12 +69,10 @@ _ENGLISH_TEXTS = {
     8: "Not enough memory resources",
     126: "The specified module could not be found",
     127: "The specified procedure could not be found",
-    182: "The operating system cannot run",
     193: "is not a valid Win32 application",
     998: "Invalid access to memory location",
     1114: "initialization routine failed",
     1455: "The paging file is too small",
-    4551: "An Application Control policy has blocked this file",
 }
 """Texts of error numbers. Python names no number where an import fails, and Windows translates the text."""
 

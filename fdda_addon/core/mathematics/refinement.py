@@ -82,7 +82,8 @@ def choose_poses(
     low, high = np.array([(channel.low, channel.high) for channel in channels]).T
     worst_errors = np.sort(probes.errors, axis=0)[-max(1, round(len(probes.errors) * WORST_PROBE_RATIO)) :]
     weights = worst_errors.mean(axis=0)
-    by_error, by_distance = (_to_probabilities(scores) for scores in (probes.errors, probes.distances))
+    squares = (np.square(scores, dtype=np.float64) + 1e-30 for scores in (probes.errors, probes.distances))
+    by_error, by_distance = (squared / squared.sum(axis=0) for squared in squares)
     poses = base_poses.copy()
     for pose in poses:
         is_free = np.ones(len(channels), bool)
@@ -97,9 +98,3 @@ def choose_poses(
             pose[channel_indices] = probes.values[probe, channel_indices] + noise
             is_free[channel_indices] = False
     return np.clip(poses, low, high)
-
-
-def _to_probabilities(scores: np.ndarray) -> np.ndarray:
-    """Convert (M, P) scores to probabilities over the M probes, proportional to their squares."""
-    squared = np.square(scores, dtype=np.float64) + 1e-30
-    return squared / squared.sum(axis=0)

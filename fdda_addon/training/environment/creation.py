@@ -99,7 +99,11 @@ class EnvironmentCreation:
                 with self._temporary() as temporary:
                     yield from self._install_with(temporary, interpreter, log)
                 yield Progress("checking", 0, 0)
-                result = self._check(log)
+                result = check(str(interpreter_path(self.folder)), f"the log is '{self.log}'")
+                log.writelines(f"{line}\n" for line in (result.message, *result.details))
+                self._stop_if_cancelled()
+                if result.level == "ERROR":
+                    raise TrainerEnvironmentError(f"The packages were installed but do not work: {result.message}")
                 write_completion_marker(self.folder, interpreter.version)
                 complete = True
             finally:
@@ -171,14 +175,6 @@ class EnvironmentCreation:
                 f"The packages {source} could not be installed ({self._error_line()}); {advice}; the log is "
                 f"'{self.log}'."
             )
-
-    def _check(self, log: IO[str]) -> CheckResult:
-        result = check(str(interpreter_path(self.folder)), f"the log is '{self.log}'")
-        log.writelines(f"{line}\n" for line in (result.message, *result.details))
-        self._stop_if_cancelled()
-        if result.level == "ERROR":
-            raise TrainerEnvironmentError(f"The packages were installed but do not work: {result.message}")
-        return result
 
     def _run(self, command: list[str], log: IO[str], variables: Mapping[str, str] = {}) -> Job[int]:
         """Run a command with further environment variables, and return its exit status.

@@ -88,29 +88,16 @@ def query_interpreter(command: list[str]) -> Interpreter | None:
 
 
 def default_candidates() -> Iterator[list[str]]:
-    """Yield command lines that may start a Python: Blender's own, on PATH, and in the folders of installers."""
+    """Yield command lines that may start a Python: Blender's own, and those on PATH."""
     if sys.executable:
         yield [sys.executable]
-    yield from _windows_candidates() if os.name == "nt" else _unix_candidates()
-
-
-def _unix_candidates() -> Iterator[list[str]]:
+    if os.name == "nt":
+        yield from _windows_candidates()
+        return
     yield from ([f"python{version}"] for version in PREFERRED_VERSIONS)
     # On macOS /usr/bin/python3 opens a dialog that installs the developer tools.
     if sys.platform != "darwin":
         yield from (["python3"], ["python"])
-    home = Path.home()
-    pyenv = Path(os.environ.get("PYENV_ROOT") or home / ".pyenv")
-    data = Path(os.environ.get("XDG_DATA_HOME") or home / ".local/share")
-    for version in PREFERRED_VERSIONS:
-        for path in (
-            *sorted(pyenv.glob(f"versions/{version}.*/bin/python")),
-            *sorted(data.glob(f"uv/python/cpython-{version}.*/bin/python")),
-            *(Path(folder) / f"python{version}" for folder in ("/opt/homebrew/bin", "/usr/local/bin", "/usr/bin")),
-            Path(f"/Library/Frameworks/Python.framework/Versions/{version}/bin/python{version}"),
-        ):
-            if path.is_file():
-                yield [str(path)]
 
 
 def _windows_candidates() -> Iterator[list[str]]:

@@ -10,8 +10,7 @@ import pytest
 
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.arm.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, LOCKED_RANGE, joint
-from fdda_addon.arm.rig import build_arm
-from fdda_addon.arm.surface import Surface, read_surface
+from fdda_addon.arm.rig import Surface, build_arm, read_surface
 
 FIXTURES = Path(__file__).resolve().parents[3] / "blend_fixtures"
 VERTEX_COUNTS = {1: 1450, 2: 10_000, 3: 50_000}

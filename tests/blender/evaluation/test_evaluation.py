@@ -16,7 +16,7 @@ from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation.results import Evaluation, PoseErrors
 from fdda_addon.evaluation.run import FIRST_HELD_OUT_INDEX, evaluate, evaluate_action
-from fdda_addon.evaluation.settings import EvaluationSettings, NamedPose
+from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.network import Network
@@ -105,18 +105,6 @@ def test_the_seed_determines_the_held_out_poses(rig, elbow_files):
     first, second, other_seed = (evaluate_with_settings(rig, elbow_files, poses=4, seed=seed) for seed in (1, 1, 2))
     assert first.to_json() == second.to_json()
     assert np.abs(first.held_out.pose_matrices - other_seed.held_out.pose_matrices).max() > 1e-2
-
-
-def test_a_named_pose_is_evaluated(rig, elbow_files):
-    pose = NamedPose("fold", {"lower": (1.5, 0, 0), "upper": (0, 0.2, 0)})
-    (errors,) = evaluate_with_settings(rig, elbow_files, poses=1, named=(pose,)).named
-    assert errors.name == "fold" and errors.fdda.shape == (1, 300)
-    rig.armature_object.animation_data_clear()
-    clear_pose(rig.armature_object)
-    bones = rig.armature_object.pose.bones
-    bones["lower"].rotation_euler, bones["upper"].rotation_euler = (1.5, 0, 0), (0, 0.2, 0)
-    true_positions = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
-    np.testing.assert_allclose(errors.positions[0], true_positions, atol=1e-6)
 
 
 def test_frames_of_an_action_are_evaluated(rig, elbow_files):

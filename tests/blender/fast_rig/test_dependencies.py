@@ -12,8 +12,7 @@ from fdda_addon.core.progress import run_job
 from fdda_addon.fast_rig.compared_poses import ComparedPoses, differing_bones, evaluate_poses
 from fdda_addon.fast_rig.controls import control_bones
 from fdda_addon.fast_rig.graph_reader import read_graph
-from fdda_addon.fast_rig.pruning import remove_bones, remove_drivers
-from fdda_addon.fast_rig.removal import remove_unneeded
+from fdda_addon.fast_rig.removal import remove_bones, remove_drivers, remove_unneeded
 from fdda_addon.rig.dependencies import read_dependencies
 from fdda_addon.rig.references import Node
 from fdda_addon.scene.node_groups import BONE_NODE
