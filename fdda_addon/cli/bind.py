@@ -11,8 +11,7 @@ from ..core.files.file_kind import BLEND
 from ..core.files.open_files import remove_file
 from ..core.files.output import atomic_write, check_outputs
 from ..core.formats.model import read_model_info
-from ..models.entries import bound_entry
-from ..models.model_list import add_bound_model
+from ..models.model_list import add_bound_model, bound_entry
 from ..runtime.binding import bind, check_plays, unbind
 from ..runtime.model_meshes import describe_missing_meshes, find_mesh
 from ..scene.blend_file import save_copy

@@ -25,7 +25,7 @@ from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from ..scene.time_stretching import time_ratio
 from ..timing.benchmark import benchmark
-from .files import add_model_argument, add_overwrite_option, add_rig_options
+from .files import add_model_argument, add_overwrite_option, add_repeatable_option, add_rig_options
 from .folders import open_rigs, to_json_by_object, with_heading
 from .progress import ProgressPrinter
 from .target import add_target_options, target_settings
@@ -44,28 +44,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", type=int, default=EVALUATION_SEED, help=f"random seed of these poses (default {EVALUATION_SEED})"
     )
-    parser.add_argument(
-        "--action",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="also compare all frames of this action; repeatable",
-    )
-    parser.add_argument(
-        "--strip",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="also compare all frames of this NLA strip; repeatable",
-    )
-    parser.add_argument(
-        "--range-scale",
-        type=float,
-        action="append",
-        default=[],
-        metavar="X",
-        help="also compare random poses within X times the rotation limits; repeatable",
-    )
+    add_repeatable_option(parser, "--action", "NAME", "also compare all frames of this action")
+    add_repeatable_option(parser, "--strip", "NAME", "also compare all frames of this NLA strip")
+    text = "also compare random poses within X times the rotation limits"
+    add_repeatable_option(parser, "--range-scale", "X", text, type=float)
     add_target_options(parser)
     parser.add_argument(
         "--heatmap",

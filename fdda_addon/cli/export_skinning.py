@@ -11,7 +11,7 @@ from ..core.files.output import check_outputs
 from ..core.recording.index import read_index
 from ..recording.plan import find_recorded_character
 from ..scene.blend_file import save_copy
-from .files import add_overwrite_option, add_rig_options, open_file
+from .files import add_overwrite_option, add_repeatable_option, add_rig_options, open_file
 from .progress import ProgressPrinter
 
 MAX_INFLUENCES = 16
@@ -20,23 +20,13 @@ MAX_INFLUENCES = 16
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
-    parser.add_argument(
-        "recording",
-        metavar="RECORDING",
-        type=Path,
-        help="recording of the meshes to export",
-    )
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="recording of the meshes to export")
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, ready for glTF and FBX")
     parser.add_argument(
         "--influences", type=int, default=4, metavar="N", help="largest number of bones per vertex (default 4)"
     )
-    parser.add_argument(
-        "--hold-out",
-        action="append",
-        default=[],
-        metavar="ACTION",
-        help="recorded action to which nothing is fitted, to measure errors on it; repeatable",
-    )
+    text = "recorded action to which nothing is fitted, to measure errors on it"
+    add_repeatable_option(parser, "--hold-out", "ACTION", text)
     parser.add_argument("--model", metavar="MODEL.onnx", type=Path, help="model whose errors are measured, too")
     add_overwrite_option(parser)
 

@@ -3,6 +3,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -25,6 +26,15 @@ def add_rig_argument(parser: argparse.ArgumentParser) -> None:
 def add_model_argument(parser: argparse.ArgumentParser) -> None:
     """Add the argument MODEL.onnx."""
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
+
+
+def add_repeatable_option(
+    parser: argparse.ArgumentParser, name: str, metavar: str, text: str, **arguments: Any
+) -> None:
+    """Add an option that may be given several times, with its help and further arguments of `add_argument`."""
+    parser.add_argument(
+        name, action="append", metavar=metavar, help=f"{text}; repeatable", **{"default": [], **arguments}
+    )
 
 
 def add_overwrite_option(parser: argparse.ArgumentParser) -> None:

@@ -13,19 +13,13 @@ from ..poses.action_range import measured_ranges
 from ..poses.clip import find_action
 from ..poses.measured_limits import DEFAULT_MARGIN, describe_limits, set_limits_from_actions
 from ..scene.blend_file import save_copy
-from .files import add_overwrite_option, add_rig_options, open_rig
+from .files import add_overwrite_option, add_repeatable_option, add_rig_options, open_rig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save the rig with the limits to")
-    parser.add_argument(
-        "--action",
-        action="append",
-        required=True,
-        metavar="NAME",
-        help="action whose motion sets the limits; repeatable",
-    )
+    add_repeatable_option(parser, "--action", "NAME", "action whose motion sets the limits", required=True)
     parser.add_argument(
         "--margin",
         type=float,

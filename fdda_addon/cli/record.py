@@ -23,7 +23,7 @@ from ..recording.refinement import RefinementSettings, refine
 from ..recording.run import record
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, find_character, find_whole_character
-from .files import add_rig_argument, open_file
+from .files import add_repeatable_option, add_rig_argument, open_file
 from .pose_options import add_pose_options
 from .progress import ProgressPrinter
 from .target import add_target_options, pose_settings, target_settings
@@ -48,13 +48,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def add_recording_options(parser: argparse.ArgumentParser, object_help: str) -> None:
     """Add the argument RIG.blend, and the options that choose meshes and poses; --object with when to give it."""
     add_rig_argument(parser)
-    parser.add_argument(
-        "--object",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help=f"mesh object to record, {object_help}; repeatable, for one recording of several meshes",
-    )
+    text = f"mesh object to record, {object_help}, or one of several of one recording"
+    add_repeatable_option(parser, "--object", "NAME", text)
     add_pose_options(
         parser,
         default=None,

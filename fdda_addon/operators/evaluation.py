@@ -15,7 +15,7 @@ from ..evaluation.results import Evaluation
 from ..evaluation.run import evaluate_meshes
 from ..evaluation.settings import EvaluationSettings
 from ..models import model_list
-from ..models.entries import bound_entry, bound_model_name
+from ..models.model_list import bound_entry, bound_model_name
 from ..poses.action_range import action_frames
 from ..properties.recording_options import target_settings
 from ..properties.view import active_action_name, show_graph

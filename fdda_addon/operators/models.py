@@ -9,7 +9,7 @@ from ..core.errors import ModelError
 from ..core.wording import format_count
 from ..models import model_list
 from ..models.changes import find_changes
-from ..models.entries import format_file_size
+from ..models.model_list import format_file_size
 from ..scene.scene_rig import remaining_rig_note
 from .rig_operator import ModelFileOperator, RigOperator
 

@@ -9,7 +9,7 @@ from ..core.errors import FDDAError, ModelError
 from ..core.wording import format_list
 from ..evaluation import side_by_side
 from ..models import model_list
-from ..models.entries import active_entry, bound_model_name, format_file_size
+from ..models.model_list import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
 from ..runtime.binding import check_plays, unbind

@@ -15,7 +15,7 @@ from ..core.recording.index import read_index, read_info
 from ..core.settings import REFINEMENT_POSES
 from ..core.wording import format_count
 from ..jobs.plan import JobPlan, JobStep, recording_steps
-from ..models.entries import format_file_size
+from ..models.model_list import format_file_size
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import copy_settings, planned_pose_count, recording_settings
 from ..recording.plan import RecordingSettings, find_recorded_character, listed_controls

@@ -7,7 +7,7 @@ from ..core.sentences.assessment import Assessment, PartErrors, assess_evaluatio
 from ..core.wording import format_count
 from ..evaluation import heat_map, last_evaluation, markers, side_by_side
 from ..jobs import job
-from ..models.entries import bound_model_name
+from ..models.model_list import bound_model_name
 from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
 from .bone_names import short_bone_name

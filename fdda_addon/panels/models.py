@@ -7,8 +7,7 @@ from ..core.errors import FDDAError
 from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.poses import CONTROL, Channel
 from ..models.changes import compare_with_model
-from ..models.entries import active_entry, format_file_size, is_bound
-from ..models.model_list import entry_info, entry_info_of_mesh
+from ..models.model_list import active_entry, entry_info, entry_info_of_mesh, format_file_size, is_bound
 from ..properties.recording_options import bones_to_pose
 from ..rig.reading import read_model_rig
 from ..scene.draw_cache import computed_once

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from ..models.entries import active_entry, bound_model_name
+from ..models.model_list import active_entry, bound_model_name
 from ..rig.modifier_stack import is_playback_modifier
 from ..runtime.confidence import partition_confidence
 from ..scene.active_rig import cached_rigs_together

@@ -14,8 +14,7 @@ from bpy.props import (
 
 from ..runtime.binding import on_mask_update, on_property_update
 from ..scene import draw_cache
-from .character import FDDA_PG_character
-from .not_animatable import not_animatable
+from .character import FDDA_PG_character, not_animatable
 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
 """Options of properties that a library override may change. Blender resets all others."""

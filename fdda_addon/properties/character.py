@@ -38,7 +38,16 @@ from ..core.settings import (
 from ..scene.control_names import control_at, suggested_controls
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
-from .not_animatable import not_animatable
+
+
+def not_animatable(property_group: type[bpy.types.PropertyGroup]) -> type[bpy.types.PropertyGroup]:
+    """Remove the option ANIMATABLE from the properties of a group that set no options themselves."""
+    nested_types = (bpy.props.CollectionProperty, bpy.props.PointerProperty)
+    for property_definition in property_group.__annotations__.values():
+        if property_definition.function not in nested_types:
+            property_definition.keywords.setdefault("options", set())
+    return property_group
+
 
 MAX_INT = (1 << 31) - 1
 """Largest value of an integer property."""

@@ -11,7 +11,7 @@ from ..jobs.job import current
 from ..recording.pose_plan import show_random_pose, show_rest_pose
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
-from .not_animatable import not_animatable
+from .character import not_animatable
 from .recording_options import actions_of_active_rig, complete_settings, recording_settings
 
 

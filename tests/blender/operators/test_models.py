@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.models.entries import bound_entry, format_file_size
+from fdda_addon.models.model_list import bound_entry, format_file_size
 from fdda_addon.runtime.binding import bind
 from fdda_addon.timing import measurements
 

@@ -8,7 +8,7 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.models.entries import bound_entry
+from fdda_addon.models.model_list import bound_entry
 from fdda_addon.runtime import packed_model
 
 from ..conftest import ELBOW, assert_plays, pose

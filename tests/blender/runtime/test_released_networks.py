@@ -8,8 +8,7 @@ import weakref
 import bpy
 import pytest
 
-from fdda_addon.models.entries import bound_entry
-from fdda_addon.models.model_list import add_bound_model, pack_entry
+from fdda_addon.models.model_list import add_bound_model, bound_entry, pack_entry
 from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.blend_file import save_copy
 
