@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Registers and unregisters the classes, properties and handlers of the add-on.
 
-A package with Blender classes lists its modules in `MODULES`, and each module lists its classes in `CLASSES`. A module
-with handlers lists them in `HANDLERS`; `handler_table` returns the handlers of all modules.
+A package with Blender classes lists its modules in `MODULES`. Each module lists its classes in `CLASSES`, properties of
+Blender's types in `PROPERTIES`, and functions that draw in Blender's menus in `MENUS`. A module with handlers lists
+them in `HANDLERS`; `handler_table` returns the handlers of all modules.
 """
 
 import atexit
@@ -24,6 +25,10 @@ def register() -> None:
         for module in _modules(package):
             for cls in module.CLASSES:
                 bpy.utils.register_class(cls)
+            for (owner, name), definition in getattr(module, "PROPERTIES", {}).items():
+                setattr(owner, name, definition)
+            for name, draw in getattr(module, "MENUS", {}).items():
+                getattr(bpy.types, name).append(draw)
             if hasattr(module, "register"):
                 module.register()
     for name, handler in handler_table():
@@ -67,6 +72,10 @@ def unregister() -> None:
         for module in reversed(_modules(package)):
             if hasattr(module, "unregister"):
                 module.unregister()
+            for name, draw in getattr(module, "MENUS", {}).items():
+                getattr(bpy.types, name).remove(draw)
+            for owner, name in getattr(module, "PROPERTIES", {}):
+                delattr(owner, name)
             for cls in reversed(module.CLASSES):
                 bpy.utils.unregister_class(cls)
 

@@ -86,16 +86,4 @@ def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 
 CLASSES = (FDDA_OT_show_mesh, FDDA_MT_main)
-MENUS = ("VIEW3D_MT_object", "VIEW3D_MT_pose")
-
-
-def register() -> None:
-    """Add the menu "FDDA" to the menus Object and Pose."""
-    for name in MENUS:
-        getattr(bpy.types, name).append(_draw_menu)
-
-
-def unregister() -> None:
-    """Undo `register`."""
-    for name in MENUS:
-        getattr(bpy.types, name).remove(_draw_menu)
+MENUS = {"VIEW3D_MT_object": _draw_menu, "VIEW3D_MT_pose": _draw_menu}

@@ -103,14 +103,9 @@ def _draw_add_menu(self: bpy.types.Menu, _context: bpy.types.Context) -> None:
 
 
 CLASSES = (FDDA_OT_add_sample_arm, FDDA_OT_measure)
-
-
-def register() -> None:
-    """Add the sample arm to the menu Add > Armature."""
-    bpy.types.VIEW3D_MT_armature_add.append(_draw_add_menu)
+MENUS = {"VIEW3D_MT_armature_add": _draw_add_menu}
 
 
 def unregister() -> None:
-    """Undo `register`."""
-    bpy.types.VIEW3D_MT_armature_add.remove(_draw_add_menu)
+    """Drop all measurements."""
     measurements.clear()

@@ -164,13 +164,4 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
 
 
 CLASSES = (FDDA_PG_modifier, FDDA_PG_model, FDDA_PG_binding)
-
-
-def register() -> None:
-    """Register `Object.fdda`."""
-    bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding, override=OVERRIDABLE)
-
-
-def unregister() -> None:
-    """Undo `register`."""
-    del bpy.types.Object.fdda
+PROPERTIES = {(bpy.types.Object, "fdda"): PointerProperty(type=FDDA_PG_binding, override=OVERRIDABLE)}

@@ -207,16 +207,7 @@ class FDDA_PG_action(bpy.types.PropertyGroup):
 
 
 CLASSES = (FDDA_PG_bone, FDDA_PG_control, FDDA_PG_character, FDDA_PG_action)
-
-
-def register() -> None:
-    """Register `Action.fdda`; `binding` registers `Object.fdda`."""
-    bpy.types.Action.fdda = PointerProperty(type=FDDA_PG_action)
-
-
-def unregister() -> None:
-    """Undo `register`."""
-    del bpy.types.Action.fdda
+PROPERTIES = {(bpy.types.Action, "fdda"): PointerProperty(type=FDDA_PG_action)}
 
 
 def default_recording(mesh_object: bpy.types.Object) -> str:

@@ -92,14 +92,9 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
 
 
 CLASSES = (FDDA_PG_session,)
-
-
-def register() -> None:
-    """Register `WindowManager.fdda`."""
-    bpy.types.WindowManager.fdda = PointerProperty(type=FDDA_PG_session)
+PROPERTIES = {(bpy.types.WindowManager, "fdda"): PointerProperty(type=FDDA_PG_session)}
 
 
 def unregister() -> None:
-    """Undo `register`."""
+    """Cancel the undo step of a previewed pose."""
     undo.cancel_push()
-    del bpy.types.WindowManager.fdda

@@ -125,13 +125,4 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
 
 
 CLASSES = (FDDA_PG_view,)
-
-
-def register() -> None:
-    """Register `WindowManager.fdda_view`."""
-    bpy.types.WindowManager.fdda_view = PointerProperty(type=FDDA_PG_view)
-
-
-def unregister() -> None:
-    """Undo `register`."""
-    del bpy.types.WindowManager.fdda_view
+PROPERTIES = {(bpy.types.WindowManager, "fdda_view"): PointerProperty(type=FDDA_PG_view)}
