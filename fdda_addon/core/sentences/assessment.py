@@ -85,15 +85,18 @@ def assess_training(report: Mapping) -> Assessment:
         for p in report["partitions"]
     ]
     problems = []
+    bones = report["training"]["bones_to_read"]
+    remedy = f"the model reads {bones} bones. Raise Bones to Read under Advanced, and train again"
+    few_bones = remedy if bones.isdigit() else ""
     if skinning.mean < MIN_SKINNING_ERROR_MM:
         problems.append(("Skinning alone already equals the rig, so a model brings nothing here", ""))
     elif _ratio(model.mean, skinning.mean) > MAX_GOOD_RATIO:
-        remedy = "set Rotation Limits, raise Random Poses, and record again"
+        remedy = few_bones or "set Rotation Limits, raise Random Poses, and record again"
         problems.append((_describe_no_gain(model.mean, skinning.mean), remedy))
     elif part := _worst_part(parts, model.mean):
-        problems.append((_describe_part(part), PART_REMEDIES.get(part.cause, ADD_POSES)))
+        problems.append((_describe_part(part), few_bones or PART_REMEDIES.get(part.cause, ADD_POSES)))
     elif tail := _unimproved_tail(model, skinning):
-        problems.append((tail, ADD_POSES))
+        problems.append((tail, few_bones or ADD_POSES))
     if overfit := _describe_overfitting(report, _ratio(model.p999, skinning.p999)):
         problems.append((overfit, "the model needs more poses. Raise Random Poses or check more actions, and record"))
     warnings = _describe_problems(problems, report.get("warnings", ()))

@@ -26,7 +26,10 @@ REPORTS = Path(__file__).parents[1] / "reports"
 
 def read(name: str) -> dict:
     """Read a report; all its body parts have the errors of the whole mesh."""
-    report = json.loads((REPORTS / f"{name}.json").read_text(encoding="utf-8")) | {"meshes": [{"name": "arm"}]}
+    report = json.loads((REPORTS / f"{name}.json").read_text(encoding="utf-8")) | {
+        "meshes": [{"name": "arm"}],
+        "training": {"bones_to_read": "all"},
+    }
     for partition in report["partitions"]:
         partition |= {"held_out": report["fdda"]["held_out"], "linear": report["linear"]["held_out"]}
         partition["largest_errors"] = {"cause": "poses"}
@@ -86,6 +89,9 @@ def test_errors_that_hardly_beat_skinning_are_named_with_a_remedy(errors, start)
     warning = assess_training(report).warnings[0]
     assert warning.startswith(start)
     assert "Add Poses at Worst Errors" in warning or "record again" in warning
+    report["training"]["bones_to_read"] = "4"
+    remedy = "the model reads 4 bones. Raise Bones to Read under Advanced, and train again."
+    assert assess_training(report).warnings[0].endswith(remedy)
 
 
 def test_a_rig_that_is_skinning_alone_needs_no_model():
