@@ -35,8 +35,9 @@ from fdda_addon.core.errors import FDDAError  # noqa: E402
 
 Random = np.random.Generator
 PASSED, REFUSED, FAILED = "passed", "refused", "failed"
-MAX_MB, MAX_SECONDS, START_SECONDS = 1024, 30, 120
-POSES, TRAINING_OPTIONS = 40, ("--passes", "3", "--hidden", "4", "4")
+MAX_MB, MAX_SECONDS, MAX_SILENT_SECONDS = 1024, 30, 600
+"""Limits of a case: memory, time of the processor, and time until it ends, which is longer on a busy machine."""
+POSES, LONG_POSES, TRAINING_OPTIONS = 40, 2000, ("--passes", "3", "--hidden", "4", "4")
 DISK_FULL_STATUS = 75
 DISK_BYTES = {"record": 400e3, "train": 600e3, "bind": 2e6, "evaluate": 12e3}
 ODD_VALUES = (
@@ -234,13 +235,13 @@ def train_recording(folder: Path, random: Random) -> None:
         raise CaseFailedError("the model outputs infinite or NaN positions")
 
 
-def run_and_kill(command: list, seconds: float) -> bool:
-    """Run a command and kill it after a time; return whether it was still running."""
+def run_and_stop(random: Random, command: list, seconds: float) -> bool:
+    """Run a command and kill, interrupt or end it after a time; return whether it was still running."""
     process = subprocess.Popen(list(map(str, command)), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     try:
         output, _ = process.communicate(timeout=seconds)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGKILL)
+        process.send_signal(pick(random, (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)))
         process.communicate()
         return True
     if process.returncode:
@@ -249,18 +250,18 @@ def run_and_kill(command: list, seconds: float) -> bool:
 
 
 def kill_process(folder: Path, random: Random) -> None:
-    """Kill a recording, which then resumes to the same bytes, or a training, which leaves the old or a new model."""
+    """Stop a recording, which then resumes to the same bytes, or a training, which leaves the old or a new model."""
     from fdda_addon.core.formats.model import read_model
 
     verb = [sys.executable, "-m", "fdda_addon"]
     if random.random() < 0.6:
         recording = folder / "killed recording"
         shutil.rmtree(recording, ignore_errors=True)
-        record = [*verb, "record", folder / "elbow.blend", recording, "--poses", POSES]
-        for seconds in (*random.uniform(0.5, 2.5, 3), 60):
-            if not run_and_kill([*record, *(["--resume"] if recording.exists() else [])], float(seconds)):
+        record = [*verb, "record", folder / "elbow.blend", recording, "--poses", LONG_POSES]
+        for seconds in (*random.uniform(0.5, 4, 3), MAX_SILENT_SECONDS / 2):
+            if not run_and_stop(random, [*record, *(["--resume"] if recording.exists() else [])], float(seconds)):
                 break
-        for path in (folder / "short recording").glob("*.npy"):
+        for path in (folder / "long recording").glob("*.npy"):
             if path.read_bytes() != (recording / path.name).read_bytes():
                 raise CaseFailedError(f"{path.name} differs from that of an uninterrupted recording")
         return
@@ -269,7 +270,7 @@ def kill_process(folder: Path, random: Random) -> None:
     shutil.copy(folder / "character.onnx", model)
     old = model.read_bytes()
     command = [sys.executable, "-m", "trainer", folder / "short recording", model, *TRAINING_OPTIONS]
-    has_finished = not run_and_kill(command, float(random.uniform(0.2, 6)))
+    has_finished = not run_and_stop(random, command, float(random.uniform(0.2, 6)))
     if has_finished == (read_model(model)[1] == old):
         raise CaseFailedError("there is an old model after, or a new one before the end")
 
@@ -299,7 +300,9 @@ def fill_disk(folder: Path, random: Random) -> None:
             "evaluate": (rig, model, "--json", disk / "e.json", "--poses", 2),
         }[verb]
         command = [sys.executable, "-m", "fdda_addon", verb, *map(str, arguments)]
-        result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+        result = subprocess.run(
+            command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=MAX_SILENT_SECONDS / 2
+        )
         if result.returncode not in (0, DISK_FULL_STATUS) or "Traceback" in result.stderr:
             raise CaseFailedError(f"exit status {result.returncode}: {result.stderr[-300:]}")
         if result.returncode == DISK_FULL_STATUS:
@@ -331,7 +334,7 @@ def work(folder: Path, part: str, seed: int, first: int, count: int) -> None:
         # Linux resets the peak of the memory.
         with contextlib.suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")
-        start, memory = time.monotonic(), read_memory("VmRSS")
+        start, memory = time.process_time(), read_memory("VmRSS")
         outcome, text = PASSED, ""
         try:
             PARTS[part][0](folder, np.random.default_rng((seed, index)))
@@ -340,7 +343,7 @@ def work(folder: Path, part: str, seed: int, first: int, count: int) -> None:
             outcome = REFUSED if re.fullmatch(r"[^\x00-\x1f\x7f]{1,1500}[.)]", text) else FAILED
         except Exception as error:
             outcome, text = FAILED, repr(error)
-        seconds, peak = time.monotonic() - start, read_memory("VmHWM") - memory
+        seconds, peak = time.process_time() - start, read_memory("VmHWM") - memory
         if peak > MAX_MB or (seconds > MAX_SECONDS and part in ("models", "recordings")):
             outcome, text = FAILED, f"it took {peak:.0f} MB and {seconds:.0f} s; {text}"
         print(json.dumps({"case": f"{part} {index}", "outcome": outcome, "text": text}), flush=True)
@@ -361,18 +364,18 @@ def run_part(folder: Path, part: str, seed: int, count: int) -> Iterator[dict]:
         command = [sys.executable, __file__, str(folder), "--seed", str(seed), "--work", part, str(index), str(count)]
         with open(folder / f"{part}.log", "a") as log:
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, errors="replace")
-        timer = threading.Timer(START_SECONDS, process.kill)
+        timer = threading.Timer(MAX_SILENT_SECONDS, process.kill)
         timer.start()
         for line in process.stdout:
             if line.startswith('{"case"'):
                 timer.cancel()
-                timer = threading.Timer(START_SECONDS, process.kill)
+                timer = threading.Timer(MAX_SILENT_SECONDS, process.kill)
                 timer.start()
                 yield json.loads(line)
                 index += 1
         timer.cancel()
         if process.wait() or index < count:
-            text = f"its process ended with status {process.returncode} or was silent for {START_SECONDS} s"
+            text = f"its process ended with status {process.returncode} or was silent for {MAX_SILENT_SECONDS} s"
             yield {"case": f"{part} {index}", "outcome": FAILED, "text": text}
             index += 1
 
@@ -416,10 +419,10 @@ def make_files(folder: Path) -> None:
 
     fdda_addon.register()
     bind_elbow(folder, 1)
-    recording = folder / "short recording"
-    command = ["record", str(folder / "elbow.blend"), str(recording), "--poses", str(POSES)]
-    if not recording.exists() and run_verb(command, "fdda"):
-        sys.exit(1)
+    for name, poses in (("short recording", POSES), ("long recording", LONG_POSES)):
+        command = ["record", str(folder / "elbow.blend"), str(folder / name), "--poses", str(poses)]
+        if not (folder / name).exists() and run_verb(command, "fdda"):
+            sys.exit(1)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     fdda_addon.unregister()
 
