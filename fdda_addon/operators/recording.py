@@ -3,12 +3,11 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import FDDAError, RigError
+from ..core.errors import FDDAError
 from ..core.recording.estimate import format_poses
 from ..core.recording.folder import remove_recording
 from ..core.recording.index import read_index, read_info
@@ -18,9 +17,9 @@ from ..jobs.plan import JobPlan, JobStep, recording_steps
 from ..models.model_list import format_file_size
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import copy_settings, planned_pose_count, recording_settings
-from ..recording.plan import RecordingSettings, find_recorded_character, listed_controls
+from ..recording.plan import find_recorded_character
 from ..recording.refinement import RefinementSettings, refine
-from ..recording.rig_check import check_recordable_rig
+from ..recording.rig_check import problems_beside_others
 from ..recording.run import record
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, describe_left_out, join_rigs, left_out_reason
@@ -43,23 +42,12 @@ def recordable_character(rigs: list[SceneRig], shown: SceneRig) -> tuple[SceneRi
             reasons[rig.mesh_object] = reason
             continue
         with model_disabled(rig.mesh_object):
-            # The joined rig needs a bone to sample and the owner of each extra input, not each of its meshes.
-            inputs = tuple(text for text in settings.extra_inputs if _has_input(rig, settings, text))
-            if found := check_recordable_rig(rig, replace(settings, poses=0, extra_inputs=inputs)).problems:
+            if found := problems_beside_others(rig, settings):
                 problems.append(f"Left out '{rig.mesh_object.name}': {found[0]}")
                 reasons[rig.mesh_object] = ""
     text = describe_left_out({o: reason for o, reason in reasons.items() if reason})
     character = join_rigs([rig for rig in rigs if rig.mesh_object not in reasons])
     return character, " ".join(filter(None, [text, *problems]))
-
-
-def _has_input(rig: SceneRig, settings: RecordingSettings, text: str) -> bool:
-    """Return whether a mesh or its armature has an extra input of the settings."""
-    try:
-        listed_controls(rig, replace(settings, extra_inputs=(text,)))
-    except RigError:
-        return False
-    return True
 
 
 def record_character(

@@ -242,7 +242,7 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
         shown_object, unrecorded = self.rig(context).mesh_object, {}
         for mesh_object in sorted((rig.mesh_object for rig in self.rigs(context)), key=lambda o: o != shown_object):
             files = self._files(mesh_object)
-            if mesh_object == shown_object or _is_recorded(mesh_object, files[0]) or is_detached(files[1]):
+            if mesh_object == shown_object or is_mesh_recorded(mesh_object, files[0]) or is_detached(files[1]):
                 meshes_of_files.setdefault(files, []).append(mesh_object)
             else:
                 unrecorded[mesh_object] = "not recorded"
@@ -262,7 +262,7 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
         return "Training canceled; no model was written."
 
 
-def _is_recorded(mesh_object: bpy.types.Object, recording: Path) -> bool:
+def is_mesh_recorded(mesh_object: bpy.types.Object, recording: Path) -> bool:
     """Return whether a recording has a mesh, by its name or its shape."""
     try:
         meshes = read_meshes(read_index(recording)["meshes"])

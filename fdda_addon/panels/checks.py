@@ -9,7 +9,7 @@ from bpy.app.handlers import persistent
 from ..core.errors import RigError
 from ..properties.recording_options import recording_settings
 from ..recording.plan import RecordingSettings
-from ..recording.rig_check import RigCheck, check_recordable_rig
+from ..recording.rig_check import RigCheck, check_recordable_rig, problems_beside_others
 from ..scene import draw_cache
 from ..scene.arrays import REST_MATRIX_ELEMENT, read
 from ..scene.scene_rig import SceneRig, armature_of
@@ -73,7 +73,8 @@ def _check(mesh_object: bpy.types.Object) -> RigCheck | None:
         result = check_recordable_rig(scene_rig, settings, previous)
     else:
         result = check_recordable_rig(scene_rig, settings)
-    result = replace(result, problems=result.problems + problems)
+    beside_others = problems_beside_others(scene_rig, settings) if result.problems else ()
+    result = replace(result, problems=result.problems + problems, problems_beside_others=beside_others)
     _changes.signatures[uid] = signature
     _changes.outdated.discard(uid)
     _changes.meshes.discard(mesh_object.data.name)

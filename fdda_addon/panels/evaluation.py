@@ -11,7 +11,7 @@ from ..models.model_list import bound_model_name
 from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
 from .bone_names import short_bone_name
-from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
+from .section import Section, draw_button, draw_job, draw_wrapped, is_bound, panel_rig
 from .training import recording_warnings
 
 SHOWN_PARTITIONS = 5
@@ -94,7 +94,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         row = layout.row()
         row.scale_y = 1.4
         row.enabled = view.source == "RANDOM" or action is not None
-        button = draw_button(row, context, "fdda.evaluate", "Evaluate", "PLAY")
+        button = draw_button(row, context, "fdda.evaluate", "Evaluate", "PLAY", is_bound)
         button.source, button.poses, button.seed = view.source, view.poses, view.seed
         if state is not None and state.outcome_level != "INFO":
             draw_job(layout, context, "evaluate")

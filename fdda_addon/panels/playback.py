@@ -18,7 +18,7 @@ from ..timing.benchmark import FDDA, RIG
 from .bone_names import short_bone_name
 from .frame_profile import draw_model_times
 from .meshes import draw_meshes
-from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, is_bound, panel_rig
 from .timed_value import timed_values
 from .trained_file import find_trained_file
 
@@ -33,6 +33,12 @@ def is_outside_model_folders(mesh_object: bpy.types.Object) -> bool:
     model_path = resolve_path(mesh_object.fdda.model, mesh_object.library).resolve()
     blend_path = Path(bpy.data.filepath).resolve()
     return bool(bpy.data.filepath) and not model_path.is_relative_to(blend_path.parent) and not is_trusted(model_path)
+
+
+def _has_model(rig: SceneRig) -> bool:
+    """Return whether a mesh has a model to bind: in its Model Library, or just trained."""
+    trained = find_trained_file(rig)
+    return active_entry(rig.mesh_object) is not None or (trained is not None and not trained.mismatch)
 
 
 def mask_problem(mesh_object: bpy.types.Object) -> str:
@@ -86,7 +92,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
                 draw_wrapped(layout, context, text, "INFO")
             elif not draw_job(layout, context, "fast_rig"):
                 layout.operator("fdda.fast_rig", text="Fast Rig…", icon="ARMATURE_DATA")
-        draw_button(layout, context, "fdda.unbind", "Unbind", "UNLINKED")
+        draw_button(layout, context, "fdda.unbind", "Unbind", "UNLINKED", is_bound)
         if not mesh_object.fdda.status and (advanced := draw_advanced(layout, "fdda_model_advanced")) is not None:
             # Draw the vertex group that limits the model.
             binding = mesh_object.fdda
@@ -102,14 +108,14 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         layout, entry, trained = self.layout, active_entry(mesh_object), find_trained_file(rig)
         if mesh_object.fdda.status:
             draw_wrapped(layout, context, mesh_object.fdda.status, "ERROR")
-        if entry is None and (trained is None or trained.mismatch):
+        if not _has_model(rig):
             draw_wrapped(layout, context, "No model yet: train one above, or choose a file.", "INFO")
             layout.operator("fdda.bind", text="Choose Model and Bind…", icon="FILEBROWSER")
             return
         column = layout.column()
         column.scale_y = 1.4
         name = entry.name if entry is not None else trained.path.stem
-        draw_button(column, context, "fdda.bind", f"Bind {name}", "LINKED")
+        draw_button(column, context, "fdda.bind", f"Bind {name}", "LINKED", _has_model)
 
     def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout, binding = self.layout, mesh_object.fdda
@@ -206,7 +212,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         samples = column.row()
         samples.active = session.bake_format != ".usdc"
         samples.prop(session, "bake_samples")
-        button = draw_button(body, context, "fdda.bake", "Bake…", "EXPORT")
+        button = draw_button(body, context, "fdda.bake", "Bake…", "EXPORT", is_bound)
         button.action, button.use_frames = session.bake_action, session.bake_use_frames
         button.frame_start, button.frame_end = session.bake_start, session.bake_end
         button.suffix, button.samples = session.bake_format, session.bake_samples if samples.active else 1

@@ -9,7 +9,7 @@ from ..properties.recording_options import actions_of_rig, meshes_with_other_set
 from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
 from . import limits, sampling
-from .section import Section, draw_advanced, draw_button, draw_wrapped, panel_rig
+from .section import Section, draw_advanced, draw_wrapped, panel_rig
 
 
 class FDDA_UL_actions(bpy.types.UIList):
@@ -58,7 +58,8 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         row = layout.row(align=True)
         row.prop(context.window_manager.fdda, "preview_pose")
         row.operator("fdda.rest_pose", text="Rest Pose", icon="LOOP_BACK")
-        draw_button(layout, context, "fdda.poses_to_action", "Poses to Action", "ACTION")
+        # The action is the armature's, of all checked meshes.
+        layout.operator("fdda.poses_to_action", icon="ACTION").all_meshes = bool(cached_rigs_together(context))
         # Draw the sentences that come and go, below the buttons, so that these do not move under the mouse.
         if not _has_poses(rig):
             draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")

@@ -28,7 +28,7 @@ from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
 from .meshes import draw_meshes
-from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, is_recordable, panel_rig
 
 
 @draw_cached
@@ -39,6 +39,12 @@ def read_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
         return path, cached_content(rig, path)
     except FDDAError as error:
         return str(error)
+
+
+def has_recording(rig: SceneRig) -> bool:
+    """Return whether the recording folder of a character has its complete recording."""
+    content = read_content(rig)
+    return not isinstance(content, str) and content[1].state is FolderState.COMPLETE
 
 
 def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
@@ -82,8 +88,7 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
         running_job = job.current()
         if rig is None or (running_job and running_job.verb == "record"):
             return False
-        content = read_content(rig)
-        return not isinstance(content, str) and content[1].state is FolderState.COMPLETE
+        return has_recording(rig)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
@@ -126,7 +131,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     if content.state is FolderState.COMPLETE:
         row = layout.row()
         row.scale_y = 1.3
-        draw_button(row, context, "fdda.train", "Train", "PLAY")
+        draw_button(row, context, "fdda.train", "Train", "PLAY", has_recording)
         text = f"{format_poses(content.poses, content.alone_poses)}. Next: Train"
         draw_wrapped(layout, context, f"Recorded: {text}", "CHECKMARK")
     elif content.state is FolderState.INCOMPLETE:
@@ -158,7 +163,7 @@ def _draw_record(
     row = layout.row()
     row.enabled = enabled
     row.scale_y = 1.3
-    draw_button(row, context, "fdda.record", text, "REC").resume = resume
+    draw_button(row, context, "fdda.record", text, "REC", is_recordable).resume = resume
 
 
 @draw_cached

@@ -3,7 +3,6 @@
 
 import bpy
 
-from ..core.recording.folder import FolderState
 from ..core.wording import format_count
 from ..jobs import job
 from ..properties.character import file_problem
@@ -11,8 +10,8 @@ from ..scene.scene_rig import SceneRig
 from . import checks, curves, findings, limits
 from .frame_profile import draw_profile, draw_times
 from .meshes import draw_meshes
-from .recording import read_content
-from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
+from .recording import has_recording
+from .section import Section, draw_button, draw_job, draw_wrapped, is_recordable, panel_rig
 from .trained_file import find_trained_file
 from .training import read_assessment
 
@@ -99,10 +98,10 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
     row.scale_y = 1.3
     problem = file_problem(rig.mesh_object)
     row.enabled = not problem
-    content = read_content(rig)
-    is_recorded = not isinstance(content, str) and content[1].state is FolderState.COMPLETE
-    label = "Train & Bind" if is_recorded else "Record, Train & Bind"
-    draw_button(row, context, "fdda.build_model", label, "PLAY")
+    label, applies_to = "Record, Train & Bind", is_recordable
+    if has_recording(rig):
+        label, applies_to = "Train & Bind", has_recording
+    draw_button(row, context, "fdda.build_model", label, "PLAY", applies_to)
     if problem:
         draw_wrapped(layout, context, problem, "INFO")
     elif limits.lacks_limits(rig) and settings.has_random_poses:

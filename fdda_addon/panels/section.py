@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Base class of all sections of the sidebar, and functions that draw wrapped text, paths and jobs."""
 
+from collections.abc import Callable
+
 import blf
 import bpy
 
@@ -65,35 +67,40 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
 
 
 def draw_button(
-    layout: bpy.types.UILayout, context: bpy.types.Context, name: str, text: str, icon: str
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    name: str,
+    text: str,
+    icon: str,
+    applies_to: Callable[[SceneRig], bool] = lambda _: True,
 ) -> bpy.types.OperatorProperties:
-    """Draw the button of an operator that may apply to several meshes; its text then has their number."""
+    """Draw the button of an operator that may apply to several meshes; its text then has their number.
+
+    Args:
+        applies_to: whether the operator applies to a checked mesh.
+    """
     rigs = cached_rigs_together(context)
-    count = sum(map(COUNTED_MESHES.get(name, lambda _: True), rigs))
+    count = sum(map(applies_to, rigs))
     properties = layout.operator(name, text=f"{text} ({count} Meshes)" if count > 1 else text, icon=icon)
     properties.all_meshes = bool(rigs)
     return properties
 
 
 def mesh_problem(rig: SceneRig) -> str:
-    """Return why a mesh cannot be recorded, at its last check; empty without a reason."""
+    """Return why a mesh cannot be recorded with others, at its last check; empty without a reason."""
     check = checks.last_check(rig)
-    return check.problems[0] if check is not None and check.problems else ""
+    return next(iter(check.problems_beside_others), "") if check is not None else ""
 
 
-def _is_recordable(rig: SceneRig) -> bool:
+def is_recordable(rig: SceneRig) -> bool:
+    """Return whether a recording of all checked meshes has a mesh."""
     # What is bound was recorded; a check while the user poses would cost time.
-    return not left_out_reason(rig.mesh_object) and (rig.mesh_object.fdda.is_bound or not mesh_problem(rig))
+    return not left_out_reason(rig.mesh_object) and (is_bound(rig) or not mesh_problem(rig))
 
 
-def _is_bound(rig: SceneRig) -> bool:
+def is_bound(rig: SceneRig) -> bool:
+    """Return whether a model is bound to a mesh."""
     return rig.mesh_object.fdda.is_bound
-
-
-COUNTED_MESHES = dict.fromkeys(("fdda.record", "fdda.build_model"), _is_recordable) | dict.fromkeys(
-    ("fdda.unbind", "fdda.evaluate", "fdda.bake"), _is_bound
-)
-"""Which of the checked meshes the button of an operator applies to; all of them for other operators."""
 
 
 def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:

@@ -8,7 +8,6 @@ import bpy
 
 from ..core.errors import TrainingError
 from ..core.formats.report import Verdict, checkpoint_path, read_report, report_path
-from ..core.recording.folder import FolderState
 from ..core.sentences.assessment import Assessment, assess_training
 from ..jobs import job
 from ..jobs.state import JobState
@@ -19,7 +18,7 @@ from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
 from .bone_names import short_bone_name
-from .recording import read_content
+from .recording import has_recording, read_content
 from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
 from .trained_file import TrainedFile, find_trained_file
 
@@ -92,14 +91,14 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
             settings = rig.mesh_object.fdda.settings
             # The labels are above the fields, because a narrow sidebar would cut them off beside the fields.
-            for name in ("base_skinning", "bones_to_read"):
+            for name in ("base_skinning", "bones_to_read", "min_vertices_per_part"):
                 field = advanced.column(align=True)
                 field.use_property_split = False
                 field.label(text=settings.bl_rna.properties[name].name)
                 field.prop(settings, name, text="")
-            if settings.bones_to_read == "NUMBER":
-                advanced.prop(settings, "bone_count")
-            for name in ("min_vertices_per_part", "passes", "detail_mm", "training_seed"):
+                if name == "bones_to_read" and settings.bones_to_read == "NUMBER":
+                    field.prop(settings, "bone_count")
+            for name in ("passes", "detail_mm", "training_seed"):
                 advanced.prop(settings, name)
             draw_path(advanced, settings, "model", default_model(rig.mesh_object))
 
@@ -161,12 +160,12 @@ def _draw_settings(
     goal = row.row()
     goal.active = settings.use_goal
     goal.prop(settings, "goal_mm", text="")
-    content = read_content(rig)
-    is_recorded = not isinstance(content, str) and content[1].state is FolderState.COMPLETE
+    content, is_recorded = read_content(rig), has_recording(rig)
     row = layout.row()
     row.enabled = can_train and is_recorded
     row.scale_y = 1.3
-    draw_button(row, context, "fdda.train", "Train" if trained is None else "Train Again", "PLAY")
+    text = "Train" if trained is None else "Train Again"
+    draw_button(row, context, "fdda.train", text, "PLAY", has_recording)
     if isinstance(content, str):
         draw_wrapped(layout, context, content, "ERROR")
     elif not is_recorded:

@@ -66,7 +66,7 @@ def describe_bones(
 ) -> str:
     """Return a sentence about what random poses move; `bones_to_pose` is a result of `choose_bones`."""
     if not bones_to_pose:
-        return "Random poses move the deforming bones within their limits."
+        return "Random poses move the deforming bones and all bones with limits."
     count = len(remixed_actions(scene_rig, recorded_actions))
     if recorded_actions:
         return f"Random poses combine limbs from {format_count(count, 'recorded action')}."

@@ -36,6 +36,7 @@ class RigCheck:
         automatic_controls: controls that are not listed in the settings: drivers of the mesh read them, or sampled
             actions key them.
         extra_joints, include_static_joint: arguments of `read_rig`.
+        problems_beside_others: those of `problems` that also leave the mesh out of a recording of several meshes.
     """
 
     problems: tuple[str, ...]
@@ -45,6 +46,7 @@ class RigCheck:
     automatic_controls: tuple[Control, ...] = ()
     extra_joints: tuple[str, ...] | None = None
     include_static_joint: bool = False
+    problems_beside_others: tuple[str, ...] = ()
 
 
 def check_has_weights(scene_rig: SceneRig) -> None:
@@ -121,3 +123,18 @@ def check_recordable_rig(
         if str(error) not in problems and (result.rig is None or settings.poses):
             problems.append(str(error))
     return replace(result, problems=tuple(problems))
+
+
+def problems_beside_others(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[str, ...]:
+    """Return why a mesh cannot be recorded together with others, which have what random poses need."""
+    inputs = tuple(text for text in settings.extra_inputs if _has_input(scene_rig, settings, text))
+    return check_recordable_rig(scene_rig, replace(settings, poses=0, extra_inputs=inputs)).problems
+
+
+def _has_input(scene_rig: SceneRig, settings: RecordingSettings, text: str) -> bool:
+    """Return whether a mesh or its armature has an extra input of the settings."""
+    try:
+        listed_controls(scene_rig, replace(settings, extra_inputs=(text,)))
+    except RigError:
+        return False
+    return True

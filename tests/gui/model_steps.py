@@ -23,6 +23,7 @@ from arm import (
     require_unkeyed_pose,
     wait_for_job,
 )
+from poses_steps import POSE_COUNT
 from window import (
     park_mouse,
     press_keys,
@@ -61,7 +62,7 @@ def check_the_trainer(_folder: Path) -> Iterator[float]:
 def train(folder: Path) -> Iterator[float]:
     """Press Train: Blender stays responsive, and the model is more accurate than linear skinning."""
     job = extension_module("jobs.job")
-    epochs = arm_object().fdda.settings.passes
+    epochs = extension_module("core.settings").automatic_passes(POSE_COUNT)
     yield from sidebar.press_button("fdda.train")
     yield from wait_until(lambda: job.current() is not None, 10, "the button starts no training")
     longest_wait, state = 0.0, job.current()
@@ -84,7 +85,7 @@ def train(folder: Path) -> Iterator[float]:
     report = json.loads((folder / "work" / "arm_model" / "report.json").read_text(encoding="utf-8"))
     fdda, linear = (report[deformation]["held_out"]["mean"] for deformation in ("fdda", "linear"))
     require(fdda < linear, f"the held-out error is {fdda} mm and the error of linear skinning {linear} mm")
-    assessment = extension_module("core.assessment").assess_training(report)
+    assessment = extension_module("core.sentences.assessment").assess_training(report)
     require(assessment.sentence.startswith("arm, unseen poses: "), f"the verdict is '{assessment.sentence}'")
     yield from redraw_window()
     yield from sidebar.find_button("fdda.bind")

@@ -169,7 +169,11 @@ def test_other_meshes_need_neither_the_extra_inputs_nor_a_sampled_bone(two, text
     first.fdda.settings.auto_poses, first.fdda.settings.bones_to_pose = False, "WEIGHTS"
     control = first.fdda.settings.extra_inputs.add()
     control.name, control.has_range, control.low, control.high = text, True, 0.0, 1.0
-    assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
+    for recorded in (False, True):
+        for mesh_object in two:
+            checks.check_now(SceneRig(mesh_object, armature_object))
+        assert not any("Left out" in text for text in texts_of(draw_section("rig"))), recorded
+        assert recorded or bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
     assert [mesh["name"] for mesh in read_index(recording_folder(first))["meshes"]] == [o.name for o in two]
 
 
@@ -181,11 +185,21 @@ def test_a_mesh_that_a_later_recording_lacks_is_left_out(two):
     bpy.ops.fdda.delete_recording()
     bpy.ops.fdda.record(all_meshes=True)
     assert [mesh["name"] for mesh in read_index(recording_folder(other))["meshes"]] == [first.name]
+    other.hide_set(False)
+    bpy.context.view_layer.objects.active = first
+    for mesh_object in two:
+        checks.check_now(SceneRig(mesh_object, armature_of(first)))
+    assert "Train" in texts_of(draw_section("training")) and "Train & Bind" in texts_of(draw_section("rig"))
     assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
     assert job.state_of("train").outcome.endswith("Left out: the mesh 'elbow.001', which is not recorded.")
     assert not other.fdda.models
+    checks.check_now(SceneRig(first, armature_of(first)))
+    assert "Bind two_elbow" in texts_of(draw_section("playback"))
     assert bpy.ops.fdda.bind(all_meshes=True) == {"FINISHED"}
     assert first.fdda.is_bound and not other.fdda.is_bound
+    bpy.ops.fdda.unbind()
+    assert bpy.ops.fdda.build_model(all_meshes=True) == {"FINISHED"}
+    assert first.fdda.is_bound and not other.fdda.models and not other.fdda.is_bound
 
 
 def test_a_model_that_an_undo_takes_off_the_list_is_known(two):

@@ -70,7 +70,7 @@ def test_a_successful_verb(elbow_files, tmp_path):
     status, out, err = run_to_end("record", elbow_files.rig, tmp_path / "r", "--poses", 4)
     assert status == 0, err
     choice, estimate, recorded = out.splitlines()
-    assert choice == "Random poses move the deforming bones within their limits."
+    assert choice == "Random poses move the deforming bones and all bones with limits."
     poses = "4 poses, and 12 to find what each bone and input moves"
     assert estimate.startswith(f"{poses}, each of 300 vertices: "), "Blender's output is hidden"
     assert recorded.startswith(f"{tmp_path / 'r'}: {poses}, in ")

@@ -208,7 +208,7 @@ def test_the_sidebar_chooses_limbs_from_actions(waving, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "waving.blend"))
     settings, action = waving.mesh_object.fdda.settings, bpy.data.actions[WAVE]
     assert recording_settings(waving).bones_to_pose == ()
-    assert describe_chosen_bones(waving) == "Random poses move the deforming bones within their limits."
+    assert describe_chosen_bones(waving) == "Random poses move the deforming bones and all bones with limits."
     action.fdda.record = True
     assert describe_chosen_bones(waving) == "Random poses combine limbs from 1 recorded action."
     assert {channel.kind for channel in checks.check_now(waving).channels} == {ROTATION_VECTOR, LOCATION, CONTROL}
