@@ -72,7 +72,7 @@ def _show_sections(folder: Path, name: str, sections: tuple[str, ...]) -> Iterat
 def mend_what_is_found(folder: Path) -> Iterator[float]:
     """Show each mesh with a finding, and press the button that mends it."""
     find, find_rig = extension_module("panels.findings").find, extension_module("scene.scene_rig").find_rig
-    bone = bpy.data.objects["elbow_rig"].pose.bones["lower"]
+    bone = bpy.data.objects["elbow_rig"].pose.bones["upper"]
     limit = bone.constraints.new("LIMIT_ROTATION")
     limit.use_limit_x, limit.max_x, limit.owner_space = True, 1.0, "LOCAL"
     yield from sidebar.open_section("rig")
@@ -95,7 +95,7 @@ def mend_what_is_found(folder: Path) -> Iterator[float]:
         operators = [finding.operator for finding in find(find_rig(name))]
         require(operators == ["fdda.select_unlimited"], f"{name} still has {operators}")
     selected = [b.name for b in bone.id_data.pose.bones if extension_module("scene.compatibility").is_selected(b)]
-    require(selected == ["upper"], f"{selected} are selected")
+    require(selected == ["lower"], f"{selected} are selected")
     bone.constraints.remove(limit)
     with region_override("WINDOW"):
         bpy.ops.object.mode_set(mode="OBJECT")

@@ -38,7 +38,7 @@ STEPS = {
     "update": update_story.STEPS,
     "manual": manual_story.STEPS,
 }[STORY_NAME]
-MAX_SECONDS = 590
+MAX_SECONDS = 1790
 """Time limit of the whole story. A Blender that exceeds it is killed and prints where it was."""
 
 step_records: list[dict] = []

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 VERSION = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"]
 PACKAGE = ROOT / "dist" / f"fdda_addon-{VERSION}.zip"
 WIDTH, HEIGHT = 1600, 1200
-INSTALL_MAX_SECONDS, STORY_MAX_SECONDS, TERMINATE_MAX_SECONDS = 60, 600, 5
+INSTALL_MAX_SECONDS, STORY_MAX_SECONDS, TERMINATE_MAX_SECONDS = 60, 1800, 5
 MISSING_REQUIREMENT_STATUS = 3
 MAX_BLANK_IMAGE_VALUES = 32
 STORIES = ("path", "choices", "work", "shot", "session")

@@ -232,10 +232,10 @@ def test_the_sidebar_chooses_limbs_from_actions(waving, tmp_path):
     "options, source, sentence",
     [
         (["--action", WAVE, "--action", STILL], "remix", "combine limbs from 2 recorded actions."),
-        ([], "", "within their limits."),
+        ([], "", "bones with limits."),
         (["--bones-to-pose", "deforming"], "", ""),
         # There is no motion of bones to combine.
-        (["--action", TURN], "", "within their limits."),
+        (["--action", TURN], "", "bones with limits."),
         (["--action", WAVE, "--poses", 0], None, ""),
     ],
 )
