@@ -66,8 +66,8 @@ def _summary(fast_rig: FastRig) -> str:
     lines = [
         f"'{fast_rig.armature_name}' has {fast_rig.bones_after:,} of {fast_rig.bones_before:,} bones; the model reads "
         f"{fast_rig.joints:,}, animators pose {len(fast_rig.controls):,}",
-        f"  removed {_count(fast_rig.removed_objects, 'object')}, {_count(fast_rig.removed_modifiers, 'modifier')} "
-        f"and {format_count(fast_rig.removed_drivers, 'driver')}",
+        f"  removed {_count(fast_rig.removed.objects, 'object')}, {_count(fast_rig.removed.modifiers, 'modifier')} "
+        f"and {format_count(fast_rig.removed.drivers, 'driver')}",
     ]
     if fast_rig.moving_joints:
         lines.append(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Makes a fast rig of the open file: binds the models, removes what nothing needs, compares, and saves a copy."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..core.errors import RigError
@@ -48,7 +48,7 @@ class FastRig:
         bones_before, bones_after: number of bones of the full rig and of the fast rig.
         joints: number of joints that the models read.
         controls: names of the chosen control bones.
-        removed_objects, removed_modifiers, removed_drivers: names of objects and modifiers, and number of drivers.
+        removed: what was removed.
         lost_channels: number of keyed channels that have lost their bones, by action and bone.
         object_count: number of objects that were compared.
         pose_count: number of poses in which bones and objects were compared.
@@ -64,16 +64,14 @@ class FastRig:
     bones_after: int
     joints: int
     controls: tuple[str, ...]
-    removed_objects: tuple[str, ...]
-    removed_modifiers: tuple[str, ...]
-    removed_drivers: int
-    lost_channels: dict[str, dict[str, int]] = field(default_factory=dict)
-    object_count: int = 0
-    pose_count: int = 0
-    largest_difference: float = 0.0
-    moving_joints: int = 0
-    infinite_bones: dict[str, int] = field(default_factory=dict)
-    unrepeated: tuple[str, ...] = ()
+    removed: Removed
+    lost_channels: dict[str, dict[str, int]]
+    object_count: int
+    pose_count: int
+    largest_difference: float
+    moving_joints: int
+    infinite_bones: dict[str, int]
+    unrepeated: tuple[str, ...]
 
 
 def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choices: tuple[str, ...]) -> Job[FastRig]:
@@ -143,9 +141,7 @@ def make_fast_rig(rigs_and_models: list[tuple[SceneRig, Path]], out: Path, choic
         len(armature_object.data.bones),
         len(joint_names),
         controls,
-        removed.objects,
-        removed.modifiers,
-        removed.drivers,
+        removed,
         {action: counts for action, counts in lost_channels.items() if counts},
         len(shown),
         len(before.matrices),

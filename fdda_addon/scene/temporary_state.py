@@ -13,16 +13,13 @@ from .unkeyed_changes import discard_requests, keep_unkeyed_changes
 
 
 @contextmanager
-def temporary_pose(
-    armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action] = (), keep_animation: bool = False
-) -> Iterator[None]:
+def temporary_pose(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action] = ()) -> Iterator[None]:
     """Remove the animation of an armature, so that poses can be set; restore it, the pose and the frame afterwards.
 
     Args:
         armature_object: the armature object, not in the NLA's tweak mode, in which its action cannot be changed.
         actions: actions that will be assigned to the armature object. All other properties that they animate are
             restored too, such as transforms of the object and custom properties.
-        keep_animation: keep the action and the NLA of the armature object.
 
     Unkeyed changes of the scene's other objects are restored too, because setting the frame resets them.
     """
@@ -35,7 +32,7 @@ def temporary_pose(
     animation = armature_object.animation_data
     animated_before = animated_values(armature_object, actions)
     state = animation_state(armature_object)
-    if animation is not None and not keep_animation:
+    if animation is not None:
         animation.use_nla, animation.action = False, None
     try:
         yield
