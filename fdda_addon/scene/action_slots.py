@@ -155,14 +155,14 @@ def is_overridden(owner: "bpy.types.PoseBone | bpy.types.Object", kind: str) -> 
     """Return whether a constraint overrides the channels of `kind` of a bone or an object, such as `LOCATION`."""
     return any(
         constraint.type == "COPY_TRANSFORMS"
-        or (_COPY_CONSTRAINTS.get(constraint.type) == kind and _copies_all_axes(constraint))
+        or (
+            _COPY_CONSTRAINTS.get(constraint.type) == kind
+            and all((constraint.use_x, constraint.use_y, constraint.use_z))
+            and not getattr(constraint, "use_offset", False)
+        )
         for constraint in owner.constraints
         if not constraint.mute and constraint.influence == 1 and getattr(constraint, "mix_mode", "REPLACE") == "REPLACE"
     )
-
-
-def _copies_all_axes(constraint: bpy.types.Constraint) -> bool:
-    return all(getattr(constraint, f"use_{axis}") for axis in "xyz") and not getattr(constraint, "use_offset", False)
 
 
 def _used_identifiers(datablock: bpy.types.ID) -> set[str]:

@@ -81,41 +81,42 @@ def find_expensive_groups(armature_object: bpy.types.Object, frames: range) -> J
     parts = parts_by_bone(armature_object)
     if not parts:
         return ()
+    measured_count, groups = 0, []
     with armature_copy(armature_object) as full_scene:
-        groups = yield from _divide(armature_object, parts, full_scene, frames)
+
+        def measure(names: Iterable[str]) -> Job[BoneGroup]:
+            nonlocal measured_count
+            group = [part for name in names for part in parts[name]]
+            rounds, ratios = [], []
+            with armature_copy(armature_object, group) as scene:
+                for round_index in range(ROUNDS):
+                    first_index = round_index * FRAMES_PER_ROUND
+                    rounds.append(frame_ms(full_scene, frames, first_index, FRAMES_PER_ROUND))
+                    ratios.append(1 - frame_ms(scene, frames, first_index, FRAMES_PER_ROUND) / rounds[-1])
+            full_ms = statistics.median(rounds)
+            driver_count = sum(isinstance(part, bpy.types.FCurve) for part in group)
+            duration = Duration.of([ratio * full_ms for ratio in ratios])
+            measured_count += 1
+            yield Progress("bones", measured_count, MAX_MEASUREMENTS)
+            return BoneGroup(tuple(names), len(group) - driver_count, driver_count, duration)
+
+        # Divide the group that takes the most time first.
+        queue = [(yield from measure(parts))]
+        while queue:
+            queue.sort(key=lambda group: group.duration.median)
+            group = queue.pop()
+            halves = []
+            if len(group.bones) > 1 and group.duration.median > MIN_GROUP_MS and measured_count + 2 <= MAX_MEASUREMENTS:
+                middle = len(group.bones) // 2
+                for names in (group.bones[:middle], group.bones[middle:]):
+                    halves.append((yield from measure(names)))
+            # A half within the noise says nothing. If both are, the group stays whole.
+            if clear_halves := [half for half in halves if half.duration.is_clear]:
+                queue += clear_halves
+            elif group.duration.is_clear:
+                groups.append(group)
     yield Progress("bones", MAX_MEASUREMENTS, MAX_MEASUREMENTS)
     return tuple(sorted(groups, key=lambda group: -group.duration.median)[:MAX_GROUPS])
-
-
-def _divide(
-    armature_object: bpy.types.Object, parts: dict[str, list[RemovablePart]], full_scene: bpy.types.Scene, frames: range
-) -> Job[list[BoneGroup]]:
-    """Divide the bones with `parts` into groups, the one that takes the most time first."""
-    measured_count = 0
-
-    def measure(names: Iterable[str]) -> Job[BoneGroup]:
-        nonlocal measured_count
-        group = _measure_group(armature_object, parts, names, full_scene, frames)
-        measured_count += 1
-        yield Progress("bones", measured_count, MAX_MEASUREMENTS)
-        return group
-
-    queue = [(yield from measure(parts))]
-    groups: list[BoneGroup] = []
-    while queue:
-        queue.sort(key=lambda group: group.duration.median)
-        group = queue.pop()
-        halves = []
-        if len(group.bones) > 1 and group.duration.median > MIN_GROUP_MS and measured_count + 2 <= MAX_MEASUREMENTS:
-            middle = len(group.bones) // 2
-            for names in (group.bones[:middle], group.bones[middle:]):
-                halves.append((yield from measure(names)))
-        # A half within the noise says nothing. If both are, the group stays whole.
-        if clear_halves := [half for half in halves if half.duration.is_clear]:
-            queue += clear_halves
-        elif group.duration.is_clear:
-            groups.append(group)
-    return groups
 
 
 def parts_by_bone(armature_object: bpy.types.Object) -> dict[str, list[RemovablePart]]:
@@ -130,27 +131,6 @@ def parts_by_bone(armature_object: bpy.types.Object) -> dict[str, list[Removable
                 bone_name, _ = split_bone_path(datablock, curve.data_path)
                 parts.setdefault(bone_name if bone_name in parts else NO_BONE, []).append(curve)
     return {name: bone_parts for name, bone_parts in parts.items() if bone_parts}
-
-
-def _measure_group(
-    armature_object: bpy.types.Object,
-    parts: dict[str, list[RemovablePart]],
-    names: Iterable[str],
-    full_scene: bpy.types.Scene,
-    frames: range,
-) -> BoneGroup:
-    group = [part for name in names for part in parts[name]]
-    rounds, ratios = [], []
-    with armature_copy(armature_object, group) as scene:
-        for round_index in range(ROUNDS):
-            first_index = round_index * FRAMES_PER_ROUND
-            rounds.append(frame_ms(full_scene, frames, first_index, FRAMES_PER_ROUND))
-            ratios.append(1 - frame_ms(scene, frames, first_index, FRAMES_PER_ROUND) / rounds[-1])
-    full_ms = statistics.median(rounds)
-    driver_count = sum(isinstance(part, bpy.types.FCurve) for part in group)
-    return BoneGroup(
-        tuple(names), len(group) - driver_count, driver_count, Duration.of([ratio * full_ms for ratio in ratios])
-    )
 
 
 @contextmanager

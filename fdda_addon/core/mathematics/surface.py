@@ -190,11 +190,9 @@ class SurfaceComparison:
         for positions in compared_positions:
             angles = angles_between(normals, surface.normals(positions)).astype(np.float32)
             errors = np.abs(surface.edge_lengths(positions) - lengths)
-            rows.append((angles, *(self._mean(errors, edges) for edges in self._kinds)))
+            ratios = [errors[edges] / self._rest_lengths[edges] for edges in self._kinds]
+            rows.append((angles, *(float(np.mean(each)) if len(each) else np.nan for each in ratios)))
         return rows
-
-    def _mean(self, errors: np.ndarray, edges: np.ndarray) -> float:
-        return float(np.mean(errors[edges] / self._rest_lengths[edges])) if len(edges) else np.nan
 
 
 def surface_errors(rows: list[tuple[np.ndarray, float, float, float]]) -> SurfaceErrors:

@@ -30,9 +30,9 @@ def for_window(text: str) -> str:
         return text
     for phrase, label in PHRASES:
         text = text.replace(phrase, label)
-    return re.sub(r"(?<![\w-])--[a-z][a-z-]*", lambda match: LABELS.get(match[0]) or _title(match[0]), text)
 
+    def label(match: re.Match[str]) -> str:
+        words = match[0].replace("-", " ").title().split()
+        return LABELS.get(match[0], " ".join(word.lower() if word in SMALL_WORDS else word for word in words))
 
-def _title(option: str) -> str:
-    words = option.replace("-", " ").title().split()
-    return " ".join(word.lower() if word in SMALL_WORDS else word for word in words)
+    return re.sub(r"(?<![\w-])--[a-z][a-z-]*", label, text)
