@@ -5,11 +5,9 @@ import bpy
 
 
 def animation_curves(action: bpy.types.Action) -> list[bpy.types.FCurve]:
-    """Return the F-curves of all slots of an action (4.4 and later have layers and slots)."""
-    if getattr(action, "layers", None):
-        strips = (strip for layer in action.layers for strip in layer.strips)
-        return [curve for strip in strips for channelbag in strip.channelbags for curve in channelbag.fcurves]
-    return list(getattr(action, "fcurves", ()))
+    """Return the F-curves of all slots of an action."""
+    strips = (strip for layer in action.layers for strip in layer.strips)
+    return [curve for strip in strips for channelbag in strip.channelbags for curve in channelbag.fcurves]
 
 
 def accepts_slot(datablock: bpy.types.ID, slot: "bpy.types.ActionSlot") -> bool:

@@ -22,9 +22,6 @@ from ..figure import ARM_REACH, FRAMES, SMILE, WAVE, add_smile, add_wave, build_
 from ..refusals import file_contents
 from ..scene_state import assert_same_state, drain, scene_state
 
-HAS_SLOTS = bpy.app.version >= (4, 4, 0)
-needs_slots = pytest.mark.skipif(not HAS_SLOTS, reason="actions have slots from Blender 4.4 on")
-
 
 @pytest.fixture
 def figure() -> SceneRig:
@@ -180,7 +177,6 @@ def test_strips_that_are_missing_or_muted_are_refused(figure, tmp_path):
         record_and_read(figure, tmp_path / "recording", strips=("swing",))
 
 
-@needs_slots
 def test_an_action_with_curves_for_shape_keys_moves_them(figure, tmp_path):
     wave, keys = bpy.data.actions[WAVE], figure.mesh_object.data.shape_keys
     add_smile(figure, wave)
@@ -207,7 +203,6 @@ def test_an_action_with_curves_for_shape_keys_moves_them(figure, tmp_path):
     assert_same_state({**before, "positions": ()}, {**scene_state(figure), "positions": ()})
 
 
-@needs_slots
 def test_a_renamed_character_uses_the_slot_that_moves_bones(figure, tmp_path):
     """No slot has the name of the armature, so the slot with curves of bones is used, not an empty slot."""
     wave = bpy.data.actions[WAVE]

@@ -20,8 +20,6 @@ from ..conftest import run
 from ..figure import FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key_channel
 from ..scene_state import fresh_elbow
 
-HAS_SLOTS = bpy.app.version >= (4, 4, 0)
-
 
 @pytest.fixture
 def figure() -> SceneRig:
@@ -98,8 +96,7 @@ def test_keys_of_an_unused_rotation_mode_are_ignored(figure):
 
 
 def test_keyed_properties_are_measured_as_controls(figure):
-    if HAS_SLOTS:
-        add_smile(figure, wave())
+    add_smile(figure, wave())
     arm = figure.armature_object.pose.bones["arm.R"]
     constraint = arm.constraints.new("LIMIT_SCALE")
     for frame, influence in ((1, 0.25), (9, 0.75)):
@@ -108,8 +105,7 @@ def test_keyed_properties_are_measured_as_controls(figure):
     found = {c.name: (c.low, c.high) for c in measured_controls(figure, [wave()])}
     assert found.pop('armature_object/pose.bones["arm.L"]["fist"]') == pytest.approx((0, 1), abs=1e-2)
     assert found.pop('armature_object/pose.bones["arm.R"].constraints["Limit Scale"].influence') == (0.25, 0.75)
-    if HAS_SLOTS:
-        assert found.pop(f"shape_keys/{SMILE}") == pytest.approx((0, 0.8), abs=1e-6)
+    assert found.pop(f"shape_keys/{SMILE}") == pytest.approx((0, 0.8), abs=1e-6)
     assert not found
 
 
