@@ -17,24 +17,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core import settings
 from ..core.errors import OutputError
-from ..core.settings import (
-    AUTO_POSES,
-    DETAIL_MM,
-    GOAL_MM,
-    LEARN_FROM,
-    MIN_VERTICES_PER_PART,
-    MIRROR,
-    OVERSHOOT,
-    PASSES,
-    POSES,
-    PRE_ROLL,
-    SEED,
-    SETTLE_FRAMES,
-    SPREAD,
-    TRAINING_SEED,
-    Setting,
-)
 from ..scene.control_names import control_at, suggested_controls
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
@@ -53,7 +37,7 @@ MAX_INT = (1 << 31) - 1
 """Largest value of an integer property."""
 
 
-def make_property(setting: Setting, **arguments: object) -> object:
+def make_property(setting: settings.Setting, **arguments: object) -> object:
     """Make Blender's property of a setting, with further arguments."""
     kinds = {bool: BoolProperty, int: IntProperty, float: FloatProperty, str: StringProperty}
     limits = {"min": setting.low} if setting.kind in (int, float) else {}
@@ -63,8 +47,8 @@ def make_property(setting: Setting, **arguments: object) -> object:
     return kinds[setting.kind](name=setting.label, description=setting.description, **values)
 
 
-def _leave_automatic_poses(settings: "FDDA_PG_character", _context: bpy.types.Context) -> None:
-    settings.auto_poses = False
+def _leave_automatic_poses(character: "FDDA_PG_character", _context: bpy.types.Context) -> None:
+    character.auto_poses = False
 
 
 @not_animatable
@@ -112,11 +96,11 @@ class FDDA_PG_control(bpy.types.PropertyGroup):
 class FDDA_PG_character(bpy.types.PropertyGroup):
     """Settings of the poses, the recording and the training of a character."""
 
-    poses: make_property(POSES, update=_leave_automatic_poses)
-    auto_poses: make_property(AUTO_POSES)
-    seed: make_property(SEED)
-    spread: make_property(SPREAD)
-    overshoot: make_property(OVERSHOOT)
+    poses: make_property(settings.POSES, update=_leave_automatic_poses)
+    auto_poses: make_property(settings.AUTO_POSES)
+    seed: make_property(settings.SEED)
+    spread: make_property(settings.SPREAD)
+    overshoot: make_property(settings.OVERSHOOT)
     bones_to_pose: EnumProperty(
         name="Bones to Pose",
         description="Bones that random poses move",
@@ -170,28 +154,28 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     bone_count: IntProperty(
         name="Number of Bones", description="How many bones the model reads", default=50, min=1, soft_max=500
     )
-    learn_from: make_property(LEARN_FROM)
-    pre_roll: make_property(PRE_ROLL)
-    settle_frames: make_property(SETTLE_FRAMES)
-    mirror: make_property(MIRROR)
+    learn_from: make_property(settings.LEARN_FROM)
+    pre_roll: make_property(settings.PRE_ROLL)
+    settle_frames: make_property(settings.SETTLE_FRAMES)
+    mirror: make_property(settings.MIRROR)
     recording: StringProperty(
         name="Folder",
         description="Folder of the recording. Empty for a folder next to the .blend file",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    min_vertices_per_part: make_property(MIN_VERTICES_PER_PART)
+    min_vertices_per_part: make_property(settings.MIN_VERTICES_PER_PART)
     model: StringProperty(
         name="Model",
         description="File to write the trained model to. Empty for a file in a folder next to the .blend file",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    detail_mm: make_property(DETAIL_MM)
+    detail_mm: make_property(settings.DETAIL_MM)
     use_goal: BoolProperty(name="Goal (mm)", description="Report after the training whether the goal is met")
-    goal_mm: make_property(GOAL_MM)
-    passes: make_property(PASSES)
-    training_seed: make_property(TRAINING_SEED)
+    goal_mm: make_property(settings.GOAL_MM)
+    passes: make_property(settings.PASSES)
+    training_seed: make_property(settings.TRAINING_SEED)
 
     @property
     def has_random_poses(self) -> bool:

@@ -48,7 +48,6 @@ def recorded(tmp_path: Path, *options: object) -> Recording:
 
 @pytest.mark.parametrize("bounds", [(-0.05, 0.05), (-0.02, 0.04)])
 def test_a_control_that_moves_the_target_through_other_bones_is_an_input(tmp_path, bounds):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     face()
     save_copy(tmp_path / "rig.blend")
     control = SLIDE if bounds[0] == -0.05 else f"{SLIDE}={bounds[0]}:{bounds[1]}"
@@ -96,7 +95,6 @@ def keyed_smile() -> None:
 
 
 def test_a_keyed_property_that_is_a_control_does_not_bind_the_target_to_frames(tmp_path, capsys):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     keyed_smile()
     save_copy(tmp_path / "rig.blend")
     action = bpy.data.objects["elbow_rig"].animation_data.action.name

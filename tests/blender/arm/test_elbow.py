@@ -19,7 +19,6 @@ def test_the_elbow_is_a_small_closed_tube():
 
 
 def test_constraints_define_the_range_of_motion_of_the_elbow():
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, rig = build_elbow()
     assert (mesh_object.name, rig.name) == ("elbow", "elbow_rig")
     assert {bone.name: bone.parent and bone.parent.name for bone in rig.data.bones} == {"upper": None, "lower": "upper"}
@@ -36,7 +35,6 @@ def test_constraints_define_the_range_of_motion_of_the_elbow():
 
 
 def test_the_action_moves_the_tip_of_the_elbow():
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, rig = build_elbow()
     assert rig.animation_data.action.name == "elbow_wave"
     scene = bpy.context.scene

@@ -105,7 +105,6 @@ np.save(sys.argv[2], [vertex.co[:] for vertex in mesh.vertices])
 
 @pytest.mark.parametrize("is_overridden", [False, True], ids=["linked", "overridden"])
 def test_a_linked_character_is_baked_to_a_folder_that_is_moved(elbow_files, tmp_path, is_overridden, capfd):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     (tmp_path / "in").mkdir()
     rig, out = tmp_path / "in" / "shot.blend", tmp_path / "out" / "a.blend"
     save_copy(rig)

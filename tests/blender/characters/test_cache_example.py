@@ -26,7 +26,6 @@ def export_cache(path: Path, mesh_object: bpy.types.Object) -> None:
 
 
 def test_the_example_trains_a_model_of_a_cache(tmp_path):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, _ = build_elbow()
     cache, rig, out = tmp_path / "elbow.abc", tmp_path / "rig.blend", tmp_path / "out"
     export_cache(cache, mesh_object)

@@ -185,7 +185,6 @@ def test_the_menu_has_all_operators_but_those_that_need_a_button_of_a_panel():
 
 @pytest.mark.parametrize("name", MODULES)
 def test_a_section_without_a_rig_draws(name: str):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     texts = texts_of(draw_section(name))
     if name == "rig":
         assert "Add Sample Arm" in texts
