@@ -14,13 +14,22 @@ from ..scene.compatibility import set_video_format
 def main() -> None:
     """Encode, printing `encoded N` after each frame, or `encoding failed: ` and the reason."""
     job = json.load(sys.stdin)
-    scene = _scene(job["pictures"], job["size"], job["fps"])
-    set_video_format(scene.render.image_settings)
-    encoding = scene.render.ffmpeg
+    scene, pictures = bpy.data.scenes.new("FDDA video"), job["pictures"]
+    strip = scene.sequence_editor_create().strips.new_image("film", pictures[0], 1, 1)
+    for picture in pictures[1:]:
+        strip.elements.append(os.path.basename(picture))
+    scene.frame_start, scene.frame_end = 1, len(pictures)
+    render = scene.render
+    render.resolution_x, render.resolution_y = job["size"]
+    render.fps = max(1, round(job["fps"]))
+    render.fps_base = render.fps / job["fps"]
+    scene.view_settings.view_transform = "Standard"
+    set_video_format(render.image_settings)
+    encoding = render.ffmpeg
     encoding.format, encoding.codec, encoding.audio_codec = job["container"], job["codec"], "NONE"
     encoding.constant_rate_factor, encoding.gopsize = "HIGH", 12
-    scene.render.use_file_extension, scene.render.filepath = False, job["path"]
-    bpy.app.handlers.render_write.append(_print_frame)
+    render.use_file_extension, render.filepath = False, job["path"]
+    bpy.app.handlers.render_write.append(lambda shown, _: print(f"\nencoded {shown.frame_current}", flush=True))
     try:
         bpy.ops.render.render(animation=True, scene=scene.name)
     except RuntimeError as error:
@@ -29,21 +38,3 @@ def main() -> None:
     sys.stdout.flush()
     # Nothing is left to do, and Blender 4.5 as a module may hang at its end.
     os._exit(0)
-
-
-def _scene(pictures: list[str], size: list[int], fps: float) -> bpy.types.Scene:
-    scene = bpy.data.scenes.new("FDDA video")
-    strip = scene.sequence_editor_create().strips.new_image("film", pictures[0], 1, 1)
-    for picture in pictures[1:]:
-        strip.elements.append(os.path.basename(picture))
-    scene.frame_start, scene.frame_end = 1, len(pictures)
-    render = scene.render
-    render.resolution_x, render.resolution_y = size
-    render.fps = max(1, round(fps))
-    render.fps_base = render.fps / fps
-    scene.view_settings.view_transform = "Standard"
-    return scene
-
-
-def _print_frame(scene: bpy.types.Scene, _depsgraph: object) -> None:
-    print(f"\nencoded {scene.frame_current}", flush=True)

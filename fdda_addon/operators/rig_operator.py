@@ -11,12 +11,7 @@ from ..jobs.job import current
 from ..scene.active_rig import active_rig, any_mesh_object, cached_active_rig, rigs_together
 from ..scene.scene_rig import SceneRig, armature_of, join_rigs
 
-
-def _is_bound(mesh_object: bpy.types.Object) -> bool:
-    return mesh_object.fdda.is_bound
-
-
-NEEDS_MODEL = (_is_bound, "No model is bound; bind one first")
+NEEDS_MODEL = (lambda mesh_object: mesh_object.fdda.is_bound, "No model is bound; bind one first")
 """`RigOperator.needs` of operators on a bound model."""
 OBJECT_OR_POSE_MODE = frozenset({"OBJECT", "POSE"})
 

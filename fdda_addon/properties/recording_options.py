@@ -35,7 +35,11 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         actions=actions,
         resume=resume,
         bones_to_pose=_sample_options(scene_rig, actions),
-        extra_inputs=_control_options(settings),
+        extra_inputs=tuple(
+            f"{control.name}={control.low!r}:{control.high!r}" if control.has_range else control.name
+            for control in settings.extra_inputs
+            if control.name
+        ),
         target=target_settings(settings),
         **values,
     )
@@ -150,15 +154,6 @@ def _sample_options(scene_rig: SceneRig, actions: tuple[str, ...]) -> tuple[str,
             )
         return tuple(f"bone:{bone.name}" for bone in settings.sampled_bones)
     return ()
-
-
-def _control_options(settings: FDDA_PG_character) -> tuple[str, ...]:
-    """Return the named extra inputs in the syntax of `scene.controls.parse_controls`."""
-    return tuple(
-        f"{control.name}={control.low!r}:{control.high!r}" if control.has_range else control.name
-        for control in settings.extra_inputs
-        if control.name
-    )
 
 
 def recorded_actions(scene_rig: SceneRig) -> tuple[str, ...]:
