@@ -26,7 +26,6 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
         "Write the meshes as their models deform them to a file that plays without the add-on: Alembic, USD, or a copy "
         "of this .blend file"
     )
-    bl_options = {"REGISTER"}
     needs = NEEDS_MODEL
     verb, title = "bake", "Bake"
     changes_scene = False
@@ -98,7 +97,6 @@ class FDDA_OT_export_skinning(FileJobOperator, bpy.types.Operator):
         "Write a copy of this file whose recorded meshes follow bones by fitted skin weights alone, ready for glTF and "
         "FBX. Game engines play it without a model"
     )
-    bl_options = {"REGISTER"}
     verb, title = "export_skinning", "Export Skinning"
     changes_scene = False
 

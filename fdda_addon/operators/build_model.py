@@ -23,7 +23,6 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
         "Record with the settings below, train, and bind the model, one after the other. An existing recording is used "
         "as it is. Press ESC or Cancel to stop"
     )
-    bl_options = {"REGISTER"}
     verb, title = "build_model", "Record, Train & Bind"
     ends_itself = True
 

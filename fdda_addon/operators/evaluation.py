@@ -31,7 +31,6 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.evaluate"
     bl_label = "Evaluate"
     bl_description = "Compare the bound model with the rig, on the action of the armature or on random poses"
-    bl_options = {"REGISTER"}
     needs = NEEDS_MODEL
     verb, title = "evaluate", "Evaluation"
 
@@ -203,7 +202,6 @@ class FDDA_OT_show_rig(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.show_rig"
     bl_label = "Show the Rig"
     bl_description = "Show the rig together with the model, next to it or over it as a wireframe"
-    bl_options = {"REGISTER", "UNDO"}
     needs = NEEDS_MODEL
 
     placement: bpy.props.EnumProperty(

@@ -23,7 +23,6 @@ class FDDA_OT_fast_rig(FileJobOperator, bpy.types.Operator):
         "Write a file for animators with the same names, without the bones and objects that the model and the controls "
         "do not need. Relocate the library to this file for rendering"
     )
-    bl_options = {"REGISTER"}
     needs = NEEDS_MODEL
     verb, title = "fast_rig", "Fast Rig"
     changes_scene = False

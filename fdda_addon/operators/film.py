@@ -33,7 +33,6 @@ class FDDA_OT_render_comparison(FileJobOperator, bpy.types.Operator):
     bl_description = (
         "Render a film of the action: rig, linear skinning, model and heat map side by side, as seen in the 3D View"
     )
-    bl_options = {"REGISTER"}
     needs = NEEDS_MODEL
     verb, title = "render_comparison", "Film"
 

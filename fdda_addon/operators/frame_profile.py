@@ -36,7 +36,6 @@ class FDDA_OT_profile_frame(JobOperator, bpy.types.Operator):
         "Measure how much time bones, each modifier, the rest of the evaluation and drawing take in a frame; which "
         "bones are the slowest; and what models of all meshes and a fast rig would save"
     )
-    bl_options = {"REGISTER"}
     verb, title = measurements.PROFILE, "Profiling"
 
     def steps(self, context: bpy.types.Context) -> Job[FrameProfile]:

@@ -41,6 +41,7 @@ class JobOperator(RigOperator):
     calls `execute`, which would block Blender until the job ends, so `execute` invokes the operator again.
     """
 
+    bl_options = {"REGISTER"}
     waits_for_all_jobs = True
     is_confirming = False
     verb = ""

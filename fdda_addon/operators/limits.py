@@ -50,7 +50,6 @@ class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
     bl_idname = "fdda.set_limits"
     bl_label = "Set Limits of Selected Bones"
     bl_description = "Give all selected bones the same rotation limits"
-    bl_options = {"REGISTER", "UNDO"}
 
     axes: bpy.props.BoolVectorProperty(name="Axes", description="Axes to limit", default=(True, True, True))
     low: bpy.props.FloatVectorProperty(
@@ -96,7 +95,6 @@ class FDDA_OT_copy_limits(_SelectedBonesOperator, bpy.types.Operator):
     bl_idname = "fdda.copy_limits"
     bl_label = "Copy Limits to Selected Bones"
     bl_description = "Copy the limits of the active bone of the list to the selected bones"
-    bl_options = {"REGISTER", "UNDO"}
 
     bone: bpy.props.StringProperty(
         name="Bone", description="Bone to copy from. Empty for the active bone of the list", options={"SKIP_SAVE"}
@@ -118,7 +116,6 @@ class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
     bl_idname = "fdda.mirror_limits"
     bl_label = "Mirror Limits to Other Side"
     bl_description = "Copy the limits of the selected bones, mirrored, to the bones of the other side"
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         bones = self.rig(context).armature_object.pose.bones
@@ -144,7 +141,6 @@ class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
         "Give all bones that are named after body parts (arm, forearm, thigh, spine, index1 …) the rotation limits of "
         "a person. The character must stand upright and face -Y"
     )
-    bl_options = {"REGISTER", "UNDO"}
 
     only_selected: bpy.props.BoolProperty(name="Only Selected", description="Set the limits of selected bones only")
     replace: bpy.props.BoolProperty(name="Replace", description="Overwrite the limits of bones that already have some")
@@ -177,7 +173,6 @@ class FDDA_OT_clear_limits(_SelectedBonesOperator, bpy.types.Operator):
     bl_idname = "fdda.clear_limits"
     bl_label = "Clear Limits of Selected Bones"
     bl_description = "Remove the rotation limits of the selected bones. The default is ±45°"
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         bones = self.selected_bones(context)

@@ -53,7 +53,6 @@ class FDDA_OT_add_model(ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.add_model"
     bl_label = "Add Model"
     bl_description = "Add a model file to the list of this mesh"
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig = self.rig(context)
@@ -69,7 +68,6 @@ class FDDA_OT_remove_model(ModelListOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_model"
     bl_label = "Remove Model"
     bl_description = "Remove the model from the list, and unbind it. Its file is kept; a packed model is deleted"
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig, entry = self.active_entry(context)
@@ -84,7 +82,6 @@ class FDDA_OT_pack_model(ModelListOperator, bpy.types.Operator):
     bl_idname = "fdda.pack_model"
     bl_label = "Pack Model"
     bl_description = "Store the model in the .blend file"
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         scene_rig, entry = self.active_entry(context)
@@ -98,7 +95,6 @@ class FDDA_OT_unpack_model(ModelListOperator, bpy.types.Operator):
     bl_idname = "fdda.unpack_model"
     bl_label = "Unpack Model"
     bl_description = "Write the packed model to a file, and remove it from the .blend file"
-    bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(
         name="File",

@@ -98,7 +98,6 @@ class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
         "Use a model instead of the rig's modifiers: the active one of the Model Library, or a file. It is bound to "
         "each mesh that it deforms"
     )
-    bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(
         name="Model",
@@ -162,7 +161,6 @@ class FDDA_OT_unbind(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.unbind"
     bl_label = "Unbind"
     bl_description = "Restore the modifiers of the rig. The model stays in the Model Library"
-    bl_options = {"REGISTER", "UNDO"}
     needs = NEEDS_MODEL
 
     def apply(self, context: bpy.types.Context) -> str:
@@ -181,7 +179,6 @@ class FDDA_OT_set_mode(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.set_mode"
     bl_label = "Switch Deformation"
     bl_description = "Deform the mesh with the modifiers of the rig, linear skinning alone, or the model"
-    bl_options = {"REGISTER", "UNDO"}
     needs = NEEDS_MODEL
 
     mode: bpy.props.EnumProperty(
@@ -214,7 +211,6 @@ class FDDA_OT_relink(ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.relink"
     bl_label = "Find Model"
     bl_description = "Choose where the file of the bound model is now"
-    bl_options = {"REGISTER", "UNDO"}
     needs = NEEDS_MODEL
 
     def apply(self, context: bpy.types.Context) -> str:

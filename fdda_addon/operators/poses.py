@@ -27,7 +27,6 @@ class FDDA_OT_preview_pose(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.preview_pose"
     bl_label = "Preview Random Pose"
     bl_description = "Show one of the random poses that will be recorded"
-    bl_options = {"REGISTER", "UNDO"}
     modes = OBJECT_OR_POSE_MODE
 
     number: bpy.props.IntProperty(
@@ -50,7 +49,6 @@ class FDDA_OT_rest_pose(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.rest_pose"
     bl_label = "Rest Pose"
     bl_description = "Reset all bones to the rest pose, and all extra inputs of the random poses to their defaults"
-    bl_options = {"REGISTER", "UNDO"}
     modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:
@@ -67,7 +65,6 @@ class FDDA_OT_poses_to_action(JobOperator, bpy.types.Operator):
         "Make an action with one training pose per frame, after the rest pose in frame 0, to export it for training in "
         "other programs. The scene gets its frames"
     )
-    bl_options = {"REGISTER"}
     verb, title = "poses", "Poses to Action"
     changes_file = True
 
@@ -133,7 +130,6 @@ class FDDA_OT_set_limit(_LimitOperator, bpy.types.Operator):
     bl_idname = "fdda.set_limit"
     bl_label = "Set Limit"
     bl_description = "Limit the rotation of the bone about this axis, in its Limit Rotation constraint or as IK limits"
-    bl_options = {"REGISTER", "UNDO"}
 
     low: bpy.props.FloatProperty(
         name="Minimum", subtype="ANGLE", default=-math.pi / 4, min=-math.pi, max=math.pi, description="Lowest angle"
@@ -153,7 +149,6 @@ class FDDA_OT_clear_limit(_LimitOperator, bpy.types.Operator):
     bl_idname = "fdda.clear_limit"
     bl_label = "Clear Limit"
     bl_description = "Remove the rotation limit of the bone about this axis. The default is ±45°"
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         bone = self.pose_bone(context)
@@ -165,7 +160,6 @@ class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
     bl_idname = "fdda.limits_from_actions"
     bl_label = "Set Limits from Actions"
     bl_description = "Set each bone's limits to the motion in the checked actions. Bones can still be posed freely"
-    bl_options = {"REGISTER", "UNDO"}
 
     margin: bpy.props.FloatProperty(
         name="Margin",
@@ -202,7 +196,6 @@ class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.show_bone"
     bl_label = "Select Bone"
     bl_description = "Select this bone in Pose Mode"
-    bl_options = {"REGISTER", "UNDO"}
     waits_for_jobs = False
 
     bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})

@@ -82,7 +82,6 @@ class FDDA_OT_record(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.record"
     bl_label = "Record"
     bl_description = "Evaluate random poses and the checked actions, and write the deformed mesh to the folder"
-    bl_options = {"REGISTER"}
     verb, title = "record", "Recording"
 
     folder: bpy.props.StringProperty(
@@ -127,7 +126,6 @@ class FDDA_OT_refine(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.refine"
     bl_label = "Add Poses at Worst Errors"
     bl_description = "Compare the trained model with the rig, and record more poses where its error is largest"
-    bl_options = {"REGISTER"}
     verb, title = "refine", "Refinement"
 
     poses: bpy.props.IntProperty(

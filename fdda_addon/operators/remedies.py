@@ -20,7 +20,6 @@ class FDDA_OT_merge_vertices(RigOperator, bpy.types.Operator):
         "Merge the vertices along cuts that lie on each other, as importers of game formats leave them. Normals and UV "
         "maps stay, and cuts that skin weights or shape keys open"
     )
-    bl_options = {"REGISTER", "UNDO"}
     waits_for_all_jobs = True
     modes = frozenset({"OBJECT", "POSE"})
 
@@ -69,7 +68,6 @@ class FDDA_OT_fit_base_skinning(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.fit_base_skinning"
     bl_label = "Fit Base Skinning"
     bl_description = "Let the training fit skin weights to the recorded poses, with at most four bones per vertex"
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         self.rig(context).mesh_object.fdda.settings.base_skinning = "SMOOTH"
@@ -82,7 +80,6 @@ class FDDA_OT_select_unlimited(RigOperator, bpy.types.Operator):
     bl_description = (
         "Select the bones without rotation limits in Pose Mode, to set limits in the section Training Poses"
     )
-    bl_options = {"REGISTER", "UNDO"}
 
     def apply(self, context: bpy.types.Context) -> str:
         rig = self.rig(context)

@@ -80,7 +80,6 @@ class FDDA_OT_measure(JobOperator, bpy.types.Operator):
         "Measure the time per frame of all meshes of this armature, with the rig and with the bound models. "
         "Without a bound model, untrained models of the same size give an estimate"
     )
-    bl_options = {"REGISTER"}
     verb, title = measurements.MEASURE, "Measuring"
 
     frames: bpy.props.IntProperty(

@@ -22,6 +22,7 @@ class RigOperator:
     A subclass defines `apply`. The text of an FDDAError is reported, and the operator is canceled.
     """
 
+    bl_options = {"REGISTER", "UNDO"}
     needs = None
     """What a mesh of the scene must have: a function of its object, and the poll message if no mesh has it."""
     waits_for_jobs = True

@@ -20,7 +20,6 @@ class FDDA_OT_use_selected_bones(RigOperator, bpy.types.Operator):
     bl_description = (
         "Let random poses move the bones that are selected now. Later changes of the selection have no effect"
     )
-    bl_options = {"REGISTER", "UNDO"}
     modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:
@@ -42,7 +41,6 @@ class FDDA_OT_add_control(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.add_control"
     bl_label = "Add Extra Input"
     bl_description = "Make a shape key or another animated number an input of the model. Random poses change it too"
-    bl_options = {"REGISTER", "UNDO"}
     modes = OBJECT_OR_POSE_MODE
 
     name: bpy.props.StringProperty(
@@ -74,7 +72,6 @@ class FDDA_OT_add_control_bones(RigOperator, bpy.types.Operator):
         "Make the unlocked channels and custom properties of the selected bones inputs of the model, for control bones "
         "that deform the mesh other than through its deforming bones. Random poses move them too"
     )
-    bl_options = {"REGISTER", "UNDO"}
     modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:
@@ -99,7 +96,6 @@ class FDDA_OT_remove_control(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_control"
     bl_label = "Remove Extra Input"
     bl_description = "Remove the active input from the list"
-    bl_options = {"REGISTER", "UNDO"}
     modes = OBJECT_OR_POSE_MODE
 
     def apply(self, context: bpy.types.Context) -> str:

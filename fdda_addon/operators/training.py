@@ -179,7 +179,6 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
     bl_label = "Train"
     bl_description = "Train a model on the recording, in the background. Training continues when Blender is closed"
     # Without UNDO: Adjust Last Operation would train again at each change.
-    bl_options = {"REGISTER"}
     verb, title = "train", "Training"
     changes_scene = False
     ends_itself = True

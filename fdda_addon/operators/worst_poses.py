@@ -35,7 +35,6 @@ class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
     bl_idname = "fdda.add_worst_markers"
     bl_label = "Mark Worst Frames"
     bl_description = "Add timeline markers at the frames with the largest errors, and remove those added before"
-    bl_options = {"REGISTER", "UNDO"}
 
     count: bpy.props.IntProperty(
         name="Markers", description="Maximum number of markers", default=MARKERS, min=1, max=50
@@ -56,7 +55,6 @@ class FDDA_OT_remove_markers(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_markers"
     bl_label = "Remove Markers"
     bl_description = "Remove the timeline markers at the worst frames. Other markers are kept"
-    bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll_problem(cls, context: bpy.types.Context) -> str:
@@ -70,7 +68,6 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
     bl_idname = "fdda.jump_to_worst"
     bl_label = "Jump to Worst"
     bl_description = "Go to the frame, or show the random pose, with the largest error"
-    bl_options = {"REGISTER", "UNDO"}
 
     rank: bpy.props.IntProperty(name="Rank", description="1 is the worst, 2 the next", default=1, min=1, max=50)
 
