@@ -35,7 +35,7 @@ def new_temporary_file() -> TextIO:
 
 
 @contextmanager
-def temporary_folder(prefix: str = "fdda-") -> Iterator[Path]:
+def temporary_folder() -> Iterator[Path]:
     """Create a folder in the system's temporary folder, yield it, and remove it afterwards.
 
     Raises:
@@ -43,7 +43,7 @@ def temporary_folder(prefix: str = "fdda-") -> Iterator[Path]:
     """
     try:
         # On Windows a virus scanner may have a file open when the folder is removed.
-        folder = tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
+        folder = tempfile.TemporaryDirectory(prefix="fdda-", ignore_cleanup_errors=True)
     except OSError as error:
         raise _temporary_folder_error(error) from error
     with folder as name:
