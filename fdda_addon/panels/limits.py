@@ -28,6 +28,8 @@ from .section import panel_rig
 AXES = "xyz"
 WIDE_SIDEBAR_PIXELS = 380
 """Sidebar width from which the table shows both ends of a range, pixels at a UI scale of 1."""
+LOCKED = {True: "locked", False: "lock"}
+"""Text for a locked axis in a wide and in a narrow sidebar."""
 
 
 class FDDA_UL_bones(bpy.types.UIList):
@@ -84,7 +86,7 @@ def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[s
     if is_moved_by_constraints(bone):
         return "CONSTRAINT_BONE", name, "constrained", False
     ranges = rotation_ranges(bone)
-    texts = [_format_range(r.low, r.high, is_wide) if r.moves else "locked" for r in ranges]
+    texts = [_format_range(r.low, r.high, is_wide) if r.moves else LOCKED[is_wide] for r in ranges]
     return "NONE", name, "  ".join(texts), any(r.moves and r.source != DEFAULT for r in ranges)
 
 
@@ -143,7 +145,7 @@ def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
     rotations = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
     location_axes = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
     texts = [
-        _format_range(rotations[axis].low, rotations[axis].high, is_wide) if axis in rotations else "locked"
+        _format_range(rotations[axis].low, rotations[axis].high, is_wide) if axis in rotations else LOCKED[is_wide]
         for axis in range(3)
         if rotations
     ]

@@ -13,7 +13,7 @@ import pytest
 
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.operators.meshes import MENU_OPERATORS
-from fdda_addon.panels import MODULES, checks, findings, models, playback
+from fdda_addon.panels import MODULES, checks, findings, limits, models, playback
 from fdda_addon.panels.timed_value import timed_values
 from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
 from fdda_addon.properties.recording_options import copy_settings, meshes_with_other_settings
@@ -200,6 +200,9 @@ def test_lists_draw_their_items(active: bpy.types.Object):
         "flex 0…1",
     ]
     assert list_items("models") == ["Name"]
+    rig = SceneRig(active, active.find_armature())
+    lower = rig.armature_object.pose.bones["lower"]
+    assert limits._bone_row(rig, lower, False)[2] == "120°  lock  lock", "a narrow sidebar cuts a longer text"
 
 
 def list_items(section_name: str) -> list[str]:
