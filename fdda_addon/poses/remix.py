@@ -173,11 +173,18 @@ def _mirror_images(
 ) -> dict[str, tuple[bpy.types.PoseBone, np.ndarray]]:
     """Return the bone on the other side of each bone, and the (3, 3) reflection of its axes to those of the bone.
 
-    A bone without a side is its own mirror image. Empty if no keyed bone has another side, or if their heads in the
-    rest pose are not mirror images about the YZ plane of the armature.
+    A bone without a side is its own mirror image. Where no name has a side, as in `arm_06`, rest positions tell. Empty
+    if no keyed bone has another side, or if their heads in the rest pose are not mirror images about the YZ plane of
+    the armature.
     """
     bones, reflection = armature_object.pose.bones, np.diag([-1.0, 1.0, 1.0])
     pairs = [(bone, bones.get(flipped_name(bone.name), bone)) for bone in bones]
+    if all(bone == partner for bone, partner in pairs):
+        ends = np.array([[*bone.bone.head_local, *bone.bone.tail_local] for bone in bones]).reshape(-1, 2, 3)
+        distances = np.linalg.norm(ends[:, None] - ends[None] @ reflection, axis=-1).max(axis=-1)
+        # Of several bones in the middle, each is its own mirror image.
+        np.fill_diagonal(distances, distances.diagonal() * (1 - 1e-3) - 1e-6)
+        pairs = [(bone, bones[int(index)]) for bone, index in zip(bones, distances.argmin(axis=1), strict=True)]
     pairs = [(bone, partner) for bone, partner in pairs if keyed_names & {bone.name, partner.name}]
     heads = np.array([[bone.bone.head_local, partner.bone.head_local] for bone, partner in pairs]).reshape(-1, 2, 3)
     distances = np.linalg.norm(heads[:, 0] - heads[:, 1] @ reflection, axis=1)

@@ -22,7 +22,6 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from ..conftest import run
 from ..figure import FRAMES, add_wave, build_figure, edit_bones
 
-SIDES = ("spine", "arm.L", "arm.R")
 WAVE, STILL, TURN = "wave", "one frame", "turn the dial"
 
 
@@ -82,13 +81,15 @@ def test_remixed_frames_show_the_pose_of_the_action(waving):
         assert armature_object["dial"] == pytest.approx(dial)
 
 
-@pytest.mark.parametrize("roll", [0.0, 0.7])
-def test_mirror_images_of_the_frames_follow_where_bones_have_two_sides(roll):
-    """Whatever the roll of the bones; the property of one side is keyed alone."""
+@pytest.mark.parametrize(("roll", "left"), [(0.0, "arm.L"), (0.7, "arm.L"), (0.0, "arm_07")])
+def test_mirror_images_of_the_frames_follow_where_bones_have_two_sides(roll, left):
+    """Whatever the roll of the bones, and without names of sides."""
     figure = build_figure()
     armature_object = figure.armature_object
     edit_bones(figure, lambda bones: setattr(bones["arm.L"], "roll", bones["arm.L"].roll + roll))
     action = add_wave(figure)
+    armature_object.data.bones["arm.L"].name = left
+    sides = "spine", left, "arm.R"
     remix = read_remix(figure, [action])
     assert len(remix.values) == 2 * FRAMES
     heads_and_tails = []
@@ -97,12 +98,12 @@ def test_mirror_images_of_the_frames_follow_where_bones_have_two_sides(roll):
         clear_pose(armature_object)
         Poser(figure, remix.channels).set(remix.values[index])
         bpy.context.view_layer.update()
-        ends = [(armature_object.pose.bones[name].head, armature_object.pose.bones[name].tail) for name in SIDES]
+        ends = [(armature_object.pose.bones[name].head, armature_object.pose.bones[name].tail) for name in sides]
         heads_and_tails.append(np.array(ends))
     frame, image = heads_and_tails
     assert np.abs(frame[1] - frame[2] * [-1, 1, 1]).max() > 0.1
     np.testing.assert_allclose(image, frame[[0, 2, 1]] * [-1, 1, 1], atol=1e-6)
-    edit_bones(figure, lambda bones: setattr(bones["arm.L"], "head", (0.2, 0.1, 0.9)))
+    edit_bones(figure, lambda bones: setattr(bones[left], "head", (0.2, 0.1, 0.9)))
     assert len(read_remix(figure, [action]).values) == FRAMES, "the bones are no mirror images"
 
 
