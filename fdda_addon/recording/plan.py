@@ -130,12 +130,15 @@ def random_pose_channels(scene_rig: SceneRig, rig: Rig, selection: SampleSelecti
     return (*channels, *key_channels)
 
 
-def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseSampler:
-    """Make the sampler of the random poses of a recording."""
+def make_pose_sampler(scene_rig: SceneRig, rig: Rig, settings: RecordingSettings) -> PoseSampler:
+    """Make the sampler of the random poses of a recording. Bones that drive shape keys and are no joints are keys."""
     remix = None
     if REMIX in settings.bones_to_pose and settings.poses:
         remix = read_remix(scene_rig, find_actions(settings))
-    return PoseSampler(settings.seed, settings.spread, remix)
+    selection = read_sample_selection(scene_rig, settings)[0]
+    keys = selection.key_bones.difference(rig.joint_names)
+    keys |= {control.name for control in rig.controls if control.is_shape_key}
+    return PoseSampler(settings.seed, settings.spread, remix, keys)
 
 
 def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings, controls: Iterable[Control]) -> bool:

@@ -5,6 +5,8 @@ import bpy
 import numpy as np
 import pytest
 
+from blend_fixtures.characters import control_rigs
+from blend_fixtures.characters.controls import add_key, drive_by_property
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION_VECTOR
 from fdda_addon.core.recording.index import read_index, read_info
@@ -129,10 +131,28 @@ def test_a_recording_remixes_its_actions(waving, tmp_path):
     assert action_source.poses == 40
     settings = RecordingSettings(poses=30, seed=4, bones_to_pose=("remix",), actions=(WAVE,))
     rig = find_rig()
-    _, channels = read_sampled_rig(rig, settings)
-    sampler = make_pose_sampler(rig, settings)
+    arrays, channels = read_sampled_rig(rig, settings)
+    sampler = make_pose_sampler(rig, arrays, settings)
     assert sampler.remix is not None and sampler.draw_pose(channels, 2).shape == (len(channels),)
     assert np.ptp(np.array(recording.pose_matrices[:30]), axis=0).max() > 0.5
+
+
+@pytest.mark.parametrize(("bones", "names"), [((), ("pout",)), (("collection:Controls",), ("pout", "corrective"))])
+def test_keys_and_bones_that_act_through_keys_alone_may_rest(bones, names):
+    """A joint that also drives a key is none of them; while it is not posed, the key is set without its driver."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    control_rigs.face_slider()
+    scene_rig = find_rig()
+    add_key(scene_rig.mesh_object, "pout", lambda points: points * 1.01)
+    corrective = add_key(scene_rig.mesh_object, "corrective", lambda points: points * 0.99)
+    drive_by_property(corrective, "value", scene_rig.armature_object, 'pose.bones["upper"].rotation_euler[0]')
+    settings = RecordingSettings(bones_to_pose=bones)
+    arrays, channels = read_sampled_rig(scene_rig, settings)
+    keys = make_pose_sampler(scene_rig, arrays, settings).keys
+    assert keys & {channel.name for channel in channels} == {
+        "slider",
+        *(f'shape_keys/key_blocks["{name}"].value' for name in names),
+    }
 
 
 def remove_limits(scene_rig: SceneRig) -> None:

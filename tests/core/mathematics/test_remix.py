@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.mathematics.poses import LOCATION, ROTATION, ROTATION_VECTOR, Channel, sample_pose
+from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel, sample_pose
 from fdda_addon.core.mathematics.remix import PoseSampler, Remix, find_limbs, replace_bone_channels
 from fdda_addon.core.mathematics.rotations import (
     multiply_quaternions,
@@ -87,6 +87,27 @@ def test_every_second_pose_is_drawn_from_the_ranges():
     values = sampler.draw_pose(channels, 4)
     assert np.array_equal(values[:-1], remix.draw_pose(5, 4)) and values[-1] == sample_pose(channels, 5, 4, 0.5)[-1]
     assert np.array_equal(PoseSampler(5, 0.5).draw_pose(channels, 4), sample_pose(channels, 5, 4, 0.5))
+
+
+def test_keys_rest_in_a_part_of_the_plain_poses():
+    """From none to all keys move in a pose; those that do have the values of `sample_pose`."""
+    keys = [Channel(f"key {number}", CONTROL, 0, -0.5, 1.0) for number in range(30)]
+    lid = [Channel("lid", LOCATION, 0, -0.1, 0.1), Channel("lid", SCALE, 0, 0.5, 1.5)]
+    channels = (*keys, *lid, Channel("jaw", ROTATION, 0, -1.0, 1.0))
+    sampler = PoseSampler(3, 1.0, keys=frozenset(channel.name for channel in channels) - {"jaw"})
+    poses, plain = (
+        np.stack([draw(index) for index in range(300)])
+        for draw in (lambda index: sampler.draw_pose(channels, index), lambda index: sample_pose(channels, 3, index))
+    )
+    moves = poses == plain
+    assert np.array_equal(poses[~moves], np.broadcast_to([c.rest for c in channels], poses.shape)[~moves])
+    assert moves[:, -1].all() and np.array_equal(moves[:, -3], moves[:, -2])
+    counts = moves[:, :30].sum(axis=1)
+    assert counts.min() == 0 and counts.max() == 30 and counts.mean() == pytest.approx(15, rel=0.1)
+    assert np.ptp(moves[:, :30].mean(axis=0)) < 0.15
+    remix = make_remix()
+    remixed = PoseSampler(5, 0.5, remix, frozenset("ab")).draw_pose(remix.channels, 4)
+    assert np.array_equal(remixed, remix.draw_pose(5, 4))
 
 
 def test_the_channels_of_a_remixed_bone_are_replaced():
