@@ -40,7 +40,7 @@ def find(rig: SceneRig) -> tuple[Finding, ...]:
 
 def _find(rig: SceneRig, check: RigCheck) -> list[Finding]:
     mesh_object, bones, findings = rig.mesh_object, rig.armature_object.pose.bones, []
-    settings, joint_names = mesh_object.fdda.settings, check.rig.joint_names
+    settings, joint_names = mesh_object.fdda.settings, [name for name in check.rig.joint_names if name in bones]
     if settings.base_skinning == "RIG" and settings.bones_to_read == "ALL" and not check.rig.has_weights:
         text = f"No vertex of {mesh_object.name} has weights on deforming bones."
         findings.append(Finding(text, "fdda.fit_base_skinning"))
@@ -50,7 +50,7 @@ def _find(rig: SceneRig, check: RigCheck) -> list[Finding]:
         [(m.type, getattr(m, "use_deform_preserve_volume", False)) for m in modifiers] == [("ARMATURE", False)]
         and not has_keys
         and not settings.learn_from
-        and all(bones[name].bone.bbone_segments == 1 for name in joint_names if name in bones)
+        and all(bones[name].bone.bbone_segments == 1 for name in joint_names)
     )
     if is_linear:
         findings.append(Finding(f"Only linear skinning deforms {mesh_object.name}: a model is not worth it."))

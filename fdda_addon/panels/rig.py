@@ -56,8 +56,10 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
             text=f"{rig.mesh_object.name}: {format_count(len(rig.mesh_object.data.vertices), 'vertex', 'vertices')}",
             icon="MESH_DATA",
         )
-        bone_count = len(rig.armature_object.data.bones)
-        deforming_count = len(check.rig.joints) if check and check.rig else bone_count
+        bones = rig.armature_object.data.bones
+        bone_count = len(bones)
+        # A mesh without weights also has a joint that is no bone.
+        deforming_count = sum(name in bones for name in check.rig.joint_names) if check and check.rig else bone_count
         count_text = format_count(bone_count, "bone")
         if deforming_count != bone_count:
             count_text = f"{deforming_count:,} of {count_text}"

@@ -268,6 +268,7 @@ def test_what_makes_a_good_model_unlikely_has_a_remedy(saved: SceneRig, change, 
     (finding,) = findings.find(saved)
     assert finding.text.endswith(text) and finding.operator == (f"fdda.{button}" if button else "")
     assert not bpy.types.FDDA_PT_rig.is_done(bpy.context)
+    assert f"{ELBOW_RIG}: 2 bones" in texts_of(draw_section("rig")), "the joint of a mesh without weights is no bone"
     assert " ".join(finding.text.split()) in " ".join(" ".join(texts_of(draw_section("rig"))).split())
     if button:
         assert getattr(bpy.ops.fdda, button)() == {"FINISHED"}
