@@ -134,7 +134,7 @@ def show_the_rig_beside(folder: Path) -> Iterator[float]:
     """Press Beside: the rig is shown next to the model, and moves as the action plays."""
     side_by_side = extension_module("evaluation.side_by_side")
     yield from sidebar.open_section("evaluation")
-    yield from sidebar.press_button("fdda.show_rig(placement='BESIDE')", across=0.5)
+    yield from sidebar.press_button("placement='BESIDE'", across=0.5)
     yield from wait_until(lambda: side_by_side.find(arm_object()) is not None, 5, "the button shows no rig")
     frame_object(arm_object(), 1.8)
     yield 0.5
@@ -159,14 +159,14 @@ def show_the_rig_as_overlay(folder: Path) -> Iterator[float]:
     """Press Overlay, then Off."""
     side_by_side = extension_module("evaluation.side_by_side")
     bpy.context.scene.frame_set(BENT_FRAME)
-    yield from sidebar.press_button("fdda.show_rig(placement='OVERLAY')", across=0.85)
+    yield from sidebar.press_button("placement='OVERLAY'", across=0.85)
     yield from wait_until(
         lambda: side_by_side.display_mode(arm_object()) == "OVERLAY", 5, "the button shows no overlay"
     )
     frame_object(arm_object())
     yield 0.5
     yield from save_screenshot(folder / "overlay.png")
-    yield from sidebar.press_button("fdda.show_rig(placement='NONE')", across=0.15)
+    yield from sidebar.press_button("placement='NONE'", across=0.15)
     yield from wait_until(lambda: side_by_side.find(arm_object()) is None, 5, "the button does not hide the rig")
 
 
