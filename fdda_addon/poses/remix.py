@@ -49,8 +49,8 @@ _REST_VALUES = {ROTATION_VECTOR: 0.0, LOCATION: 0.0, SCALE: 1.0}
 def choose_bones(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Action]) -> tuple[str, ...]:
     """Choose what random poses move if the user does not.
 
-    Limbs come from the recorded actions. Without any, deforming bones move within their limits. If they have none,
-    limbs come from all actions of the rig, because any other range would be a guess.
+    Limbs come from the recorded actions. Without any, the deforming bones and all bones with limits move. If no bone
+    has limits, limbs come from all actions of the rig, because any other range would be a guess.
 
     Returns:
         The choice in the syntax of `sampling.parse_sample_selection`.

@@ -108,8 +108,8 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
             (
                 "AUTO",
                 "Automatic",
-                "Limbs from the checked actions. Without any, Deforming Bones within their limits; if there are no "
-                "limits, limbs from all actions of the rig",
+                "Limbs from the checked actions. Without any, the deforming bones and all bones with limits; if there "
+                "are no limits, limbs from all actions of the rig",
             ),
             ("WEIGHTS", "Deforming Bones", "The bones that deform the mesh, and all bones with limits"),
             ("COLLECTION", "Bone Collection", "The bones of a bone collection and of its child collections"),
