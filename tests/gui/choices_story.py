@@ -199,8 +199,7 @@ def delete_the_armature(folder: Path) -> Iterator[float]:
     bpy.data.objects.remove(bpy.data.objects["elbow_rig"])
     body = bpy.data.objects["elbow"]
     yield from wait_until(lambda: "armature" in body.fdda.status, 5, f"the status is '{body.fdda.status}'")
-    yield from sidebar.open_tab()
-    yield from redraw_window()
+    yield from sidebar.open_section("rig")
     yield from save_screenshot(folder / "choices_no_armature.png")
 
 
