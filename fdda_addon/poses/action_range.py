@@ -19,6 +19,7 @@ from ..core.mathematics.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATIO
 from ..core.mathematics.rotations import euler_angles, rotation_vectors, total_range_width
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.armature import FOUR_COMPONENT_ROTATIONS
+from ..scene.arrays import REST_MATRIX_ELEMENT, read
 from ..scene.controls import canonical_path, is_driven, is_number, make_control, owner_name, owner_of
 from ..scene.draw_cache import actions_state, computed_once
 from ..scene.scene_rig import SceneRig
@@ -182,7 +183,7 @@ def _measure_ranges(armature_object: bpy.types.Object, actions: list[bpy.types.A
 def computed_for_actions(
     name: str, datablocks: Sequence[bpy.types.Object], actions: Sequence[bpy.types.Action], compute: Callable[[], Value]
 ) -> Value:
-    """Return what follows from actions and an armature object; it is computed again if one of them changes.
+    """Return what follows from actions and the rest pose of an armature; it is computed again if one of them changes.
 
     The sidebar asks with every check of a rig, and dozens of actions take seconds.
 
@@ -195,7 +196,8 @@ def computed_for_actions(
     state = (
         actions_state(),
         animation and animation.action and animation.action.session_uid,
-        [(bone.name, bone.rotation_mode, *bone.lock_rotation) for bone in bones],
+        [(bone.name, bone.rotation_mode, *bone.lock_rotation, bone.bone.use_local_location) for bone in bones],
+        read(datablocks[0].data.bones, REST_MATRIX_ELEMENT).tobytes(),
         [tuple(action.frame_range) for action in actions],
     )
     key = (name, *(d.session_uid for d in (*datablocks, *actions)))

@@ -41,6 +41,7 @@ REMIX = "remix"
 """Entry for the bones of actions whose limbs are combined from different frames (`mathematics.remix`)."""
 MAX_FRAMES = 3000
 """Largest number of frames of actions that are read without being recorded."""
+_REFLECTION = np.diag([-1.0, 1.0, 1.0])
 HEAD_TOLERANCE = 0.01
 """Largest distance between the head of a bone and its mirror image, relative to the size of the armature."""
 _REST_VALUES = {ROTATION_VECTOR: 0.0, LOCATION: 0.0, SCALE: 1.0}
@@ -123,8 +124,8 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
         for action, curves in zip(actions, curves_by_action, strict=True)
     ]
     keyed_names = {name for _, curves in clips for name in curves}
-    mirror = _mirror_images(armature_object, keyed_names)
-    bones = [bone for bone in armature_object.pose.bones if bone.name in (mirror or keyed_names)]
+    bones = [bone for bone in armature_object.pose.bones if bone.name in keyed_names]
+    mirror = _mirror_images(bones)
     limbs = dict(zip((bone.name for bone in bones), find_limbs(_parents(bones)).tolist(), strict=True))
     columns: list[tuple[Channel, np.ndarray, int, bool]] = []
     for bone in bones:
@@ -139,12 +140,16 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
     if not columns:
         moves = f"{names} moves no bone" if names else "no action moves a bone"
         raise RigError(f"There is no pose to remix: {moves} of '{armature_object.name}'.")
-    limbs_by_path = {bone.path_from_id(): limbs[bone.name] for bone in bones}
+    bones_by_path = {bone.path_from_id(): bone for bone in bones}
     numbers = _number_values(scene_rig, actions)
     for (owner, path), values in numbers.items():
-        limb = limbs_by_path.get(path[: path.find('"]') + 2], len(bones))
+        bone_path, image_path = path[: path.find('"]') + 2], flipped_path(path)
+        bone = bones_by_path.get(bone_path)
         if mirror:
-            values = np.concatenate([values, numbers.get((owner, flipped_path(path)), values)])
+            if bone is not None:
+                image_path = mirror[bone.name].path_from_id() + path.removeprefix(bone_path)
+            values = np.concatenate([values, numbers.get((owner, image_path), values)])
+        limb = len(bones) if bone is None else limbs[bone.name]
         columns.append((Channel(f"{owner}/{path}", CONTROL, 0, *_bounds(values)), values, limb, False))
     if not any(has_width(_bounds(values)) for _, values, _, _ in columns):
         raise RigError(
@@ -168,55 +173,52 @@ def _bounds(values: np.ndarray) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def _mirror_images(
-    armature_object: bpy.types.Object, keyed_names: set[str]
-) -> dict[str, tuple[bpy.types.PoseBone, np.ndarray]]:
-    """Return the bone on the other side of each bone, and the (3, 3) reflection of its axes to those of the bone.
+def _mirror_images(bones: Sequence[bpy.types.PoseBone]) -> dict[str, bpy.types.PoseBone]:
+    """Return the bone on the other side of each keyed bone; a bone in the middle is its own mirror image.
 
-    A bone without a side is its own mirror image. Where no name has a side, as in `arm_06`, rest positions tell. Empty
-    if no keyed bone has another side, or if their heads in the rest pose are not mirror images about the YZ plane of
-    the armature.
+    Names tell the sides, or rest positions where no name has a side, as in `arm_06`. Empty if no bone has another side,
+    or if their heads in the rest pose are not mirror images about the YZ plane of the armature.
     """
-    bones, reflection = armature_object.pose.bones, np.diag([-1.0, 1.0, 1.0])
-    pairs = [(bone, bones.get(flipped_name(bone.name), bone)) for bone in bones]
-    if all(bone == partner for bone, partner in pairs):
-        ends = np.array([[*bone.bone.head_local, *bone.bone.tail_local] for bone in bones]).reshape(-1, 2, 3)
-        distances = np.linalg.norm(ends[:, None] - ends[None] @ reflection, axis=-1).max(axis=-1)
+    if not bones:
+        return {}
+    by_name = {bone.name: bone for bone in bones}
+    partners = [by_name.get(flipped_name(bone.name), bone) for bone in bones]
+    ends = np.array([[bone.bone.head_local, bone.bone.tail_local] for bone in bones])
+    if partners == list(bones):
+        distances = np.linalg.norm(ends[:, None] - ends[None] @ _REFLECTION, axis=-1).max(axis=-1)
         # Of several bones in the middle, each is its own mirror image.
         np.fill_diagonal(distances, distances.diagonal() * (1 - 1e-3) - 1e-6)
-        pairs = [(bone, bones[int(index)]) for bone, index in zip(bones, distances.argmin(axis=1), strict=True)]
-    pairs = [(bone, partner) for bone, partner in pairs if keyed_names & {bone.name, partner.name}]
-    heads = np.array([[bone.bone.head_local, partner.bone.head_local] for bone, partner in pairs]).reshape(-1, 2, 3)
-    distances = np.linalg.norm(heads[:, 0] - heads[:, 1] @ reflection, axis=1)
-    if (
-        all(bone == partner for bone, partner in pairs)
-        or distances.max() > HEAD_TOLERANCE * np.ptp(heads, axis=(0, 1)).max()
-    ):
-        return {}
-    axes = {bone: np.array(bone.bone.matrix_local.to_3x3()) for pair in pairs for bone in pair}
-    return {bone.name: (partner, axes[bone].T @ reflection @ axes[partner]) for bone, partner in pairs}
+        partners = [bones[int(index)] for index in distances.argmin(axis=1)]
+    images = {bone.name: partner for bone, partner in zip(bones, partners, strict=True)}
+    heads, image_heads = ends[:, 0], np.array([partner.bone.head_local for partner in partners]) @ _REFLECTION
+    are_pairs = all(images[partner.name] == bone for bone, partner in zip(bones, partners, strict=True))
+    is_symmetric = np.linalg.norm(heads - image_heads, axis=1).max() <= HEAD_TOLERANCE * np.ptp(heads, axis=0).max()
+    return images if are_pairs and is_symmetric and partners != list(bones) else {}
 
 
 def _bone_values(
     bone: bpy.types.PoseBone,
     clips: Iterable[tuple[range, dict[str, CurvesByChannel]]],
-    image: tuple[bpy.types.PoseBone, np.ndarray] | None = None,
+    image: bpy.types.PoseBone | None = None,
 ) -> dict[str, np.ndarray]:
     """Return (F, 3) values of a bone in all frames, by kind, or (2 F, 3) with the frames of its mirror image.
 
     Args:
         clips: the frames and F-curves of each action.
-        image: the mirror image of the bone (`_mirror_images`).
+        image: the mirror image of the bone.
     """
     quaternions, locations, scales = _read_channels(bone, clips)
     if image is not None:
-        partner, axes = image
-        other_quaternions, other_locations, other_scales = _read_channels(partner, clips)
+        axes, image_axes = (np.array(b.bone.matrix_local.to_3x3()) for b in (bone, image))
+        turn = (axes.T @ _REFLECTION @ image_axes).T
+        image_quaternions, image_locations, image_scales = _read_channels(image, clips)
         # A reflection turns the axis of a rotation, and reverses its direction.
-        vectors = -other_quaternions[:, 1:] @ axes.T
-        quaternions = np.concatenate([quaternions, np.column_stack([other_quaternions[:, 0], vectors])])
-        locations = np.concatenate([locations, other_locations @ axes.T])
-        scales = np.concatenate([scales, other_scales @ (axes.T**2)])
+        vectors = -image_quaternions[:, 1:] @ turn
+        quaternions = np.concatenate([quaternions, np.column_stack([image_quaternions[:, 0], vectors])])
+        locations = np.concatenate(
+            [locations, image_locations @ (turn if bone.bone.use_local_location else _REFLECTION)]
+        )
+        scales = np.concatenate([scales, image_scales @ turn**2])
     return {ROTATION_VECTOR: rotation_vectors(quaternions), LOCATION: locations, SCALE: scales}
 
 

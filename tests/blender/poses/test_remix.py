@@ -22,7 +22,7 @@ from fdda_addon.scene.compatibility import curves_of_slot
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from ..conftest import run
-from ..figure import FRAMES, add_wave, build_figure, edit_bones
+from ..figure import FRAMES, add_wave, build_figure, edit_bones, key_channel
 
 WAVE, STILL, TURN = "wave", "one frame", "turn the dial"
 
@@ -83,17 +83,28 @@ def test_remixed_frames_show_the_pose_of_the_action(waving):
         assert armature_object["dial"] == pytest.approx(dial)
 
 
-@pytest.mark.parametrize(("roll", "left"), [(0.0, "arm.L"), (0.7, "arm.L"), (0.0, "arm_07")])
-def test_mirror_images_of_the_frames_follow_where_bones_have_two_sides(roll, left):
-    """Whatever the roll of the bones, and without names of sides."""
+@pytest.mark.parametrize(
+    ("roll", "left", "is_local"), [(0.0, "arm.L", True), (0.7, "arm.L", True), (0.7, "arm.L", False), (0.0, "a7", True)]
+)
+def test_mirror_images_of_the_frames_follow_where_bones_have_two_sides(roll, left, is_local):
+    """Whatever the roll of the bones and the space of locations, and without names of sides."""
     figure = build_figure()
     armature_object = figure.armature_object
     edit_bones(figure, lambda bones: setattr(bones["arm.L"], "roll", bones["arm.L"].roll + roll))
+    for bone in armature_object.data.bones:
+        bone.use_local_location = is_local
     action = add_wave(figure)
+    key_channel(armature_object.pose.bones["arm.L"], 1, "location", (0.03, 0.02, 0.04))
+    armature_object.pose.bones["arm.R"]["fist"] = 0.25
+    armature_object.pose.bones["arm.R"].keyframe_insert('["fist"]', frame=1)
     armature_object.data.bones["arm.L"].name = left
     sides = "spine", left, "arm.R"
     remix = read_remix(figure, [action])
     assert len(remix.values) == 2 * FRAMES
+    fists = {channel.name.split('"')[1]: n for n, channel in enumerate(remix.channels) if "fist" in channel.name}
+    columns = [fists[left], fists["arm.R"]]
+    assert remix.values[FRAMES:, columns] == pytest.approx(remix.values[:FRAMES, columns[::-1]])
+    assert (remix.values[:FRAMES, fists["arm.R"]] == 0.25).all()
     heads_and_tails = []
     for index in (9, FRAMES + 9):
         armature_object.animation_data.action = None
