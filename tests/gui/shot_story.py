@@ -143,7 +143,7 @@ def show_the_rig_beside(folder: Path) -> Iterator[float]:
     yield from park_mouse()
     bpy.context.scene.frame_set(1)
     yield from start_playback()
-    yield from wait_until(lambda: bpy.context.scene.frame_current > 40, 30, "the action does not go on")
+    yield from wait_until(lambda: bpy.context.scene.frame_current > 10, 120, "the action does not go on")
     yield from stop_playback()
     require(
         mean_distance_mm(
