@@ -88,13 +88,15 @@ def query_interpreter(command: list[str]) -> Interpreter | None:
 
 
 def default_candidates() -> Iterator[list[str]]:
-    """Yield command lines that may start a Python: Blender's own, and those on PATH."""
+    """Yield command lines that may start a Python: Blender's own, those on PATH, and those of Homebrew."""
     if sys.executable:
         yield [sys.executable]
     if os.name == "nt":
         yield from _windows_candidates()
         return
-    yield from ([f"python{version}"] for version in PREFERRED_VERSIONS)
+    # PATH lacks the folders of Homebrew and python.org in a Blender that was started from its icon.
+    for folder in ("", "/opt/homebrew/bin/", "/usr/local/bin/"):
+        yield from ([f"{folder}python{version}"] for version in PREFERRED_VERSIONS)
     # On macOS /usr/bin/python3 opens a dialog that installs the developer tools.
     if sys.platform != "darwin":
         yield from (["python3"], ["python"])

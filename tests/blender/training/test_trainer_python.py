@@ -190,6 +190,18 @@ def test_pythons_are_searched_on_the_path_of_windows(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.one_blender_version
+@pytest.mark.parametrize("platform", ["darwin", "linux"])
+def test_pythons_are_searched_in_folders_that_path_lacks(monkeypatch: pytest.MonkeyPatch, platform: str):
+    """On macOS, PATH lacks the folders of Homebrew and python.org in a Blender that was started from its icon."""
+    monkeypatch.setattr(interpreters.os, "name", "posix")
+    monkeypatch.setattr(interpreters.sys, "platform", platform)
+    candidates = [command for (command,) in interpreters.default_candidates()]
+    assert candidates[:2] == [sys.executable, "python3.13"]
+    assert {"/opt/homebrew/bin/python3.13", "/usr/local/bin/python3.11"} <= set(candidates)
+    assert ("python3" in candidates) is (platform == "linux")
+
+
+@pytest.mark.one_blender_version
 def test_package_names_match_the_trainer_group_of_pyproject():
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
     assert set(folder.PACKAGES) == {requirement.partition("==")[0] for requirement in groups["trainer"]}
