@@ -70,7 +70,10 @@ _REPORT_KEYS = {
     "joints": int,
     "controls?": [str],
     "poses": int,
-    "training": {"seconds": float, "device": str, "passes": int, "training_poses": int, "held_out_poses": int},
+    "training": {
+        **{"seconds": float, "device": str, "passes": int, "training_poses": int, "held_out_poses": int},
+        "bones_to_read": str,
+    },
     "parity": float,
     "constant_bytes?": int,
     "fdda": {"training": _ERROR_STATISTICS, "held_out": _ERROR_STATISTICS},

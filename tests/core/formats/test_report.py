@@ -21,7 +21,10 @@ REPORT = {
     "vertices": 300,
     "joints": 2,
     "poses": 150,
-    "training": {"seconds": 1.5, "device": "cpu", "passes": 2, "training_poses": 120, "held_out_poses": 15},
+    "training": {
+        **{"seconds": 1.5, "device": "cpu", "passes": 2, "training_poses": 120, "held_out_poses": 15},
+        "bones_to_read": "all",
+    },
     "parity": 1e-4,
     "fdda": {"training": ERRORS, "held_out": ERRORS},
     "linear": {"held_out": ERRORS},
@@ -85,6 +88,7 @@ def test_optional_keys_may_be_missing(tmp_path, key):
 
 DAMAGES = [
     (("fdda",), ..., "it has no fdda"),
+    (("training", "bones_to_read"), ..., "training has no bones_to_read"),
     (("fdda", "held_out"), 3, "fdda.held_out is no object"),
     (("fdda", "held_out", "p999"), ..., "fdda.held_out has no p999"),
     (("fdda", "held_out", "max"), "2", "fdda.held_out.max is no number"),
