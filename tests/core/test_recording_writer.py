@@ -133,7 +133,7 @@ def test_poses_are_incomplete_if_the_index_cannot_be_written(tmp_path, monkeypat
 
     rig = make_rig()
     with (
-        pytest.raises(OutputError, match="5 of 12 poses are complete, continue with --resume"),
+        pytest.raises(OutputError, match="5 of 12 poses are complete; make room and run the command again"),
         RecordingWriter(tmp_path / "r", rig, recording_info(POSE_COUNT)) as writer,
     ):
         writer.append(random_poses(POSE_COUNT)[:5], random_positions(POSE_COUNT)[:5])

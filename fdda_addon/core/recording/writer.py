@@ -243,11 +243,11 @@ class RecordingWriter:
             raise self._write_error(error) from error
 
     def _write_error(self, error: OSError) -> OutputError:
-        progress = f"{self.complete} of {self.info.poses} poses are complete, continue with --resume"
-        return OutputError(
-            f"Cannot write the recording '{self.path}': {os_error_text(error)}; "
-            f"{progress if self.complete else 'make room or choose another folder'}."
-        )
+        advice = "make room or choose another folder"
+        if self.complete:
+            advice = f"{self.complete} of {self.info.poses} poses are complete; make room and run the command again, "
+            advice += "`record` with --resume"
+        return OutputError(f"Cannot write the recording '{self.path}': {os_error_text(error)}; {advice}.")
 
     def __enter__(self) -> "RecordingWriter":
         return self

@@ -18,6 +18,7 @@ PHRASES = (
     ("give --poses or --action", "set Random Poses, or check an action"),
     ("give --action or --strip", "check an action or a strip"),
     ("0 random poses (--action NAME --poses 0)", "Random Poses at 0"),
+    ("run the command again, `record` with --resume", "press Resume"),
     ("(--action NAME)", "in Training Poses"),
 )
 """Phrases with options, and the words of the window where these differ."""

@@ -65,7 +65,7 @@ def test_a_disk_that_fills_up_during_a_recording_leaves_complete_poses(small_dis
     ballast = small_disk / "ballast"
     with (
         pytest.raises(
-            OutputError, match=rf"Cannot write the recording .*: {FULL_DISK_ERROR}; 20 of 100 poses are complete, cont"
+            OutputError, match=rf"Cannot write the recording .*: {FULL_DISK_ERROR}; 20 of 100 poses are complete; make"
         ),
         RecordingWriter(path, rig, recording_info(poses)) as writer,
     ):

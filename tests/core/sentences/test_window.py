@@ -22,6 +22,7 @@ from fdda_addon.core.sentences.window import for_window
             "continue it with --resume, or replace it with --overwrite.",
             "continue it with Resume, or replace it with Overwrite.",
         ),
+        ("make room and run the command again, `record` with --resume.", "make room and press Resume."),
         ("more frames (--settle-frames) let them rest", "more frames (Settle) let them rest"),
         (
             "or record actions alone, with 0 random poses (--action NAME --poses 0).",
