@@ -8,10 +8,13 @@ continued if it was interrupted.
 import argparse
 from pathlib import Path
 
-from ..core.files.file_kind import BLEND, MODEL
+from ..core.files.file_kind import BLEND, CHECKPOINT, MODEL, PAGE, REPORT
 from ..core.files.output import check_folder_writable, check_outputs
+from ..core.formats.report import checkpoint_path, page_path, report_path
+from ..core.recording.folder import is_recorded
 from ..core.recording.index import INDEX_NAME, read_index
 from . import bind, check_trainer, record, train
+from .files import check_file
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -22,14 +25,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     recording, model, bound = (options.folder / name for name in ("recording", "model.onnx", "bound.blend"))
-    # What can fail at once is checked before minutes of recording.
-    check_folder_writable(options.folder, [recording.name, model.name, bound.name])
-    if options.folder.is_dir():
-        check_outputs({model: MODEL, bound: BLEND}, [options.rig], options.overwrite)
-    check_trainer.run(options)
     resume = (recording / INDEX_NAME).exists() and not options.overwrite
     values = vars(options) | {"recording": recording, "resume": resume, "refine": None, "all": not options.object}
-    record.run(argparse.Namespace(**values))
+    # What can fail at once is checked before minutes of recording; the check of the trainer's Python takes seconds.
+    record.check_options(argparse.Namespace(**values))
+    check_file(options.rig)
+    kinds = {checkpoint_path(model): CHECKPOINT, report_path(model): REPORT, page_path(model): PAGE}
+    kinds |= {model: MODEL, bound: BLEND}
+    check_folder_writable(options.folder, [recording.name, *(path.name for path in kinds)])
+    if options.folder.is_dir():
+        check_outputs(kinds, [options.rig], options.overwrite)
+    check_trainer.run(options)
+    if resume and is_recorded(recording) and not _has_recording_options(options):
+        print(f"{recording}: used as it is; --overwrite records again")
+    else:
+        record.run(argparse.Namespace(**values))
     overwrite = ["--overwrite"] if options.overwrite else []
     if train.run([str(recording), str(model), *overwrite]):
         raise KeyboardInterrupt
@@ -38,3 +48,11 @@ def run(options: argparse.Namespace) -> None:
     name = meshes[0]["name"] if len(meshes) == 1 else ""
     values = vars(options) | {"object": name, "model": model, "out": bound, "use_in_render": False}
     bind.run(argparse.Namespace(**values))
+
+
+def _has_recording_options(options: argparse.Namespace) -> bool:
+    """Return whether options choose meshes or poses, with which a recording has to be recorded."""
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    defaults = vars(parser.parse_args([str(options.rig), str(options.folder)]))
+    return any(getattr(options, name) != value for name, value in defaults.items())

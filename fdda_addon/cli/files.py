@@ -50,14 +50,19 @@ def open_rig(options: argparse.Namespace) -> SceneRig:
     return find_rig(options.object)
 
 
+def check_file(path: Path) -> None:
+    """Raise an FDDAError if there is no file to open."""
+    if not path.is_file():
+        raise FDDAError(f"There is no file '{path}'; give the path of a .blend file.")
+
+
 def open_file(path: Path) -> None:
     """Open a .blend file.
 
     Raises:
         FDDAError: there is no such file, or Blender cannot read it.
     """
-    if not path.is_file():
-        raise FDDAError(f"There is no file '{path}'; give the path of a .blend file.")
+    check_file(path)
     try:
         with silenced_stdout():
             bpy.ops.wm.open_mainfile(filepath=blender_path(path), load_ui=False)

@@ -61,7 +61,7 @@ def add_recording_options(parser: argparse.ArgumentParser, object_help: str) -> 
 
 
 def run(options: argparse.Namespace) -> None:
-    _check_options(options)
+    check_options(options)
     open_file(options.rig)
     scene_rig = _find_rig(options)
     if not options.refine:
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"{options.recording}: {poses}{meshes}, in {seconds:.1f} s")
 
 
-def _check_options(options: argparse.Namespace) -> None:
+def check_options(options: argparse.Namespace) -> None:
     """Check the options, as far as they need no rig.
 
     Raises:

@@ -5,6 +5,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.progress import Job
+from ..core.recording.folder import is_recorded
 from ..core.recording.index import INDEX_NAME
 from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
@@ -12,7 +13,7 @@ from ..properties.recording_options import planned_pose_count
 from ..recording.rig_check import check_has_weights
 from ..scene.scene_rig import SceneRig, armature_of, describe_left_out
 from .playback import bind_model
-from .recording import is_recorded, record_character, recordable_character, recording_plan
+from .recording import record_character, recordable_character, recording_plan
 from .training import TrainingOperator, is_mesh_recorded
 
 
@@ -40,7 +41,7 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
         if not is_missing:
             unrecorded = [o for o in mesh_objects[1:] if not is_mesh_recorded(o, recording)]
             mesh_objects = [o for o in mesh_objects if o not in unrecorded]
-            self._note = f"{self._note} {describe_left_out(dict.fromkeys(unrecorded, 'not recorded'))}".strip()
+            self._note = f"{self._note} {describe_left_out(dict.fromkeys(unrecorded, 'not in this recording'))}".strip()
         trainings = self.training_plan(mesh_objects, planned_pose_count(shown))
         self.state.plan = JobPlan([*(recording_plan(shown) if is_missing else ()), *trainings])
         if is_missing:

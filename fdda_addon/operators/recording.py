@@ -69,15 +69,6 @@ def recording_plan(rig: SceneRig) -> list[JobStep]:
     return recording_steps(pose_count, bool(settings.learn_from))
 
 
-def is_recorded(path: Path) -> bool:
-    """Return whether a folder has a complete recording."""
-    try:
-        index = read_index(path)
-    except FDDAError:
-        return False
-    return index["complete"] >= index["poses"]
-
-
 class FDDA_OT_record(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.record"
     bl_label = "Record"

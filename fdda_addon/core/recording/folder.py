@@ -210,6 +210,15 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None) -> FolderC
     return FolderContent(FolderState.INCOMPLETE, *pose_counts)
 
 
+def is_recorded(path: Path) -> bool:
+    """Return whether a folder has a complete recording."""
+    try:
+        index = read_index(path)
+    except RecordingError:
+        return False
+    return index["complete"] >= index["poses"]
+
+
 def recordings_in(folder: Path) -> list[Path]:
     """List the recordings in the subfolders of a folder; empty where the folder is a recording itself."""
     if os.path.exists(folder / INDEX_NAME) or not os.path.isdir(folder):

@@ -138,14 +138,19 @@ def test_an_interrupted_recording_resumes_with_the_same_bytes(dressed, tmp_path)
 def test_one_command_records_trains_and_binds_all_meshes(dressed, tmp_path, capfd, monkeypatch):
     command, recording = ("build-model", dressed.rig, tmp_path), tmp_path / "recording"
     shutil.copytree(dressed.recording, recording)
-    (tmp_path / "bound.blend").write_text("mine")
     refusal = Refusal(tmp_path, capfd)
-    assert "another file is there" in refusal(*command)
     with monkeypatch.context() as context:
         context.setenv(PYTHON_VARIABLE, str(tmp_path / "nothing"))
+        for name in ("bound.blend", "report.json", "report.html", "model.checkpoint.npz"):
+            (tmp_path / name).write_text("mine")
+            assert "another file is there" in refusal(*command)
+            (tmp_path / name).unlink()
         assert "cannot be started" in refusal(*command, "--overwrite")
-    (tmp_path / "bound.blend").unlink()
-    lines = output_of(*command, *OPTIONS).out
+        assert "There is no file" in refusal("build-model", dressed.folder / "none.blend", tmp_path)
+        assert run(*command, "--pre-roll", 3) == 2
+    assert "it was recorded differently" in refusal(*command, "--poses", 3)
+    # A complete recording is used even if the default options would record other poses.
+    lines = output_of(*command).out
     assert lines[-3:] == [f"{tmp_path / 'bound.blend'}: '{name}' plays model.onnx" for name in NAMES]
     assert file_contents(recording) == file_contents(dressed.recording)
 
