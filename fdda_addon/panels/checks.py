@@ -73,7 +73,7 @@ def _check(mesh_object: bpy.types.Object) -> RigCheck | None:
         result = check_recordable_rig(scene_rig, settings, previous)
     else:
         result = check_recordable_rig(scene_rig, settings)
-    beside_others = problems_beside_others(scene_rig, settings) if result.problems else ()
+    beside_others = problems_beside_others(scene_rig, settings, result) if result.problems else ()
     result = replace(result, problems=result.problems + problems, problems_beside_others=beside_others)
     _changes.signatures[uid] = signature
     _changes.outdated.discard(uid)
@@ -83,7 +83,8 @@ def _check(mesh_object: bpy.types.Object) -> RigCheck | None:
 
 
 def _drawn_values(check: RigCheck) -> tuple:
-    return id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls
+    problems = check.problems, check.problems_beside_others
+    return id(check.rig), problems, check.channels, check.replaced_modifiers, check.automatic_controls
 
 
 def _change_signature(scene_rig: SceneRig) -> tuple:

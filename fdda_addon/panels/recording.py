@@ -15,6 +15,7 @@ from ..core.recording.index import INDEX_NAME
 from ..core.settings import MAX_AUTO_POSES, POSES
 from ..core.wording import format_count
 from ..jobs import job
+from ..operators.training import is_mesh_recorded
 from ..poses.action_range import action_frames
 from ..properties.character import default_recording, recording_folder
 from ..properties.recording_options import recorded_actions, recording_settings
@@ -45,6 +46,14 @@ def has_recording(rig: SceneRig) -> bool:
     """Return whether the recording folder of a character has its complete recording."""
     content = read_content(rig)
     return not isinstance(content, str) and content[1].state is FolderState.COMPLETE
+
+
+def is_in_recording(rig: SceneRig, shown: SceneRig) -> bool:
+    """Return whether the recording of a shown rig, which is complete, has the mesh of another that is not left out."""
+    path, check = recording_folder(shown.mesh_object), checks.last_check(rig)
+    inputs = path, os.stat(path / INDEX_NAME).st_mtime_ns, rig.mesh_object.name, check and check.rig
+    name = ("mesh in a recording", rig.mesh_object.session_uid)
+    return is_recordable(rig) and computed_once(name, inputs, lambda: is_mesh_recorded(rig.mesh_object, path))
 
 
 def cached_content(rig: SceneRig, path: Path) -> "FolderContent":

@@ -10,7 +10,7 @@ from ..scene.scene_rig import SceneRig
 from . import checks, curves, findings, limits
 from .frame_profile import draw_profile, draw_times
 from .meshes import draw_meshes
-from .recording import has_recording
+from .recording import has_recording, is_in_recording
 from .section import Section, draw_button, draw_job, draw_wrapped, is_recordable, panel_rig
 from .trained_file import find_trained_file
 from .training import read_assessment
@@ -102,7 +102,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context, ri
     row.enabled = not problem
     label, applies_to = "Record, Train & Bind", is_recordable
     if has_recording(rig):
-        label, applies_to = "Train & Bind", has_recording
+        label, applies_to = "Train & Bind", lambda each: each == rig or is_in_recording(each, rig)
     draw_button(row, context, "fdda.build_model", label, "PLAY", applies_to)
     if problem:
         draw_wrapped(layout, context, problem, "INFO")

@@ -125,10 +125,16 @@ def check_recordable_rig(
     return replace(result, problems=tuple(problems))
 
 
-def problems_beside_others(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[str, ...]:
-    """Return why a mesh cannot be recorded together with others, which have what random poses need."""
+def problems_beside_others(
+    scene_rig: SceneRig, settings: RecordingSettings, previous_check: RigCheck | None = None
+) -> tuple[str, ...]:
+    """Return why a mesh cannot be recorded together with others, which have what random poses need.
+
+    Args:
+        scene_rig, settings, previous_check: as of `check_recordable_rig`.
+    """
     inputs = tuple(text for text in settings.extra_inputs if _has_input(scene_rig, settings, text))
-    return check_recordable_rig(scene_rig, replace(settings, poses=0, extra_inputs=inputs)).problems
+    return check_recordable_rig(scene_rig, replace(settings, poses=0, extra_inputs=inputs), previous_check).problems
 
 
 def _has_input(scene_rig: SceneRig, settings: RecordingSettings, text: str) -> bool:
