@@ -51,18 +51,22 @@ def has_recording(rig: SceneRig) -> bool:
 def is_in_recording(rig: SceneRig, shown: SceneRig) -> bool:
     """Return whether the recording of a shown rig, which is complete, has the mesh of another that is not left out."""
     path, check = recording_folder(shown.mesh_object), checks.last_check(rig)
-    inputs = path, os.stat(path / INDEX_NAME).st_mtime_ns, rig.mesh_object.name, check and check.rig
+    inputs = path, _modified_ns(path), rig.mesh_object.name, check and check.rig
     name = ("mesh in a recording", rig.mesh_object.session_uid)
     return is_recordable(rig) and computed_once(name, inputs, lambda: is_mesh_recorded(rig.mesh_object, path))
+
+
+def _modified_ns(path: Path) -> int:
+    """Return when the index of a recording was written; -1 for a folder without one, 0 for none."""
+    try:
+        return os.stat(path / INDEX_NAME).st_mtime_ns
+    except OSError:
+        return -1 if path.exists() else 0
 
 
 def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     """Return the content of a recording folder. Read it again after a change of the folder, the rig or the settings."""
     check, settings = checks.last_check(rig), recording_settings(rig)
-    try:
-        modified_ns = os.stat(path / INDEX_NAME).st_mtime_ns
-    except OSError:
-        modified_ns = -1 if path.exists() else 0
 
     def read() -> "FolderContent":
         if check is None or check.rig is None:
@@ -82,7 +86,7 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
         return read_folder(path, recorded_rig, sampling)
 
     name = ("recording folder", rig.mesh_object.session_uid)
-    return computed_once(name, (path, modified_ns, check, settings), read)
+    return computed_once(name, (path, _modified_ns(path), check, settings), read)
 
 
 class FDDA_PT_recording(Section, bpy.types.Panel):
