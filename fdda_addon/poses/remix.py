@@ -129,7 +129,7 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
     limbs = dict(zip((bone.name for bone in bones), find_limbs(_parents(bones)).tolist(), strict=True))
     columns: list[tuple[Channel, np.ndarray, int, bool]] = []
     for bone in bones:
-        for kind, values in _bone_values(bone, clips, mirror.get(bone.name)).items():
+        for kind, values in _bone_values(bone, clips, mirror).items():
             is_used = np.abs(values - _REST_VALUES[kind]).max(axis=0) > RANGE_TOLERANCE
             for axis in range(3):
                 if is_used[axis] or (kind == ROTATION_VECTOR and is_used.any()):
@@ -143,11 +143,12 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
     bones_by_path = {bone.path_from_id(): bone for bone in bones}
     numbers = _number_values(scene_rig, actions)
     for (owner, path), values in numbers.items():
-        bone_path, image_path = path[: path.find('"]') + 2], flipped_path(path)
+        bone_path = path[: path.find('"]') + 2]
         bone = bones_by_path.get(bone_path)
         if mirror:
-            if bone is not None:
-                image_path = mirror[bone.name].path_from_id() + path.removeprefix(bone_path)
+            image_path = flipped_path(path) if bone is None else path
+            if bone is not None and bone.name in mirror:
+                image_path = mirror[bone.name].path_from_id() + flipped_path(path.removeprefix(bone_path))
             values = np.concatenate([values, numbers.get((owner, image_path), values)])
         limb = len(bones) if bone is None else limbs[bone.name]
         columns.append((Channel(f"{owner}/{path}", CONTROL, 0, *_bounds(values)), values, limb, False))
@@ -174,10 +175,11 @@ def _bounds(values: np.ndarray) -> tuple[float, float]:
 
 
 def _mirror_images(bones: Sequence[bpy.types.PoseBone]) -> dict[str, bpy.types.PoseBone]:
-    """Return the bone on the other side of each keyed bone; a bone in the middle is its own mirror image.
+    """Return the bone on the other side of keyed bones; a bone in the middle is its own mirror image.
 
-    Names tell the sides, or rest positions where no name has a side, as in `arm_06`. Empty if no bone has another side,
-    or if their heads in the rest pose are not mirror images about the YZ plane of the armature.
+    Names tell the sides, or rest positions where no name has a side, as in `arm_06`. Bones are left out whose head in
+    the rest pose is not the mirror image of the other's about the YZ plane of the armature. Empty if no bone has
+    another side.
     """
     if not bones:
         return {}
@@ -189,37 +191,51 @@ def _mirror_images(bones: Sequence[bpy.types.PoseBone]) -> dict[str, bpy.types.P
         # Of several bones in the middle, each is its own mirror image.
         np.fill_diagonal(distances, distances.diagonal() * (1 - 1e-3) - 1e-6)
         partners = [bones[int(index)] for index in distances.argmin(axis=1)]
-    images = {bone.name: partner for bone, partner in zip(bones, partners, strict=True)}
+    partner_of = dict(zip((bone.name for bone in bones), partners, strict=True))
     heads, image_heads = ends[:, 0], np.array([partner.bone.head_local for partner in partners]) @ _REFLECTION
-    are_pairs = all(images[partner.name] == bone for bone, partner in zip(bones, partners, strict=True))
-    is_symmetric = np.linalg.norm(heads - image_heads, axis=1).max() <= HEAD_TOLERANCE * np.ptp(heads, axis=0).max()
-    return images if are_pairs and is_symmetric and partners != list(bones) else {}
+    is_image = np.linalg.norm(heads - image_heads, axis=1) <= HEAD_TOLERANCE * np.ptp(heads, axis=0).max()
+    images = {
+        bone.name: partner
+        for bone, partner, is_symmetric in zip(bones, partners, is_image, strict=True)
+        if is_symmetric and partner_of[partner.name] == bone
+    }
+    return images if any(image.name != name for name, image in images.items()) else {}
 
 
 def _bone_values(
     bone: bpy.types.PoseBone,
     clips: Iterable[tuple[range, dict[str, CurvesByChannel]]],
-    image: bpy.types.PoseBone | None = None,
+    mirror: dict[str, bpy.types.PoseBone],
 ) -> dict[str, np.ndarray]:
-    """Return (F, 3) values of a bone in all frames, by kind, or (2 F, 3) with the frames of its mirror image.
+    """Return (F, 3) values of a bone in all frames, by kind.
 
     Args:
         clips: the frames and F-curves of each action.
-        image: the mirror image of the bone.
+        mirror: mirror images of the bones (`_mirror_images`). Unless it is empty, the frames of the bone's image
+            follow, or those of the bone again, (2 F, 3).
     """
-    quaternions, locations, scales = _read_channels(bone, clips)
-    if image is not None:
-        axes, image_axes = (np.array(b.bone.matrix_local.to_3x3()) for b in (bone, image))
-        turn = (axes.T @ _REFLECTION @ image_axes).T
-        image_quaternions, image_locations, image_scales = _read_channels(image, clips)
-        # A reflection turns the axis of a rotation, and reverses its direction.
-        vectors = -image_quaternions[:, 1:] @ turn
-        quaternions = np.concatenate([quaternions, np.column_stack([image_quaternions[:, 0], vectors])])
-        locations = np.concatenate(
-            [locations, image_locations @ (turn if bone.bone.use_local_location else _REFLECTION)]
-        )
-        scales = np.concatenate([scales, image_scales @ turn**2])
+    channels = [_read_channels(bone, clips)]
+    if mirror:
+        channels.append(_image_channels(bone, mirror[bone.name], clips) if bone.name in mirror else channels[0])
+    quaternions, locations, scales = (np.concatenate(values) for values in zip(*channels, strict=True))
     return {ROTATION_VECTOR: rotation_vectors(quaternions), LOCATION: locations, SCALE: scales}
+
+
+def _image_channels(
+    bone: bpy.types.PoseBone, image: bpy.types.PoseBone, clips: Iterable[tuple[range, dict[str, CurvesByChannel]]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (F, 4) quaternions, (F, 3) locations and scales that mirror those of another bone."""
+    axes, image_axes = (np.array(each.bone.matrix_local.to_3x3()) for each in (bone, image))
+    turn = image_axes.T @ _REFLECTION @ axes
+    # Without Local Location, a location is in the space of the armature.
+    space, image_space = (
+        each_axes if each.bone.use_local_location else np.eye(3)
+        for each, each_axes in ((bone, axes), (image, image_axes))
+    )
+    quaternions, locations, scales = _read_channels(image, clips)
+    # A reflection turns the axis of a rotation, and reverses its direction.
+    quaternions = np.column_stack([quaternions[:, 0], -quaternions[:, 1:] @ turn])
+    return quaternions, locations @ image_space.T @ _REFLECTION @ space, scales @ turn**2
 
 
 def _read_channels(

@@ -362,7 +362,7 @@ def plan_alone_poses(
         player: player of the clips.
         has_target: the surface is that of a target, so bones other than the joints may deform it.
     """
-    count, sampler = max(MIN_DRAWN_POSES, settings.influence_poses), make_pose_sampler(scene_rig, rig, settings)
+    count, sampler = max(MIN_DRAWN_POSES, settings.influence_poses), make_pose_sampler(scene_rig, settings)
     poses = [sampler.draw_pose(channels, SEED_OFFSET + index) for index in range(count)] if channels else []
     # Channels do not move the other joints that have a joint as their reference joint.
     has_references = any(joint.reference is not None for joint in rig.joints)

@@ -127,18 +127,18 @@ def random_pose_channels(scene_rig: SceneRig, rig: Rig, selection: SampleSelecti
         for control in selection.controls
         if control.is_shape_key and control.name in unposed_keys
     )
-    return (*channels, *key_channels)
+    # Bones that drive shape keys and are no joints act through these alone.
+    keys = selection.key_bones.difference(rig.joint_names)
+    keys |= {control.name for control in selection.controls if control.is_shape_key}
+    return tuple(replace(channel, is_key=channel.name in keys) for channel in (*channels, *key_channels))
 
 
-def make_pose_sampler(scene_rig: SceneRig, rig: Rig, settings: RecordingSettings) -> PoseSampler:
-    """Make the sampler of the random poses of a recording. Bones that drive shape keys and are no joints are keys."""
+def make_pose_sampler(scene_rig: SceneRig, settings: RecordingSettings) -> PoseSampler:
+    """Make the sampler of the random poses of a recording."""
     remix = None
     if REMIX in settings.bones_to_pose and settings.poses:
         remix = read_remix(scene_rig, find_actions(settings))
-    selection = read_sample_selection(scene_rig, settings)[0]
-    keys = selection.key_bones.difference(rig.joint_names)
-    keys |= {control.name for control in rig.controls if control.is_shape_key}
-    return PoseSampler(settings.seed, settings.spread, remix, keys)
+    return PoseSampler(settings.seed, settings.spread, remix)
 
 
 def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings, controls: Iterable[Control]) -> bool:

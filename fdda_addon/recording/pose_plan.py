@@ -53,7 +53,6 @@ class PosePlan:
     def __init__(
         self,
         scene_rig: SceneRig,
-        rig: Rig,
         channels: tuple[Channel, ...],
         settings: RecordingSettings,
         clips: tuple[Clip, ...],
@@ -74,7 +73,7 @@ class PosePlan:
         self.total = settings.poses + sum(len(clip.frames) for clip in clips)
         self._overshoot = make_recording_overshoot(self._scene_rig, settings, self._channels)
         self.in_range_count = settings.poses - (self._overshoot.poses if self._overshoot else 0)
-        self._sampler = make_pose_sampler(scene_rig, rig, settings)
+        self._sampler = make_pose_sampler(scene_rig, settings)
 
     def show_poses(self, player: ClipPlayer, pose_indices: Container[int]) -> Iterator[int]:
         """Set the poses with the given indices, one per iteration, and yield each index.
@@ -243,9 +242,9 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
 
     settings = replace(settings, poses=max(1, settings.poses))
     index = min(index, settings.poses - 1)
-    rig, channels = read_sampled_rig(scene_rig, settings)
+    _, channels = read_sampled_rig(scene_rig, settings)
     overshoot = make_recording_overshoot(scene_rig, settings, channels)
-    sampler = make_pose_sampler(scene_rig, rig, settings)
+    sampler = make_pose_sampler(scene_rig, settings)
     if overshoot and index >= settings.poses - overshoot.poses:
         channels, sampler = overshoot.channels, replace(sampler, remix=None)
     clear_pose(scene_rig.armature_object)

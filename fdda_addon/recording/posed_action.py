@@ -72,7 +72,7 @@ def make_posed_action(
         channels = info.sampling.channels
         kinds = {RANDOM, ACTION, STRIP, MIRRORED}
         recorded = replace(info.sampling, sources=tuple(s for s in info.sampling.sources if s.kind in kinds))
-        remix = make_pose_sampler(scene_rig, rig, settings).remix
+        remix = make_pose_sampler(scene_rig, settings).remix
         recorded_limbs, limbs = (
             tuple(channel for channel in each if channel.kind == ROTATION_VECTOR)
             for each in (channels, remix.channels if remix else channels)
@@ -84,7 +84,7 @@ def make_posed_action(
                 "axes have changed; record again, or leave --recording out."
             )
     clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
-    plan = PosePlan(scene_rig, rig, channels, settings, clips)
+    plan = PosePlan(scene_rig, channels, settings, clips)
     if plan.total < 1:
         raise RigError("There is no pose: 0 random poses and no action; give --poses or --action.")
     names = [channel.name for channel in channels if channel.kind == CONTROL and can_be_set(channel.name)]

@@ -173,7 +173,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             notes.append(check_time_inputs(scene_rig, rig.controls, stack, actions, mesh_object))
     check_recordable(path, settings.resume, settings.overwrite)
     pose_setter = make_pose_setter(scene_rig, settings.target, clips, settings.poses, rig.controls)
-    plan = PosePlan(scene_rig, rig, channels, settings, clips, pose_setter)
+    plan = PosePlan(scene_rig, channels, settings, clips, pose_setter)
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     target = pose_setter.target
@@ -194,7 +194,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
                 bytes_per_pose = recording_bytes(rig, 1) - recording_bytes(rig, 0)
                 poses = automatic_poses(seconds_per_pose, bytes_per_pose, free_bytes(path))
                 settings = replace(settings, poses=poses, auto_poses=False)
-                plan = PosePlan(scene_rig, rig, channels, settings, clips, pose_setter)
+                plan = PosePlan(scene_rig, channels, settings, clips, pose_setter)
                 notes.append(f"{format_count(poses, 'random pose')}, at {1000 * seconds_per_pose:.1f} ms each.")
             notes += [check_seams(evaluator, plan, player), check_saturation(evaluator)]
         for note in filter(None, notes):

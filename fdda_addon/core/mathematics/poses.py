@@ -21,6 +21,8 @@ MAX_OVERSHOOT = 4.0
 """Largest scale of the range of motion; animators need no wider poses."""
 LOCKED_AXIS_ANGLE = np.pi / 4
 """Largest rotation of a locked axis in the overshoot, radians, for each unit by which the factor exceeds 1."""
+REST_STREAM = 2
+"""Number that distinguishes the random stream of resting keys from the others of a pose."""
 RANGE_TOLERANCE = 1e-4
 """Largest difference of two limits that count as equal, radians or meters. Blender stores them as float32."""
 
@@ -36,6 +38,7 @@ class Channel:
             unit of its property).
         axis: 0, 1 or 2; 0 for a control.
         low, high: the range of motion.
+        is_key: it is a shape key, or belongs to a bone that acts through shape keys alone (`sample_pose`).
     """
 
     name: str
@@ -43,6 +46,7 @@ class Channel:
     axis: int
     low: float
     high: float
+    is_key: bool = False
 
     @property
     def rest(self) -> float:
@@ -73,6 +77,8 @@ class Channel:
             raise ValueError(f"its range of motion is of a bone called {channel.name!r}")
         if channel.kind not in CHANNEL_KINDS or type(channel.axis) is not int or channel.axis not in range(3):
             raise ValueError(f"its range of motion of {channel.name!r} is of {channel.kind!r}, axis {channel.axis!r}")
+        if type(channel.is_key) is not bool:
+            raise ValueError(f"its range of motion of {channel.name!r} has is_key {channel.is_key!r}")
         for limit in (channel.low, channel.high):
             if type(limit) not in (int, float) or not np.isfinite(float(limit)):
                 raise ValueError(f"its range of motion of {channel.name!r} ends at {limit!r}")
@@ -84,7 +90,9 @@ class Channel:
 def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: float = SPREAD.default) -> np.ndarray:
     """Draw one pose from normal distributions around the centers of the ranges, truncated to the ranges.
 
-    The pose depends on seed and index alone, so a resumed recording continues with the same poses.
+    Each key moves with a probability that the pose draws from 0 to 1, and rests otherwise, because animation moves few
+    of many keys at once. If there are only keys, at least one moves. The pose depends on channels, seed and index
+    alone, so a resumed recording continues with the same poses.
 
     Args:
         channels: C channels with their ranges.
@@ -101,7 +109,15 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
     while len(outside := np.flatnonzero(np.abs(offsets) > 1)):
         offsets[outside] = rng.standard_normal(len(outside)) * spread
     # Rounding may lead to values slightly outside of the range.
-    return np.clip((low + high) / 2 + (high - low) / 2 * offsets, low, high)
+    values = np.clip((low + high) / 2 + (high - low) / 2 * offsets, low, high)
+    if keys := list(dict.fromkeys(channel.name for channel in channels if channel.is_key)):
+        rng = np.random.default_rng([seed, index, REST_STREAM])
+        probability, draws = rng.random(), rng.random(len(keys))
+        if len(keys) == len({channel.name for channel in channels}):
+            draws[draws.argmin()] = -1.0
+        resting = {key for key, draw in zip(keys, draws, strict=True) if draw >= probability}
+        values = np.array([c.rest if c.name in resting else value for c, value in zip(channels, values, strict=True)])
+    return values
 
 
 def widen_ranges(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:

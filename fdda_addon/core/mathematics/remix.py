@@ -4,9 +4,6 @@
 The rotations of a limb belong together, as in real animation. The limbs are independent of each other, so that a model
 does not learn that both arms swing in step. A little noise reaches what lies between and beyond the frames. Every
 second pose is a plain random pose in the ranges of the same channels.
-
-In a plain random pose, some keys rest: shape keys, and bones that act through these alone. Animation moves few of the
-many keys of a face at once.
 """
 
 from collections.abc import Sequence
@@ -19,8 +16,8 @@ from .rotations import multiply_quaternions, to_quaternions, to_rotation_vectors
 
 NOISE_RADIANS = 0.2
 """Standard deviation of the noise about each free axis of a bone, radians (docs/experiments.md)."""
-REMIX_STREAM, REST_STREAM = 1, 2
-"""Numbers that distinguish the random streams of frames and noise, and of resting keys, from that of `sample_pose`."""
+REMIX_STREAM = 1
+"""Number that distinguishes the random stream of frames and noise from those of `sample_pose`."""
 
 
 def find_limbs(parents: Sequence[int]) -> np.ndarray:
@@ -88,18 +85,14 @@ class PoseSampler:
     Attributes:
         seed, spread: as for `sample_pose`.
         remix: the frames whose limbs are combined; None for poses in the ranges of motion.
-        keys: names of the controls that are shape keys, and of the bones that act through these alone.
     """
 
     seed: int
     spread: float
     remix: Remix | None = None
-    keys: frozenset[str] = frozenset()
 
     def draw_pose(self, channels: tuple[Channel, ...], index: int) -> np.ndarray:
         """Draw a pose. Channels that are not remixed, and those of every second pose, are drawn from their ranges.
-
-        Each key moves with a probability that the pose draws from 0 to 1, and rests otherwise.
 
         Args:
             channels: C channels.
@@ -109,11 +102,6 @@ class PoseSampler:
             (C,) float64, each in the unit of its channel.
         """
         values = sample_pose(channels, self.seed, index, self.spread)
-        rng = np.random.default_rng([self.seed, index, REST_STREAM])
-        names = list(dict.fromkeys(channel.name for channel in channels if channel.name in self.keys))
-        probability, draws = rng.random(), rng.random(len(names))
-        resting = {name for name, draw in zip(names, draws, strict=True) if draw >= probability}
-        values = np.array([c.rest if c.name in resting else v for c, v in zip(channels, values, strict=True)])
         if self.remix is not None and index % 2 == 0:
             remixed_values = dict(
                 zip(map(_key, self.remix.channels), self.remix.draw_pose(self.seed, index), strict=True)

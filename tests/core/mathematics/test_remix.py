@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Remixed poses: limbs from different frames, with noise, and the plain random poses between them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -91,13 +93,14 @@ def test_every_second_pose_is_drawn_from_the_ranges():
 
 def test_keys_rest_in_a_part_of_the_plain_poses():
     """From none to all keys move in a pose; those that do have the values of `sample_pose`."""
-    keys = [Channel(f"key {number}", CONTROL, 0, -0.5, 1.0) for number in range(30)]
-    lid = [Channel("lid", LOCATION, 0, -0.1, 0.1), Channel("lid", SCALE, 0, 0.5, 1.5)]
+    keys = [Channel(f"key {number}", CONTROL, 0, -0.5, 1.0, True) for number in range(30)]
+    # The locked axis of a bone rests with the others.
+    lid = [Channel("lid", LOCATION, 0, -0.1, 0.1, True), Channel("lid", SCALE, 0, 0.5, 1.5)]
     channels = (*keys, *lid, Channel("jaw", ROTATION, 0, -1.0, 1.0))
-    sampler = PoseSampler(3, 1.0, keys=frozenset(channel.name for channel in channels) - {"jaw"})
+    no_keys = tuple(replace(channel, is_key=False) for channel in channels)
     poses, plain = (
-        np.stack([draw(index) for index in range(300)])
-        for draw in (lambda index: sampler.draw_pose(channels, index), lambda index: sample_pose(channels, 3, index))
+        np.stack([sample_pose(drawn_channels, 3, index) for index in range(300)])
+        for drawn_channels in (channels, no_keys)
     )
     moves = poses == plain
     assert np.array_equal(poses[~moves], np.broadcast_to([c.rest for c in channels], poses.shape)[~moves])
@@ -106,8 +109,10 @@ def test_keys_rest_in_a_part_of_the_plain_poses():
     assert counts.min() == 0 and counts.max() == 30 and counts.mean() == pytest.approx(15, rel=0.1)
     assert np.ptp(moves[:, :30].mean(axis=0)) < 0.15
     remix = make_remix()
-    remixed = PoseSampler(5, 0.5, remix, frozenset("ab")).draw_pose(remix.channels, 4)
-    assert np.array_equal(remixed, remix.draw_pose(5, 4))
+    remixed_keys = tuple(replace(channel, is_key=True) for channel in remix.channels)
+    assert np.array_equal(PoseSampler(5, 0.5, remix).draw_pose(remixed_keys, 4), remix.draw_pose(5, 4))
+    alone = np.stack([sample_pose(tuple(keys[:2]), 3, index) for index in range(100)])
+    assert (alone != 0).any(axis=1).all() and (alone == 0).any(), "a pose of keys alone moves one"
 
 
 def test_the_channels_of_a_remixed_bone_are_replaced():
