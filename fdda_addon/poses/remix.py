@@ -177,28 +177,17 @@ def _bounds(values: np.ndarray) -> tuple[float, float]:
 def _mirror_images(bones: Sequence[bpy.types.PoseBone]) -> dict[str, bpy.types.PoseBone]:
     """Return the bone on the other side of keyed bones; a bone in the middle is its own mirror image.
 
-    Names tell the sides, or rest positions where no name has a side, as in `arm_06`. Bones are left out whose head in
-    the rest pose is not the mirror image of the other's about the YZ plane of the armature. Empty if no bone has
-    another side.
+    Names tell the sides. Bones are left out whose head in the rest pose is not the mirror image of the other's about
+    the YZ plane of the armature. Empty if no bone has another side.
     """
     if not bones:
         return {}
     by_name = {bone.name: bone for bone in bones}
     partners = [by_name.get(flipped_name(bone.name), bone) for bone in bones]
-    ends = np.array([[bone.bone.head_local, bone.bone.tail_local] for bone in bones])
-    if partners == list(bones):
-        distances = np.linalg.norm(ends[:, None] - ends[None] @ _REFLECTION, axis=-1).max(axis=-1)
-        # Of several bones in the middle, each is its own mirror image.
-        np.fill_diagonal(distances, distances.diagonal() * (1 - 1e-3) - 1e-6)
-        partners = [bones[int(index)] for index in distances.argmin(axis=1)]
-    partner_of = dict(zip((bone.name for bone in bones), partners, strict=True))
-    heads, image_heads = ends[:, 0], np.array([partner.bone.head_local for partner in partners]) @ _REFLECTION
+    heads = np.array([bone.bone.head_local for bone in bones])
+    image_heads = np.array([partner.bone.head_local for partner in partners]) @ _REFLECTION
     is_image = np.linalg.norm(heads - image_heads, axis=1) <= HEAD_TOLERANCE * np.ptp(heads, axis=0).max()
-    images = {
-        bone.name: partner
-        for bone, partner, is_symmetric in zip(bones, partners, is_image, strict=True)
-        if is_symmetric and partner_of[partner.name] == bone
-    }
+    images = {bone.name: partner for bone, partner, fits in zip(bones, partners, is_image, strict=True) if fits}
     return images if any(image.name != name for name, image in images.items()) else {}
 
 
