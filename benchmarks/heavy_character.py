@@ -48,8 +48,8 @@ def measure_inside(bound: Path, action: str) -> dict[str, list[list[float]]]:
         action: name of the action that is played.
 
     Returns:
-        By mesh, with the rig and with the model: the average number of vertices in a frame, and the median and the
-        99th percentile of their depths in all frames, mm.
+        By mesh, with the rig and with the model: the average number of vertices in a frame, and two figures of their
+        depths in all frames, mm. These are the median and the 99th percentile.
     """
     bpy.ops.wm.open_mainfile(filepath=str(bound), load_ui=False)
     fdda_addon.register()
@@ -154,8 +154,8 @@ def main() -> None:
     lines += [
         "",
         f"A frame takes {benchmark['rig']['median']:.1f} ms with the rig and {benchmark['fdda']['median']:.1f} ms with "
-        f"the model, {benchmark['ratio']:.1f} times as fast (quartiles {low:.1f} to {high:.1f}); as a fast rig "
-        f"{fast_ratio} times ({full} and {fast_ms} ms). `record` took {times['record']:.0f} s, `train` "
+        f"the model: {benchmark['ratio']:.1f} times as fast (quartiles {low:.1f} to {high:.1f}). As a fast rig it is "
+        f"{fast_ratio} times as fast ({full} and {fast_ms} ms). `record` took {times['record']:.0f} s, `train` "
         f"{times['train']:.0f} s. The model has {model.stat().st_size / 1e6:.1f} MB.",
     ]
     table = "\n".join(lines)

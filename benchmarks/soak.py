@@ -241,7 +241,7 @@ def run_and_stop(random: Random, command: list, seconds: float) -> bool:
     try:
         output, _ = process.communicate(timeout=seconds)
     except subprocess.TimeoutExpired:
-        process.send_signal(pick(random, (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)))
+        pick(random, (process.kill, process.terminate, lambda: process.send_signal(signal.SIGINT)))()
         process.communicate()
         return True
     if process.returncode:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 
 from ..core.errors import ModelError, RigError
@@ -108,35 +109,8 @@ def export_skinning(
     }
     skins = []
     for index, (mesh_object, part) in enumerate(zip(scene_rig.mesh_objects, recording.rig.mesh_slices, strict=True)):
-        joints, weights = fit["joints"][part], fit["weights"][part]
-        # The Armature modifier alone deforms the mesh.
-        unbind(mesh_object)
-        mesh_object.fdda.models.clear()
-        positions = rest_positions(mesh_object.data)
-        mesh_object.data = mesh_object.data.copy()
-        mesh_object.shape_key_clear()
-        write(mesh_object.data.vertices, COORDINATE_ELEMENT, np.ascontiguousarray(positions, np.float32))
-        mesh_object.modifiers.clear()
-        mesh_object.vertex_groups.clear()
-        if animation := mesh_object.animation_data:
-            for curve in [curve for curve in animation.drivers if curve.data_path.startswith("modifiers[")]:
-                animation.drivers.remove(curve)
-        used = np.unique(joints[weights > 0]).tolist()
-        for joint in used:
-            group = mesh_object.vertex_groups.new(name=recording.rig.joint_names[joint])
-            for vertex, slot in np.argwhere((joints == joint) & (weights > 0)).tolist():
-                group.add([vertex], float(weights[vertex, slot]), "REPLACE")
-            bone = scene_rig.armature_object.data.bones[recording.rig.joint_names[joint]]
-            # A bone of several segments would bend the mesh.
-            bone.use_deform, bone.bbone_segments = True, 1
-        modifier = mesh_object.modifiers.new("Armature", "ARMATURE")
-        modifier.object = scene_rig.armature_object
-        if mesh_object.parent != scene_rig.armature_object or mesh_object.parent_type != "OBJECT":
-            # Exporters expect the armature as the parent.
-            matrix = mesh_object.matrix_world.copy()
-            mesh_object.parent, mesh_object.parent_type = scene_rig.armature_object, "OBJECT"
-            mesh_object.matrix_parent_inverse = scene_rig.armature_object.matrix_world.inverted_safe()
-            mesh_object.matrix_basis = matrix
+        arrays = recording.rig.joint_names, fit["joints"][part], fit["weights"][part]
+        bones = _write_skin(mesh_object, scene_rig.armature_object, *arrays)
         has_weights = part.start not in recording.rig.unweighted_vertices
         mesh_errors = {
             poses_name: {
@@ -144,7 +118,7 @@ def export_skinning(
             }
             for poses_name, by_name in errors.items()
         }
-        skins.append(ExportedSkin(mesh_object.name, len(used), influences, mesh_errors))
+        skins.append(ExportedSkin(mesh_object.name, bones, influences, mesh_errors))
     return skins
 
 
@@ -190,3 +164,46 @@ def _measure(recording: Recording, poses: np.ndarray, positions: PositionsFuncti
     unit = recording.rig.metres_per_unit
     errors = np.concatenate([distances(positions(block), recording.positions[block], unit) for block in blocks])
     return [error_statistics(errors[:, part]) for part in recording.rig.mesh_slices]
+
+
+def _write_skin(
+    mesh_object: bpy.types.Object,
+    armature_object: bpy.types.Object,
+    joint_names: tuple[str, ...],
+    joints: np.ndarray,
+    weights: np.ndarray,
+) -> int:
+    """Let the Armature modifier alone deform a mesh; return the number of bones with weights.
+
+    Args:
+        joint_names: names of the joints.
+        joints, weights: (V, I) joint indices and weights.
+    """
+    unbind(mesh_object)
+    mesh_object.fdda.models.clear()
+    positions = rest_positions(mesh_object.data)
+    mesh_object.data = mesh_object.data.copy()
+    mesh_object.shape_key_clear()
+    write(mesh_object.data.vertices, COORDINATE_ELEMENT, np.ascontiguousarray(positions, np.float32))
+    mesh_object.modifiers.clear()
+    mesh_object.vertex_groups.clear()
+    if animation := mesh_object.animation_data:
+        for curve in [curve for curve in animation.drivers if curve.data_path.startswith("modifiers[")]:
+            animation.drivers.remove(curve)
+    used = np.unique(joints[weights > 0]).tolist()
+    for joint in used:
+        group = mesh_object.vertex_groups.new(name=joint_names[joint])
+        for vertex, slot in np.argwhere((joints == joint) & (weights > 0)).tolist():
+            group.add([vertex], float(weights[vertex, slot]), "REPLACE")
+        bone = armature_object.data.bones[joint_names[joint]]
+        # A bone of several segments would bend the mesh.
+        bone.use_deform, bone.bbone_segments = True, 1
+    modifier = mesh_object.modifiers.new("Armature", "ARMATURE")
+    modifier.object = armature_object
+    if mesh_object.parent != armature_object or mesh_object.parent_type != "OBJECT":
+        # Exporters expect the armature as the parent.
+        matrix = mesh_object.matrix_world.copy()
+        mesh_object.parent, mesh_object.parent_type = armature_object, "OBJECT"
+        mesh_object.matrix_parent_inverse = armature_object.matrix_world.inverted_safe()
+        mesh_object.matrix_basis = matrix
+    return len(used)

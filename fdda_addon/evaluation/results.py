@@ -23,6 +23,7 @@ class PoseErrors:
         fdda, linear: (N, V) float32, distances of the model and of linear skinning from the rig, meters.
         fdda_surface, linear_surface: errors of normals and edges; None for a mesh without faces, or if the surface was
             not compared.
+        frozen: number of poses in which the target stands still while the rig moves.
     """
 
     name: str
@@ -40,6 +41,7 @@ class PoseErrors:
         return {
             "name": self.name,
             "poses": len(self.fdda),
+            "frozen": self.frozen,
             "fdda": error_statistics(self.fdda).to_json(),
             "linear": error_statistics(self.linear).to_json(),
             **surface_json(self.fdda_surface, self.linear_surface),
@@ -81,6 +83,7 @@ class Evaluation:
         return {
             "unit": "mm",
             "poses": len(self.held_out.fdda),
+            "frozen": self.held_out.frozen,
             "vertices": self.held_out.fdda.shape[1],
             "fdda": self.fdda.to_json(),
             "linear": self.linear.to_json(),

@@ -198,7 +198,8 @@ class _MeshComparison:
         linear_positions = self._skinning.positions(pose_matrices[None])[0]
         if self._evaluator.target and self._poses:
             positions = (rig_positions, self._poses[-1][1]), (linear_positions, self._previous_linear_positions)
-            self._frozen_count += is_frozen(*(distances(*pair).max() for pair in positions), self._skinning.rig.size)
+            motions = (distances(*pair).max() for pair in positions)
+            self._frozen_count += bool(is_frozen(*motions, self._skinning.rig.size))
         self._previous_linear_positions = linear_positions
         if self._mask is not None:
             model_positions = self._mask.blend(linear_positions, model_positions)
@@ -210,8 +211,8 @@ class _MeshComparison:
     def end_set(self, name: str) -> PoseErrors:
         """Return the errors of the compared poses, and begin another set."""
         arrays = (np.stack(values) for values in zip(*self._poses, strict=True))
-        errors = PoseErrors(name, *arrays, *(surface_errors(rows) for rows in zip(*self._surfaces, strict=True)))
-        errors.frozen = self._frozen_count
+        surfaces = (surface_errors(rows) for rows in zip(*self._surfaces, strict=True))
+        errors = PoseErrors(name, *arrays, *surfaces, frozen=self._frozen_count)
         self._poses, self._surfaces, self._frozen_count = [], [], 0
         return errors
 

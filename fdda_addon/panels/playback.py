@@ -5,19 +5,16 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import ModelError
-from ..models.model_list import active_entry, bound_model_name, entry_info, entry_path
+from ..models.model_list import active_entry, bound_model_name
 from ..rig.modifier_stack import is_playback_modifier
 from ..runtime.confidence import partition_confidence
-from ..runtime.model_meshes import find_model_rigs
 from ..scene.active_rig import cached_rigs_together
-from ..scene.draw_cache import computed_once, draw_cached
+from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of, remaining_rig_note
 from ..scene.stored_paths import resolve_path
 from ..timing import measurements
 from ..timing.benchmark import FDDA, RIG
-from . import checks
 from .bone_names import short_bone_name
 from .frame_profile import draw_model_times
 from .meshes import draw_meshes
@@ -36,36 +33,6 @@ def is_outside_model_folders(mesh_object: bpy.types.Object) -> bool:
     model_path = resolve_path(mesh_object.fdda.model, mesh_object.library).resolve()
     blend_path = Path(bpy.data.filepath).resolve()
     return bool(bpy.data.filepath) and not model_path.is_relative_to(blend_path.parent) and not is_trusted(model_path)
-
-
-def _has_model(rig: SceneRig) -> bool:
-    """Return whether a mesh has a model to bind: in its Model Library, or just trained."""
-    trained = find_trained_file(rig)
-    return active_entry(rig.mesh_object) is not None or (trained is not None and not trained.mismatch)
-
-
-def _meshes_of_active_model(rig: SceneRig, rigs: tuple[SceneRig, ...]) -> frozenset[int]:
-    """Return session_uid of the meshes that the active model of a mesh deforms, if it deforms several.
-
-    Args:
-        rigs: the checked rigs of the character; a change of one is noticed.
-    """
-    mesh_object, entry = rig.mesh_object, active_entry(rig.mesh_object)
-    try:
-        if entry is None or len((info := entry_info(mesh_object, entry)).meshes) < 2:
-            return frozenset()
-        path = entry_path(mesh_object, entry)
-        states = tuple((r.mesh_object.name, (check := checks.last_check(r)) and check.rig) for r in rigs)
-        name, inputs = ("meshes of the active model", mesh_object.session_uid), (path, info.meshes, states)
-        return computed_once(
-            name,
-            inputs,
-            lambda: frozenset(
-                found.mesh_object.session_uid for found in find_model_rigs(path, info, rig.armature_object).values()
-            ),
-        )
-    except ModelError:
-        return frozenset()
 
 
 def mask_problem(mesh_object: bpy.types.Object) -> str:
@@ -135,23 +102,16 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         layout, entry, trained = self.layout, active_entry(mesh_object), find_trained_file(rig)
         if mesh_object.fdda.status:
             draw_wrapped(layout, context, mesh_object.fdda.status, "ERROR")
-        if not _has_model(rig):
+        if entry is None and (trained is None or trained.mismatch):
             draw_wrapped(layout, context, "No model yet: train one above, or choose a file.", "INFO")
             layout.operator("fdda.bind", text="Choose Model and Bind…", icon="FILEBROWSER")
             return
         column = layout.column()
         column.scale_y = 1.4
         name = entry.name if entry is not None else trained.path.stem
-        rigs = cached_rigs_together(context)
-        found = frozenset().union(*(_meshes_of_active_model(each, rigs) for each in rigs))
-        draw_button(
-            column,
-            context,
-            "fdda.bind",
-            f"Bind {name}",
-            "LINKED",
-            lambda each: _has_model(each) or each.mesh_object.session_uid in found,
-        )
+        # A model binds the meshes that it deforms, so the button names it, and no number of meshes.
+        button = column.operator("fdda.bind", text=f"Bind {name}", icon="LINKED")
+        button.all_meshes = bool(cached_rigs_together(context))
 
     def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout, binding = self.layout, mesh_object.fdda

@@ -125,11 +125,11 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
     ]
     keyed_names = {name for _, curves in clips for name in curves}
     bones = [bone for bone in armature_object.pose.bones if bone.name in keyed_names]
-    mirror = _mirror_images(bones)
+    mirror, channels_by_bone = _mirror_images(bones), {bone.name: _read_channels(bone, clips) for bone in bones}
     limbs = dict(zip((bone.name for bone in bones), find_limbs(_parents(bones)).tolist(), strict=True))
     columns: list[tuple[Channel, np.ndarray, int, bool]] = []
     for bone in bones:
-        for kind, values in _bone_values(bone, clips, mirror).items():
+        for kind, values in _bone_values(bone, channels_by_bone, mirror).items():
             is_used = np.abs(values - _REST_VALUES[kind]).max(axis=0) > RANGE_TOLERANCE
             for axis in range(3):
                 if is_used[axis] or (kind == ROTATION_VECTOR and is_used.any()):
@@ -193,27 +193,33 @@ def _mirror_images(bones: Sequence[bpy.types.PoseBone]) -> dict[str, bpy.types.P
 
 def _bone_values(
     bone: bpy.types.PoseBone,
-    clips: Iterable[tuple[range, dict[str, CurvesByChannel]]],
+    channels_by_bone: dict[str, tuple[np.ndarray, ...]],
     mirror: dict[str, bpy.types.PoseBone],
 ) -> dict[str, np.ndarray]:
     """Return (F, 3) values of a bone in all frames, by kind.
 
     Args:
-        clips: the frames and F-curves of each action.
+        channels_by_bone: the arrays of `_read_channels` of each keyed bone.
         mirror: mirror images of the bones (`_mirror_images`). Unless it is empty, the frames of the bone's image
             follow, or those of the bone again, (2 F, 3).
     """
-    channels = [_read_channels(bone, clips)]
-    if mirror:
-        channels.append(_image_channels(bone, mirror[bone.name], clips) if bone.name in mirror else channels[0])
+    channels = [channels_by_bone[bone.name]]
+    if image := mirror.get(bone.name):
+        channels.append(_mirrored_channels(bone, image, *channels_by_bone[image.name]))
+    elif mirror:
+        channels *= 2
     quaternions, locations, scales = (np.concatenate(values) for values in zip(*channels, strict=True))
     return {ROTATION_VECTOR: rotation_vectors(quaternions), LOCATION: locations, SCALE: scales}
 
 
-def _image_channels(
-    bone: bpy.types.PoseBone, image: bpy.types.PoseBone, clips: Iterable[tuple[range, dict[str, CurvesByChannel]]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (F, 4) quaternions, (F, 3) locations and scales that mirror those of another bone."""
+def _mirrored_channels(
+    bone: bpy.types.PoseBone,
+    image: bpy.types.PoseBone,
+    quaternions: np.ndarray,
+    locations: np.ndarray,
+    scales: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Mirror (F, 4) quaternions, (F, 3) locations and scales of a bone's image: what the bone does in the mirror."""
     axes, image_axes = (np.array(each.bone.matrix_local.to_3x3()) for each in (bone, image))
     turn = image_axes.T @ _REFLECTION @ axes
     # Without Local Location, a location is in the space of the armature.
@@ -221,7 +227,6 @@ def _image_channels(
         each_axes if each.bone.use_local_location else np.eye(3)
         for each, each_axes in ((bone, axes), (image, image_axes))
     )
-    quaternions, locations, scales = _read_channels(image, clips)
     # A reflection turns the axis of a rotation, and reverses its direction.
     quaternions = np.column_stack([quaternions[:, 0], -quaternions[:, 1:] @ turn])
     return quaternions, locations @ image_space.T @ _REFLECTION @ space, scales @ turn**2
@@ -229,7 +234,8 @@ def _image_channels(
 
 def _read_channels(
     bone: bpy.types.PoseBone, clips: Iterable[tuple[range, dict[str, CurvesByChannel]]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, ...]:
+    """Return (F, 4) quaternions, (F, 3) locations and scales of a bone in all frames of clips with their F-curves."""
     quaternions, locations, scales = [], [], []
     for frames, curves_of_bones in clips:
         curves = curves_of_bones.get(bone.name, {})

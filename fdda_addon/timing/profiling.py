@@ -82,8 +82,8 @@ class _Measurement:
             for datablock in bpy.context.evaluated_depsgraph_get().ids
             if isinstance(datablock, bpy.types.Object) and datablock.original.type != "ARMATURE"
         ]
-        names = sorted({o.name: o for o in objects if _removable_parts(o)}.items())
-        self._object_ratios: dict[bpy.types.Object, list[float]] = {scene_object: [] for _, scene_object in names}
+        removable = {o.name: o for o in objects if _removable_parts(o)}
+        self._object_ratios: dict[bpy.types.Object, list[float]] = {removable[name]: [] for name in sorted(removable)}
         self._part_ratios: dict[tuple[str, str, str], list[float]] = {}
 
     def _frame_ms(self, round_index: int, scene: bpy.types.Scene | None = None) -> float:

@@ -245,8 +245,10 @@ class RecordingWriter:
     def _write_error(self, error: OSError) -> OutputError:
         advice = "make room or choose another folder"
         if self.complete:
-            advice = f"{self.complete} of {self.info.poses} poses are complete; make room and run the command again, "
-            advice += "`record` with --resume"
+            advice = (
+                f"{self.complete} of {self.info.poses} poses are complete; make room and run the command again, "
+                "`record` with --resume"
+            )
         return OutputError(f"Cannot write the recording '{self.path}': {os_error_text(error)}; {advice}.")
 
     def __enter__(self) -> "RecordingWriter":

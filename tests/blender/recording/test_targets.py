@@ -123,6 +123,7 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
     save_copy(tmp_path / "short.blend")
     assert run("evaluate", tmp_path / "short.blend", model, *options, "--overwrite") == 0
     assert "The target stands still in 5 poses in which the rig moves, and these count as" in capfd.readouterr().out
+    assert (found["frozen"], json.loads(errors.read_text())["frozen"]) == (0, 5)
     assert run("record", rig, tmp_path / "recording", "--object", "elbow", "--refine", model) == 1
     assert "is of the target 'flesh', and poses are added of rigs alone" in capfd.readouterr().err
     assert run("bind", rig, model, bound_path, "--object", "elbow") == 0
