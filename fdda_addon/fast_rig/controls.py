@@ -6,12 +6,13 @@ from collections.abc import Iterable, Sequence
 
 import bpy
 
-from ..core.errors import RigError, WrongUsageError
+from ..core.errors import WrongUsageError
+from ..poses.sample_selection import COLLECTION_PREFIX, parse_bones
 from ..rig.references import split_bone_path
 from ..scene.action_slots import constraint_actions, curves_of_actions
 from ..scene.compatibility import is_bone_hidden
 
-VISIBLE, KEYED, COLLECTION = "visible", "keyed", "collection:"
+VISIBLE, KEYED = "visible", "keyed"
 
 
 def check_choices(choices: Iterable[str]) -> None:
@@ -21,9 +22,10 @@ def check_choices(choices: Iterable[str]) -> None:
         WrongUsageError: a choice is none of `visible`, `keyed` and `collection:NAME`.
     """
     for choice in choices:
-        if choice not in {VISIBLE, KEYED} and not choice.startswith(COLLECTION):
+        if choice not in {VISIBLE, KEYED} and not choice.startswith(COLLECTION_PREFIX):
             raise WrongUsageError(
-                f"'{choice}' chooses no control bones; give {VISIBLE}, {KEYED} or {COLLECTION}NAME, a bone collection."
+                f"'{choice}' chooses no control bones; give {VISIBLE}, {KEYED} or {COLLECTION_PREFIX}NAME, a bone "
+                "collection."
             )
 
 
@@ -35,7 +37,7 @@ def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> 
 
     Raises:
         WrongUsageError: as `check_choices`.
-        RigError: there is no bone collection of that name.
+        RigError: there is no bone collection of that name, or it has no bones.
     """
     choices = list(choices)
     check_choices(choices)
@@ -48,19 +50,7 @@ def control_bones(armature_object: bpy.types.Object, choices: Iterable[str]) -> 
             keyed = keyed_bones(armature_object, animating_actions(armature_object))
             names |= {name for counts in keyed.values() for name in counts if name in bones}
         else:
-            collection_name = choice.removeprefix(COLLECTION)
-            collection = armature_object.data.collections_all.get(collection_name)
-            if collection is None:
-                known = ", ".join(f"'{c.name}'" for c in armature_object.data.collections_all) or "none"
-                raise RigError(
-                    f"'{armature_object.name}' has no bone collection '{collection_name}'; its collections: {known}."
-                )
-            if not collection.bones_recursive:
-                raise RigError(
-                    f"The bone collection '{collection_name}' of '{armature_object.name}' has no bones; assign bones "
-                    "to it, or choose another collection."
-                )
-            names |= {bone.name for bone in collection.bones_recursive}
+            names |= parse_bones(armature_object, choice)
     return names
 
 

@@ -6,8 +6,6 @@ import math
 import bpy
 import numpy as np
 
-from ..scene.arrays import write_pixels
-
 WIDTH, HEIGHT = 224, 224
 MARGIN_LEFT, MARGIN_BOTTOM = 34, 16
 """Space for the numbers at the axes, pixels."""
@@ -46,7 +44,7 @@ class CurvesImage:
         preview, lengths = self._previews["curves"], [len(curve) for curve in curves.values()]
         if self._drawn[0] is not curves or self._drawn[1] != lengths:
             self._drawn = curves, lengths
-            write_pixels(preview, paint(curves))
+            preview.image_pixels_float.foreach_set(np.ravel(paint(curves)))
         return preview.icon_id
 
     def release(self) -> None:

@@ -94,7 +94,7 @@ def select_bones(
                     f"'{scene_rig.armature_object.name}' and no number of the rig; choose another action."
                 )
         else:
-            selected_bones |= parse_bones(scene_rig, text)
+            selected_bones |= parse_bones(scene_rig.armature_object, text)
     keyed_channel_ranges = keyed_ranges(scene_rig.armature_object, actions)
     keyed_bones = {bone for bone, _, _ in keyed_channel_ranges}
     controls, constant_channels = measured_controls(scene_rig, actions), constant_controls(scene_rig, actions)
@@ -109,13 +109,12 @@ def select_bones(
     )
 
 
-def parse_bones(scene_rig: SceneRig, text: str) -> set[str]:
+def parse_bones(armature_object: bpy.types.Object, text: str) -> set[str]:
     """Return the names of the bones that a text chooses: `selected`, `collection:NAME` or `bone:NAME`.
 
     Raises:
         RigError: there is no such collection or bone, or no bone is chosen.
     """
-    armature_object = scene_rig.armature_object
     bones, armature = armature_object.pose.bones, armature_object.data
     if text == SELECTED_BONES:
         names = {bone.name for bone in bones if is_selected(bone)}
@@ -157,7 +156,7 @@ def split_control_bones(scene_rig: SceneRig, texts: Iterable[str]) -> tuple[froz
     other_texts = []
     for text in texts:
         if text.startswith((COLLECTION_PREFIX, BONE_PREFIX)):
-            names |= parse_bones(scene_rig, text)
+            names |= parse_bones(scene_rig.armature_object, text)
         else:
             other_texts.append(text)
     return frozenset(names), tuple(other_texts)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of a rig before its first pose is recorded: cuts, controls, the target, and what changes with the frame."""
+"""Checks of a rig before its first pose is recorded: controls, the target, and what changes with the frame."""
 
 import time
 from collections.abc import Iterator
@@ -8,7 +8,6 @@ from contextlib import closing
 import bpy
 import numpy as np
 
-from ..core.checks.seams import find_open_seams
 from ..core.errors import RigError
 from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
 from ..core.mathematics.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE
@@ -21,9 +20,8 @@ from ..scene.armature import clear_pose
 from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control
 from .pose_plan import PosePlan
 
-MAX_TARGET_POSES, MAX_SEAM_POSES, TIMED_POSES = 20, 10, 12
-"""Numbers of poses: in which the motion of a target is compared, in which gaps at cuts are measured, and that are
-timed."""
+MAX_TARGET_POSES, TIMED_POSES = 20, 12
+"""Numbers of poses: in which the motion of a target is compared, and that are timed."""
 MIN_RIG_MOTION_RATIO, MAX_STILL_TARGET_RATIO = 0.02, 1e-5
 """Ratios of the rig's size. A target does not follow the rig if it moves by less than the second ratio while the rig
 moves by more than the first ratio."""
@@ -134,31 +132,6 @@ def check_follows_pose(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPla
         player.reset_pose()
         scene.frame_set(frame, subframe=subframe)
     return (time.perf_counter() - start_time) / evaluation_count
-
-
-def check_seams(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> str:
-    """Return a sentence if cuts of a mesh open in poses that are far apart; empty if not.
-
-    Args:
-        evaluator: evaluates the rig, prepared by `temporary_rig_state`.
-        plan: plan of the poses.
-        player: player of the clips of the plan.
-    """
-    skinning = LinearSkinning(evaluator.rig)
-    pose_indices = set(np.linspace(0, plan.total - 1, MAX_SEAM_POSES).round().astype(int).tolist())
-
-    def evaluate_residuals() -> Iterator[np.ndarray]:
-        with closing(plan.show_poses(player, pose_indices)) as poses:
-            for _ in poses:
-                pose_matrices, positions, _ = evaluator.evaluate()
-                yield skinning.local_residuals(pose_matrices[None], positions[None])[0]
-
-    with closing(evaluate_residuals()) as residuals:
-        warnings = find_open_seams(evaluator.rig, residuals)
-    player.stop()
-    clear_pose(evaluator.scene_rig.armature_object)
-    player.restore_numbers()
-    return f"{evaluator.scene_rig.mesh_object.name}: {warnings[0]}" if warnings else ""
 
 
 def measure_seconds_per_pose(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> float:

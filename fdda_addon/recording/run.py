@@ -34,7 +34,6 @@ from .alone_poses import plan_alone_poses
 from .first_checks import (
     check_follows_pose,
     check_saturation,
-    check_seams,
     check_target_moves,
     measure_seconds_per_pose,
 )
@@ -196,7 +195,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
                 settings = replace(settings, poses=poses, auto_poses=False)
                 plan = PosePlan(scene_rig, channels, settings, clips, pose_setter)
                 notes.append(f"{format_count(poses, 'random pose')}, at {1000 * seconds_per_pose:.1f} ms each.")
-            notes += [check_seams(evaluator, plan, player), check_saturation(evaluator)]
+            notes.append(check_saturation(evaluator))
         for note in filter(None, notes):
             yield Progress("poses", 0, plan.total, note)
         fixed_joints = find_fixed_joints(scene_rig)

@@ -16,6 +16,7 @@ from ..core.errors import RigError
 from ..core.recording.index import FRAMES, POSE, SIMULATION
 from ..poses.clip import Clip
 from ..scene import mesh as mesh_io
+from ..scene.arrays import EDGE_ELEMENT, read
 from ..scene.node_groups import SIMULATION_NODES, find_time_node
 from ..scene.scene_rig import SceneRig, is_flat
 from ..scene.stored_paths import resolve_path
@@ -151,8 +152,9 @@ class Target:
         mesh = self.scene_rig.mesh_object.data
         if len(target_mesh.vertices) != len(mesh.vertices):
             raise RigError(self._count_message(len(target_mesh.vertices)))
-        # A mesh from a cache file may have no faces.
-        if len(target_mesh.polygons) and len(mesh.polygons) and not _have_same_faces(target_mesh, mesh):
+        # A mesh from a cache file may have no faces. Their order, first corner and direction may differ.
+        has_faces = len(target_mesh.polygons) and len(mesh.polygons)
+        if has_faces and not np.array_equal(_sorted_edges(target_mesh), _sorted_edges(mesh)):
             raise RigError(
                 f"The target '{self.name}' has as many vertices as '{self.scene_rig.mesh_object.name}' and other "
                 "faces, so its vertices are in another order or of another mesh; export it with the vertices of the "
@@ -284,19 +286,6 @@ def temporary_frame_range(target: Target, first_frame: int | None, last_frame: i
         yield
 
 
-def _have_same_faces(first_mesh: bpy.types.Mesh, second_mesh: bpy.types.Mesh) -> bool:
-    """Return whether two meshes have the same faces, ignoring their order, first corner and direction."""
-    faces = [_faces_by_corner_count(*mesh_io.topology(mesh)) for mesh in (first_mesh, second_mesh)]
-    return faces[0].keys() == faces[1].keys() and all(
-        np.array_equal(face_vertices, faces[1][corner_count]) for corner_count, face_vertices in faces[0].items()
-    )
-
-
-def _faces_by_corner_count(starts: np.ndarray, vertices: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the sorted vertex indices of the faces, (n, corners), by number of corners; the faces are sorted, too."""
-    corner_counts = np.diff(np.append(starts, len(vertices)))
-    faces = {}
-    for corner_count in np.unique(corner_counts).tolist():
-        rows = np.sort(vertices[starts[corner_counts == corner_count][:, None] + np.arange(corner_count)], axis=1)
-        faces[corner_count] = rows[np.lexsort(rows.T[::-1])]
-    return faces
+def _sorted_edges(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Return the vertex indices of the edges, (E, 2) int32, in an order that does not depend on the mesh."""
+    return np.unique(np.sort(read(mesh.edges, EDGE_ELEMENT), axis=1), axis=0)

@@ -7,7 +7,7 @@ from mathutils import Euler, Quaternion
 
 from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import STATIC_JOINT
-from .arrays import POSE_CHANNELS, POSE_MATRIX_ELEMENT, PropertyReader, read, write
+from .arrays import POSE_CHANNELS, POSE_MATRIX_ELEMENT, read, write
 from .controls import set_control
 from .scene_rig import SceneRig
 
@@ -50,7 +50,6 @@ class PoseMatrixReader:
         self._matrix_indices = slice(0, len(matrix_indices)) if is_consecutive else matrix_indices
         self._matrices = np.empty((self._bone_count + 1, 4, 4), np.float32)
         self._matrices[-1] = np.eye(4)
-        self._bone_reader = PropertyReader(POSE_MATRIX_ELEMENT, self._matrices[:-1])
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
         """Return whether the armature still has the same number of bones."""
@@ -62,7 +61,7 @@ class PoseMatrixReader:
         Returns:
             (J, 4, 4) float32, armature space, armature units. The next call may overwrite the array.
         """
-        self._bone_reader.read(armature_object.pose.bones)
+        read(armature_object.pose.bones, POSE_MATRIX_ELEMENT, self._matrices[:-1])
         # Blender stores matrices in column-major order.
         return self._matrices[self._matrix_indices].transpose(0, 2, 1)
 

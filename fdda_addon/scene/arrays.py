@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads and writes properties of RNA collections as numpy arrays.
+"""Reads and writes properties of RNA collections as numpy arrays, in the types of Blender.
 
-`foreach_get` and `foreach_set` also accept an array of another type, which is a hundred times slower, and sometimes an
-array that is too long. The functions of this module raise an error in both cases.
+`foreach_get` and `foreach_set` also accept an array of another type, which is a hundred times slower.
 """
 
 from dataclasses import dataclass
@@ -25,10 +24,6 @@ class ElementProperty:
     dtype: type[np.generic]
     shape: tuple[int, ...] = ()
 
-    def empty(self, count: int) -> np.ndarray:
-        """Allocate an uninitialized array (count, *shape) of dtype."""
-        return np.empty((count, *self.shape), self.dtype)
-
 
 COORDINATE_ELEMENT = ElementProperty("co", np.float32, (3,))
 """Position of a vertex or of a point of a shape key; object space."""
@@ -43,6 +38,7 @@ MUTE_ELEMENT = ElementProperty("mute", np.bool_)
 LOOP_START_ELEMENT = ElementProperty("loop_start", np.int32)
 VERTEX_INDEX_ELEMENT = ElementProperty("vertex_index", np.int32)
 MATERIAL_INDEX_ELEMENT = ElementProperty("material_index", np.int32)
+EDGE_ELEMENT = ElementProperty("vertices", np.int32, (2,))
 TRIANGLE_ELEMENT = ElementProperty("vertices", np.int32, (3,))
 """Vertices of a loop triangle."""
 POSE_MATRIX_ELEMENT = ElementProperty("matrix", np.float32, (4, 4))
@@ -73,9 +69,19 @@ KEYFRAME_ELEMENTS = (
 """All properties of a keyframe that define the values of an F-curve."""
 
 
-def read(collection: bpy.types.bpy_prop_collection, element: ElementProperty) -> np.ndarray:
-    """Read the values of all elements of a collection, (n, *element.shape) of element.dtype."""
-    values = element.empty(len(collection))
+def read(
+    collection: bpy.types.bpy_prop_collection, element: ElementProperty, values: np.ndarray | None = None
+) -> np.ndarray:
+    """Read the values of all elements of a collection.
+
+    Args:
+        values: contiguous array to read into; its length must be that of the collection. None for a new array.
+
+    Returns:
+        (n, *element.shape) of element.dtype.
+    """
+    if values is None:
+        values = np.empty((len(collection), *element.shape), element.dtype)
     collection.foreach_get(element.name, values.reshape(-1))
     return values
 
@@ -85,76 +91,6 @@ def write(collection: bpy.types.bpy_prop_collection, element: ElementProperty, v
 
     Args:
         collection: n elements.
-        values: (n, *element.shape) of element.dtype, contiguous.
-
-    Raises:
-        ValueError: the array has another shape or type, or is not contiguous.
+        values: (n, *element.shape) of element.dtype.
     """
-    if not _has_layout(values, element) or len(values) != len(collection):
-        raise _layout_error(collection, element, values)
     collection.foreach_set(element.name, values.reshape(-1))
-
-
-class PropertyReader:
-    """Reads a property of a collection into an array that it reuses.
-
-    Attributes:
-        element: the property.
-        values: (n, *element.shape) of element.dtype, as of the last call of `read`.
-    """
-
-    def __init__(self, element: ElementProperty, values: np.ndarray):
-        """Prepare to read a property.
-
-        Args:
-            values: the array to read into, (n, *element.shape) of element.dtype, contiguous.
-
-        Raises:
-            ValueError: the array has another shape or type, or is not contiguous.
-        """
-        if not _has_layout(values, element):
-            raise _layout_error("the array to read into", element, values)
-        self.element, self.values, self._flat_values = element, values, values.reshape(-1)
-
-    def read(self, collection: bpy.types.bpy_prop_collection) -> None:
-        """Read the values of a collection into `values`.
-
-        A collection with fewer than n elements raises no error, because counting bones takes as long as reading them.
-
-        Raises:
-            ValueError: the collection has more than n elements.
-        """
-        try:
-            collection.foreach_get(self.element.name, self._flat_values)
-        except (RuntimeError, TypeError) as error:
-            raise _layout_error(collection, self.element, self.values) from error
-
-
-def write_pixels(preview: bpy.types.ImagePreview, pixels: np.ndarray) -> None:
-    """Write the pixels of a preview image.
-
-    Args:
-        preview: the preview; its size must be that of the pixels.
-        pixels: (height, width, 4) float32, linear RGBA, rows from the bottom.
-
-    Raises:
-        ValueError: the array has another shape or type.
-    """
-    width, height = preview.image_size
-    if pixels.shape != (height, width, 4) or pixels.dtype != np.float32:
-        raise ValueError(
-            f"The preview takes pixels ({height}, {width}, 4) float32, the array is {pixels.shape} {pixels.dtype}."
-        )
-    preview.image_pixels_float.foreach_set(pixels.ravel())
-
-
-def _has_layout(values: np.ndarray, element: ElementProperty) -> bool:
-    """Return whether an array has the dtype and shape of a property, and is contiguous."""
-    return values.dtype == element.dtype and values.shape[1:] == element.shape and values.flags.c_contiguous
-
-
-def _layout_error(collection: object, element: ElementProperty, values: np.ndarray) -> ValueError:
-    expected_layout = f"{element.shape} {np.dtype(element.dtype)} each"
-    contiguity = "" if values.flags.c_contiguous else ", not contiguous"
-    actual_layout = f"{values.shape} {values.dtype}{contiguity}"
-    return ValueError(f"'{element.name}' of {collection} is {expected_layout}, the array is {actual_layout}.")

@@ -10,7 +10,7 @@ from ..core.controls import MESH_OWNER, SHAPE_KEY_PATH, Control
 from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT
 from .armature import PoseMatrixReader, rest_matrices
-from .arrays import KEY_VALUE_ELEMENT, POSE_CHANNELS, PropertyReader
+from .arrays import KEY_VALUE_ELEMENT, POSE_CHANNELS, read
 from .bone_transform import BoneTransform, bone_transform
 from .controls import canonical_path, number_at, owner_of
 from .scene_rig import MIN_VOLUME, SceneRig
@@ -168,10 +168,9 @@ class KeyReader:
             # The last element is NaN.
             self._indices = np.array([indices.get(name, len(order)) for name in self._names])
             self._values = np.full(len(order) + 1, np.nan, np.float32)
-            self._reader = PropertyReader(KEY_VALUE_ELEMENT, self._values[: len(order)])
             self._order = order
         if order:
-            self._reader.read(shape_keys.key_blocks)
+            read(shape_keys.key_blocks, KEY_VALUE_ELEMENT, self._values[:-1])
         return self._values[self._indices]
 
 
@@ -192,14 +191,13 @@ class ConstrainedBones:
         rest, parent_rest = np.split(rest_matrices(armature_object.data, names), 2)
         self._offsets = np.linalg.inv(parent_rest) @ rest
         self._locations = np.empty((len(armature_object.pose.bones), 3), np.float32)
-        self._location_reader = PropertyReader(POSE_CHANNELS[0], self._locations)
         self._indices = [armature_object.pose.bones.find(name) for name in self._names]
         elements = [{transform.element for _, transform in numbers} for numbers in bones]
         # A connected bone ignores its location.
         self._hidden_axes = np.array(
             [
-                [(3, axis) not in read and not bone.use_connect for axis in range(3)]
-                for read, bone in zip(elements, rest_bones, strict=True)
+                [(3, axis) not in of_bone and not bone.use_connect for axis in range(3)]
+                for of_bone, bone in zip(elements, rest_bones, strict=True)
             ]
         )
         self._max_motion = MAX_HIDDEN_MOTION * np.array([bone.length for bone in rest_bones])
@@ -221,7 +219,7 @@ class ConstrainedBones:
         parent_spaces[is_flat] = np.eye(4)
         local = np.linalg.inv(parent_spaces) @ matrices
         local[is_flat] = np.eye(4)
-        self._location_reader.read(armature_object.pose.bones)
+        read(armature_object.pose.bones, POSE_CHANNELS[0], self._locations)
         moved = (local[:, :3, 3] - self._locations[self._indices]) * self._hidden_axes
         hidden = np.flatnonzero(np.linalg.norm(moved, axis=1) > self._max_motion)
         if not len(hidden):

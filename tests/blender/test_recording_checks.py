@@ -5,7 +5,6 @@ import json
 import math
 from pathlib import Path
 
-import bmesh
 import bpy
 import pytest
 
@@ -62,36 +61,6 @@ def test_nothing_is_suspicious_about_the_arm(tmp_path, capsys):
     capsys.readouterr()
     assert run("check-recording", tmp_path / "recording", "--strict") == 0
     assert capsys.readouterr().out == f"{tmp_path / 'recording'}: no problems were found\n"
-
-
-@pytest.mark.parametrize(
-    ("is_cut", "smooth", "is_found"), [(True, True, True), (True, False, False), (False, True, False)]
-)
-def test_a_mesh_that_is_cut_and_smoothed(tmp_path, capsys, is_cut, smooth, is_found):
-    elbow, _ = build_elbow()
-    # Importers of game formats cut along hard edges, here along the rings of the bend and beyond.
-    bpy.context.view_layer.objects.active = elbow
-    bpy.ops.object.mode_set(mode="EDIT")
-    mesh = bmesh.from_edit_mesh(elbow.data)
-    rings = [
-        e for e in mesh.edges if math.isclose(e.verts[0].co.x, e.verts[1].co.x, abs_tol=1e-6) and not e.is_boundary
-    ]
-    bmesh.ops.split_edges(mesh, edges=[edge for edge in rings if edge.verts[0].co.x > 0.2])
-    bmesh.update_edit_mesh(elbow.data)
-    cut_count = len(mesh.verts)
-    if not is_cut:
-        bpy.ops.mesh.select_all(action="SELECT")
-        bpy.ops.mesh.remove_doubles(threshold=1e-4, use_sharp_edge_from_normals=True)
-    bpy.ops.object.mode_set(mode="OBJECT")
-    assert (len(elbow.data.vertices) == cut_count) == is_cut
-    if not smooth:
-        elbow.modifiers.remove(elbow.modifiers["CorrectiveSmooth"])
-    save_copy(tmp_path / "elbow.blend")
-    assert run("record", tmp_path / "elbow.blend", tmp_path / "recording", "--poses", 40) == 0
-    output = capsys.readouterr().out
-    # Before the poses are recorded, and once.
-    assert output.count("elbow: Warning (open-seams): ") == is_found
-    assert output.find("Warning (open-seams)") < output.find("40 poses, and 12 to find ")
 
 
 def test_an_armature_beside_its_mesh(tmp_path):

@@ -176,10 +176,3 @@ def test_only_registration_adds_handlers():
         # These files run in a Blender of their own, which ends with them.
         and file.relative_to(ADDON).as_posix() not in {"evaluation/video_encoder.py", "baking/export.py"}
     ] == []
-
-
-def test_one_file_uses_foreach_get_and_foreach_set():
-    """scene/arrays.py checks types and shapes; with wrong ones, Blender converts values or reads only some of them."""
-    files = [file for file in python_files("fdda_addon") if "foreach_" in file.read_text("utf-8")]
-    file_names = {file.relative_to(ADDON).as_posix() for file in files}
-    assert file_names == {"scene/arrays.py"}

@@ -6,8 +6,6 @@ connected. Modifiers that smooth then move each piece alone. Its tangents depend
 jumps and opens in cracks, which no network can learn (docs/characters.md, Characters that others made).
 """
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from ..mathematics.partition import main_joints
@@ -28,12 +26,6 @@ MAX_POSES = 50
 """Number of poses in which the gaps are measured."""
 
 
-def check_seams(recording: SkinnedRecording) -> list[RecordingWarning]:
-    """Return the warnings of `find_open_seams` for evenly spaced poses of a recording."""
-    poses = np.unique(np.linspace(0, len(recording.rows) - 1, MAX_POSES).round().astype(np.int64))
-    return find_open_seams(recording.rig, recording.iterate_residuals(poses))
-
-
 def count_split_vertices(rig: Rig) -> int:
     """Count the vertices that lie on others along cuts of the mesh; 0 if these are few."""
     count = len(np.unique(_seam_pairs(rig)))
@@ -48,19 +40,17 @@ def split_vertex_groups(rig: Rig) -> list[np.ndarray]:
     return np.split(vertices[order], np.flatnonzero(np.diff(groups[order])) + 1) if len(vertices) else []
 
 
-def find_open_seams(rig: Rig, residuals: Iterable[np.ndarray]) -> list[RecordingWarning]:
-    """Return the warning "open-seams" if cuts open in the poses; none if the faces of the rig are unknown.
+def check_seams(recording: SkinnedRecording) -> list[RecordingWarning]:
+    """Return the warning "open-seams" if cuts open in evenly spaced poses; none if the faces of the rig are unknown.
 
     Gaps that are the same in all poses can be learned, so they do not count.
-
-    Args:
-        residuals: (V, 3) of each pose, axes of the main joint, mesh units. A mesh without cuts needs none of them.
     """
+    rig, poses = recording.rig, np.linspace(0, len(recording.rows) - 1, MAX_POSES).round().astype(np.int64)
     pairs = _seam_pairs(rig)
     if len(np.unique(pairs)) <= MAX_TORN_RATIO * rig.vertex_count:
         return []
     changes, gaps, first_gaps = np.zeros(len(pairs)), np.zeros(len(pairs)), None
-    for pose_residuals in residuals:
+    for pose_residuals in recording.iterate_residuals(np.unique(poses)):
         pose_gaps = pose_residuals[pairs[:, 0]].astype(np.float64) - pose_residuals[pairs[:, 1]]
         first_gaps = pose_gaps if first_gaps is None else first_gaps
         np.maximum(gaps, np.linalg.norm(pose_gaps, axis=1), out=gaps)

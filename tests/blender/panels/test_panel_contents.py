@@ -174,9 +174,9 @@ class TestTraining:
     def test_curves_of_another_training_with_as_many_epochs_are_painted(self, monkeypatch):
         """The curves of the last training may be freed, and the next may get their id."""
         image, painted = curves.CurvesImage(), []
-        preview = SimpleNamespace(icon_id=1)
+        pixels = SimpleNamespace(foreach_set=lambda values: painted.append(values.tolist()))
+        preview = SimpleNamespace(icon_id=1, image_pixels_float=pixels)
         monkeypatch.setattr(image, "_previews", {"curves": preview})
-        monkeypatch.setattr(curves, "write_pixels", lambda _preview, values: painted.append(values))
         monkeypatch.setattr(curves, "paint", lambda shown: list(shown["training"]))
         live = {"training": [0.9, 0.5], "validation": [1.0, 0.6]}
         for _ in range(2):

@@ -32,8 +32,8 @@ def add_vertices() -> None:
 
 
 def turn_a_face() -> None:
-    for loop in flesh().data.loops[:4]:
-        loop.vertex_index += 5
+    flesh().data.loops[0].vertex_index += 5
+    flesh().data.update(calc_edges=True)
 
 
 def hold() -> None:
