@@ -9,7 +9,7 @@ import pytest
 
 from fdda_addon.core.mathematics.metrics import error_statistics, viewport_colors
 from fdda_addon.core.mathematics.partition import make_partitions
-from fdda_addon.evaluation import heat_map, last_evaluation, markers, overlay
+from fdda_addon.evaluation import heat_map, last_evaluation, markers
 from fdda_addon.evaluation.run import evaluate, evaluate_action
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.rig.reading import read_rig
@@ -118,19 +118,16 @@ def test_colors_follow_the_timeline(active, evaluated_action, view):
 
 
 def test_overlay_follows_edited_and_replaced_faces(active, monkeypatch):
-    monkeypatch.setattr(overlay, "gpu", SimpleNamespace(types=SimpleNamespace(GPUIndexBuf=lambda type, seq: seq)))
-    drawn = overlay.Overlay()
-    colors = np.zeros((len(active.data.vertices), 3), np.float32)
+    monkeypatch.setattr(heat_map, "gpu", SimpleNamespace(types=SimpleNamespace(GPUIndexBuf=lambda type, seq: seq)))
+    drawn = heat_map._MeshColors()
 
-    def drawn_triangles() -> np.ndarray:
-        bpy.context.view_layer.update()
-        return drawn.overlay_mesh(bpy.context, active, colors).triangles
+    def drawn_triangles() -> np.ndarray | None:
+        return drawn.triangles_of(active, active.evaluated_get(bpy.context.evaluated_depsgraph_get()))
 
     original = drawn_triangles()
     assert drawn_triangles() is original
     bpy.ops.object.mode_set(mode="EDIT")
-    bpy.context.view_layer.update()
-    assert drawn.overlay_mesh(bpy.context, active, colors) is None
+    assert drawn_triangles() is None
     bpy.ops.object.mode_set(mode="OBJECT")
     assert drawn_triangles() is not original
     edited = drawn_triangles()
@@ -259,16 +256,8 @@ def test_colors_are_hidden_in_edit_mode_and_by_another_topology(active, colors):
         heat_map.clear_all()
 
 
-def test_only_the_latest_evaluations_are_stored(active):
+def test_only_the_latest_evaluations_are_stored(active, monkeypatch):
+    monkeypatch.setattr(last_evaluation, "MAX_STORED_EVALUATIONS", 1)
+    last_evaluation._evaluations[-1] = None
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
-    assert last_evaluation.get(active) is not None
-    kept = last_evaluation._evaluations[active.session_uid]
-    for uid in range(-last_evaluation.MAX_STORED_EVALUATIONS, 0):
-        last_evaluation._evaluations[uid] = kept
-    bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
-    assert (
-        len(last_evaluation._evaluations) <= last_evaluation.MAX_STORED_EVALUATIONS
-        and last_evaluation.get(active) is not None
-    )
-    for uid in range(-last_evaluation.MAX_STORED_EVALUATIONS, 0):
-        last_evaluation._evaluations.pop(uid, None)
+    assert list(last_evaluation._evaluations) == [active.session_uid]
