@@ -37,11 +37,15 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     filter_glob: bpy.props.StringProperty(default="*.abc;*.usd;*.usdc;*.usda;*.blend", options={"HIDDEN"})
-    suffix: bpy.props.StringProperty(
-        name="Extension",
-        description="Extension of the suggested file",
-        default=".blend",
-        options={"SKIP_SAVE", "HIDDEN"},
+    format: bpy.props.EnumProperty(
+        name="Format",
+        description="File to bake to. A script chooses it by the extension of the file",
+        items=(
+            (".blend", ".blend with Alembic", "A copy of this file, in which the meshes play an .abc file next to it"),
+            (".abc", "Alembic", "An .abc file alone"),
+            (".usdc", "USD", "A .usdc file"),
+        ),
+        options={"SKIP_SAVE"},
     )
     action: bpy.props.StringProperty(
         name="Action",
@@ -63,11 +67,25 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
 
     def suggested_path(self, context: bpy.types.Context) -> str:
         name = bpy.path.clean_name(self.bound_rig(context).mesh_object.name)
-        return f"//{Path(bpy.data.filepath).stem or 'character'}_{name}_baked{self.suffix}"
+        return f"//{Path(bpy.data.filepath).stem or 'character'}_{name}_baked{self.format}"
+
+    def check(self, _context: bpy.types.Context) -> bool:
+        """Give the file in the browser the extension of the format; return whether it has changed."""
+        path, self.filepath = self.filepath, str(Path(self.filepath).with_suffix(self.format))
+        return self.filepath != path
 
     def draw(self, _context: bpy.types.Context) -> None:
-        # The sidebar has the fields; the file browser would list them again.
-        pass
+        column = self.layout.column()
+        column.prop(self, "format")
+        column.prop_search(self, "action", bpy.data, "actions")
+        column.prop(self, "use_frames")
+        row = column.row(align=True)
+        row.active = self.use_frames
+        row.prop(self, "frame_start")
+        row.prop(self, "frame_end")
+        samples = column.row()
+        samples.active = self.format != ".usdc"
+        samples.prop(self, "samples")
 
     def steps(self, context: bpy.types.Context) -> Job[str]:
         mesh_objects = [scene_rig.mesh_object for scene_rig in self.bound_rigs(context)]

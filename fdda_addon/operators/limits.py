@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators on the rotation limits of the selected bones."""
+"""Operators on the rotation limits of bones."""
 
 import math
 
@@ -34,6 +34,31 @@ class _SelectedBonesOperator(LimitsOperator):
         return bones
 
 
+class _AxesOperator(_SelectedBonesOperator):
+    """Mixin for an operator on the limits about some axes, of one bone or of the selected bones."""
+
+    bone: bpy.props.StringProperty(
+        name="Bone", description="Name of the bone. Empty for the selected bones", options={"SKIP_SAVE"}
+    )
+    axes: bpy.props.BoolVectorProperty(
+        name="Axes", description="Axes of the rotation, in local space", default=(True,) * 3, options={"SKIP_SAVE"}
+    )
+
+    def bones(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
+        """Return the bones to apply the operator to.
+
+        Raises:
+            RigError: there is no bone of this name, or no bone is selected.
+        """
+        if not self.bone:
+            return self.selected_bones(context)
+        armature_object = self.rig(context).armature_object
+        bone = armature_object.pose.bones.get(self.bone)
+        if bone is None:
+            raise RigError(f"'{armature_object.name}' has no bone '{self.bone}'; give the name of one.")
+        return [bone]
+
+
 def _copy_limits(from_bone: bpy.types.PoseBone, to_bone: bpy.types.PoseBone, is_mirrored: bool = False) -> None:
     """Copy the rotation limits of one bone to another. Mirroring negates the limits about Y and Z."""
     for axis, limit in enumerate(rotation_ranges(from_bone)):
@@ -46,12 +71,11 @@ def _copy_limits(from_bone: bpy.types.PoseBone, to_bone: bpy.types.PoseBone, is_
         to_bone.lock_rotation[axis] = limit.is_locked or low >= high
 
 
-class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
+class FDDA_OT_set_limits(_AxesOperator, bpy.types.Operator):
     bl_idname = "fdda.set_limits"
     bl_label = "Set Limits of Selected Bones"
     bl_description = "Give all selected bones the same rotation limits"
 
-    axes: bpy.props.BoolVectorProperty(name="Axes", description="Axes to limit", default=(True, True, True))
     low: bpy.props.FloatVectorProperty(
         name="Minimum", subtype="EULER", default=(-math.pi / 4,) * 3, min=-math.pi, max=math.pi
     )
@@ -60,6 +84,8 @@ class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if self.bone:
+            return self.execute(context)
         try:
             ranges = rotation_ranges(self.selected_bones(context)[0])
         except RigError as error:
@@ -81,7 +107,7 @@ class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
             fields.prop(self, "high", index=axis, text="")
 
     def apply(self, context: bpy.types.Context) -> str:
-        bones = self.selected_bones(context)
+        bones = self.bones(context)
         for axis in (axis for axis in range(3) if self.axes[axis]):
             if not self.low[axis] < self.high[axis]:
                 raise RigError(f"The maximum about {AXES[axis]} must be larger than the minimum.")
@@ -169,15 +195,15 @@ class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
         return f"Set human limits for {format_count(count, 'bone')}."
 
 
-class FDDA_OT_clear_limits(_SelectedBonesOperator, bpy.types.Operator):
+class FDDA_OT_clear_limits(_AxesOperator, bpy.types.Operator):
     bl_idname = "fdda.clear_limits"
     bl_label = "Clear Limits of Selected Bones"
     bl_description = "Remove the rotation limits of the selected bones. The default is ±45°"
 
     def apply(self, context: bpy.types.Context) -> str:
-        bones = self.selected_bones(context)
+        bones = self.bones(context)
         for bone in bones:
-            for axis in range(3):
+            for axis in (axis for axis in range(3) if self.axes[axis]):
                 clear_rotation_range(bone, axis)
         return f"Removed the limits of {format_count(len(bones), 'bone')}."
 

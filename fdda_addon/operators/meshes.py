@@ -16,7 +16,6 @@ MENU_OPERATORS = (
     ("fdda.add_sample_arm", "fdda.build_model"),
     ("fdda.measure", "fdda.profile_frame", "fdda.merge_vertices", "fdda.fit_base_skinning", "fdda.select_unlimited"),
     (
-        "fdda.preview_pose",
         "fdda.rest_pose",
         "fdda.poses_to_action",
         "fdda.use_selected_bones",
@@ -29,7 +28,7 @@ MENU_OPERATORS = (
     ("fdda.bind", "fdda.set_mode", "fdda.bake", "fdda.fast_rig", "fdda.relink", "fdda.unbind"),
     ("fdda.evaluate", "fdda.render_comparison", "fdda.show_rig", "fdda.color_mesh", "fdda.fit_color_range"),
     ("fdda.jump_to_worst", "fdda.add_worst_markers", "fdda.remove_markers", "fdda.open_report"),
-    ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model", "fdda.check_model"),
+    ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model"),
     ("fdda.help",),
 )
 """Operators of the menu, in groups with a separator between them."""

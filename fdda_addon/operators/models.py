@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section "Model Library": add, remove, pack and check models."""
+"""Operators of the section "Model Library": add, remove and pack models."""
 
 from pathlib import Path
 
@@ -8,7 +8,6 @@ import bpy
 from ..core.errors import ModelError
 from ..core.wording import format_count
 from ..models import model_list
-from ..models.changes import find_changes
 from ..models.model_list import format_file_size
 from ..scene.scene_rig import remaining_rig_note
 from .rig_operator import ModelFileOperator, RigOperator
@@ -116,18 +115,4 @@ class FDDA_OT_unpack_model(ModelListOperator, bpy.types.Operator):
         return f"Unpacked {entry.name} to {path}."
 
 
-class FDDA_OT_check_model(ModelListOperator, bpy.types.Operator):
-    bl_idname = "fdda.check_model"
-    bl_label = "Check Model"
-    bl_description = "Report what has changed in the rig since the model was trained"
-    bl_options = {"REGISTER"}
-
-    def apply(self, context: bpy.types.Context) -> str:
-        scene_rig, entry = self.active_entry(context)
-        changes = find_changes(scene_rig, entry)
-        if changes.prevents_playback:
-            raise ModelError(changes.sentence)
-        return changes.sentence or f"{entry.name} matches '{scene_rig.mesh_object.name}'."
-
-
-CLASSES = (FDDA_OT_add_model, FDDA_OT_remove_model, FDDA_OT_pack_model, FDDA_OT_unpack_model, FDDA_OT_check_model)
+CLASSES = (FDDA_OT_add_model, FDDA_OT_remove_model, FDDA_OT_pack_model, FDDA_OT_unpack_model)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators on poses and limits: preview random poses, reset the pose, set the limits of a bone, select a bone."""
+"""Operators on poses and limits: reset the pose, make an action of poses, set limits from actions, select a bone."""
 
-import math
 from collections.abc import Collection
 from contextlib import ExitStack, suppress
 
@@ -11,7 +10,6 @@ from ..core.errors import FDDAError, RigError
 from ..core.progress import Job
 from ..core.wording import format_count
 from ..poses.measured_limits import set_limits_from_actions
-from ..poses.motion_range import clear_rotation_range, set_rotation_range
 from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
 from ..recording.pose_plan import show_random_pose, show_rest_pose, shows_random_pose
 from ..recording.posed_action import make_posed_action
@@ -21,28 +19,6 @@ from ..scene.compatibility import select_bone
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
 from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator
-
-
-class FDDA_OT_preview_pose(RigOperator, bpy.types.Operator):
-    bl_idname = "fdda.preview_pose"
-    bl_label = "Preview Random Pose"
-    bl_description = "Show one of the random poses that will be recorded"
-    modes = OBJECT_OR_POSE_MODE
-
-    number: bpy.props.IntProperty(
-        name="Index",
-        description="Index of the pose, from 0. -1 for the last one shown",
-        default=-1,
-        min=-1,
-        options={"SKIP_SAVE"},
-    )
-    step: bpy.props.IntProperty(name="Step", description="Number to add to the index", options={"SKIP_SAVE"})
-
-    def apply(self, context: bpy.types.Context) -> str:
-        rig, session = self.rig(context), context.window_manager.fdda
-        start = self.number if self.number >= 0 else max(session.pose_index, 0 if self.step <= 0 else -1)
-        session.pose_index = show_random_pose(rig, recording_settings(rig), max(0, start + self.step))
-        return f"Random pose {session.pose_index + 1}."
 
 
 class FDDA_OT_rest_pose(RigOperator, bpy.types.Operator):
@@ -99,61 +75,6 @@ class LimitsOperator(RigOperator):
             with suppress(FDDAError):
                 show_random_pose(rig, recording_settings(rig), context.window_manager.fdda.pose_index)
         return result
-
-
-class _LimitOperator(LimitsOperator):
-    """Mixin for an operator on the rotation limit of a bone about one axis."""
-
-    bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
-    axis: bpy.props.EnumProperty(
-        name="Axis", description="Of the rotation, in the bone's local space", items=[(a, a, "") for a in "XYZ"]
-    )
-
-    def pose_bone(self, context: bpy.types.Context) -> bpy.types.PoseBone:
-        """Return the bone to apply the operator to.
-
-        Raises:
-            RigError: there is no bone of this name.
-        """
-        armature_object = self.rig(context).armature_object
-        bone = armature_object.pose.bones.get(self.bone)
-        if bone is None:
-            raise RigError(f"'{armature_object.name}' has no bone '{self.bone}'; give the name of one.")
-        return bone
-
-    @property
-    def axis_index(self) -> int:
-        return "XYZ".index(self.axis)
-
-
-class FDDA_OT_set_limit(_LimitOperator, bpy.types.Operator):
-    bl_idname = "fdda.set_limit"
-    bl_label = "Set Limit"
-    bl_description = "Limit the rotation of the bone about this axis, in its Limit Rotation constraint or as IK limits"
-
-    low: bpy.props.FloatProperty(
-        name="Minimum", subtype="ANGLE", default=-math.pi / 4, min=-math.pi, max=math.pi, description="Lowest angle"
-    )
-    high: bpy.props.FloatProperty(
-        name="Maximum", subtype="ANGLE", default=math.pi / 4, min=-math.pi, max=math.pi, description="Highest angle"
-    )
-
-    def apply(self, context: bpy.types.Context) -> str:
-        bone = self.pose_bone(context)
-        set_rotation_range(bone, self.axis_index, self.low, self.high)
-        low, high = math.degrees(self.low), math.degrees(self.high)
-        return f"'{bone.name}' rotates about {self.axis} from {low:.0f}° to {high:.0f}°."
-
-
-class FDDA_OT_clear_limit(_LimitOperator, bpy.types.Operator):
-    bl_idname = "fdda.clear_limit"
-    bl_label = "Clear Limit"
-    bl_description = "Remove the rotation limit of the bone about this axis. The default is ±45°"
-
-    def apply(self, context: bpy.types.Context) -> str:
-        bone = self.pose_bone(context)
-        clear_rotation_range(bone, self.axis_index)
-        return f"Removed the limit of '{bone.name}' about {self.axis}."
 
 
 class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
@@ -225,11 +146,8 @@ def select_bones(context: bpy.types.Context, rig: SceneRig, names: Collection[st
 
 
 CLASSES = (
-    FDDA_OT_preview_pose,
     FDDA_OT_rest_pose,
     FDDA_OT_poses_to_action,
-    FDDA_OT_set_limit,
-    FDDA_OT_clear_limit,
     FDDA_OT_limits_from_actions,
     FDDA_OT_show_bone,
 )

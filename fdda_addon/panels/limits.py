@@ -7,7 +7,6 @@ from collections.abc import Iterable
 import bpy
 
 from ..core.mathematics.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, Channel
-from ..operators.poses import FDDA_OT_set_limit
 from ..poses.motion_range import (
     CONSTRAINT,
     DEFAULT,
@@ -239,14 +238,14 @@ def _draw_limits(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
         if axis_range.source == DEFAULT:
             text = "locked (IK)" if axis_range.is_locked and not bone.lock_rotation[axis] else "±45° (default)"
             fields.label(text="locked" if bone.lock_rotation[axis] else text)
-            _draw_limit_button(fields, rig, bone, axis, "fdda.set_limit", "ADD")
+            _draw_limit_button(fields, rig, bone, axis, "fdda.set_limits", "ADD")
             continue
         owner, prefix = (
             (find_local_limit(bone, "LIMIT_ROTATION"), "") if axis_range.source == CONSTRAINT else (bone, "ik_")
         )
         fields.prop(owner, f"{prefix}min_{AXES[axis]}", text="")
         fields.prop(owner, f"{prefix}max_{AXES[axis]}", text="")
-        _draw_limit_button(fields, rig, bone, axis, "fdda.clear_limit", "X")
+        _draw_limit_button(fields, rig, bone, axis, "fdda.clear_limits", "X")
     for axis in locations:
         row = column.row(align=True)
         limit = find_local_limit(bone, "LIMIT_LOCATION")
@@ -259,7 +258,8 @@ def _draw_limit_button(
     layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone, axis: int, operator: str, icon: str
 ) -> None:
     properties = layout.operator(operator, text="", icon=icon)
-    properties.object, properties.bone, properties.axis = rig.mesh_object.name, bone.name, AXES[axis].upper()
-    if operator == FDDA_OT_set_limit.bl_idname:
+    properties.object, properties.bone = rig.mesh_object.name, bone.name
+    properties.axes = tuple(index == axis for index in range(3))
+    if operator == "fdda.set_limits":
         # Otherwise Blender would use the values of the last call.
-        properties.low, properties.high = -math.pi / 4, math.pi / 4
+        properties.low, properties.high = (-math.pi / 4,) * 3, (math.pi / 4,) * 3

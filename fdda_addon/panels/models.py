@@ -5,8 +5,9 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..core.formats.model_info import ModelInfo
-from ..core.mathematics.poses import CONTROL, Channel
-from ..models.changes import compare_with_model
+from ..core.mathematics.poses import CONTROL, ROTATION_VECTOR, Channel, bones_with_changed_range
+from ..core.rig import Rig, rig_differences
+from ..core.wording import format_list
 from ..models.model_list import active_entry, entry_info, entry_info_of_mesh, format_file_size, is_bound
 from ..properties.recording_options import bones_to_pose
 from ..rig.reading import read_model_rig
@@ -37,12 +38,33 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
             info = entry_info_of_mesh(mesh_object, entry)
             if check is not None and check.rig is not None:
                 rig = rig_of_model(scene_rig, check.rig, info)
-                changes = compare_with_model(entry.name, info, rig, _compared_channels(scene_rig, check.channels, info))
-                if changes.sentence:
-                    problems[_entry_key(entry)] = ("ERROR" if changes.prevents_playback else "INFO", changes.sentence)
+                channels = _compared_channels(scene_rig, check.channels, info)
+                if (problem := _describe_changes(entry.name, info, rig, channels)) is not None:
+                    problems[_entry_key(entry)] = problem
         except FDDAError as error:
             problems[_entry_key(entry)] = ("ERROR", str(error))
     return problems
+
+
+def _describe_changes(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> tuple[str, str] | None:
+    """Describe how a rig with the joints of a model, and its ranges of motion, differ from those of its training.
+
+    Returns:
+        An icon and a message. None without a difference.
+    """
+    if differences := rig_differences(info.joints, info.rest_matrices, info.meshes, rig):
+        return "ERROR", (
+            f"{name} was trained for an earlier state of this rig: {'; '.join(differences)}. "
+            "Undo the change, or record and train again."
+        )
+    # Ranges of control bones and of actions are chosen by the user and not compared.
+    has_joint_ranges = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
+    if not (info.limits and has_joint_ranges and (names := bones_with_changed_range(info.limits, channels))):
+        return None
+    return "INFO", (
+        f"The range of motion of {format_list(names)} has changed since {name} was trained: it plays, but may be less "
+        "exact there. Record and train again."
+    )
 
 
 def _compared_channels(

@@ -77,7 +77,8 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         self._draw_bound(context, mesh_object)
         if not mesh_object.fdda.status:
             self._draw_confidence(context, mesh_object)
-            self._draw_bake(context)
+            if not draw_job(layout, context, "bake"):
+                draw_button(layout, context, "fdda.bake", "Bake…", "EXPORT", is_bound)
             if mesh_object.fdda.is_fast_rig:
                 text = (
                     "This is a fast rig: it lacks modifiers and bones of the full rig. For rendering, relocate the "
@@ -190,28 +191,6 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             row.progress(factor=value, text=f"{100 * value:.0f} %")
         if len(partitions_beyond_range) > MAX_SHOWN_PARTITIONS:
             column.label(text=f"and {len(partitions_beyond_range) - MAX_SHOWN_PARTITIONS} more")
-
-    def _draw_bake(self, context: bpy.types.Context) -> None:
-        header, body = self.layout.panel("fdda_bake", default_closed=True)
-        header.label(text="Bake")
-        if body is None or draw_job(body, context, "bake"):
-            return
-        session = context.window_manager.fdda
-        column = body.column()
-        column.prop(session, "bake_format", text="")
-        column.prop(session, "bake_action", text="", icon="ACTION", placeholder="Animation of the Scene")
-        column.prop(session, "bake_use_frames")
-        row = column.row(align=True)
-        row.active = session.bake_use_frames
-        row.prop(session, "bake_start")
-        row.prop(session, "bake_end")
-        samples = column.row()
-        samples.active = session.bake_format != ".usdc"
-        samples.prop(session, "bake_samples")
-        button = draw_button(body, context, "fdda.bake", "Bake…", "EXPORT", is_bound)
-        button.action, button.use_frames = session.bake_action, session.bake_use_frames
-        button.frame_start, button.frame_end = session.bake_start, session.bake_end
-        button.suffix, button.samples = session.bake_format, session.bake_samples if samples.active else 1
 
 
 CLASSES = (FDDA_PT_playback,)

@@ -4,7 +4,7 @@
 from contextlib import suppress
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
 
 from ..core.errors import FDDAError
 from ..jobs.job import current
@@ -12,7 +12,7 @@ from ..recording.pose_plan import show_random_pose, show_rest_pose
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
 from .character import not_animatable
-from .recording_options import actions_of_active_rig, complete_settings, recording_settings
+from .recording_options import complete_settings, recording_settings
 
 
 def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
@@ -61,27 +61,6 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
         get=lambda session: session.pose_index + 1,
         set=_show_random_pose,
     )
-    bake_format: EnumProperty(
-        name="Format",
-        description="File to bake to",
-        items=(
-            (".blend", ".blend with Alembic", "A copy of this file, in which the meshes play an .abc file next to it"),
-            (".abc", "Alembic", "An .abc file alone"),
-            (".usdc", "USD", "A .usdc file"),
-        ),
-    )
-    bake_action: StringProperty(
-        name="Action",
-        description="Action to bake. Empty for the animation of the scene",
-        search=lambda _session, context, _text: actions_of_active_rig(context),
-    )
-    bake_use_frames: BoolProperty(name="Frame Range", description="Bake these frames instead of all of the action")
-    bake_start: IntProperty(name="Start", description="First frame to bake", default=1)
-    bake_end: IntProperty(name="End", description="Last frame to bake", default=250)
-    bake_samples: IntProperty(
-        name="Samples", description="Samples per frame, for motion blur of an Alembic file", default=1, min=1
-    )
-
     bone_index: IntProperty(
         name="Bone", description="Active bone of the armature", get=_active_bone_index, set=_set_active_bone
     )

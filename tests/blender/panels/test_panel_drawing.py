@@ -179,7 +179,7 @@ def test_the_menu_has_all_operators_but_those_that_need_a_button_of_a_panel():
     assert set(dir(bpy.ops.fdda)) - in_menu == {
         *("add_trusted_folder", "remove_trusted_folder"),
         *("cancel", "cancel_trainer_environment", "open_trainer_log", "remove_trainer_environment"),
-        *("set_limit", "clear_limit", "show_bone", "show_mesh", "copy_objects"),
+        *("show_bone", "show_mesh", "copy_objects"),
     }
 
 
