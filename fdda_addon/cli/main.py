@@ -23,7 +23,6 @@ from .interruption import interruptible, raise_pending
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
     "build-model": ("build_model", "record a character, train a model and bind it, with one command"),
-    "limits": ("limits", "set the rotation limits of a rig to the motion in actions"),
     "record": ("record", "record how a rig deforms its mesh in random poses and actions"),
     "check-recording": ("check_recording", "check a recording for problems before training"),
     "check-trainer": ("check_trainer", "check the Python that trains, and show its device"),

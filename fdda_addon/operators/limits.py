@@ -190,7 +190,7 @@ class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
         if not count:
             raise RigError(
                 f"No bone of '{armature_object.name}' without limits has the name of a body part; set the limits by "
-                "hand, or from actions."
+                "hand, or check actions."
             )
         return f"Set human limits for {format_count(count, 'bone')}."
 

@@ -15,12 +15,7 @@ from .rig_operator import RigOperator
 MENU_OPERATORS = (
     ("fdda.add_sample_arm", "fdda.build_model"),
     ("fdda.measure", "fdda.profile_frame", "fdda.merge_vertices", "fdda.fit_base_skinning", "fdda.select_unlimited"),
-    (
-        "fdda.rest_pose",
-        "fdda.poses_to_action",
-        "fdda.use_selected_bones",
-        "fdda.limits_from_actions",
-    ),
+    ("fdda.rest_pose", "fdda.poses_to_action", "fdda.use_selected_bones"),
     ("fdda.human_limits", "fdda.copy_limits", "fdda.mirror_limits", "fdda.set_limits", "fdda.clear_limits"),
     ("fdda.add_control", "fdda.add_control_bones", "fdda.remove_control"),
     ("fdda.record", "fdda.export_skinning", "fdda.delete_recording"),

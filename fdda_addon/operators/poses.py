@@ -9,8 +9,7 @@ import bpy
 from ..core.errors import FDDAError, RigError
 from ..core.progress import Job
 from ..core.wording import format_count
-from ..poses.measured_limits import set_limits_from_actions
-from ..properties.recording_options import complete_settings, recorded_actions, recording_settings
+from ..properties.recording_options import complete_settings, recording_settings
 from ..recording.pose_plan import show_random_pose, show_rest_pose, shows_random_pose
 from ..recording.posed_action import make_posed_action
 from ..runtime.binding import model_disabled
@@ -77,42 +76,6 @@ class LimitsOperator(RigOperator):
         return result
 
 
-class FDDA_OT_limits_from_actions(LimitsOperator, bpy.types.Operator):
-    bl_idname = "fdda.limits_from_actions"
-    bl_label = "Set Limits from Actions"
-    bl_description = "Set each bone's limits to the motion in the checked actions. Bones can still be posed freely"
-
-    margin: bpy.props.FloatProperty(
-        name="Margin",
-        description="Part of each range to add at both ends",
-        default=0.1,
-        min=0.0,
-        max=10.0,
-    )
-
-    def apply(self, context: bpy.types.Context) -> str:
-        rig = self.rig(context)
-        names = recorded_actions(rig)
-        if not names:
-            raise RigError(
-                "No action is checked; check the actions under Also Record Actions that show how the rig moves."
-            )
-        limits = set_limits_from_actions(rig, [bpy.data.actions[name] for name in names], self.margin)
-        limited_bones = {limit.bone for limit in limits if not limit.reason_unset}
-        unset_limits = [limit for limit in limits if limit.reason_unset]
-        remarks = ""
-        if unset_limits:
-            count, first = format_count(len(unset_limits), "axis", "axes"), unset_limits[0]
-            remarks = f"; {count} not changed ('{first.bone}' {first.reason_unset})"
-        if wide_bones := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
-            count = format_count(len(wide_bones), "bone")
-            remarks += (
-                f"; {count} near gimbal lock ('{wide_bones[0]}') with limits that are too wide: choose Bones in the "
-                "Checked Actions instead"
-            )
-        return f"Set the limits of {format_count(len(limited_bones), 'bone')} from {', '.join(names)}{remarks}."
-
-
 class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.show_bone"
     bl_label = "Select Bone"
@@ -148,6 +111,5 @@ def select_bones(context: bpy.types.Context, rig: SceneRig, names: Collection[st
 CLASSES = (
     FDDA_OT_rest_pose,
     FDDA_OT_poses_to_action,
-    FDDA_OT_limits_from_actions,
     FDDA_OT_show_bone,
 )

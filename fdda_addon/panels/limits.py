@@ -16,7 +16,7 @@ from ..poses.motion_range import (
     location_ranges,
     rotation_ranges,
 )
-from ..properties.recording_options import bones_to_pose, recorded_actions
+from ..properties.recording_options import bones_to_pose
 from ..scene.compatibility import is_selected, selection_owner
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
@@ -159,16 +159,6 @@ def _format_range(low: float, high: float, is_wide: bool) -> str:
     if low == -high:
         return f"±{high}°"
     return f"{low}…{high}°" if is_wide else f"{high - low}°"
-
-
-def draw_limit_sources(layout: bpy.types.UILayout, rig: SceneRig) -> None:
-    """Draw the buttons that set the limits of all bones."""
-    column = layout.column(align=True)
-    column.operator("fdda.human_limits", text="Human Limits (All Bones)", icon="OUTLINER_OB_ARMATURE")
-    row = column.row(align=True)
-    # It can be pressed, so that its message says what to do first.
-    row.active = bool(recorded_actions(rig))
-    row.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
 
 
 def draw_limits(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

@@ -52,7 +52,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         if rig is None:
             return
         _draw_shared(layout, context, rig)
-        limits.draw_limit_sources(layout, rig)
+        layout.operator("fdda.human_limits", text="Human Limits (All Bones)", icon="OUTLINER_OB_ARMATURE")
         sampling.draw_bones_to_pose(layout, context, rig)
         _draw_table(layout, context, rig)
         row = layout.row(align=True)

@@ -131,14 +131,8 @@ def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.typ
         `LOCATION` in meters, `SCALE` as factors. Rotations are Euler angles as `armature.Poser` sets them: in the
         rotation order of the bone (XYZ for quaternions and axis angles), and continuous beyond 180 degrees.
     """
-    return moving_ranges(keyed_ranges(armature_object, actions))
-
-
-def moving_ranges(keyed_channel_ranges: ChannelRanges) -> ChannelRanges:
-    """Select the ranges of moving channels from the ranges of `keyed_ranges`."""
-    return {
-        key: bounds for key, bounds in keyed_channel_ranges.items() if key[1] != ROTATION_VECTOR and has_width(bounds)
-    }
+    ranges = keyed_ranges(armature_object, actions)
+    return {key: bounds for key, bounds in ranges.items() if key[1] != ROTATION_VECTOR and has_width(bounds)}
 
 
 def has_width(bounds: tuple[float, float]) -> bool:

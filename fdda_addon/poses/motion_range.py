@@ -22,8 +22,6 @@ from ..core.rig import Rig
 from ..scene.armature import FOUR_COMPONENT_ROTATIONS
 
 AXES = "xyz"
-RANGE_NAME = "FDDA Range"
-"""Name of the constraints that store a range without enforcing it."""
 CONSTRAINT, IK, DEFAULT = "CONSTRAINT", "IK", "DEFAULT"
 """Where a range is stored: in a Limit constraint, as IK limits, or nowhere, so that the default range applies."""
 LIMIT_CONSTRAINT_TYPES = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
@@ -165,35 +163,6 @@ def clear_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
         setattr(bone, f"lock_ik_{letter}", False)
 
 
-def ensure_range_constraint(bone: bpy.types.PoseBone, constraint_type: str) -> bpy.types.Constraint:
-    """Return the constraint that stores the ranges of a bone with an influence of 0; add it if there is none.
-
-    A new constraint becomes the first one of the bone, and gets the existing ranges.
-
-    Args:
-        constraint_type: "LIMIT_ROTATION", "LIMIT_LOCATION" or "LIMIT_SCALE".
-    """
-    existing_constraint = find_local_limit(bone, constraint_type)
-    if existing_constraint is not None and existing_constraint.influence == 0:
-        return existing_constraint
-    existing_rotation_ranges = rotation_ranges(bone)
-    read_ranges = {"LIMIT_LOCATION": location_ranges, "LIMIT_SCALE": scale_ranges}
-    existing_ranges = read_ranges[constraint_type](bone) if constraint_type in read_ranges else {}
-    constraint = bone.constraints.new(constraint_type)
-    constraint.name, constraint.owner_space, constraint.influence = RANGE_NAME, "LOCAL", 0.0
-    bone.constraints.move(len(bone.constraints) - 1, 0)
-    if constraint_type == "LIMIT_ROTATION":
-        for axis, rotation_range in enumerate(existing_rotation_ranges):
-            if rotation_range.source != DEFAULT:
-                set_constraint_limit(constraint, axis, rotation_range.low, rotation_range.high)
-            elif rotation_range.is_locked and not bone.lock_rotation[axis]:
-                # IK locks are ignored if there is a constraint.
-                set_constraint_limit(constraint, axis, 0.0, 0.0)
-    for axis, bounds in existing_ranges.items():
-        set_constraint_limit(constraint, axis, *bounds)
-    return constraint
-
-
 def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float, high: float) -> None:
     """Set the limits of one axis of a Limit constraint, in radians, meters or factors."""
     letter = AXES[axis]
@@ -202,19 +171,6 @@ def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float
             setattr(constraint, name, True)
     setattr(constraint, f"min_{letter}", low)
     setattr(constraint, f"max_{letter}", high)
-
-
-def enforced_range(bone: bpy.types.PoseBone, constraint_type: str, axis: int) -> tuple[float, float]:
-    """Return the range that Limit constraints in local space enforce on an axis; infinite without such a constraint."""
-    limits = [
-        axis_limits(constraint, axis)
-        for constraint in bone.constraints
-        if constraint.type == constraint_type
-        and constraint.owner_space == "LOCAL"
-        and not constraint.mute
-        and constraint.influence
-    ]
-    return max([low for low, _ in limits], default=-np.inf), min([high for _, high in limits], default=np.inf)
 
 
 LIMIT_CONSTRAINTS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}

@@ -31,8 +31,7 @@ from .action_range import (
     evaluate_curves,
     has_width,
     keyed_numbers,
-    keyed_ranges,
-    moving_ranges,
+    measured_ranges,
 )
 from .clip_player import flipped_name, flipped_path
 from .motion_range import limited_bones
@@ -59,7 +58,7 @@ def choose_bones(scene_rig: SceneRig, recorded_actions: Sequence[bpy.types.Actio
     if not recorded_actions and limited_bones(scene_rig.armature_object):
         return ()
     actions = remixed_actions(scene_rig, recorded_actions)
-    return (REMIX,) if moving_ranges(keyed_ranges(scene_rig.armature_object, actions)) else ()
+    return (REMIX,) if measured_ranges(scene_rig.armature_object, actions) else ()
 
 
 def describe_bones(

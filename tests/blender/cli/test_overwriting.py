@@ -36,8 +36,6 @@ def place(elbow_files, tmp_path):
 RECORDING = "recording/recording.json"
 VERBS = {
     "build-arm over a note": ("build-arm notes.txt", "notes.txt", "a .blend file"),
-    "limits in place": ("limits rig.blend rig.blend --action bend", "rig.blend", ""),
-    "limits over a model": ("limits rig.blend m.onnx --action bend", "m.onnx", "a .blend file"),
     "check-recording over its index": (
         f"check-recording recording --json {RECORDING}",
         RECORDING,

@@ -12,7 +12,6 @@ from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
 from fdda_addon.panels.limits import _format_channels
 from fdda_addon.poses.action_range import measured_ranges
-from fdda_addon.poses.measured_limits import GIMBAL_LOCK_NOTE, describe_limits, set_limits_from_actions
 from fdda_addon.poses.sample_selection import select_bones
 from fdda_addon.poses.sampling import sampled_channels, selected_channels
 from fdda_addon.recording.plan import RecordingSettings, read_sampled_rig
@@ -21,7 +20,6 @@ from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.compatibility import animation_curves, select_bone
 from fdda_addon.scene.scene_rig import SceneRig
 
-from ..conftest import run
 from ..figure import WAVE, add_wave, build_figure, key_channel
 
 ARM = "arm.L"
@@ -85,10 +83,6 @@ def test_a_channel_keyed_at_a_constant_value_keeps_the_value(figure):
     for frame, turn in ((1, -0.2), (9, 0.2)):
         key_channel(spine, frame, "rotation_euler", (0.75, turn, 0))
         key_channel(spine, frame, "location", (0, 0.5, 0))
-    limits = set_limits_from_actions(figure, bpy.data.actions, 0.0)
-    assert describe_limits(figure.armature_object, limits) == [
-        "spine: turns X 43.0 to 43.0° (constant and not at rest, so it gets no range), turns Y -11.5 to 11.5°"
-    ]
     channels = sampled(figure)
     assert _format_channels(list(channels), True) == "locked  ±11°  locked"
     assert ranges(channels, "spine") == {
@@ -151,8 +145,6 @@ def test_random_poses_are_close_to_the_poses_of_actions(figure, motion, mode):
         drawn[-1] = drawn[-1].copy()
     apart = 2 * np.arccos(np.clip(np.abs(np.array(drawn) @ keyed.T).max(axis=1), 0, 1))
     assert np.degrees(apart.max()) < 20
-    wide = [line for line in describe_limits(figure.armature_object, set_limits_from_actions(figure, bpy.data.actions))]
-    assert [GIMBAL_LOCK_NOTE in line for line in wide] == [motion == "gimbal lock"]
 
 
 def test_euler_angles_of_several_actions_do_not_wrap(figure):
@@ -197,13 +189,3 @@ def test_selections_without_bones_are_refused(figure, settings, message):
         select_bone(bone, False)
     with pytest.raises(RigError, match=message):
         read_sampled_rig(figure, RecordingSettings(**settings))
-
-
-def test_an_action_that_moves_no_bone_is_printed(figure, tmp_path, capsys):
-    add_wave(figure)
-    figure.mesh_object.animation_data_create().action = bpy.data.actions.new("slide")
-    figure.mesh_object.keyframe_insert("location", frame=1)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
-    options = ("--action", WAVE, "--action", "slide")
-    assert run("limits", tmp_path / "rig.blend", tmp_path / "limited.blend", *options) == 0
-    assert "The action 'slide' moves no bone of 'figure_rig'." in capsys.readouterr().out
