@@ -4,13 +4,12 @@
 A timer iterates them. A modal operator would end when its window, such as the preferences, is closed.
 """
 
-import queue
 import threading
 from collections.abc import Callable
 
 import bpy
 
-from ..core.progress import Job, Progress, Result
+from ..core.progress import Job, Result, run_job
 from .job import current_runner, redraw
 from .state import ENVIRONMENT, JobState
 
@@ -23,43 +22,34 @@ def iterate_in_thread(job: Job[Result], state: JobState, cancel: Callable[[], No
     """Iterate a job in a thread, because it blocks; it must not use data of Blender.
 
     Args:
-        state: state of the job, whose `cancel_requested` is checked.
+        state: state of the job. The thread shows the progress in it.
         cancel: thread-safe function that makes `job` end soon; None if it cannot be canceled.
 
     Raises:
         BaseException: the exception that `job` has raised.
     """
-    steps: queue.SimpleQueue[Progress | BaseException | None] = queue.SimpleQueue()
+    outcomes: list[Result | BaseException] = []
 
     def work() -> None:
         try:
-            while True:
-                steps.put(next(job))
+            outcomes.append(run_job(job, state.show))
         except BaseException as error:  # Raised again in the main thread.
-            steps.put(error)
+            outcomes.append(error)
 
     thread = threading.Thread(target=work, name=f"FDDA: {state.title}", daemon=True)
     thread.start()
-    is_cancel_sent = False
     try:
-        while True:
-            if state.cancel_requested and cancel and not is_cancel_sent:
-                is_cancel_sent = True
+        while thread.is_alive():
+            if state.cancel_requested and cancel:
                 cancel()
-            try:
-                step = steps.get_nowait()
-            except queue.Empty:
-                yield None
-                continue
-            if isinstance(step, StopIteration):
-                return step.value
-            if isinstance(step, BaseException):
-                raise step
-            yield step
+            yield None
     finally:
         if cancel and thread.is_alive():
             cancel()
         thread.join(THREAD_JOIN_SECONDS)
+    if isinstance(outcomes[0], BaseException):
+        raise outcomes[0]
+    return outcomes[0]
 
 
 def run_in_background() -> None:

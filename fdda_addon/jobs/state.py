@@ -2,10 +2,10 @@
 """The state of a running or ended job, which panels draw."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from ..core.progress import Progress
-from .plan import JobPlan
 
 CHARACTER, ENVIRONMENT = "character", "environment"
 """Kinds of jobs. A job on a character ends when another file is opened. A job on the training environment uses no data
@@ -31,6 +31,8 @@ PREPARING_STAGES = {
     *("full rig", "repeated poses", "fast rig"),
 }
 """Stages that are always followed by another stage of the same job."""
+JobStep = tuple[str, tuple[str, ...]]
+"""A step of a job: what is done, as a participle ("recording"), and the stages of `Progress` that belong to it."""
 
 
 @dataclass
@@ -47,9 +49,10 @@ class JobState:
         is_running: whether it is running.
         cancel_requested: whether the user has requested cancellation.
         current_object: name of the object that the job works on now; empty for a job on one object.
-        plan: the steps of a job that has several; None for others.
+        steps: the steps of a job; empty for a job with one.
+        step: index of the running step.
         stage, done, total: progress. If the number of steps is unknown, total is 0 and done counts seconds.
-        started, ended: times of `time.monotonic`, seconds.
+        ended: when it ended, a time of `time.monotonic`, seconds.
         note: why something that the user has tried must wait; empty for nothing.
         outcome: message at the end of the job; empty while it runs.
         outcome_level: 'INFO', 'WARNING' (canceled) or 'ERROR'.
@@ -66,11 +69,11 @@ class JobState:
     is_running: bool = True
     cancel_requested: bool = False
     current_object: str = ""
-    plan: JobPlan | None = None
+    steps: Sequence[JobStep] = ()
+    step: int = 0
     stage: str = ""
     done: int = 0
     total: int = 0
-    started: float = field(default_factory=time.monotonic)
     ended: float = 0.0
     note: str = ""
     outcome: str = ""
@@ -78,7 +81,6 @@ class JobState:
     warnings: list[str] = field(default_factory=list)
     curves: dict[str, list[float]] = field(default_factory=dict)
     _stage_start: tuple[float, int] = (0.0, 0)
-    _shown_fraction: float = 0.0
 
     @property
     def busy_text(self) -> str:
@@ -87,46 +89,29 @@ class JobState:
 
     @property
     def fraction(self) -> float:
-        """Return the completed ratio of the job, 0 to 1: by time if it has a plan, else of its only stage."""
-        if self.plan is None:
-            return self.done / self.total if self.total else 0.0
-        remaining, elapsed = self.remaining_seconds, time.monotonic() - self.started
-        if remaining is not None and elapsed > 0:
-            # Estimates change, but a bar should neither go back nor be full before the last step is.
-            step_fraction = (self.plan.index + self.done / max(self.total, 1)) / len(self.plan.steps)
-            limit = min(step_fraction, 1.0) if self.total else 1.0
-            self._shown_fraction = max(self._shown_fraction, min(elapsed / (elapsed + remaining), limit))
-        return self._shown_fraction
+        """Return the completed ratio of the stage, 0 to 1."""
+        return self.done / self.total if self.total else 0.0
 
     @property
     def remaining_seconds(self) -> float | None:
-        """Return the estimated remaining time of the job; None if it is unknown."""
-        if not self.is_running:
+        """Return the estimated remaining time of the stage; None if it is unknown."""
+        start, first_done = self._stage_start
+        if not self.total or self.done <= first_done:
             return None
-        stage_start, first_done = self._stage_start
-        if self.total and self.done > first_done:
-            seconds_per_step = (time.monotonic() - stage_start) / (self.done - first_done)
-            stage_seconds = seconds_per_step * (self.total - self.done)
-        elif self.plan is not None and self.plan.current.seconds is not None:
-            seconds_per_step = None
-            stage_seconds = max(1.0, self.plan.current.seconds - (time.monotonic() - (stage_start or self.started)))
-        else:
-            return None
-        later_seconds = self.plan.later_seconds(seconds_per_step) if self.plan is not None else 0.0
-        return None if later_seconds is None else stage_seconds + later_seconds
+        return (time.monotonic() - start) / (self.done - first_done) * (self.total - self.done)
 
     @property
     def heading(self) -> str:
         """Return a short text for the progress bar: "Step 2 of 5, body", "body" or "Recording"."""
-        parts = [self.plan.heading if self.plan is not None else "", self.current_object]
+        parts = [f"Step {self.step + 1} of {len(self.steps)}" if len(self.steps) > 1 else "", self.current_object]
         return ", ".join(filter(None, parts)) or self.title
 
     @property
     def detail(self) -> str:
         """Return the progress of the stage: "Training: 50 of 200", "Poses compared: 3 of 10", "Starting…"."""
         stage, separator, mesh_part = self.stage.partition(" of '")
-        is_step = self.plan is not None and stage in ("", self.plan.current.stages[0])
-        label = self.plan.current.label if is_step else STAGE_UNITS.get(stage, stage)
+        step_label, step_stages = self.steps[self.step] if self.steps else ("", ())
+        label = step_label if stage in ("", *step_stages[:1]) else STAGE_UNITS.get(stage, stage)
         if not self.stage:
             return f"{label[:1].upper()}{label[1:]}…" if label else "Starting…"
         count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
@@ -140,17 +125,24 @@ class JobState:
 
     @property
     def remaining_text(self) -> str:
-        """Return the remaining time as text: "About 5 min left"; "…" while it is unknown."""
+        """Return the remaining time as text: "About 5 min left", with steps that follow "in this step"; "…" before."""
         if self.is_finishing:
             return "Finishing…"
         seconds_left = self.remaining_seconds
-        return "…" if seconds_left is None else f"About {format_duration(seconds_left)} left"
+        if seconds_left is None:
+            return "…"
+        return f"About {format_duration(seconds_left)} left{'' if self.is_in_last_step else ' in this step'}"
+
+    @property
+    def is_in_last_step(self) -> bool:
+        """Return whether no step follows."""
+        return self.step >= len(self.steps) - 1
 
     @property
     def is_finishing(self) -> bool:
         """Return whether the last stage is complete."""
-        is_last = self.plan is None or self.plan.is_last
-        return is_last and 0 < self.total == self.done and self.stage.partition(" of '")[0] not in PREPARING_STAGES
+        is_complete = self.is_in_last_step and 0 < self.total == self.done
+        return is_complete and self.stage.partition(" of '")[0] not in PREPARING_STAGES
 
     def begin_object(self, name: str) -> None:
         """Reset the progress and the curves, because the job begins with another object."""
@@ -161,8 +153,9 @@ class JobState:
         """Update the progress."""
         if progress.stage != self.stage:
             self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
-            if self.plan is not None:
-                self.plan.enter(progress.stage.partition(" of '")[0])
+            name = progress.stage.partition(" of '")[0]
+            later_steps = range(self.step, len(self.steps))
+            self.step = next((index for index in later_steps if name in self.steps[index][1]), self.step)
         self.done, self.total = progress.done, progress.total
 
 

@@ -7,13 +7,11 @@ from ..core.errors import RigError
 from ..core.progress import Job
 from ..core.recording.folder import is_recorded
 from ..core.recording.index import INDEX_NAME
-from ..jobs.plan import JobPlan
 from ..properties.character import model_file, recording_folder
-from ..properties.recording_options import planned_pose_count
 from ..recording.rig_check import check_has_weights
 from ..scene.scene_rig import SceneRig, armature_of, describe_left_out
 from .playback import bind_model
-from .recording import record_character, recordable_character, recording_plan
+from .recording import record_character, recordable_character, recording_steps
 from .training import TrainingOperator, is_mesh_recorded
 
 
@@ -42,8 +40,7 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
             unrecorded = [o for o in mesh_objects[1:] if not is_mesh_recorded(o, recording)]
             mesh_objects = [o for o in mesh_objects if o not in unrecorded]
             self._note = f"{self._note} {describe_left_out(dict.fromkeys(unrecorded, 'not in this recording'))}".strip()
-        trainings = self.training_plan(mesh_objects, planned_pose_count(shown))
-        self.state.plan = JobPlan([*(recording_plan(shown) if is_missing else ()), *trainings])
+        self.state.steps = [*(recording_steps(shown) if is_missing else ()), *self.training_steps(mesh_objects[0])]
         if is_missing:
             # An interrupted recording is resumed.
             for step in record_character(character, mesh_object, recording, (recording / INDEX_NAME).exists()):

@@ -9,7 +9,6 @@ import bpy
 from ..core.errors import FDDAError
 from ..core.files.temporary import temporary_folder
 from ..core.progress import Job
-from ..jobs.plan import JobPlan, JobStep
 from ..jobs.verb_process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements
@@ -40,7 +39,7 @@ class FDDA_OT_profile_frame(JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Job[FrameProfile]:
         scene_rig = self.rig(context)
-        self.state.plan = JobPlan([JobStep(label, stages) for label, stages in STEPS])
+        self.state.steps = STEPS
         profile = yield from profile_frame(scene_rig.armature_object)
         return (yield from _with_fast_rig(profile, scene_rig.mesh_object.name))
 

@@ -176,15 +176,10 @@ class JobOperator(RigOperator):
         progress = (state.stage, state.done, len(state.warnings), state.cancel_requested)
         if progress != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
             self._drawn_progress, self._last_redraw = progress, now
-            # Show the progress in the status bar, beside Blender's hints if the user can work meanwhile.
-            text = f"{self.title}: {self.state.sentence}"
-            if self.state.remaining_seconds is not None:
-                text += f", {self.state.remaining_text.lower()}"
-            if self.changes_scene:
-                self._set_status_text(context, f"{text} (ESC: cancel). {self.state.note}".rstrip(". "))
-            elif len(context.window.modal_operators) <= 1:
-                # Another modal operator, such as Move, shows its own keys.
-                self._set_status_text(context, text)
+            # If the user can work meanwhile, the status bar has Blender's hints.
+            remaining = f", {state.remaining_text.lower()}" if state.remaining_seconds is not None else ""
+            text = f"{self.title}: {state.sentence}{remaining} (ESC: cancel). {state.note}".rstrip(". ")
+            self._set_status_text(context, text if self.changes_scene else None)
             redraw()
         return None
 
@@ -202,11 +197,7 @@ class JobOperator(RigOperator):
         """Show a text in the status bar; None restores Blender's own."""
         if text == self._status_text or context.workspace is None:
             return
-        if text is None or self.changes_scene:
-            context.workspace.status_text_set(text)
-        else:
-            # Blender accepts a function, but no other callable object.
-            context.workspace.status_text_set(lambda header, _context: _draw_status(header.layout, text))
+        context.workspace.status_text_set(text)
         self._status_text = text
 
     def _end_modal(self, context: bpy.types.Context) -> None:
@@ -214,19 +205,6 @@ class JobOperator(RigOperator):
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None
             self._set_status_text(context, None)
-
-
-def _draw_status(layout: bpy.types.UILayout, text: str) -> None:
-    """Draw the status bar as Blender does, with a text before its information at the right."""
-    layout.template_input_status()
-    layout.separator_spacer()
-    layout.template_reports_banner()
-    layout.template_running_jobs()
-    layout.label(text=text, icon="SORTTIME")
-    layout.separator_spacer()
-    row = layout.row()
-    row.alignment = "RIGHT"
-    row.template_status_info()
 
 
 def _is_view_event(context: bpy.types.Context, event: bpy.types.Event) -> bool:

@@ -13,10 +13,10 @@ from ..core.recording.folder import remove_recording
 from ..core.recording.index import read_index, read_info
 from ..core.settings import REFINEMENT_POSES
 from ..core.wording import format_count
-from ..jobs.plan import JobPlan, JobStep, recording_steps
+from ..jobs.state import JobStep
 from ..models.model_list import format_file_size
 from ..properties.character import model_file, recording_folder
-from ..properties.recording_options import copy_settings, planned_pose_count, recording_settings
+from ..properties.recording_options import copy_settings, recording_settings
 from ..recording.plan import find_recorded_character
 from ..recording.refinement import RefinementSettings, refine
 from ..recording.rig_check import problems_beside_others
@@ -62,11 +62,10 @@ def record_character(
         yield from record(character, path, recording_settings(character, resume))
 
 
-def recording_plan(rig: SceneRig) -> list[JobStep]:
+def recording_steps(rig: SceneRig) -> list[JobStep]:
     """Return the steps of a recording with the settings of a rig."""
-    settings = rig.mesh_object.fdda.settings
-    pose_count = planned_pose_count(rig)
-    return recording_steps(pose_count, bool(settings.learn_from))
+    check = [("checking the object", ("target",))] if rig.mesh_object.fdda.settings.learn_from else []
+    return [*check, ("recording", ("poses", "influences", "repeatability"))]
 
 
 class FDDA_OT_record(JobOperator, bpy.types.Operator):
@@ -94,7 +93,7 @@ class FDDA_OT_record(JobOperator, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         shown = self.rig(context)
         character, self._note = recordable_character(self.rigs(context), shown)
-        self.state.plan = JobPlan(recording_plan(shown))
+        self.state.steps = recording_steps(shown)
         # The other meshes get the settings of the shown one.
         self.changes_file = len(character.mesh_objects) > 1
         folder = self.folder and Path(bpy.path.abspath(self.folder))

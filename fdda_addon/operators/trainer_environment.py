@@ -144,7 +144,7 @@ class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operato
     )
 
     python: StringProperty(
-        name="Python", description="Python to create it from. Empty to search for one", options={"SKIP_SAVE"}
+        name="Python", description="Python to create it from. Empty for Blender's own", options={"SKIP_SAVE"}
     )
     wheels: StringProperty(
         name="Offline Packages",

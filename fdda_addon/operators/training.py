@@ -20,11 +20,10 @@ from ..core.settings import (
     MIN_VERTICES_PER_PART,
     PASSES,
     TRAINING_SEED,
-    automatic_passes,
     values_from,
 )
 from ..jobs.job import current
-from ..jobs.plan import JobPlan, JobStep, training_steps
+from ..jobs.state import JobStep
 from ..models.former_model import add_former_model, keep_former_model
 from ..models.model_list import add_model, check_matches_rig
 from ..properties.character import model_file, recording_folder
@@ -87,21 +86,23 @@ class TrainingOperator(JobOperator):
     ) -> Job[float | None]:
         """Train models, each given with its meshes and its recording; return the seconds of the last training."""
         seconds = None
-        for number, (mesh_objects, recording, model) in enumerate(files):
+        for mesh_objects, recording, model in files:
             self.state.begin_object(mesh_objects[0].name if len(files) > 1 else "")
-            self.state.plan.begin_training(number)
             seconds = (yield from self.train(mesh_objects, recording, model, warm_start)) or seconds
             if self.state.cancel_requested:
                 break
         return seconds
 
-    def training_plan(self, mesh_objects: Sequence[bpy.types.Object], pose_count: int) -> list[JobStep]:
-        """Return the steps of a training on a recording of meshes with this number of poses."""
-        settings = mesh_objects[0].fdda.settings
+    def training_steps(self, mesh_object: bpy.types.Object) -> list[JobStep]:
+        """Return the steps of a training with the settings of a mesh."""
+        settings = mesh_object.fdda.settings
         fits_weights = settings.base_skinning != "RIG" or settings.bones_to_read != "ALL"
-        group_count = max(len(mesh_object.vertex_groups) for mesh_object in mesh_objects)
-        counts = group_count, sum(len(mesh_object.data.vertices) for mesh_object in mesh_objects), pose_count
-        return training_steps(*counts, settings.passes or automatic_passes(pose_count), fits_weights)
+        return [
+            ("reading the recording", (STARTING_STAGE,)),
+            *([("fitting the skinning", ("key joints", "fit"))] if fits_weights else ()),
+            ("preparing body parts", ("partitions prepared",)),
+            ("training", ("epochs",)),
+        ]
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
         if not bpy.app.background and is_detached(model):
@@ -247,8 +248,7 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
                 unrecorded[mesh_object] = "not recorded"
         self._note = describe_left_out(unrecorded)
         files = [(mesh_objects, *paths) for paths, mesh_objects in meshes_of_files.items()]
-        plans = (self.training_plan(mesh_objects, _pose_count(recording)) for mesh_objects, recording, _ in files)
-        self.state.plan = JobPlan([step for plan in plans for step in plan])
+        self.state.steps = [step for mesh_objects, *_ in files for step in self.training_steps(mesh_objects[0])]
         return (yield from self.train_all(files, self.warm_start))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
@@ -269,14 +269,6 @@ def is_mesh_recorded(mesh_object: bpy.types.Object, recording: Path) -> bool:
         # The training says what is wrong with a damaged recording.
         return (recording / INDEX_NAME).exists()
     return any(mesh.name == mesh_object.name or has_shape(mesh_object, mesh) for mesh in meshes)
-
-
-def _pose_count(recording: Path) -> int:
-    """Return the number of poses of a recording; 0 if it cannot be read, which the training reports."""
-    try:
-        return read_index(recording)["poses"]
-    except FDDAError:
-        return 0
 
 
 def _follow_detached_training() -> None:

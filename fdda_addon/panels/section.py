@@ -182,7 +182,7 @@ def draw_job(
             draw_wrapped(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
         return False
     column = layout.column(align=True)
-    if state.total or state.plan is not None:
+    if state.total or state.steps:
         # The text of a progress bar is cut off at the default width, so the bar has the short one.
         column.progress(factor=state.fraction, text=state.heading)
         draw_wrapped(column, context, state.detail)

@@ -6,8 +6,7 @@ from collections.abc import Iterable
 import bpy
 
 from ..core.errors import RigError
-from ..core.settings import MAX_AUTO_POSES, POSES, settings_of, values_from
-from ..poses.action_range import action_frames
+from ..core.settings import POSES, settings_of, values_from
 from ..poses.motion_range import limited_bones
 from ..poses.remix import REMIX, choose_bones, describe_bones
 from ..recording.plan import RecordingSettings
@@ -159,15 +158,6 @@ def _sample_options(scene_rig: SceneRig, actions: tuple[str, ...]) -> tuple[str,
 def recorded_actions(scene_rig: SceneRig) -> tuple[str, ...]:
     """Return the names of the checked actions that animate a rig."""
     return tuple(action.name for action in actions_of_rig(scene_rig) if action.fdda.record)
-
-
-def planned_pose_count(scene_rig: SceneRig) -> int:
-    """Return the number of poses that a recording with the settings of a character has."""
-    settings = scene_rig.mesh_object.fdda.settings
-    frames = sum(len(action_frames(bpy.data.actions[name])) for name in recorded_actions(scene_rig))
-    # The number of automatic poses is known once the first ones were evaluated.
-    poses = (POSES.default + MAX_AUTO_POSES) // 2 if settings.auto_poses else settings.poses
-    return poses + frames * (2 if settings.mirror else 1)
 
 
 def actions_of_active_rig(context: bpy.types.Context) -> list[str]:

@@ -77,8 +77,6 @@ def train(folder: Path) -> Iterator[float]:
             f"the progress is '{state.sentence}'",
         )
         require(state.remaining_seconds is not None, "the remaining time is unknown in the middle of the training")
-        header = bpy.types.STATUSBAR_HT_header
-        require(header.draw != header._draw_orig, "the status bar does not show the training")
         yield from save_screenshot(folder / "training.png")
     yield from wait_for_job("train", 120)
     require(len(state.curves["training"]) == epochs, f"{len(state.curves['training'])} epochs have a loss")

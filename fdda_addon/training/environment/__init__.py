@@ -2,5 +2,5 @@
 """The Python that trains.
 
 `choice` selects it and `check` checks it, with a `CheckResult`. `folder` is the folder of the add-on's environment,
-`interpreters` finds a Python to create it from, `creation` installs it. `session` caches results for panels.
+which `creation` installs. `session` caches results for panels.
 """

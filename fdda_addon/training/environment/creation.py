@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Installs the training environment, a virtual environment with pinned package versions, and writes a log."""
 
+import json
 import os
 import re
 import shutil
@@ -11,6 +12,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -21,6 +23,7 @@ from ...core.progress import Job, Progress
 from .check import CheckResult, check
 from .folder import (
     PACKAGES,
+    PINNED_REQUIREMENTS,
     creation_lock,
     interpreter_path,
     remove_environment,
@@ -28,7 +31,6 @@ from .folder import (
     site_packages,
     write_completion_marker,
 )
-from .interpreters import Interpreter, find_interpreters, query_interpreter
 
 RUN_PIP = Path(__file__).with_name("run_pip.py")
 UNREADABLE_SETTINGS_STATUS = 78
@@ -37,6 +39,36 @@ MAX_WHEEL_PATH_LENGTH = 126
 """Length of the longest path in the wheels for Windows, a license file of torch 2.15.0."""
 MIN_FREE_GB = 9 if sys.platform.startswith("linux") else 2
 """Free disk space that the packages and downloads need. On Linux they include CUDA."""
+QUERY_SECONDS = 30.0
+"""Time limit of `query_interpreter`."""
+_QUERY_SCRIPT = """
+import json, sys
+missing = []
+for name in ("ctypes", "ensurepip", "ssl", "venv"):
+    try:
+        __import__(name)
+    except ImportError:
+        missing.append(name)
+print(json.dumps([list(sys.version_info[:2]), sys.maxsize > 2**32, missing, sys.executable]))
+"""
+
+
+@dataclass(frozen=True)
+class Interpreter:
+    """A Python interpreter that runs.
+
+    Attributes:
+        path: path of the executable.
+        version: major and minor version.
+        problem: why no environment can be created from it; empty if one can.
+    """
+
+    path: str
+    version: tuple[int, int]
+    problem: str
+
+    def __str__(self) -> str:
+        return f"'{self.path}' (Python {self.version[0]}.{self.version[1]})"
 
 
 class EnvironmentCreation:
@@ -46,11 +78,11 @@ class EnvironmentCreation:
         folder: folder of the environment. An existing environment is removed first.
         log: file for the output of all commands.
         wheels: folder of wheels; None for the package index in the settings of pip.
-        base: path of the Python to create the environment from; empty to search for a suitable one.
+        base: path of the Python to create the environment from; empty for Blender's own.
     """
 
     def __init__(self, folder: Path, log: Path, wheels: Path | None = None, base: str = ""):
-        self.folder, self.log, self.wheels, self.base = folder, log, wheels, base
+        self.folder, self.log, self.wheels, self.base = folder, log, wheels, base or sys.executable
         self._lock = threading.Lock()
         self._process: subprocess.Popen | None = None
         self._cancelled = False
@@ -74,28 +106,23 @@ class EnvironmentCreation:
     def _steps(self) -> Job[CheckResult]:
         with creation_lock(self.folder), _open_log(self.log) as log:
             _check_source(self.folder, self.wheels)
-            yield Progress("looking for a Python", 0, 0)
-            if self.base:
-                queried = query_interpreter([self.base])
-                if queried is None:
-                    raise TrainerEnvironmentError(
-                        f"'{self.base}' is no Python that runs; name another, or leave it out."
-                    )
-                candidates = [queried]
-            else:
-                candidates = list(find_interpreters())
-            log.writelines(f"{interpreter} {interpreter.problem or 'can be tried'}\n" for interpreter in candidates)
-            interpreters = [interpreter for interpreter in candidates if not interpreter.problem]
+            yield Progress(f"asking '{self.base}'", 0, 0)
+            interpreter = query_interpreter(self.base)
             self._stop_if_cancelled()
-            if not interpreters:
-                raise self._no_python_error(f"{candidates[0]} {candidates[0].problem}" if candidates else "none runs")
+            if interpreter is None:
+                raise self._no_python_error(f"'{self.base}' is no Python that runs")
+            if interpreter.problem:
+                raise self._no_python_error(f"{interpreter} {interpreter.problem}")
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
                 self._stop_if_cancelled()
                 self._has_changed_folder = True
                 remove_environment(self.folder)
-                interpreter = yield from self._create_venv(interpreters, log)
+                yield Progress(f"making it from {interpreter}", 0, 0)
+                command = [interpreter.path, "-I", "-m", "venv", "--clear", str(self.folder)]
+                if (yield from self._run(command, log)):
+                    raise self._no_python_error(f"{interpreter}: {self._error_line()}")
                 with self._temporary() as temporary:
                     yield from self._install_with(temporary, interpreter, log)
                 yield Progress("checking", 0, 0)
@@ -118,21 +145,10 @@ class EnvironmentCreation:
             if self._process is not None:
                 _kill(self._process)
 
-    def _create_venv(self, interpreters: list[Interpreter], log: IO[str]) -> Job[Interpreter]:
-        """Create the virtual environment with the first interpreter that succeeds, and return that interpreter."""
-        for interpreter in interpreters:
-            yield Progress(f"making it from {interpreter}", 0, 0)
-            command = [interpreter.path, "-I", "-m", "venv", "--clear", str(self.folder)]
-            if (yield from self._run(command, log)) == 0 and query_interpreter(
-                [str(interpreter_path(self.folder))]
-            ) is not None:
-                return interpreter
-        raise self._no_python_error(f"{interpreters[-1]}: {self._error_line()}")
-
     def _no_python_error(self, reason: str) -> TrainerEnvironmentError:
         return TrainerEnvironmentError(
-            f"No Python on this machine can create the training environment ({reason}); install Python 3.13 with its "
-            f"venv module, or choose an existing Python that has torch. '{self.log}' lists what was tried."
+            f"The training environment cannot be created ({reason}); choose an existing Python that has torch. The log "
+            f"is '{self.log}'."
         )
 
     @contextmanager
@@ -277,3 +293,22 @@ def _kill(process: subprocess.Popen) -> None:
         process.kill()
     else:
         os.killpg(process.pid, signal.SIGKILL)
+
+
+def query_interpreter(path: str) -> Interpreter | None:
+    """Run an interpreter, and return its version and problem; None if it is no Python."""
+    command = [path, "-I", "-c", _QUERY_SCRIPT]
+    try:
+        result = subprocess.run(command, capture_output=True, timeout=QUERY_SECONDS, check=True, **child_options())
+        version, is_64_bit, missing, path = json.loads(result.stdout.splitlines()[-1])
+    except (OSError, subprocess.SubprocessError, ValueError, TypeError, IndexError):
+        return None
+    problem = ""
+    if tuple(version) not in PINNED_REQUIREMENTS:
+        supported = ", ".join(f"{major}.{minor}" for major, minor in sorted(PINNED_REQUIREMENTS))
+        problem = f"is none of {supported}"
+    elif not is_64_bit:
+        problem = "is not 64-bit"
+    elif missing:
+        problem = f"lacks the module {missing[0]}"
+    return Interpreter(path, tuple(version), problem)

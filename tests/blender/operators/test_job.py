@@ -10,7 +10,6 @@ from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.progress import Progress
 from fdda_addon.jobs import job
 from fdda_addon.jobs.job import JobRunner
-from fdda_addon.jobs.plan import JobPlan, recording_steps, training_steps
 from fdda_addon.jobs.state import JobState
 from fdda_addon.operators.job import JobOperator
 
@@ -197,58 +196,28 @@ def test_remaining_time_comes_from_the_speed_of_the_stage(monkeypatch):
     assert state.remaining_seconds is None, "without a total, the progress counts seconds"
 
 
-def test_a_job_with_a_plan_has_one_number_of_steps_and_one_remaining_time(monkeypatch):
+def test_a_job_with_steps_counts_them_and_knows_the_remaining_time_of_the_running_one(monkeypatch):
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    state = JobState("build_model", "Record, Train & Bind", started=100.0)
-    # The training takes 6, 6 and 24 s.
-    state.plan = JobPlan([*recording_steps(1000), *training_steps(22, 20_000, 1000, 200)])
-    assert (state.heading, state.detail) == ("Step 1 of 4", "Recording…") and state.remaining_text == "…"
+    state = JobState("build_model", "Record, Train & Bind")
+    state.steps = [("recording", ("poses", "influences")), ("reading it", ("starting",)), ("training", ("epochs",))]
+    assert (state.heading, state.detail, state.remaining_text) == ("Step 1 of 3", "Recording…", "…")
     state.show(Progress("poses", 0, 1000))
-    now[0] += 10
-    state.show(Progress("poses", 100, 1000))
-    fractions = [state.fraction]
     now[0] += 40
     state.show(Progress("poses", 500, 1000))
-    assert state.sentence == "Step 1 of 4: recording: 500 of 1,000"
-    assert state.remaining_seconds == pytest.approx(50 + 36)
-    fractions.append(state.fraction)
-    now[0] += 50
-    state.show(Progress("poses", 1000, 1000))
-    assert not state.is_finishing, "the training follows"
-    state.plan.begin_training(0)
-    state.show(Progress("starting", 0, 0))
-    now[0] += 2
+    assert state.sentence == "Step 1 of 3: recording: 500 of 1,000" and state.fraction == 0.5
+    assert state.remaining_text == "About 40 s left in this step"
+    state.show(Progress("influences", 9, 9))
+    assert state.detail == "Bones and inputs moved alone: 9 of 9" and not state.is_finishing, "the training follows"
     state.show(Progress("starting", 2, 0))
-    assert state.detail == "Reading the recording: 2 s"
-    assert state.remaining_seconds == pytest.approx(4 + 6 + 24)
-    fractions.append(state.fraction)
+    assert state.detail == "Reading it: 2 s" and state.remaining_seconds is None
     state.show(Progress("epochs", 0, 200))
     now[0] += 10
     state.show(Progress("epochs", 50, 200))
     state.current_object = "body"
-    assert state.heading == "Step 4 of 4, body" and state.remaining_text == "About 30 s left"
-    assert state.sentence == "Step 4 of 4, body: training: 50 of 200"
-    fractions.append(state.fraction)
-    assert fractions == sorted(fractions) and fractions[0] > 0 and fractions[-1] < 1
+    assert state.sentence == "Step 3 of 3, body: training: 50 of 200" and state.remaining_text == "About 30 s left"
     state.show(Progress("epochs", 200, 200))
     assert state.is_finishing and state.remaining_text == "Finishing…"
-
-
-def test_the_progress_bar_does_not_go_back(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
-    state = JobState("train", "Training", started=100.0)
-    state.plan = JobPlan(training_steps(0, 0, 0, 200))
-    now[0] += 5
-    state.show(Progress("epochs", 0, 200))
-    now[0] += 1
-    state.show(Progress("epochs", 100, 200))
-    fraction = state.fraction
-    assert 0.8 < fraction < 0.9
-    now[0] += 60
-    state.show(Progress("epochs", 101, 200))
-    assert state.fraction == fraction
 
 
 @pytest.mark.parametrize("stage", ["poses", "epochs", "frames of 'arm'"])

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from fdda_addon.training.environment import check, folder, interpreters
+from fdda_addon.training.environment import check, folder
 from fdda_addon.training.environment.check import CheckResult
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+from fdda_addon.training.environment.creation import query_interpreter
 from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, interpreter_path
-from fdda_addon.training.environment.interpreters import find_interpreters, query_interpreter
 
 from ..conftest import run
 from ..stand_ins import import_from, write_program
@@ -140,16 +140,6 @@ def test_a_hanging_python_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
     )
 
 
-def test_candidates_are_run_to_find_the_usable_python(tmp_path: Path):
-    shim = write_program(tmp_path / "python3.13", "sys.exit('this version is not selected')")
-    hangs = write_program(tmp_path / "hangs")
-    python, real = sys.executable, sys.executable
-    if os.name != "nt":
-        real = write_program(tmp_path / "real", f"os.execv({python!r}, [{python!r}, *sys.argv[1:]])")
-    found = list(find_interpreters(iter([[shim], [hangs], ["/none"], [real], [sys.executable]])))
-    assert [(base.path, base.version, base.problem) for base in found] == [(sys.executable, sys.version_info[:2], "")]
-
-
 @pytest.mark.parametrize(
     ("answer", "lacks"),
     [
@@ -159,7 +149,7 @@ def test_candidates_are_run_to_find_the_usable_python(tmp_path: Path):
     ],
 )
 def test_a_base_python_says_what_it_lacks(tmp_path: Path, answer: list, lacks: str):
-    base = query_interpreter([write_program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
+    base = query_interpreter(write_program(tmp_path / "python", f"print({json.dumps(answer)!r})"))
     assert base.problem == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
 
 
@@ -174,31 +164,6 @@ def test_a_training_without_blenders_program_finds_the_environment_that_blender_
     command = [sys.executable, "-m", "fdda_addon", "check-trainer"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.stderr.startswith(f"Error: The trainer's Python '{python}' cannot be started ("), done.stderr
-
-
-@pytest.mark.one_blender_version
-def test_pythons_are_searched_on_the_path_of_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The launcher comes first; the alias of the Microsoft Store is skipped."""
-    names = ("WindowsApps/python.exe", "WindowsApps/python3.13.exe", "path/python.exe", "path/py.exe")
-    for path in map(tmp_path.joinpath, names):
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-    monkeypatch.setenv("PATH", os.pathsep.join(str(tmp_path / name) for name in ("WindowsApps", "path")))
-    launcher, python = (str(tmp_path / "path" / name) for name in ("py.exe", "python.exe"))
-    expected = [*([launcher, f"-{version}"] for version in ("3.13", "3.11", "3.12")), [python]]
-    assert list(interpreters._windows_candidates()) == expected
-
-
-@pytest.mark.one_blender_version
-@pytest.mark.parametrize("platform", ["darwin", "linux"])
-def test_pythons_are_searched_in_folders_that_path_lacks(monkeypatch: pytest.MonkeyPatch, platform: str):
-    """On macOS, PATH lacks the folders of Homebrew and python.org in a Blender that was started from its icon."""
-    monkeypatch.setattr(interpreters.os, "name", "posix")
-    monkeypatch.setattr(interpreters.sys, "platform", platform)
-    candidates = [command for (command,) in interpreters.default_candidates()]
-    assert candidates[:2] == [sys.executable, "python3.13"]
-    assert {"/opt/homebrew/bin/python3.13", "/usr/local/bin/python3.11"} <= set(candidates)
-    assert ("python3" in candidates) is (platform == "linux")
 
 
 @pytest.mark.one_blender_version
