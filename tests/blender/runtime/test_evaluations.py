@@ -17,14 +17,6 @@ from ..rendering import rig_pixels, set_camera, still
 FRAMES = (4, 11, 20)
 
 
-@pytest.mark.parametrize("subframe", [0.25, 0.5, 0.999])
-def test_subframes_show_the_model(bound_elbow, elbow_files, subframe):
-    bpy.context.scene.frame_set(10)
-    frame_positions = assert_plays(bound_elbow, elbow_files.model)
-    bpy.context.scene.frame_set(10, subframe=subframe)
-    assert np.abs(assert_plays(bound_elbow, elbow_files.model) - frame_positions).max() > 1e-4
-
-
 def export_alembic(path: Path, mode: str) -> None:
     bpy.ops.wm.alembic_export(
         filepath=str(path), start=min(FRAMES), end=max(FRAMES), evaluation_mode=mode, as_background_job=False
@@ -105,17 +97,6 @@ def test_motion_blur_equals_that_of_an_alembic_cache(bound_elbow, elbow_files, t
     assert np.abs(sharp_image - model_image).mean() > 4 * np.abs(model_image - cache_image).mean()
 
 
-def test_two_view_layers_show_the_model(bound_elbow, elbow_files):
-    scene = bpy.context.scene
-    second_layer = scene.view_layers.new("second")
-    for angle in (0.4, 1.5):
-        bpy.data.objects[ELBOW_RIG].animation_data_clear()
-        pose(angle=angle)
-        second_layer.update()
-        expected = assert_plays(bound_elbow, elbow_files.model)
-        assert np.abs(shown_in(second_layer.depsgraph, bound_elbow) - expected).max() < 1e-5
-
-
 def test_two_scenes_show_the_model_at_different_frames(bound_elbow, elbow_files):
     """The character is linked to a second scene with another current frame."""
     first, second = bpy.context.scene, bpy.data.scenes.new("second")
@@ -142,19 +123,6 @@ def test_a_handler_of_another_add_on_evaluates_the_model(bound_elbow, elbow_file
             bpy.context.scene.frame_set(frame)
             assert np.abs(handler_positions[-1] - assert_plays(bound_elbow, elbow_files.model)).max() < 1e-5
     assert len(handler_positions) == len(FRAMES)
-
-
-def test_another_add_on_may_set_the_pose_after_a_frame_change(bound_elbow, elbow_files):
-    bpy.data.objects[ELBOW_RIG].animation_data_clear()
-
-    def set_pose(scene, _graph):
-        bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] = scene.frame_current / 20
-
-    with handler("frame_change_post", set_pose):
-        shown = [
-            assert_plays(bound_elbow, elbow_files.model) for frame in FRAMES if not bpy.context.scene.frame_set(frame)
-        ]
-    assert np.abs(shown[0] - shown[2]).max() > 1e-2
 
 
 def test_python_drivers_of_other_objects_do_not_block_playback(bound_elbow, elbow_files, monkeypatch):

@@ -1,19 +1,29 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames stay correct after users, scripts or other add-ons change a character during playback."""
+"""Frames stay correct after users, scripts or other add-ons change a character, and when characters fail."""
 
+import json
 import os
 import sys
+from pathlib import Path
 
 import bpy
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper
 
 import fdda_addon
+from fdda_addon.cli import interruption
+from fdda_addon.cli.main import registered
 from fdda_addon.core.errors import ModelError
+from fdda_addon.core.formats.model import CONTROLS_INPUT, METADATA_KEY
+from fdda_addon.registration import handler_table
 from fdda_addon.runtime import modifier_switch, playback_modifier
+from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.player import Player
 from fdda_addon.runtime.session import session
 from fdda_addon.runtime.transitions import Event, State
-from fdda_addon.scene.scene_rig import armature_modifier
+from fdda_addon.scene.scene_rig import armature_modifier, find_rig
 
 from ..conftest import (
     ADDED,
@@ -22,12 +32,13 @@ from ..conftest import (
     assert_plays,
     evaluated_positions,
     pose,
-    predicted_positions,
     rig_positions,
+    write_edited,
 )
 from ..crowds import crowd_of
 from ..evaluations import handler
 from ..rendering import FRAME, animation, set_camera
+from ..rig_changes import change_in_edit_mode
 
 RENDER_HANDLERS = ("render_pre", "render_post", "render_write")
 
@@ -96,23 +107,6 @@ def test_duplicates_and_deletions_leave_nothing(bound_elbow, tmp_path):
     fdda_addon.unregister()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
     assert in_memory() == (objects - 1, meshes - 1)
-
-
-def test_data_of_deleted_duplicates_is_not_saved(bound_elbow, elbow_files, tmp_path):
-    bpy.ops.ed.undo_push(message="start")
-    for _ in range(30):
-        bpy.ops.object.select_all(action="DESELECT")
-        bpy.data.objects[ELBOW].select_set(True)
-        bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW]
-        bpy.ops.object.duplicate()
-        bpy.context.view_layer.update()
-        bpy.ops.object.delete()
-        bpy.context.view_layer.update()
-        bpy.ops.ed.undo_push(message="deleted")
-    assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"), copy=True)
-    with bpy.data.libraries.load(str(tmp_path / "saved.blend")) as (found, _):
-        assert found.meshes == [ELBOW] and sorted(found.objects) == [ELBOW, ELBOW_RIG]
 
 
 def test_a_deleted_character_leaves_nothing(bound_elbow):
@@ -243,47 +237,6 @@ def test_a_topology_that_changes_shows_the_rig_in_the_same_frame(bound_elbow):
     assert len(evaluated_positions(bound_elbow)) == 303 and bound_elbow.modifiers["Armature"].show_viewport
 
 
-def test_undo_of_many_kinds(bound_elbow, elbow_files):
-    """Undo steps before and after a duplicate, a mode and a deletion."""
-
-    def step(name):
-        bpy.context.view_layer.update()
-        bpy.ops.ed.undo_push(message=name)
-
-    step("start")
-    pose(angle=0.6)
-    step("pose")
-    copy = bpy.data.objects[ELBOW].copy()
-    bpy.context.scene.collection.objects.link(copy)
-    step("duplicate")
-    bpy.data.objects[ELBOW].fdda.mode = "RIG"
-    step("mode")
-    bpy.data.objects.remove(bpy.data.objects[copy.name])
-    step("delete")
-
-    def check():
-        bpy.context.view_layer.update()
-        for mesh_object in [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]:
-            if mesh_object.fdda.mode == "FDDA":
-                assert_plays(mesh_object, elbow_files.model)
-            else:
-                assert (
-                    np.abs(evaluated_positions(mesh_object) - predicted_positions(mesh_object, elbow_files.model)).max()
-                    > 1e-5
-                )
-
-    for _ in range(2):
-        for _ in range(4):
-            bpy.ops.ed.undo()
-            check()
-        for _ in range(4):
-            bpy.ops.ed.redo()
-            check()
-    bpy.ops.ed.undo()
-    pose(angle=1.0)
-    check()
-
-
 def test_enabled_while_the_mesh_is_in_edit_mode(bound_elbow, elbow_files):
     """In Edit Mode Blender has no mesh attributes. The add-on must register, and the model plays afterwards."""
     bpy.context.view_layer.objects.active = bound_elbow
@@ -294,3 +247,192 @@ def test_enabled_while_the_mesh_is_in_edit_mode(bound_elbow, elbow_files):
     bpy.data.objects[ELBOW].fdda.mode = "FDDA"
     pose(angle=0.8)
     assert_plays(bpy.data.objects[ELBOW], elbow_files.model)
+
+
+def add_on_handlers() -> list[tuple[str, object]]:
+    """Return the registered handlers of the add-on, with the names of their lists."""
+    lists = {name: getattr(bpy.app.handlers, name) for name in dir(bpy.app.handlers) if not name.startswith("_")}
+    handlers = [(name, handler) for name, listed in lists.items() if isinstance(listed, list) for handler in listed]
+    return [entry for entry in handlers if getattr(entry[1], "__module__", "").startswith("fdda_addon.")]
+
+
+def persistent_functions() -> set[object]:
+    """Return the functions of the add-on's loaded modules that are marked as persistent."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("fdda_addon.")]
+    functions = {value for module in modules for value in vars(module).values() if callable(value)}
+    return {f for f in functions if "_bpy_persistent" in getattr(f, "__dict__", {}) or hasattr(f, "_bpy_persistent")}
+
+
+def test_registering_twice_adds_each_handler_once():
+    expected = sorted(handler_table(), key=str)
+    assert expected and sorted(add_on_handlers(), key=str) == expected
+    fdda_addon.register()
+    assert sorted(add_on_handlers(), key=str) == expected
+
+
+def test_unregistering_removes_only_handlers_of_the_add_on():
+    def other_handler(*_: object) -> None:
+        """Do nothing, as a handler of another add-on."""
+
+    bpy.app.handlers.load_post.append(other_handler)
+    try:
+        fdda_addon.unregister()
+        assert add_on_handlers() == [] and other_handler in bpy.app.handlers.load_post
+    finally:
+        bpy.app.handlers.load_post.remove(other_handler)
+        fdda_addon.register()
+
+
+def test_all_handlers_are_persistent_and_in_the_table():
+    before = add_on_handlers()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert add_on_handlers() == before
+    assert persistent_functions() == {handler for _, handler in handler_table()}
+
+
+def test_ctrl_c_is_delayed_in_all_modules_with_handlers():
+    """Blender prints exceptions of handlers and continues, so a KeyboardInterrupt in a handler would be lost."""
+    with registered():
+        modules = [sys.modules[handler.__module__] for _, handler in handler_table()]
+        assert all(interruption._has_callbacks(vars(module)) for module in modules)
+        assert all(name in sys.modules for name in interruption._CALLBACK_MODULES)
+        assert not interruption._has_callbacks(vars(interruption))
+
+
+@pytest.mark.parametrize("count", [3, 5], ids=["single", "batched"])
+def test_a_character_without_vertices_shows_an_error(bound_elbow, elbow_files, count):
+    crowd = crowd_of(bound_elbow, count)
+    for frame in (1, 2, 3):
+        bpy.context.scene.frame_set(frame)
+    crowd[1].data = crowd[1].data.copy()
+    change_in_edit_mode(crowd[1], lambda: (bpy.ops.mesh.select_all(action="SELECT"), bpy.ops.mesh.delete(type="VERT")))
+    for frame in (4, 9):
+        bpy.context.scene.frame_set(frame)
+        for mesh_object in [o for o in crowd if o != crowd[1]]:
+            assert_plays(mesh_object, elbow_files.model)
+    pose(angle=0.4)
+    assert_plays(crowd[0], elbow_files.model)
+    assert crowd[1].fdda.mode == "RIG" and "has 0 vertices and its model was trained for" in crowd[1].fdda.status
+
+
+FAILING_METHODS = {
+    "created": (Player, "__init__"),
+    "object changed": (Player, "fits_object"),
+    "rig checked": (Player, "check_rig"),
+    "mask read": (Player, "update_mask"),
+}
+
+
+@pytest.mark.parametrize("event", FAILING_METHODS)
+def test_an_unexpected_error_stops_one_character_only(bound_elbow, elbow_files, monkeypatch, event):
+    crowd = crowd_of(bound_elbow, 3)
+    bpy.context.view_layer.update()
+    owner, name = FAILING_METHODS[event]
+    method, failing_uid = getattr(owner, name), crowd[1].session_uid
+
+    def fail(player: Player, *arguments: object, **keywords: object) -> object:
+        if failing_uid in (getattr(player, "object_uid", 0), getattr(arguments[0], "session_uid", 0)):
+            raise KeyError("position")
+        return method(player, *arguments, **keywords)
+
+    monkeypatch.setattr(owner, name, fail)
+    if event == "created":
+        session.reset()
+    for mesh_object in crowd:
+        mesh_object.data.update()
+        mesh_object.update_tag()
+    bpy.context.view_layer.update()
+    bpy.context.scene.frame_set(8)
+    for mesh_object in (crowd[0], crowd[2]):
+        assert_plays(mesh_object, elbow_files.model)
+    assert crowd[1].fdda.mode == "RIG" and "cannot be played (KeyError('position'))" in crowd[1].fdda.status
+
+
+def add_control_to_model(model: Path, owner: str, path: str) -> Path:
+    """Write a copy of a model with a control that has no effect, in the same folder."""
+
+    def add_control(proto: onnx.ModelProto) -> None:
+        proto.graph.input.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", 1]))
+        (metadata,) = (prop for prop in proto.metadata_props if prop.key == METADATA_KEY)
+        info = json.loads(metadata.value)
+        info["controls"] = [{"owner": owner, "path": path, "low": 0.0, "high": 1.0}]
+        metadata.value = json.dumps(info)
+
+    return write_edited(model, model.with_name(f"controlled_{os.getpid()}.onnx"), add_control)
+
+
+def armature_object() -> bpy.types.Object:
+    return bpy.data.objects[ELBOW_RIG]
+
+
+def shape_keys() -> bpy.types.Key:
+    return bpy.data.objects[ELBOW].data.shape_keys
+
+
+def remove_shape_key() -> None:
+    bpy.data.objects[ELBOW].shape_key_remove(shape_keys().key_blocks["smile"])
+
+
+def delete_property() -> None:
+    del armature_object()["dial"]
+    # Like the user interface; without the tag, Blender keeps using the old value.
+    armature_object().update_tag()
+
+
+def rename_property() -> None:
+    armature_object()["stretch"] = armature_object()["dial"]
+    delete_property()
+
+
+def rename_object() -> None:
+    bpy.data.objects["dials"].name = "others"
+    session.reset()
+
+
+SHAPE_KEY_CONTROL = ("shape_keys", 'key_blocks["smile"].value')
+
+BONE_CONTROL = ("armature_object", 'pose.bones["dial"]["fist"]')
+
+OBJECT_CONTROL = ("object:dials", "location[2]")
+
+CONTROL_REMOVALS = {
+    "a property is deleted": (("armature_object", '["dial"]'), delete_property),
+    "a property is renamed": (("armature_object", '["dial"]'), rename_property),
+    "a shape key is removed": (SHAPE_KEY_CONTROL, remove_shape_key),
+    "all shape keys are removed": (SHAPE_KEY_CONTROL, lambda: bpy.data.objects[ELBOW].shape_key_clear()),
+    "a shape key is renamed": (SHAPE_KEY_CONTROL, lambda: setattr(shape_keys().key_blocks["smile"], "name", "grin")),
+    "a bone is renamed": (BONE_CONTROL, lambda: setattr(armature_object().data.bones["dial"], "name", "knob")),
+    "an object is removed": (OBJECT_CONTROL, lambda: bpy.data.objects.remove(bpy.data.objects["dials"])),
+    "an object is renamed": (OBJECT_CONTROL, rename_object),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("update", ["pose", "frame"])
+@pytest.mark.parametrize("removal", CONTROL_REMOVALS)
+def test_a_character_that_lacks_a_control_shows_its_rig(rig, elbow_files, removal, update):
+    mesh_object = rig.mesh_object
+    armature_object()["dial"] = 0.5
+    mesh_object.shape_key_add(name="Basis")
+    mesh_object.shape_key_add(name="smile").value = 0.5
+    dials = bpy.data.objects.new("dials", None)
+    bpy.context.scene.collection.objects.link(dials)
+    bpy.context.view_layer.objects.active = armature_object()
+    bpy.ops.object.mode_set(mode="EDIT")
+    bone = armature_object().data.edit_bones.new("dial")
+    bone.head, bone.tail, bone.use_deform = (1, 0, 0), (1, 0, 0.2), False
+    bpy.ops.object.mode_set(mode="OBJECT")
+    armature_object().pose.bones["dial"]["fist"] = 0.5
+    (owner, path), change = CONTROL_REMOVALS[removal]
+    bind(find_rig(), add_control_to_model(elbow_files.model, owner, path))
+    pose(angle=1.0)
+    assert mesh_object.fdda.mode == "FDDA" and not mesh_object.fdda.status
+    change()
+    if update == "pose":
+        pose(angle=0.6)
+    else:
+        bpy.context.scene.frame_set(11)
+    assert mesh_object.fdda.mode == "RIG"
+    assert f"'elbow' lacks the control '{owner}/{path}'" in mesh_object.fdda.status
+    shown = evaluated_positions(mesh_object)
+    mesh_object.modifiers.remove(mesh_object.modifiers["FDDA"])
+    assert np.array_equal(evaluated_positions(mesh_object), shown)
