@@ -12,8 +12,7 @@ from ..core.progress import Job
 from ..runtime.binding import unbind
 from ..scene.blend_file import save_copy
 from ..scene.scene_rig import check_full_rig, rigs_of_armature
-from ..timing.durations import Duration
-from ..timing.fast_rig_saving import FastRigSaving
+from ..timing.frame_profile import FastRigSaving
 from ..timing.untrained_models import untrained_models
 from .compared_poses import rig_size
 from .controls import VISIBLE, control_bones
@@ -53,8 +52,5 @@ def measure_saving(armature_object: bpy.types.Object, file: Path) -> Job[FastRig
         save_copy(fast_file)
         frames = ROUNDS * FRAMES_PER_ROUND
         times = yield from measure_frames(file, fast_file, object_name, controls, frames, size, ROUNDS)
-    full, fast = (
-        Duration.of([float(np.median(round_times)) for round_times in np.split(np.array(all_times), ROUNDS)])
-        for all_times in (times.full, times.fast)
-    )
-    return FastRigSaving(bone_count, kept_count, len(joints), len(controls), full, fast)
+    medians = (round(float(np.median(each)), 4) for each in (times.full, times.fast))
+    return FastRigSaving(bone_count, kept_count, len(joints), len(controls), *medians)

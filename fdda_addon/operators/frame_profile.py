@@ -12,15 +12,13 @@ from ..core.progress import Job
 from ..jobs.verb_process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements
-from ..timing.fast_rig_saving import FastRigSaving
-from ..timing.frame_profile import FrameProfile
+from ..timing.frame_profile import FastRigSaving, FrameProfile
 from ..timing.profiling import profile_frame
 from .job import JobOperator
 
 STEPS = (
     ("timing objects", ("objects",)),
     ("timing modifiers", ("modifiers",)),
-    ("timing bones", ("bones",)),
     *([] if bpy.app.background else [("timing drawing", ("drawing",))]),
     ("timing models", ("benchmark",)),
     ("timing a fast rig", ("frames",)),
@@ -32,8 +30,8 @@ class FDDA_OT_profile_frame(JobOperator, bpy.types.Operator):
     bl_idname = "fdda.profile_frame"
     bl_label = "Profile Frame"
     bl_description = (
-        "Measure how much time bones, each modifier, the rest of the evaluation and drawing take in a frame; which "
-        "bones are the slowest; and what models of all meshes and a fast rig would save"
+        "Measure how much time bones, each modifier, the rest of the evaluation and drawing take in a frame; and "
+        "what models of all meshes and a fast rig would save"
     )
     verb, title = measurements.PROFILE, "Profiling"
 
@@ -59,8 +57,9 @@ def _with_fast_rig(profile: FrameProfile, object_name: str) -> Job[FrameProfile]
             arguments = [str(file), "--fast-rig", f"--object={object_name}", "--json", str(result_file)]
             with VerbProcess("benchmark", arguments) as process:
                 yield from process.steps()
-            saving = FastRigSaving.from_json(json.loads(result_file.read_text(encoding="utf-8")))
-        return replace(profile, fast_rig=saving)
+            values = json.loads(result_file.read_text(encoding="utf-8"))
+        values.pop("unit")
+        return replace(profile, fast_rig=FastRigSaving(**values))
     except FDDAError as error:
         return replace(profile, fast_rig_problem=str(error))
 

@@ -91,11 +91,6 @@ def draw_profile(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         for index, (part, share) in enumerate(shown):
             letter, percentage = letters[index : index + 1], f"{share:.0%}" if share >= 0.01 else "<1%"
             draw_wrapped(column, context, f"{letter}  {percentage}  {part.duration} ms  {part.title}")
-        if profile.groups:
-            column = body.column(align=True)
-            column.label(text="Slowest Constraints and Drivers")
-            for group in profile.groups:
-                draw_wrapped(column, context, f"{group.duration.median:.2f} ms  {group.title}", "BONE_DATA")
         for sentence in profile.savings_sentences():
             draw_wrapped(body, context, sentence, "INFO")
     if state is None or not state.is_running:

@@ -16,7 +16,7 @@ from ..scene.temporary_state import temporary_attributes
 WARM_UP_FRAMES = 3
 """Number of frames before each measurement that are not timed."""
 TEMPORARY_SCENE_NAME = "FDDA Profile"
-"""Name of temporary scenes, and of the copies in them."""
+"""Name of temporary scenes."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,6 @@ class Duration:
         """Return the duration for the times of several rounds, ms."""
         first_quartile, median, third_quartile = np.percentile(rounds, (25, 50, 75))
         return Duration(max(float(median), 0.0), float(third_quartile - first_quartile) / 2)
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the median is larger than the spread; otherwise it is noise."""
-        return self.median > self.spread
 
     def to_json(self) -> dict:
         return {"median": round(self.median, 4), "spread": round(self.spread, 4)}

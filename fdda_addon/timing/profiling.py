@@ -21,7 +21,6 @@ from ..scene.scene_rig import SceneRig, check_full_rig, rigs_of_armature
 from ..scene.temporary_state import temporary_attributes
 from .animation import main_rig, temporary_animation
 from .benchmark import benchmark
-from .bone_groups import find_expensive_groups
 from .durations import Duration, frame_ms, temporary_armature_scene, time_redraws
 from .frame_profile import BONES, DRAWING, KEY_DRIVERS, MODIFIER, REST, ROUNDS, SHAPE_KEYS, FramePart, FrameProfile
 
@@ -56,12 +55,11 @@ def _profile_shown_rig(rigs: list[SceneRig]) -> Job[FrameProfile]:
         with temporary_armature_scene(armature_object) as armature_scene:
             yield from measurement.measure_objects(armature_scene)
             yield from measurement.measure_parts()
-        groups = yield from find_expensive_groups(armature_object, frames)
         redraw_rounds = yield from time_redraws(frames, ROUNDS, FRAMES_PER_ROUND)
     parts = measurement.parts()
     if redraw_rounds:
         parts.append(FramePart(DRAWING, "", "", Duration.of(redraw_rounds)))
-    return FrameProfile(Duration.of(measurement.frame_rounds), tuple(parts), groups)
+    return FrameProfile(Duration.of(measurement.frame_rounds), tuple(parts))
 
 
 class _Measurement:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The frame profile: the parts of a frame, the bones with the slowest constraints, and the restored scene."""
+"""The frame profile: the parts of a frame, what a fast rig would save, and the restored scene."""
 
 import errno
 import json
@@ -19,9 +19,7 @@ from fdda_addon.panels.frame_profile import draw_profile
 from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing import measurements
-from fdda_addon.timing.bone_groups import BoneGroup, armature_copy, find_expensive_groups, parts_by_bone
 from fdda_addon.timing.durations import TEMPORARY_SCENE_NAME, Duration
-from fdda_addon.timing.fast_rig_saving import FastRigSaving
 from fdda_addon.timing.frame_profile import (
     BONES,
     DRAWING,
@@ -101,105 +99,6 @@ def test_shape_keys_and_their_drivers_are_parts(slow_rig):
     assert parts[KEY_DRIVERS].title == "elbow: Drivers of Shape Keys" and SHAPE_KEYS in parts
 
 
-def expensive_groups(armature_object: bpy.types.Object, frames: range) -> tuple[BoneGroup, ...]:
-    search = find_expensive_groups(armature_object, frames)
-    while True:
-        try:
-            next(search)
-        except StopIteration as stop:
-            return stop.value
-
-
-def test_the_bone_with_the_slow_constraints_is_found(slow_rig):
-    frames = range(1, 30)
-    bone = slow_rig.armature_object.pose.bones["lower"]
-    for frame in frames:
-        bone.rotation_euler[0] = frame / 20
-        bone.keyframe_insert("rotation_euler", frame=frame)
-    groups = expensive_groups(slow_rig.armature_object, frames)
-    assert groups[0].bones == ("extra.7",) and groups[0].constraints == 400
-    assert groups[0].title == "extra.7: 400 constraints"
-
-
-def test_drivers_belong_to_their_bones_and_muted_constraints_are_left_out(slow_rig):
-    slow_rig.armature_object.pose.bones["extra.3"].driver_add("location", 0)
-    slow_rig.armature_object.driver_add("hide_render")
-    parts = parts_by_bone(slow_rig.armature_object)
-    assert {name: len(items) for name, items in parts.items()} == {
-        **dict.fromkeys(("upper", "lower"), 1),
-        **{f"extra.{n}": 1 for n in range(12) if n not in (2, 7)},
-        "extra.3": 2,
-        "extra.7": 400,
-        "": 1,
-    }
-
-
-def test_a_copy_depends_on_itself_and_lacks_what_was_removed(slow_rig):
-    """The copy moves like the original, which is not in its scene; without a driver and a constraint it does not."""
-    armature_object = slow_rig.armature_object
-    curve = armature_object.pose.bones["lower"].driver_add("rotation_euler", 0)
-    curve.driver.type = "SUM"
-    target = curve.driver.variables.new().targets[0]
-    target.id, target.data_path = armature_object, 'pose.bones["upper"].location[0]'
-    armature_object.pose.bones["upper"].location[0] = 0.7
-    removed = [curve, armature_object.pose.bones["extra.4"].constraints[0]]
-    counts = {name: len(getattr(bpy.data, name)) for name in ("objects", "armatures", "scenes", "actions")}
-    expected = evaluated_matrices(bpy.context.scene, armature_object)
-    with armature_copy(armature_object) as full, armature_copy(armature_object, removed) as pruned:
-        assert [len(scene.collection.all_objects) for scene in (full, pruned)] == [1, 1]
-        copy = full.collection.all_objects[0]
-        assert armature_object not in {ID.original for ID in depsgraph_of(full).ids}
-        assert evaluated_matrices(full, copy) == expected
-        copy = pruned.collection.all_objects[0]
-        matrices = evaluated_matrices(pruned, copy)
-        assert matrices["extra.4"] != expected["extra.4"] and matrices["lower"] != expected["lower"]
-        assert matrices["upper"] == expected["upper"]
-        assert len(pruned.collection.all_objects[0].pose.bones["extra.7"].constraints) == 400
-    assert counts == {name: len(getattr(bpy.data, name)) for name in counts}
-    assert (
-        len(armature_object.pose.bones["extra.4"].constraints) == 1 and len(armature_object.animation_data.drivers) == 1
-    )
-
-
-def test_the_armature_of_a_library_is_copied(slow_rig, tmp_path):
-    """Constraints of a linked armature, overridden or not, can be removed from a copy."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
-    name = slow_rig.armature_object.name
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, linked):
-        linked.objects = [name]
-    linked_object = bpy.data.objects[name]
-    overridden = linked_object.override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
-    for armature_object in (linked_object, overridden):
-        removed = list(armature_object.pose.bones["extra.7"].constraints)
-        with armature_copy(armature_object, removed) as scene:
-            copy = scene.collection.all_objects[0]
-            assert not copy.pose.bones["extra.7"].constraints and len(copy.pose.bones["extra.3"].constraints) == 1
-        assert len(armature_object.pose.bones["extra.7"].constraints) == 400
-
-
-def depsgraph_of(scene: bpy.types.Scene) -> bpy.types.Depsgraph:
-    scene.frame_set(1)
-    return scene.view_layers[0].depsgraph
-
-
-def evaluated_matrices(scene: bpy.types.Scene, armature_object: bpy.types.Object) -> dict[str, tuple]:
-    evaluated = armature_object.evaluated_get(depsgraph_of(scene))
-    return {bone.name: tuple(map(tuple, bone.matrix)) for bone in evaluated.pose.bones}
-
-
-@pytest.mark.parametrize(
-    ("group", "title"),
-    [
-        (BoneGroup(("a",), 1, 0, Duration(1, 0)), "a: 1 constraint"),
-        (BoneGroup(("a", "b", "c"), 2, 3, Duration(1, 0)), "a to c, 3 bones: 2 constraints, 3 drivers"),
-        (BoneGroup(("",), 0, 1, Duration(1, 0)), "Properties: 1 driver"),
-    ],
-)
-def test_groups_are_described(group, title):
-    assert group.title == title
-
-
 def test_a_duration_is_the_median_with_half_the_distance_of_the_quartiles():
     assert Duration.of([5.0, 1.0, 2.0, 3.0, 4.0]) == Duration(3.0, 1.0)
     assert Duration.of([-2.0, -1.0, 0.0]).median == 0, "a difference within the noise is no negative time"
@@ -224,9 +123,9 @@ def test_a_fast_rig_leaves_out_the_slow_bone_that_nothing_needs(slow_rig, tmp_pa
     bpy.ops.wm.save_as_mainfile(filepath=str(file))
     content = file.read_bytes()
     assert run("benchmark", file, "--fast-rig", "--json", path) == 0
-    saving = FastRigSaving.from_json(json.loads(path.read_text()))
-    assert (saving.bones, saving.kept_bones, saving.joints, saving.controls) == (14, 2, 2, 2)
-    assert saving.fast.median < saving.full.median
+    saving = json.loads(path.read_text())
+    assert [saving[key] for key in ("bones", "kept_bones", "joints", "controls")] == [14, 2, 2, 2]
+    assert saving["fast"] < saving["full"] and saving["unit"] == "ms"
     assert "would keep 2 of 14 bones" in capfd.readouterr().out
     assert file.read_bytes() == content
 
@@ -284,7 +183,7 @@ def test_the_button_stores_the_profile(slow_rig):
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
     profile = measurements.last(measurements.PROFILE, slow_rig.armature_object)
     assert (profile.fast_rig.bones, profile.fast_rig.kept_bones) == (14, 2) and not profile.fast_rig_problem
-    assert profile.fast_rig.full.median > profile.fast_rig.fast.median
+    assert profile.fast_rig.full > profile.fast_rig.fast
     assert len(slow_rig.armature_object.data.bones) == 14, "only a copy was pruned"
 
 
