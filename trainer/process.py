@@ -12,7 +12,6 @@ from contextlib import contextmanager, suppress
 from typing import TextIO
 
 from fdda_addon.core.errors import (
-    MACHINE_WINERRORS,
     TRY_AGAIN,
     FDDAError,
     TrainingError,
@@ -20,7 +19,7 @@ from fdda_addon.core.errors import (
     machine_fault_sentence,
     to_single_line,
 )
-from fdda_addon.core.files.native_library import loader_winerror, runtime_advice
+from fdda_addon.core.files.native_library import lacks_memory, runtime_advice
 from fdda_addon.core.files.stop_signals import INTERRUPTED, handle_stop_signals
 from fdda_addon.core.formats.messages import STOP_FILE_VARIABLE, MessageType
 
@@ -28,8 +27,6 @@ from .progress import OUTPUT_LOCK, MessageSink
 
 POLL_SECONDS = 0.1
 """Time between checks for a stop request."""
-MEMORY_ERROR_TEXTS = ("can't allocate memory", "not enough memory", "bad allocation", "bad_alloc", "WinError 1455")
-"""Texts in errors of torch and ONNX Runtime when memory runs out. Windows error 1455: the paging file is too small."""
 # OpenMP threads that wait actively make training ten times slower on a busy machine, and no faster on an idle machine.
 # torch reads the variable when it loads.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -130,12 +127,6 @@ def _describe_error(error: Exception) -> tuple[str, int]:
     """Return a sentence for an error that ended the job, and the exit status."""
     if isinstance(error, FDDAError):
         return str(error), exit_status(error)
-    # Without the name of a library, an error that the machine causes may be about the data.
-    lacks_resources = loader_winerror(str(error)) in MACHINE_WINERRORS
-    is_load_error = isinstance(error, ImportError) or not lacks_resources or 'Error loading "' in str(error)
-    if is_load_error and (advice := runtime_advice(str(error))):
-        status = TRY_AGAIN if lacks_resources else 1
-        return to_single_line(f"A library of '{sys.executable}' cannot be loaded ({error}); {advice}."), status
     cause: BaseException = error
     while cause.__cause__ is not None and not isinstance(cause, OSError | MemoryError):
         cause = cause.__cause__
@@ -143,6 +134,8 @@ def _describe_error(error: Exception) -> tuple[str, int]:
         return to_single_line(
             f"The training lacks memory ({cause}); free some, or train on a larger machine."
         ), TRY_AGAIN
+    if advice := runtime_advice(str(error)):
+        return to_single_line(f"A library of '{sys.executable}' cannot be loaded ({error}); {advice}."), 1
     if text := machine_fault_sentence(cause):
         return text, TRY_AGAIN
     with suppress(OSError):
@@ -155,7 +148,7 @@ def _is_memory_error(error: BaseException) -> bool:
     class_names = {cls.__name__ for cls in type(error).__mro__}
     if class_names & {"MemoryError", "OutOfMemoryError"} or getattr(error, "errno", None) == errno.ENOMEM:
         return True
-    return any(text in str(error) for text in MEMORY_ERROR_TEXTS)
+    return lacks_memory(str(error))
 
 
 def missing_package_error(activity: str, error: ModuleNotFoundError) -> TrainingError:

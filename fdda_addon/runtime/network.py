@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import MACHINE_WINERRORS, TRY_AGAIN, ModelError
-from ..core.files.native_library import check_cpp_library, loader_winerror, runtime_advice
+from ..core.errors import TRY_AGAIN, ModelError
+from ..core.files.native_library import check_cpp_library, lacks_memory, runtime_advice
 from ..core.formats.model import (
     CONFIDENCE_OUTPUT,
     CONTROLS_INPUT,
@@ -63,7 +63,7 @@ class Network:
                 "3.14 has its own"
             )
             refusal = ModelError(f"ONNX Runtime cannot be loaded by Python {version} ({error}); {advice}.")
-            if loader_winerror(str(error)) in MACHINE_WINERRORS:
+            if lacks_memory(str(error)):
                 refusal.exit_status = TRY_AGAIN
             raise refusal from error
         onnxruntime.set_default_logger_severity(3)

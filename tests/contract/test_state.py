@@ -13,7 +13,6 @@ MUTATING_METHODS = frozenset(
 STATE = {
     "__init__.py": {"_cli_command": "made by register, dropped by unregister"},
     "cli/interruption.py": {"_pending_signal": "set by a signal, dropped when its KeyboardInterrupt is raised"},
-    "core/recording/lock.py": {"_held_lock_paths": "locks of recordings, each from acquire to release"},
     "evaluation/heat_map.py": {"_colors": "colors of meshes, from paint_… to clear; all end with unregister"},
     "evaluation/last_evaluation.py": {"_evaluations": "the last 4 evaluations, also of closed files, until unregister"},
     "evaluation/timeline.py": {"graph": "drawn from start to stop"},

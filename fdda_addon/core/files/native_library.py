@@ -6,75 +6,26 @@ import platform
 import re
 import sys
 from importlib import metadata
-from typing import NamedTuple
 
 OLD_CPP_LIBRARY, LAST_OLD_RUNTIME = (14, 40), (1, 20)
 """ONNX Runtime after the second version ends the process if the C++ library is older than the first.
 `setup/package.py` refuses wheels that need more than Blender brings, but another extension may have brought one."""
-_REINSTALL = "install the training environment again", "install the extension's zip for this platform again"
-"""Replaces {again} in advice for the trainer's Python, and for Blender."""
-_INSTALL_RUNTIME = "install Microsoft's Visual C++ runtime from {runtime}"
-_OTHER_FILE = "the file is damaged or made for another processor: {again}"
-
-
-class _Cause(NamedTuple):
-    """A reason why a library cannot be loaded.
-
-    Attributes:
-        pattern: regular expression for the text of the error. Its group is {0} in the advice.
-        winerrors: error numbers of Windows.
-        advice: {runtime} is the URL of Microsoft's runtime.
-        blender_advice: advice for a library of the extension, if it differs. Blender brings Microsoft's runtime itself.
-    """
-
-    pattern: str
-    winerrors: tuple[int, ...]
-    advice: str
-    blender_advice: str | None = None
-
-
-_CAUSES = (
-    _Cause("", (126, 1157, 14001), _INSTALL_RUNTIME, "a virus scanner may have removed a file: {again}"),
-    _Cause(
-        r"needs msvcp140\.dll",
-        (127, 998, 1114),
-        _INSTALL_RUNTIME,
-        "another extension may have brought a newer ONNX Runtime: remove that extension, or use a newer Blender",
+_ADVICE = {
+    r"((?:GLIBC|GLIBCXX|CXXABI)_[\d.]+)' not found": (
+        "this Linux is too old, or LD_LIBRARY_PATH names an older library: {0} is needed",
     ),
-    _Cause(
-        r"shared object.*: Cannot allocate memory",
-        (8, 14, 1455),
-        "enlarge the paging file of Windows, or end other programs",
+    r'DLL load failed|Error loading "|needs msvcp140\.dll': (
+        "install Microsoft's Visual C++ runtime from {runtime}, or else the training environment again",
+        "another extension may have brought a newer ONNX Runtime, or a virus scanner removed a file: remove that "
+        "extension, use a newer Blender, or install the extension's zip for this platform again",
     ),
-    _Cause(
-        r"ELF (?:class|header|load)|file too short|cannot read file data|/[^\s:]+: cannot open shared object|mach-o",
-        (193, 216),
-        f"{_OTHER_FILE}, with a Python for this processor",
-        _OTHER_FILE,
+    r"dlopen\(|shared object|undefined symbol|ELF (?:class|header|load)|file too short|cannot read file data": (
+        "a file is missing, damaged or made for another processor: install the training environment again",
+        "a file is missing, damaged or made for another processor: install the extension's zip for this platform again",
     ),
-    _Cause(r"(GLIBC_[\d.]+)' not found", (), "this Linux is too old: use one whose C library has {0}"),
-    _Cause(
-        r"((?:GLIBCXX|CXXABI)_[\d.]+)' not found",
-        (),
-        "an older C++ library is loaded: unset LD_LIBRARY_PATH, or use a Linux whose libstdc++ has {0}",
-    ),
-    _Cause(
-        r"([^\s:('\"/]+): cannot open shared object file",
-        (),
-        "install the package of this Linux that has '{0}', or {again}",
-    ),
-    _Cause(r'Error loading "|DLL load failed|dlopen\(|shared object|undefined symbol', (), "{again}", ""),
-)
-_ENGLISH_TEXTS = {
-    8: "Not enough memory resources",
-    126: "The specified module could not be found",
-    127: "The specified procedure could not be found",
-    193: "is not a valid Win32 application",
-    998: "Invalid access to memory location",
-    1114: "initialization routine failed",
-    1455: "The paging file is too small",
 }
-"""Texts of error numbers. Python names no number where an import fails, and Windows translates the text."""
+"""Advice by patterns of loader errors: for the trainer's Python and, if it differs, for Blender, which brings the C++
+runtime of Windows itself. {0} is the group of the pattern."""
 
 
 def runtime_advice(error_text: str, in_blender: bool = False) -> str:
@@ -85,26 +36,20 @@ def runtime_advice(error_text: str, in_blender: bool = False) -> str:
         in_blender: whether the library belongs to the extension in Blender, not to the trainer's Python.
 
     Returns:
-        The advice; empty where the text is no such error, or nothing is known about it.
+        The advice; empty where the text is no such error.
     """
-    winerror = loader_winerror(error_text)
-    for cause in _CAUSES:
-        match = re.search(cause.pattern, error_text) if cause.pattern else None
-        if match or winerror in cause.winerrors:
-            advice = cause.advice if cause.blender_advice is None or not in_blender else cause.blender_advice
-            return advice.format(*match.groups() if match else (), runtime=runtime_url(), again=_REINSTALL[in_blender])
+    for pattern, advice in _ADVICE.items():
+        if match := re.search(pattern, error_text):
+            if lacks_memory(error_text):
+                return "end other programs, or enlarge the paging file of Windows"
+            return advice[-1 if in_blender else 0].format(*match.groups(), runtime=runtime_url())
     return ""
 
 
-def loader_winerror(error_text: str) -> int | None:
-    """Return the error number of Windows in the text of a failed import; None where the text has none."""
-    if match := re.search(r"WinError (\d+)", error_text):
-        return int(match[1])
-    for winerror in sorted({winerror for cause in _CAUSES for winerror in cause.winerrors}):
-        local_text = ctypes.FormatError(winerror).strip().rstrip(".") if sys.platform == "win32" else ""
-        if any(text and text in error_text for text in (_ENGLISH_TEXTS.get(winerror), local_text)):
-            return winerror
-    return 126 if "DLL load failed" in error_text else None
+def lacks_memory(error_text: str) -> bool:
+    """Return whether a system, torch or ONNX Runtime reports that memory ran out; 8, 14 and 1455 are Windows'."""
+    pattern = r"WinError (?:8|14|1455)\b|(?:can't|cannot) allocate memory|not enough memory|bad.allocation|bad_alloc"
+    return re.search(pattern, error_text, re.IGNORECASE) is not None
 
 
 def runtime_url() -> str:

@@ -8,7 +8,6 @@ import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from itertools import count
 from pathlib import Path
 
 from ..errors import OutputError, os_error_text
@@ -138,8 +137,8 @@ def atomic_write(path: Path, keep_on_failure: bool = True) -> Iterator[Path]:
 
     Args:
         path: path of the file.
-        keep_on_failure: whether a file that is written, but cannot be renamed to `path`, is kept beside `path` under
-            another name.
+        keep_on_failure: whether a file that is written, but cannot be renamed to `path`, is kept under its temporary
+            name, which the error tells.
 
     Raises:
         OutputError: the file cannot be written or renamed, for instance because the disk is full.
@@ -176,7 +175,10 @@ def atomic_write_all(*paths: Path, keep_on_failure: bool = True) -> Iterator[tup
 
 
 def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failure: bool) -> None:
-    """Rename the temporary files to their paths, after a check that no other program keeps one from being replaced."""
+    """Rename the temporary files to their paths, after a check that no other program keeps one from being replaced.
+
+    Temporary files that are kept leave the list.
+    """
     renamed: list[Path] = []
     try:
         for path in filter(os.path.lexists, paths):
@@ -189,32 +191,12 @@ def _rename_all(temporaries: list[Path], paths: tuple[Path, ...], keep_on_failur
     except OSError as error:
         text = f"{_format_names(renamed)} was replaced, and no other" if renamed else "nothing was changed"
         if keep_on_failure:
-            kept_paths = _keep_beside(temporaries[len(renamed) :], paths[len(renamed) :])
-            if kept_paths:
-                text += (
-                    f", and the new content is in {_format_names(kept_paths)}; rename it when no program has "
-                    f"'{path.name}' open"
-                )
+            text += (
+                f", and the new content is in {_format_names(temporaries[len(renamed) :])}; rename it when no program "
+                f"has '{path.name}' open"
+            )
+            temporaries.clear()
         raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; {text}.") from error
-
-
-def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
-    """Rename temporary files that could not replace `paths` to new names beside these paths, where that is possible.
-
-    Returns:
-        The new paths.
-    """
-    for attempt in count(1):
-        prefix = "new-" if attempt == 1 else f"new-{attempt}-"
-        new_paths = [path.with_name(prefix + path.name) for path in paths]
-        if not any(map(os.path.lexists, new_paths)):
-            break
-    kept_paths = []
-    for temporary, new_path in zip(temporaries, new_paths, strict=True):
-        with suppress(OSError):
-            replace_file(temporary, new_path)
-            kept_paths.append(new_path)
-    return kept_paths
 
 
 def _format_names(paths: Iterable[Path]) -> str:

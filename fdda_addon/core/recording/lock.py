@@ -1,27 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Lock file of a recording folder, which permits one writer at a time.
 
-The content of the file names the owner. On a drive that cannot lock files, the existence of the file is the lock.
+On a drive that cannot lock files, the existence of the file is the lock.
 """
 
 import contextlib
 import errno
-import json
 import os
-import socket
 import stat
 import sys
 from pathlib import Path
 
 from ..errors import BusyError
-from ..files.file_lock import NoLocksError, has_ended, try_lock
+from ..files.file_lock import NoLocksError, try_lock
 
 LOCK_NAME = "recording.lock"
-MAX_OWNER_BYTES = 1000
 _OPTIONAL_FLAGS = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
 _OPEN_FLAGS = os.O_RDWR | sum(_OPTIONAL_FLAGS)
-
-_held_lock_paths: set[Path] = set()
 
 
 class RecordingLock:
@@ -39,7 +34,7 @@ class RecordingLock:
         return self._handle >= 0
 
     def acquire(self) -> None:
-        """Acquire the lock. A lock file that an ended process left behind does not block it.
+        """Acquire the lock. A lock file that an ended process left behind blocks it only where files have no locks.
 
         Raises:
             BusyError: another process holds the lock.
@@ -56,18 +51,18 @@ class RecordingLock:
             try:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
                     raise OSError(errno.EINVAL, f"'{LOCK_NAME}' is not a regular file")
-                advice, owner = "wait for it, or choose another folder", self._read_owner(handle)
+                advice = "wait for it, or choose another folder"
                 try:
                     is_locked = try_lock(handle)
                 except NoLocksError:
-                    is_locked = is_new or (self._path not in _held_lock_paths and owner and has_ended(*owner))
+                    is_locked = is_new
                     advice = f"wait for it, or remove '{LOCK_NAME}' there if it has ended: the drive cannot lock files"
                     self.note = (
                         f"The drive of '{self._folder}' cannot lock files; the file '{LOCK_NAME}' there keeps other "
-                        "processes out. Remove it if a recording on another machine was ended."
+                        "recordings out. Remove it after a recording whose process was ended."
                     )
                 if not is_locked:
-                    raise BusyError(f"{self._describe(owner)} is recording into '{self._folder}'; {advice}.")
+                    raise BusyError(f"Another job is recording into '{self._folder}'; {advice}.")
                 if self._is_current_file(handle):
                     break
             except BaseException:
@@ -76,18 +71,11 @@ class RecordingLock:
             # The previous owner has removed the file since it was opened.
             os.close(handle)
         self._handle = handle
-        _held_lock_paths.add(self._path)
-        # A full disk may refuse the content, which the lock does not need.
-        with contextlib.suppress(OSError):
-            os.ftruncate(handle, 0)
-            os.lseek(handle, 0, os.SEEK_SET)
-            os.write(handle, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
 
     def release(self) -> None:
         """Release the lock where it is held."""
         if not self.is_held:
             return
-        _held_lock_paths.discard(self._path)
         # Remove the file while the lock is still held, so that it is not the file of another owner. Windows refuses to
         # remove an open file, so there the file is removed after it is closed.
         with contextlib.suppress(OSError):
@@ -103,20 +91,3 @@ class RecordingLock:
             return os.path.samestat(os.fstat(handle), os.lstat(self._path))
         except FileNotFoundError:
             return False
-
-    def _read_owner(self, handle: int) -> tuple[int, str] | None:
-        """Return process ID and host of the owner; None if the file does not name them."""
-        try:
-            os.lseek(handle, 0, os.SEEK_SET)
-            owner = json.loads(os.read(handle, MAX_OWNER_BYTES))
-            return int(owner["pid"]), str(owner["host"])[:80]
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            return None
-
-    def _describe(self, owner: tuple[int, str] | None) -> str:
-        if self._path in _held_lock_paths:
-            return "This Blender"
-        if owner is None:
-            return "Another process"
-        pid, host = owner
-        return f"Another Blender (process {pid}{'' if host == socket.gethostname() else f' on {host!r}'})"
