@@ -8,19 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdda_addon.core.checks import residual_scan
 from fdda_addon.core.checks.recording import check_recording, merges_sentence
-from fdda_addon.core.checks.warning import RecordingWarning, format_length
+from fdda_addon.core.checks.warning import format_length
 from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.recording.index import Source
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.rig import STATIC_JOINT, Joint
-from fdda_addon.core.wording import format_list, format_with_noun
 
 from .good_recording import (
-    BONE_LENGTH,
-    JOINTS,
-    ROTATION_LIMIT,
     axis_rotations,
     good_recording,
     single_warning_text,
@@ -161,32 +156,6 @@ def test_equal_poses_with_different_residuals_are_reported(clean_recording):
     )
 
 
-def test_vertices_that_never_move_are_reported(clean_recording):
-    angles = np.random.default_rng(0).uniform(-ROTATION_LIMIT, ROTATION_LIMIT, (200, len(JOINTS)))
-    angles[:, 0] = 0
-    locked_recording = good_recording(angles=angles)
-    locked_recording.residuals[:, locked_recording.rig.rest_positions[:, 2] < 0.3 * BONE_LENGTH] = 0
-    count = int((locked_recording.rig.rest_positions[:, 2] < 0.3 * BONE_LENGTH).sum())
-    text = single_warning_text(locked_recording, "still-vertices")
-    assert text.startswith(f"{count} of 240 vertices never move, of the partition 'root': if they should, weight them")
-    locked_recording.residuals[100, :, 0] += 0.001
-    assert warning_texts(locked_recording) == {}
-
-
-def test_small_partitions_are_reported(clean_recording):
-    skin_joints, skin_weights = clean_recording.rig.skin_joints.copy(), clean_recording.rig.skin_weights.copy()
-    tip_vertices = clean_recording.rig.rest_positions[:, 2].argsort()[-5:]
-    hand_vertices = skin_joints[:, 1] == 3
-    skin_joints[hand_vertices], skin_weights[hand_vertices] = 2, (0.5, 0.5)
-    skin_joints[tip_vertices], skin_weights[tip_vertices] = 3, (0.5, 0.5)
-    changed_recording = with_rig(clean_recording, skin_joints=skin_joints, skin_weights=skin_weights)
-    partitions = make_partitions(changed_recording.rig, {3: (3,)}, dict.fromkeys(range(4), (0,)))
-    text = single_warning_text(replace(changed_recording, partitions=partitions), "small-partitions")
-    assert text.startswith("The partition 'hand' has fewer than 8 vertices (the smallest 5), and a network each: ")
-    partitions = make_partitions(changed_recording.rig, None, dict.fromkeys(range(4), (0,)), merged={3: 2})
-    assert warning_texts(replace(changed_recording, partitions=partitions)) == {}
-
-
 def test_sentence_about_merged_partitions(clean_recording):
     joints = tuple(Joint(name, -1) for name in ("root", "a", "b", STATIC_JOINT, *map(str, range(20))))
     recording = with_rig(clean_recording, joints=joints)
@@ -200,38 +169,6 @@ def test_sentence_about_merged_partitions(clean_recording):
         "2 partitions of fewer than 8 vertices are merged: 'b' into 'root', 'no bone' into 'root'."
     )
     assert sentence(tuple(range(4, 20)), 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
-
-
-def test_the_scan_reads_a_limited_number_of_poses_and_vertices(clean_recording, monkeypatch):
-    monkeypatch.setattr(residual_scan, "MAX_SCANNED_POSES", 50)
-    monkeypatch.setattr(residual_scan, "MAX_KEPT_VERTICES", 40)
-    scan = residual_scan.scan_residuals(clean_recording)
-    assert len(scan.poses) == 50 and (scan.poses[0], scan.poses[-1]) == (0, 199)
-    assert all(len(r) == 50 and 8 <= r.shape[1] <= 10 for r in scan.residuals)
-    for kept_vertices, partition in zip(scan.vertices, clean_recording.partitions, strict=True):
-        assert set(kept_vertices) <= set(partition.vertices)
-    lengths = np.linalg.norm(clean_recording.residuals[scan.poses], axis=2)
-    np.testing.assert_allclose(scan.rms, np.sqrt((lengths**2).mean(axis=0)), rtol=1e-5)
-    np.testing.assert_allclose(scan.largest, lengths.max(axis=0), rtol=1e-5)
-    changes = np.linalg.norm(clean_recording.residuals[scan.poses] - clean_recording.residuals[0], axis=2)
-    np.testing.assert_allclose(scan.change, changes.max(axis=0), rtol=1e-4, atol=1e-9)
-    vertex = int(lengths.max(axis=0).argmax())
-    assert scan.largest_pose[vertex] == scan.poses[lengths[:, vertex].argmax()]
-
-
-def test_texts_of_warnings_and_lists():
-    warning = RecordingWarning("flips", "It jumps; limit it.")
-    assert str(warning) == "Warning (flips): It jumps; limit it."
-    assert warning.to_json() == {"name": "flips", "text": "It jumps; limit it."}
-    assert (
-        format_list(["a"]) == "'a'"
-        and format_list(["a", "b"]) == "'a' and 'b'"
-        and format_list([1, 2, 3, 4, 5]) == "1, 2, 3 and 2 more"
-    )
-    assert (
-        format_with_noun([3], "pose") == "the pose 3"
-        and format_with_noun(["a", "b"], "joint") == "the 2 joints 'a' and 'b'"
-    )
 
 
 def test_lengths_are_formatted_in_meters_for_any_unit(clean_recording):

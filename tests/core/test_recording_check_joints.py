@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from fdda_addon.core.controls import Control
-from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.poses import Channel
 from fdda_addon.core.recording.skinned import SkinnedRecording
-from fdda_addon.core.rig import STATIC_JOINT, Joint
+from fdda_addon.core.rig import Joint
 
 from .good_recording import (
     JOINTS,
@@ -147,22 +146,3 @@ def test_a_joint_that_drives_another_causes_no_warning(clean_recording):
         @ (clean_recording.rig.rest_matrices[3] @ axis_rotations(0.5 * angles + 0.1))
     )
     assert "dead-joints" not in warning_texts(with_target)
-
-
-def test_still_vertices_without_a_bone_are_reported(clean_recording):
-    rest_matrices = np.concatenate([clean_recording.rig.rest_matrices, np.eye(4, dtype=np.float32)[None]])
-    static_matrices = np.tile(np.eye(4, dtype=np.float32), (200, 1, 1, 1))
-    skin_joints, skin_weights = clean_recording.rig.skin_joints.copy(), clean_recording.rig.skin_weights.copy()
-    skin_joints[-20:], skin_weights[-20:] = 4, (1, 0)
-    clean_recording.residuals[:, -20:] = 0
-    joints = (*clean_recording.rig.joints, Joint(STATIC_JOINT, -1))
-    clean_recording = with_rig(
-        clean_recording, joints=joints, rest_matrices=rest_matrices, skin_joints=skin_joints, skin_weights=skin_weights
-    )
-    clean_recording = replace(
-        clean_recording, pose_matrices=np.concatenate([clean_recording.pose_matrices, static_matrices], axis=1)
-    )
-    clean_recording = replace(clean_recording, partitions=make_partitions(clean_recording.rig))
-    assert (
-        "20 of 240 vertices never move, of the partition 'no bone'" in warning_texts(clean_recording)["still-vertices"]
-    )

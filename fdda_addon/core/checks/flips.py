@@ -37,8 +37,8 @@ JUMP_RATIO = 8.0
 median distance of such pairs."""
 MIN_SPREAD_RATIO, MIN_SIZE_RATIO = 1 / 3, 1e-3
 """Smallest size of a jump, as a ratio of the largest distance of two poses, and as a ratio of the rig's size."""
-HALF_TURN_DEGREES = 150.0
-"""Rotations by at least this angle are near 180 degrees, where the sign of a quaternion flips."""
+MAX_TRACE = 1 + 2 * np.cos(np.radians(150.0))
+"""Trace of a matrix that rotates by 150 degrees. Larger rotations are near 180 degrees, where quaternions flip."""
 MIN_DEVIATION = 1e-5
 """An element of a transform with a smaller standard deviation counts as constant."""
 PAIR_BATCH = 512
@@ -131,37 +131,22 @@ def _find_half_turn_pairs(
 ) -> Iterator[tuple[int, tuple[np.ndarray, np.ndarray]]]:
     """Yield each joint that passes 180 degrees, with its pairs of similar poses on two sides and on the same side."""
     for joint in sorted({j for partition in partitions for j in partition.influencing}):
-        quaternions = _to_quaternions(features[:, joint])
-        is_near_half_turn = quaternions[:, 0] < np.cos(np.radians(HALF_TURN_DEGREES / 2))
+        matrices = features[:, joint].reshape(-1, 3, 4)[:, :, :3].astype(np.float64)
+        scales = np.cbrt(np.abs(np.linalg.det(matrices)))
+        is_near_half_turn = np.trace(matrices, axis1=1, axis2=2) < scales * MAX_TRACE
         if is_near_half_turn.sum() < 2:
             continue
+        # Near 180 degrees, these are small vectors along the axis, whose sign differs on the two sides.
+        axes = np.stack([matrices[:, x, y] - matrices[:, y, x] for x, y in ((2, 1), (0, 2), (1, 0))], axis=1)
         pairs = find_similar_poses(features[:, joint], JOINT_DISTANCE_RATIO)
         first, second = pairs.T
         is_opposite = (
             is_near_half_turn[first]
             & is_near_half_turn[second]
-            & (np.einsum("mq,mq->m", quaternions[first], quaternions[second]) < 0)
+            & (np.einsum("mc,mc->m", axes[first], axes[second]) < 0)
         )
         if (~is_opposite).sum() >= MIN_PAIRS:
             yield joint, (pairs[is_opposite], pairs[~is_opposite])
-
-
-def _to_quaternions(features: np.ndarray) -> np.ndarray:
-    """Convert (n, 12) features of a joint to (n, 4) rotation quaternions with w >= 0.
-
-    Source: Bar-Itzhack, New Method for Extracting the Quaternion from a Rotation Matrix, 2000.
-    """
-    matrices = features.reshape(-1, 3, 4)[:, :, :3].astype(np.float64)
-    u, _, v = np.linalg.svd(matrices)
-    rotations = u @ v * np.linalg.det(u @ v)[:, None, None]
-    # The eigenvector of the largest eigenvalue is well-defined at 180 degrees, too.
-    bar_itzhack = np.zeros((len(rotations), 4, 4))
-    bar_itzhack[:, 0, 0] = np.trace(rotations, axis1=1, axis2=2)
-    bar_itzhack[:, 1:, 1:] = rotations + rotations.transpose(0, 2, 1) - bar_itzhack[:, :1, :1] * np.eye(3)
-    for i, (x, y) in enumerate(((2, 1), (0, 2), (1, 0)), 1):
-        bar_itzhack[:, 0, i] = bar_itzhack[:, i, 0] = rotations[:, x, y] - rotations[:, y, x]
-    quaternions = np.linalg.eigh(bar_itzhack)[1][:, :, -1]
-    return quaternions * np.where(quaternions[:, :1] < 0, -1, 1)
 
 
 def find_similar_poses(values: np.ndarray, max_ratio: float) -> np.ndarray:

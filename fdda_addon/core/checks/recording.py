@@ -4,10 +4,9 @@
 import numpy as np
 
 from ..controls import SHAPE_KEY_PATH
-from ..mathematics.features import FEATURES_PER_JOINT, float32_rounding, joint_features_in_metres
+from ..mathematics.features import FEATURES_PER_JOINT, joint_features_in_metres
 from ..recording.skinned import SkinnedRecording
 from ..rig import Rig
-from ..settings import MIN_VERTICES_PER_PART
 from ..wording import format_count, format_list, format_with_noun
 from .flips import check_flips
 from .poses import check_poses
@@ -20,13 +19,11 @@ from .warning import RecordingWarning, format_length, joint_name
 WARNING_NAMES = (
     *("units", "axes", "large-residuals", "duplicate-poses", "hidden-inputs", "degenerate-poses", "flips"),
     *("open-seams", "hysteresis", "frame-jumps", "frozen-frames", "target-place"),
-    *("dead-controls", "dead-joints", "still-vertices", "small-partitions"),
+    *("dead-controls", "dead-joints"),
 )
 """Names of all warnings."""
 MIN_MOTION_RATIO = 1e-5
 """A vertex or joint whose motion over all poses is below this ratio of the rig's size counts as still."""
-MAX_STILL_RATIO = 0.01
-"""Largest ratio of still vertices without a warning."""
 MAX_LISTED_MERGES = 10
 """Largest number of merges that a message lists; further merges are only counted."""
 MIN_CORRELATION = 0.3
@@ -45,11 +42,6 @@ def check_recording(recording: SkinnedRecording) -> list[RecordingWarning]:
         The warnings in the order of `WARNING_NAMES`; empty for a good recording.
     """
     scan = scan_residuals(recording)
-    low, high = (function(recording.pose_matrices, axis=0) for function in (np.min, np.max))
-    rig, ranges = recording.rig, high - low
-    rounding = float32_rounding(recording.pose_matrices)
-    threshold = max(MIN_MOTION_RATIO * max(1 / rig.metres_per_unit, rig.size), rounding)
-    moving = (ranges[:, :3, :3].max(axis=(1, 2)) > MIN_MOTION_RATIO) | (ranges[:, :3, 3].max(axis=1) > threshold)
     warnings = [
         *check_rest(recording.rig),
         *_check_large_residuals(recording, scan),
@@ -59,8 +51,6 @@ def check_recording(recording: SkinnedRecording) -> list[RecordingWarning]:
         *check_target(recording),
         *_check_controls(recording),
         *_check_joints(recording),
-        *_check_still_vertices(recording, scan, moving),
-        *_check_small_partitions(recording),
     ]
     return sorted(warnings, key=lambda warning: WARNING_NAMES.index(warning.name))
 
@@ -230,35 +220,3 @@ def _are_related(first: np.ndarray, second: np.ndarray) -> bool:
     )
     correlations = np.abs(standardized[0].T @ columns) / len(first)
     return bool(correlations.max(initial=0) > max(MIN_CORRELATION, 5 / np.sqrt(len(first))))
-
-
-def _check_still_vertices(
-    recording: SkinnedRecording, scan: ResidualScan, moving_joints: np.ndarray
-) -> list[RecordingWarning]:
-    rig = recording.rig
-    follows_moving_joint = ((rig.skin_weights > 0) & moving_joints[rig.skin_joints]).any(axis=1)
-    is_still = ~follows_moving_joint & (scan.change < MIN_MOTION_RATIO * rig.size)
-    if is_still.sum() <= MAX_STILL_RATIO * rig.vertex_count:
-        return []
-    names = [
-        joint_name(rig, partition.joint) for partition in recording.partitions if is_still[partition.vertices].any()
-    ]
-    text = (
-        f"{int(is_still.sum())} of {rig.vertex_count} vertices never move, of {format_with_noun(names, 'partition')}: "
-        "if they should, weight them to joints that do, or give their joints a range of motion, and record again."
-    )
-    return [RecordingWarning("still-vertices", text)]
-
-
-def _check_small_partitions(recording: SkinnedRecording) -> list[RecordingWarning]:
-    limit = MIN_VERTICES_PER_PART.default
-    small = [partition for partition in recording.partitions if len(partition.vertices) < limit]
-    if not small or len(recording.partitions) == 1:
-        return []
-    text = (
-        f"{format_with_noun([joint_name(recording.rig, partition.joint) for partition in small], 'partition')} "
-        f"{'has' if len(small) == 1 else 'have'} fewer than {limit} vertices (the smallest "
-        f"{min(len(partition.vertices) for partition in small)}), and a network each: train with "
-        f"--min-vertices-per-part {limit} to merge them into others."
-    )
-    return [RecordingWarning("small-partitions", text)]

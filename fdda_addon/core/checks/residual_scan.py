@@ -22,7 +22,6 @@ class ResidualScan:
         rms: (V,) float64, rms of the length over the poses.
         largest: (V,) float32, largest length over the poses.
         largest_pose: (V,) int64, index of the pose in which the length is largest.
-        change: (V,) float32, largest difference from the residual of the first pose.
         vertices: for each partition, (S_p,) int64 indices of the vertices whose residuals are kept.
         residuals: for each partition, (n, S_p, 3) float32 residuals of these vertices.
     """
@@ -31,7 +30,6 @@ class ResidualScan:
     rms: np.ndarray
     largest: np.ndarray
     largest_pose: np.ndarray
-    change: np.ndarray
     vertices: tuple[np.ndarray, ...]
     residuals: tuple[np.ndarray, ...]
 
@@ -50,24 +48,19 @@ def scan_residuals(recording: SkinnedRecording) -> ResidualScan:
     kept_residuals = np.empty((len(poses), len(all_vertices), 3), np.float32)
     sum_of_squares = np.zeros(rig.vertex_count, np.float64)
     largest = np.full(rig.vertex_count, -1, np.float32)
-    change = np.zeros(rig.vertex_count, np.float32)
     largest_pose = np.zeros(rig.vertex_count, np.int64)
-    first_residuals = recording.compute_residuals(poses[:1])[0]
     for row, residuals in enumerate(recording.iterate_residuals(poses)):
         kept_residuals[row] = residuals[all_vertices]
         squared_lengths = np.einsum("vc,vc->v", residuals, residuals)
         sum_of_squares += squared_lengths
         larger_vertices = np.flatnonzero(squared_lengths > largest)
         largest[larger_vertices], largest_pose[larger_vertices] = squared_lengths[larger_vertices], poses[row]
-        residuals -= first_residuals
-        np.maximum(change, np.einsum("vc,vc->v", residuals, residuals), out=change)
     ends = np.cumsum([len(partition_vertices) for partition_vertices in vertices])[:-1]
     return ResidualScan(
         poses,
         np.sqrt(sum_of_squares / len(poses)),
         np.sqrt(largest),
         largest_pose,
-        np.sqrt(change),
         vertices,
         tuple(np.split(kept_residuals, ends, axis=1)),
     )
