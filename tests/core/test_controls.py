@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.controls import Control
-from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.formats.model_info import ModelInfo, ModelPartition
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
 
 from ..recordings import read_skinned, write_recording
-from .limb import CHANNELS, make_rig, partitions_of, random_poses, random_positions, recording_info
-from .tiny_model import tiny_info
+from .limb import make_rig, partitions_of, random_poses, random_positions, recording_info
 
 SMILE = Control("shape_keys", 'key_blocks["Smile"].value', 0.0, 1.0)
 FIST = Control("armature_object", 'pose.bones["hand.L"]["fist"]', -1.0, 1.0)
@@ -35,12 +32,6 @@ def controlled_recording(tmp_path):
     with RecordingWriter(tmp_path / "recording", rig, recording_info(POSE_COUNT)) as writer:
         writer.append(random_poses(POSE_COUNT), random_positions(POSE_COUNT), control_values(POSE_COUNT))
     return tmp_path / "recording"
-
-
-def test_controls_are_read_back(controlled_recording):
-    read_back = read_recording(controlled_recording)
-    assert read_back.rig.controls == (SMILE, FIST)
-    assert np.array_equal(read_back.controls, control_values(POSE_COUNT))
 
 
 def test_influences_follow_from_poses_in_which_inputs_move_alone(tmp_path):
@@ -74,44 +65,9 @@ def test_positions_that_stop_being_finite_are_influenced(tmp_path):
     assert "are not finite in 1 test of its influences, as when 'root' moves from the rest pose" in notes[0]
 
 
-def test_an_extension_appends_controls(controlled_recording):
+def test_controls_are_read_back_and_appended(controlled_recording):
     with RecordingExtension(read_recording(controlled_recording), 2, "model.onnx") as extension:
         extension.append(random_poses(2), random_positions(2), control_values(2))
-    assert np.array_equal(
-        read_recording(controlled_recording).controls, np.concatenate([control_values(POSE_COUNT), control_values(2)])
-    )
-
-
-def test_missing_and_non_finite_controls_are_refused(controlled_recording):
-    array = np.load(controlled_recording / "controls.npy")
-    array[2] = np.nan
-    np.save(controlled_recording / "controls.npy", array)
-    with pytest.raises(RecordingError, match=r"not numbers \(controls"):
-        read_recording(controlled_recording)
-    (controlled_recording / "controls.npy").unlink()
-    with pytest.raises(RecordingError, match=r"controls\.npy' cannot be used"):
-        read_recording(controlled_recording)
-
-
-def test_model_metadata_contains_controls():
-    info = tiny_info(
-        controls=(SMILE, FIST),
-        partitions=(
-            ModelPartition(0, (), 1, 0),
-            ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,)),
-        ),
-    )
-    decoded_info = ModelInfo.from_json(info.to_json())
-    assert (decoded_info.controls, decoded_info.partitions) == (info.controls, info.partitions)
-    assert "controls" not in tiny_info().to_json()
-
-
-def test_model_with_an_unknown_control_in_a_partition_is_refused():
-    info = tiny_info(partitions=(ModelPartition(0, (), 4, 0, controls=(0,)),))
-    with pytest.raises(ValueError, match="a control that is none of its controls"):
-        ModelInfo.from_json(info.to_json())
-
-
-def test_control_names_are_distinct():
-    assert SMILE.name == 'shape_keys/key_blocks["Smile"].value'
-    assert len({SMILE.name, FIST.name, *(c.name for c in CHANNELS)}) == 4
+    read_back = read_recording(controlled_recording)
+    assert read_back.rig.controls == (SMILE, FIST)
+    assert np.array_equal(read_back.controls, np.concatenate([control_values(POSE_COUNT), control_values(2)]))

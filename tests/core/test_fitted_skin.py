@@ -9,9 +9,9 @@ import pytest
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import SKIN_KEY, read_model, read_skin
-from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, skin_from_text, skin_to_text
+from fdda_addon.core.mathematics.skin_fit import FitReport, SkinFit, skin_to_text
 
-from .tiny_model import JOINT_COUNT, VERTEX_COUNT, tiny_info, tiny_model
+from .tiny_model import VERTEX_COUNT, tiny_info, tiny_model
 
 FIT = SkinFit(
     "smooth",
@@ -31,10 +31,6 @@ def test_sentence_about_a_fit():
     )
 
 
-def test_a_fit_is_read_back_from_json():
-    assert SkinFit.from_json(json.loads(json.dumps(FIT.to_json()))) == FIT
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -48,13 +44,6 @@ def test_a_fit_is_read_back_from_json():
 def test_a_damaged_fit_is_refused(changes, words):
     with pytest.raises((ValueError, KeyError, TypeError), match=words):
         SkinFit.from_json({**FIT.to_json(), **changes})
-
-
-def test_weights_are_decoded_unchanged_from_text():
-    joints, weights = skin_from_text(skin_to_text(SKIN_JOINTS, SKIN_WEIGHTS), VERTEX_COUNT, JOINT_COUNT)
-    np.testing.assert_array_equal(joints, SKIN_JOINTS)
-    np.testing.assert_array_equal(weights, SKIN_WEIGHTS)
-    assert (joints.dtype, weights.dtype) == (np.int32, np.float32)
 
 
 def changed_skin_text(**changes) -> str:
@@ -72,16 +61,11 @@ def base64_of_array(array: np.ndarray) -> str:
     [
         ("", "its skin weights cannot be read"),
         ("[" * 100_000, "its skin weights cannot be read"),
-        ("[3]", "its skin weights cannot be read"),
         ("{}", "its skin weights cannot be read ('influences')"),
-        (changed_skin_text(joints=None), "its skin weights cannot be read"),
-        (changed_skin_text(joints="!" * 88), "its skin weights cannot be read"),
         (changed_skin_text(influences=0), "its skin weights are damaged: they have 0 joints per vertex"),
         (changed_skin_text(influences=10**9), "they have 1000000000 joints per vertex"),
-        (changed_skin_text(influences=5), f"they are not for {VERTEX_COUNT} vertices"),
         (changed_skin_text(weights="AAAA"), f"they are not for {VERTEX_COUNT} vertices"),
         (changed_skin_text(joints=base64_of_array(SKIN_JOINTS + 1)), "its skin weights are no weights of its joints"),
-        (changed_skin_text(joints=base64_of_array(SKIN_JOINTS - 1)), "its skin weights are no weights of its joints"),
         (changed_skin_text(weights=base64_of_array(SKIN_WEIGHTS * 2)), "its skin weights are no weights of its joints"),
         (
             changed_skin_text(weights=base64_of_array(SKIN_WEIGHTS * np.float32("nan"))),

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdda_addon.core.errors import FDDAError, RecordingError
+from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording.folder import check_recordable
 from fdda_addon.core.recording.reader import check_resumable, read_recording
-from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
+from fdda_addon.core.recording.writer import RecordingWriter
 
 from .. import systems
 from .damage import assert_refused, edit_index, npy_bytes
@@ -59,7 +59,7 @@ def test_a_named_pipe_is_refused(recording, name):
 
 @systems.symbolic_links
 @pytest.mark.parametrize("name", RECORDING_FILES)
-@pytest.mark.parametrize("target", ["/dev/zero", "/dev/stdin", "/etc/passwd", "another recording"])
+@pytest.mark.parametrize("target", ["/dev/zero", "another recording"])
 def test_a_link_to_another_folder_is_refused(recording, tmp_path, name, target):
     """Links to valid files are refused too, because a resumed recording would write through them."""
     if target == "another recording":
@@ -96,25 +96,9 @@ def test_resuming_does_not_write_through_links(recording, tmp_path, name):
     assert victim.read_text() == "precious"
 
 
-@systems.symbolic_links
-def test_an_extension_does_not_write_through_links(recording, tmp_path):
-    opened_recording = read_recording(recording)
-    victim = shutil.move(recording / "positions.npy", tmp_path / "victim.npy")
-    bytes_before = (tmp_path / "victim.npy").read_bytes()
-    (recording / "positions.npy").symlink_to(victim)
-    with pytest.raises(FDDAError, match="it is a link to another place"):
-        RecordingExtension(opened_recording, 2, "m.onnx")
-    assert (tmp_path / "victim.npy").read_bytes() == bytes_before
-
-
 def flatten_axis(matrix):
     """Set the Y axis of a matrix to zero."""
     matrix[:3, 1] = 0
-
-
-def make_axes_parallel(matrix):
-    """Make the Y axis of a matrix parallel to its X axis."""
-    matrix[:3, 1] = matrix[:3, 0]
 
 
 def clear_last_row(matrix):
@@ -122,7 +106,7 @@ def clear_last_row(matrix):
     matrix[3] = 0
 
 
-@pytest.mark.parametrize("damage", [flatten_axis, make_axes_parallel, clear_last_row])
+@pytest.mark.parametrize("damage", [flatten_axis, clear_last_row])
 def test_degenerate_joint_matrices_are_refused(recording, damage):
     array = np.load(recording / "pose_matrices.npy")
     damage(array[7, 2])
@@ -208,22 +192,6 @@ def test_an_invalid_joint_name_is_refused(recording, name):
     index["joints"][1]["name"] = name
     edit_index(recording, joints=index["joints"])
     assert_refused(recording, "recording.json' is damaged: ", "name")
-
-
-@pytest.mark.parametrize(
-    "fingerprint",
-    [
-        {},
-        [],
-        {**FINGERPRINT_HASHES, "topology": 7},
-        {**FINGERPRINT_HASHES, "skin_weights": None},
-        {**FINGERPRINT_HASHES, "topology": "a" * 10**6},
-    ],
-)
-def test_an_invalid_fingerprint_is_refused(recording, fingerprint):
-    index = json.loads((recording / "recording.json").read_text())
-    edit_index(recording, meshes=[{**index["meshes"][0], "fingerprint": fingerprint}])
-    assert_refused(recording, "recording.json' is damaged: ")
 
 
 def test_messages_are_short_and_escape_control_characters(recording):

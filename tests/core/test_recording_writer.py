@@ -48,24 +48,7 @@ def test_content_is_read_back_unchanged(recording):
     assert read_back.info.sampling == recording_info(POSE_COUNT).sampling
 
 
-def test_arrays_are_plain_npy_files(recording):
-    positions = np.load(recording / "positions.npy", mmap_mode="r", allow_pickle=False)
-    assert positions.shape == (POSE_COUNT, 40, 3) and positions.dtype == np.float32
-    assert sorted(file_bytes(recording)) == [
-        "bones.json",
-        "face_starts.npy",
-        "face_vertices.npy",
-        "pose_matrices.npy",
-        "positions.npy",
-        "recording.json",
-        "rest_matrices.npy",
-        "rest_positions.npy",
-        "skin_joints.npy",
-        "skin_weights.npy",
-    ]
-
-
-@pytest.mark.parametrize("complete", [0, 5, 10])
+@pytest.mark.parametrize("complete", [0, 10])
 def test_a_resumed_recording_has_the_same_bytes(recording, tmp_path, complete):
     path = tmp_path / "interrupted"
     record_limb(path, POSE_COUNT, complete)
@@ -76,26 +59,14 @@ def test_a_resumed_recording_has_the_same_bytes(recording, tmp_path, complete):
     assert file_bytes(path) == file_bytes(recording)
 
 
-def test_resuming_a_complete_recording_changes_nothing(recording):
-    bytes_before = file_bytes(recording)
-    record_limb(recording, POSE_COUNT, resume=True)
-    assert file_bytes(recording) == bytes_before
-
-
-def test_resuming_without_a_recording_starts_one(tmp_path, recording):
-    record_limb(tmp_path / "new", POSE_COUNT, resume=True)
-    assert file_bytes(tmp_path / "new") == file_bytes(recording)
-
-
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_an_error_between_batches_keeps_complete_poses(tmp_path, recording, error):
+def test_an_error_between_batches_keeps_complete_poses(tmp_path, recording):
     path, rig = tmp_path / "interrupted", make_rig()
     with (
-        pytest.raises(error),
+        pytest.raises(KeyboardInterrupt),
         RecordingWriter(path, rig, recording_info(POSE_COUNT)) as writer,
     ):
         writer.append(random_poses(POSE_COUNT)[:5], random_positions(POSE_COUNT)[:5])
-        raise error
+        raise KeyboardInterrupt
     record_limb(path, POSE_COUNT, resume=True)
     assert file_bytes(path) == file_bytes(recording)
 
@@ -105,13 +76,6 @@ def test_an_error_before_the_first_pose_leaves_no_folder(tmp_path):
     with pytest.raises(KeyboardInterrupt), RecordingWriter(path, rig, recording_info(POSE_COUNT)):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_error_before_the_first_pose_keeps_an_existing_folder(tmp_path):
-    rig = make_rig()
-    with pytest.raises(RuntimeError), RecordingWriter(tmp_path, rig, recording_info(POSE_COUNT)):
-        raise RuntimeError
-    assert tmp_path.is_dir() and list(tmp_path.iterdir()) == []
 
 
 def test_an_incompletely_written_batch_is_not_read(tmp_path, recording):
@@ -228,17 +192,12 @@ def set_nested_value(index, *keys, value):
     ("keys", "value", "difference"),
     [
         (("sampling", "seed"), 3, "sampling.seed"),
-        (("sampling", "spread"), 0.5, "sampling.spread"),
         (("sampling", "limits", 0, "high"), 0.1, "sampling.limits"),
-        (("sampling", "sources", 1, "name"), "fist", "sampling.sources"),
-        (("rig", "file"), "other.blend", "rig.file"),
         (("meshes", 0, "fingerprint", "skin_weights"), "0", "meshes"),
         (("joints", 1, "name"), "arm", "joints"),
         (("bones", "dependencies"), [2], "bones.dependencies"),
         (("poses",), 13, "poses"),
-        (("blender",), "4.5.0", "blender"),
         (("extra",), 1, "extra"),
-        (("faces",), 3, "faces"),
         (("corners",), 60, "corners"),
     ],
 )
@@ -256,8 +215,7 @@ def test_resuming_another_recording_names_the_differences(tmp_path, keys, value,
     assert file_bytes(tmp_path / "r") == bytes_before
 
 
-@pytest.mark.parametrize("name", ["pose_matrices", "positions"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(("name", "value"), [("pose_matrices", np.nan), ("positions", np.inf)])
 def test_non_finite_values_are_refused_with_the_pose(tmp_path, name, value):
     rig, arrays = make_rig(), {"pose_matrices": random_poses(POSE_COUNT), "positions": random_positions(POSE_COUNT)}
     arrays[name][7, 1, 2] = value

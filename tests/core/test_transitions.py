@@ -8,7 +8,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
-from fdda_addon.runtime.transitions import SHOWS_MODEL, TABLE, Effect, Event, State, transition
+from fdda_addon.runtime.transitions import SHOWS_MODEL, Effect, Event, State, transition
 
 ALL_PAIRS = [(state, event) for state in State for event in Event]
 BOUND_STATES = set(State) - {State.UNBOUND}
@@ -172,57 +172,3 @@ def test_what_users_expect(event: Event):
     for following, former_states in NEXT_STATES.get(event, {}).items():
         expected |= dict.fromkeys(former_states, following)
     assert {state: transition(state, event).state for state in State} == expected
-
-
-PAUSE = (Effect.REMOVE_PLAYER, Effect.SHOW_RIG)
-STOP = (*PAUSE, Effect.DISCONNECT)
-START = (Effect.SHOW_MODEL, Effect.CREATE_PLAYER)
-RESTART = (Effect.REMOVE_PLAYER, Effect.CREATE_PLAYER)
-EFFECTS = {
-    Event.UNBIND: {STOP: SHOWS_MODEL, (Effect.DISCONNECT,): {State.SUSPENDED}},
-    Event.CHOOSE_MODEL: {START: {State.BOUND, State.FAILED}, (Effect.SHOW_MODEL,): SHOWS_MODEL},
-    Event.ANIMATE_MODEL: {START: {State.BOUND}},
-    Event.SHOW_RIG: {
-        (*STOP, Effect.CLEAR_STATUS): SHOWS_MODEL,
-        (Effect.SHOW_RIG, Effect.DISCONNECT): {State.BOUND},
-        (Effect.DISCONNECT,): {State.SUSPENDED},
-    },
-    Event.EDIT_OBJECT: {(Effect.READ_VISIBILITY,): BOUND_STATES},
-    Event.REPLAY: {(Effect.TAG_BUFFER,): SHOWS_MODEL},
-    Event.WARN: {(Effect.SHOW_WARNING,): SHOWS_MODEL},
-    Event.SUSPEND: {PAUSE: SHOWS_MODEL},
-    Event.RESUME: {START: {State.SUSPENDED}},
-    Event.CHANGE: {(Effect.SCHEDULE_CHECK,): {State.PLAYING, State.CHANGED}},
-    Event.CHECK: {(Effect.CHECK_RIG,): {State.CHANGED}},
-    Event.LEAVE_EDIT: {(Effect.FORGET_CHECK, *RESTART): {State.EDITED}},
-    Event.OUTDATE: {RESTART: SHOWS_MODEL},
-    Event.FAIL: {
-        (Effect.REPORT, *STOP): SHOWS_MODEL,
-        # The modifiers of a bound character may be half switched.
-        (Effect.REPORT, Effect.SHOW_RIG, Effect.DISCONNECT): {State.BOUND},
-        # A suspended character shows its rig already.
-        (Effect.REPORT, Effect.DISCONNECT): {State.SUSPENDED},
-    },
-}
-"""By event: the effects, each with the states in which the event has them. In all other states it has none.
-
-More effects would cost time in each pose: CHANGE must not read the rig, and only edits forget a check. If effects fail
-during FAIL, the reason has been reported."""
-
-
-@pytest.mark.parametrize("event", Event, ids=lambda event: event.name.lower())
-def test_each_event_has_these_effects_in_this_order(event: Event):
-    expected = {state: () for state in State}
-    for effects, states in EFFECTS.get(event, {}).items():
-        expected |= dict.fromkeys(states, effects)
-    assert {state: transition(state, event).effects for state in State} == expected
-
-
-def test_the_table_names_no_transition_that_does_nothing():
-    idle = {
-        (state.name, event.name)
-        for state, row in TABLE.items()
-        for event, (following, effects) in row.items()
-        if following == state and not effects
-    }
-    assert idle == {("EDITED", "CHANGE"), ("EDITED", "EDIT")}, "these replace what the other playing states do"
