@@ -106,7 +106,7 @@ def main() -> None:
         "linear_mm": errors_mm["linear"],
         "fdda_mm": errors_mm["fdda"],
         "part": errors_mm["fdda"]["mean"] / errors_mm["linear"]["mean"],
-        "repeatability": recording_info.get("repeatability"),
+        "repeatability_mm": recording_info.get("repeatability_mm"),
         "simulation_ms": frame_ms(rig, FLESH, "arm"),
         "model_ms": frame_ms(bound, "arm", FLESH),
         "seconds": seconds,

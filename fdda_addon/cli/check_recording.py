@@ -9,6 +9,7 @@ from ..core.checks.warning import raise_first_warning
 from ..core.errors import RecordingError
 from ..core.files.file_kind import WARNINGS
 from ..core.files.output import check_outputs, write_json
+from ..core.recording.index import repeatability_sentence
 from ..core.recording.reader import read_recording
 from ..core.recording.skinned import skin_recording
 from .files import add_overwrite_option
@@ -36,8 +37,8 @@ def run(options: argparse.Namespace) -> None:
             f"The rig of '{options.recording}' has no skin weights, and its residuals follow from fitted ones; train "
             "with --base-skinning smooth, which checks the recording."
         )
-    if recording.info.repeatability:
-        print(recording.info.repeatability.sentence())
+    if sentence := repeatability_sentence(recording.info.repeatability_mm):
+        print(sentence)
     warnings = check_recording(skin_recording(recording))
     for warning in warnings:
         print(warning)

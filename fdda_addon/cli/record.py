@@ -13,8 +13,8 @@ from ..core.checks.target import unsettled_sentence
 from ..core.errors import WrongUsageError
 from ..core.progress import Progress
 from ..core.recording.estimate import format_poses
-from ..core.recording.index import read_index, read_info
-from ..core.settings import MAX_AUTO_POSES, POSES, REFINEMENT_POSES, REPEATABILITY_POSES
+from ..core.recording.index import read_index, read_info, repeatability_sentence
+from ..core.settings import MAX_AUTO_POSES, POSES, REFINEMENT_POSES
 from ..core.wording import format_count
 from ..poses.remix import choose_bones, describe_bones
 from ..poses.sample_selection import describe_control_bones, split_control_bones
@@ -57,7 +57,6 @@ def add_recording_options(parser: argparse.ArgumentParser, object_help: str) -> 
         "that they take about a minute)",
     )
     add_target_options(parser)
-    REPEATABILITY_POSES.add_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -84,7 +83,7 @@ def run(options: argparse.Namespace) -> None:
         return
     index = read_index(options.recording)
     info = read_info(index)
-    for sentence in filter(None, (unsettled_sentence(index), info.repeatability and info.repeatability.sentence())):
+    for sentence in filter(None, (unsettled_sentence(index), repeatability_sentence(info.repeatability_mm))):
         print(sentence)
     meshes = f", of {len(index['meshes'])} meshes" if len(index["meshes"]) > 1 else ""
     poses = format_poses(info.poses, len(info.alone_poses))

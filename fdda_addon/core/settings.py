@@ -172,12 +172,6 @@ SETTLE_FRAMES = Setting(
 REST_THRESHOLD_MM = Setting(
     "rest_threshold_mm", 0.1, "A simulation is at rest if no vertex moves by more mm in a frame", low=ABOVE_ZERO
 )
-REPEATABILITY_POSES = Setting(
-    "repeatability_poses",
-    10,
-    "Number of settled poses or frames of actions that are shown again, coming from another pose, to measure how "
-    "closely a simulation repeats its shape",
-)
 REFINEMENT_POSES = 250
 """Number of poses that a refinement adds where the error of a model is largest."""
 

@@ -19,7 +19,7 @@ from ..core.rig import Rig
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.motion_range import SuspendedLimits
-from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest, reversible_frames
+from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest
 from ..rig.reading import PoseReader
 from ..rig.references import split_bone_path
 from ..rig.shape_keys import set_keys_undriven
@@ -113,46 +113,14 @@ class PosePlan:
         with self.pose_setter.prepared(), set_keys_undriven(self._scene_rig, self._channels):
             yield
 
-    @property
-    def repeatable_poses(self) -> list[int]:
-        """Return the ascending indices of the poses that `show_poses_again` can set, without overshoot poses."""
-        if not self.pose_setter.depends_on_history:
-            return []
-        if self.pose_setter.is_settling:
-            # `make_pose_setter` raises an error for clips if poses settle.
-            return list(range(self.in_range_count))
-        clip_start, indices = self._settings.poses, []
-        for clip in self._clips:
-            indices += [clip_start + frame_index for frame_index in reversible_frames(clip)]
-            clip_start += len(clip.frames)
-        return indices
-
-    def show_poses_again(self, player: ClipPlayer, pose_indices: Collection[int]) -> Iterator[int]:
-        """Set poses again from another direction, and yield each index.
-
-        A random pose is reached via another random pose, and a frame of a clip by playing the clip backwards.
-        """
-        if self.pose_setter.is_settling:
-            set_pose = Poser(self._scene_rig, self._channels).set
-            with self._random_poses_prepared():
-                for index in sorted(pose_indices):
-                    sample_indices = (index, REPEATABILITY_INDEX_OFFSET + index)
-                    self.pose_setter.set_pose(
-                        *(
-                            self._make_transition(self._channels, sample_index, set_pose)
-                            for sample_index in sample_indices
-                        )
-                    )
-                    yield index
-            return
-        clip_start = self._settings.poses
-        for clip in self._clips:
-            if frame_indices := {
-                index - clip_start for index in pose_indices if 0 <= index - clip_start < len(clip.frames)
-            }:
-                for index in self.pose_setter.show_frames_reversed(player, clip, frame_indices):
-                    yield clip_start + index
-            clip_start += len(clip.frames)
+    def show_poses_again(self, pose_indices: Collection[int]) -> Iterator[int]:
+        """Set settled random poses again, reached via other random poses, and yield each index."""
+        set_pose = Poser(self._scene_rig, self._channels).set
+        with self._random_poses_prepared():
+            for index in pose_indices:
+                indices = (index, REPEATABILITY_INDEX_OFFSET + index)
+                self.pose_setter.set_pose(*(self._make_transition(self._channels, each, set_pose) for each in indices))
+                yield index
 
     def _make_transition(
         self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]

@@ -12,17 +12,15 @@ import bpy
 import numpy as np
 
 from ..core.errors import RecordingError, RigError
-from ..core.mathematics.metrics import distances, error_statistics
-from ..core.mathematics.partition import GOLDEN_RATIO
+from ..core.mathematics.metrics import distances
 from ..core.progress import Progress
 from ..core.recording.arrays import open_array
 from ..core.recording.estimate import Estimate, check_disk_space, free_bytes, recording_bytes
 from ..core.recording.folder import check_recordable
-from ..core.recording.index import ALONE, POSE, RecordingInfo, Repeatability, Source
+from ..core.recording.index import ALONE, POSE, RecordingInfo, Source, repeated_poses
 from ..core.recording.writer import RecordingWriter
 from ..core.wording import format_count
 from ..poses.clip import find_clips
-from ..poses.clip_player import ClipPlayer
 from ..rig.deformation import describe_bones
 from ..rig.dependencies import deforming_mesh_objects, read_dependencies
 from ..rig.modifier_stack import check_evaluable, read_stack
@@ -246,48 +244,30 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
                 for _ in poses:
                     appender.append_current_pose()
                     yield Progress("influences", appender.pose_count - plan.total, alone_count)
-        if plan.repeatable_poses and settings.target.repeatability_poses:
+        if pose_setter.is_settling and writer.repeatability_mm is None:
             appender.flush()
-            count = settings.target.repeatability_poses
-            yield from measure_repeatability(evaluator, plan, player, writer, count)
+            yield from measure_repeatability(evaluator, plan, writer)
 
 
-def measure_repeatability(
-    evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, max_poses: int
-) -> Iterator[Progress]:
-    """Reach some poses from another direction, and write the distance from the recorded target to the index.
-
-    Does nothing if the repeatability was measured before. Poses that did not come to rest are left out.
+def measure_repeatability(evaluator: PoseEvaluator, plan: PosePlan, writer: RecordingWriter) -> Iterator[Progress]:
+    """Reach settled poses from another direction, and write the mean distance from the recorded target to the index.
 
     Args:
         evaluator: evaluates the target.
         plan: plan of the poses.
-        player: player of the clips; None without clips.
         writer: writer of the complete recording.
-        max_poses: largest number of poses.
 
     Yields:
         Progress of the stage "repeatability".
     """
-    repeatable_indices = [index for index in plan.repeatable_poses if index not in writer.unsettled]
-    if writer.repeatability or not repeatable_indices:
-        return
-    pose_indices = sorted(
-        {
-            repeatable_indices[int(number * GOLDEN_RATIO * len(repeatable_indices)) % len(repeatable_indices)]
-            for number in range(max_poses)
-        }
-    )
+    indices = repeated_poses(plan.in_range_count, writer.unsettled)
     shape = writer.complete, writer.rig.vertex_count, 3
-    recorded, pose_distances = open_array(writer.path / "positions.npy", shape, np.float32), []
-    # Closing the generator stops playback.
-    with closing(plan.show_poses_again(player, pose_indices)) as shown_poses:
-        for compared_count, pose_index in enumerate(shown_poses, 1):
+    recorded, means = open_array(writer.path / "positions.npy", shape, np.float32), []
+    with closing(plan.show_poses_again(indices)) as shown_poses:
+        for index in shown_poses:
             positions = evaluator.evaluate()[1]
-            pose_distances.append(distances(positions, recorded[pose_index], writer.rig.metres_per_unit))
+            means.append(float(distances(positions, recorded[index], writer.rig.metres_per_unit).mean() * 1000))
             detail = plan.pose_setter.rest_description
-            yield Progress("repeatability", compared_count, len(pose_indices), detail=detail)
-    statistics = error_statistics(np.stack(pose_distances)).to_json()
-    writer.set_repeatability(
-        Repeatability(tuple(pose_indices), {name: round(value, 6) for name, value in statistics.items()})
-    )
+            yield Progress("repeatability", len(means), len(indices), detail=detail)
+    if means:
+        writer.set_repeatability(round(float(np.mean(means)), 6))

@@ -5,7 +5,7 @@ A simulation gets a pre-roll before actions, and random poses are held until it 
 """
 
 import time
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from ..core.errors import RigError
 from ..core.mathematics.poses import CONTROL, Channel
 from ..core.recording.index import FRAMES, SIMULATION, RecordedTarget
 from ..core.rig import Rig
-from ..core.settings import LEARN_FROM, PRE_ROLL, REPEATABILITY_POSES, REST_THRESHOLD_MM, SETTLE_FRAMES
+from ..core.settings import LEARN_FROM, PRE_ROLL, REST_THRESHOLD_MM, SETTLE_FRAMES
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer, clip_player
 from ..scene.arrays import POSE_CHANNELS, write
@@ -43,15 +43,12 @@ class TargetSettings:
         settle_frames: largest number of frames for which a random pose is held until the target is at rest; 0 to
             hold no pose.
         rest_threshold_mm: the target is at rest when no vertex moves by more in a frame, mm.
-        repeatability_poses: number of held poses, or frames of actions, that are set a second time, from another
-            direction.
     """
 
     name: str = LEARN_FROM.default
     pre_roll: int = PRE_ROLL.field()
     settle_frames: int = SETTLE_FRAMES.field()
     rest_threshold_mm: float = REST_THRESHOLD_MM.field()
-    repeatability_poses: int = REPEATABILITY_POSES.field()
 
 
 NO_TARGET = TargetSettings()
@@ -81,16 +78,9 @@ def blend_from_rest(
 
 APPROACH_FRAMES = 10
 """Frames in which the rig moves from the rest pose to a pose that is held."""
-MAX_REVERSED_FRAMES = 100
-"""Largest number of frames of a clip that are shown in reverse, because the frames before them are played twice."""
 MIN_REST_FRAMES = 3
 """Number of consecutive frames without motion that count as rest. A swinging vertex stands still for only one frame at
 each turning point."""
-
-
-def reversible_frames(clip: Clip) -> range:
-    """Return the indices of the frames of a clip that can be shown in reverse: later frames must come before them."""
-    return range(min(len(clip.frames) - APPROACH_FRAMES, MAX_REVERSED_FRAMES))
 
 
 class PoseSetter:
@@ -184,35 +174,11 @@ class PoseSetter:
                 if index in frame_indices:
                     yield index
 
-    def show_frames_reversed(self, player: ClipPlayer, clip: Clip, frame_indices: Collection[int]) -> Iterator[int]:
-        """Show frames of a clip in reverse: play past the last one, then the poses backwards in later and later frames.
-
-        Args:
-            player: the player of the clip.
-            frame_indices: indices of the frames to yield, at least one, from `reversible_frames`.
-
-        Yields:
-            The index of the frame in the clip, the last one first.
-        """
-        turning_index = max(frame_indices) + APPROACH_FRAMES
-        with self._started_simulations(player, clip, extra_frames=turning_index):
-            shown_frames = []
-            for frame in clip.frames[: turning_index + 1]:
-                player.show(clip, frame)
-                shown_frames.append(player.current_clip_frame)
-            for step, index in enumerate(range(turning_index - 1, min(frame_indices) - 1, -1), 1):
-                player.set_clip_frame(shown_frames[index], clip.frames[turning_index] + step)
-                if index in frame_indices:
-                    yield index
-
     @contextmanager
-    def _started_simulations(self, player: ClipPlayer, clip: Clip, extra_frames: int = 0) -> Iterator[None]:
-        """Play simulations up to the frame before a clip; inside, they can continue past the end of the clip."""
-        pre_roll = self._settings.pre_roll
-        first_frame = clip.frames[0] - pre_roll if pre_roll else None
-        last_frame = clip.frames[-1] + extra_frames
-        needs_range = pre_roll or extra_frames
-        with temporary_frame_range(self.target, first_frame, last_frame) if needs_range else nullcontext():
+    def _started_simulations(self, player: ClipPlayer, clip: Clip) -> Iterator[None]:
+        """Play simulations up to the frame before a clip."""
+        pre_roll, first_frame = self._settings.pre_roll, clip.frames[0] - self._settings.pre_roll
+        with temporary_frame_range(self.target, first_frame, clip.frames[-1]) if pre_roll else nullcontext():
             if pre_roll:
                 # Move from the rest pose towards the first pose of the clip, up to the frame before the clip.
                 player.show(clip, clip.frames[0])

@@ -72,7 +72,7 @@ def make_report(
             "linear": _histogram(held_out.linear),
         },
         "partitions": partitions,
-        **({"repeatability": recording.info.repeatability.to_json()} if recording.info.repeatability else {}),
+        **({"repeatability_mm": mm} if (mm := recording.info.repeatability_mm) is not None else {}),
     }
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from ..mathematics.metrics import distances
-from ..recording.index import ACTION, STRIP, Source
+from ..recording.index import ACTION, STRIP, Source, repeated_poses
 from ..recording.skinned import SkinnedRecording
 from ..wording import format_count, format_list
 from .warning import RecordingWarning, format_length
@@ -57,18 +57,17 @@ def frozen_sentence(count: int) -> str:
 
 
 def _check_repeatability(recording: SkinnedRecording) -> list[RecordingWarning]:
-    repeatability = recording.info.repeatability
-    if repeatability is None:
+    repeatability_mm = recording.info.repeatability_mm
+    if repeatability_mm is None:
         return []
-    pairs = _iterate_positions(recording, repeatability.poses)
+    pairs = _iterate_positions(recording, repeated_poses(recording.info.poses, recording.info.unsettled))
     linear_mm = 1000 * float(np.mean([distances(*pair, recording.rig.metres_per_unit).mean() for pair in pairs]))
-    if repeatability.distance_mm["mean"] <= MAX_DISTANCE_RATIO * linear_mm:
+    if repeatability_mm <= MAX_DISTANCE_RATIO * linear_mm:
         return []
     text = (
-        f"The target is {repeatability.distance_mm['mean']:.2g} mm from itself when the same pose is reached from "
-        f"another direction, on average over {len(repeatability.poses)} poses, and linear skinning is "
-        f"{linear_mm:.2g} mm off: no model can be closer; hold poses for more frames or play actions "
-        "slower, damp the simulation, or leave folds to another mesh."
+        f"The target is {repeatability_mm:.2g} mm from itself when the same pose is reached from another direction, on "
+        f"average, and linear skinning is {linear_mm:.2g} mm off: no model can be closer; hold poses for more frames, "
+        "damp the simulation, or leave folds to another mesh."
     )
     return [RecordingWarning("hysteresis", text)]
 

@@ -83,7 +83,7 @@ _REPORT_KEYS = {
     "histogram": {"edges": [float], "fdda": [int], "linear": [int]},
     "partitions": [_PARTITION_KEYS],
     "warnings?": [{"name": str, "text": str}],
-    "repeatability?": {"poses": [int], "distance_mm": _ERROR_STATISTICS},
+    "repeatability_mm?": float,
     "goal?": {"goal": float, "p999": float, "verdict": Verdict},
 }
 """Keys of a report and the types of their values. `?` marks an optional key, a pair with None a value that may

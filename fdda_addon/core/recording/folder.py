@@ -13,7 +13,16 @@ from ..files.open_files import remove_file
 from ..files.output import check_folder_writable, is_temporary_name
 from ..rig import Rig, read_joints, read_meshes, rig_differences
 from .arrays import ARRAY_NAMES, STREAMED_ARRAY_NAMES
-from .index import ALONE, BONES_NAME, INDEX_NAME, REFINED, find_different_keys, read_index, read_info
+from .index import (
+    ALONE,
+    BONES_NAME,
+    INDEX_NAME,
+    REFINED,
+    find_different_keys,
+    read_index,
+    read_info,
+    repeatability_sentence,
+)
 from .lock import LOCK_NAME, RecordingLock
 from .reader import check_resumable
 
@@ -196,7 +205,7 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None) -> FolderC
     if pose_counts[0] == pose_counts[1]:
         sentence = f"It was recorded with other settings than those above: {setting_names}." if different_keys else ""
         info = read_info(index)
-        measured_sentence = info.repeatability.sentence() if info.repeatability else ""
+        measured_sentence = repeatability_sentence(info.repeatability_mm)
         return FolderContent(
             FolderState.COMPLETE, *pose_counts, sentence, measured_sentence, alone_poses=len(info.alone_poses)
         )

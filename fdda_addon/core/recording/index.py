@@ -3,7 +3,7 @@
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from ..files.output import atomic_write, to_json_text
 from ..mathematics.poses import CONTROL, Channel, Overshoot
 from ..mathematics.surface import MIN_CORNERS
 from ..rig import read_joints, read_meshes, read_name, read_unit
-from ..wording import format_count
 
 FORMAT = "fdda-recording"
 VERSION = 2
@@ -39,7 +38,8 @@ JOINT = "joint"
 """Kind of an input that is a joint; the other kind is `CONTROL`."""
 
 
-STATISTIC_NAMES = ("mean", "rms", "p99", "p999", "max")
+REPEATED_POSES = 10
+"""Largest number of poses that are reached from a second direction."""
 POSE, FRAMES, SIMULATION = "pose", "frames", "simulation"
 """The dependence of a target: on the pose alone; on the frame, as a cache; or on the pose and earlier poses, as a
 simulation."""
@@ -92,47 +92,38 @@ class RecordedTarget:
         return target
 
 
-@dataclass(frozen=True)
-class Repeatability:
-    """Distance between the two shapes of a target in a pose that is reached from two directions.
+def repeated_poses(count: int, unsettled: Collection[int]) -> list[int]:
+    """Return the indices of the poses that are reached from a second direction: the first that came to rest.
 
-    No model can have a smaller error.
-
-    Attributes:
-        poses: indices of the poses.
-        distance_mm: distance of the vertices by name of a statistic: mean, rms, p99, p999 (99.9 %) and max, mm.
+    Args:
+        count: number of random poses in the range of motion, which are the first poses of a recording.
+        unsettled: indices of the poses in which the target did not come to rest.
     """
+    return [index for index in range(count) if index not in unsettled][:REPEATED_POSES]
 
-    poses: tuple[int, ...]
-    distance_mm: dict[str, float]
 
-    def to_json(self) -> dict:
-        return {"poses": list(self.poses), "distance_mm": self.distance_mm}
+def read_repeatability(index: dict) -> float | None:
+    """Return the mean distance of a target from itself in poses that are reached from two directions, mm.
 
-    @staticmethod
-    def from_json(value: dict, poses: int) -> "Repeatability":
-        """Read a repeatability from a file; raise ValueError, TypeError or KeyError where it is damaged.
+    No model can have a smaller error. It is None where it was not measured.
 
-        Args:
-            poses: number of poses of the recording.
-        """
-        repeatability = Repeatability(
-            tuple(value["poses"]), {name: value["distance_mm"][name] for name in STATISTIC_NAMES}
-        )
-        if not repeatability.poses or not all(type(pose) is int and 0 <= pose < poses for pose in repeatability.poses):
-            raise ValueError("its repeated poses are none of its poses")
-        for distance in repeatability.distance_mm.values():
-            if type(distance) not in (int, float) or not 0 <= distance < math.inf:
-                raise ValueError(f"repeated poses are {distance!r} mm apart")
-        return repeatability
+    Raises:
+        ValueError: it is no distance.
+    """
+    repeatability_mm = index.get("repeatability_mm")
+    if repeatability_mm is not None and (type(repeatability_mm) is not float or not 0 <= repeatability_mm < math.inf):
+        raise ValueError(f"repeated poses are {repeatability_mm!r} mm apart")
+    return repeatability_mm
 
-    def sentence(self) -> str:
-        """Return a text about how closely a repeated pose gives the same surface."""
-        count = format_count(len(self.poses), "pose")
-        return (
-            f"The same pose from two directions: {self.distance_mm['mean']:.3g} mm apart on average, "
-            f"{self.distance_mm['max']:.3g} mm at most ({count}). No model can be closer than that."
-        )
+
+def repeatability_sentence(repeatability_mm: float | None) -> str:
+    """Return a sentence about how closely a repeated pose gives the same surface; empty where it was not measured."""
+    if repeatability_mm is None:
+        return ""
+    return (
+        f"The same pose from two directions: {repeatability_mm:.3g} mm apart on average. No model can be closer than "
+        "that."
+    )
 
 
 @dataclass(frozen=True)
@@ -273,7 +264,7 @@ class RecordingInfo:
         bones: the bones of the rig.
         target: target whose surface was recorded; None where the rig itself was recorded.
         unsettled: ascending indices of the poses in which the target did not come to rest.
-        repeatability: repeatability of the target; None where it was not measured.
+        repeatability_mm: as of `read_repeatability`.
         alone: the poses in which one input moves alone; None where the target depends on time.
     """
 
@@ -285,7 +276,7 @@ class RecordingInfo:
     bones: RecordedBones = field(default_factory=RecordedBones)
     target: RecordedTarget | None = None
     unsettled: tuple[int, ...] = ()
-    repeatability: Repeatability | None = None
+    repeatability_mm: float | None = None
     alone: AloneMoves | None = None
 
     @property
@@ -429,7 +420,7 @@ def read_info(index: dict) -> RecordingInfo:
         RecordedBones.from_json(index["bones"], joint_count) if "bones" in index else RecordedBones(),
         RecordedTarget.from_json(index["target"]) if "target" in index else None,
         tuple(index.get("unsettled", ())),
-        Repeatability.from_json(index["repeatability"], index["complete"]) if "repeatability" in index else None,
+        read_repeatability(index),
         AloneMoves.from_json(index["alone"], joint_count, control_count) if "alone" in index else None,
     )
 

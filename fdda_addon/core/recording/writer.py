@@ -34,16 +34,16 @@ from .index import (
     REFINED,
     VERSION,
     RecordingInfo,
-    Repeatability,
     Source,
     find_different_keys,
     read_index,
+    read_repeatability,
     write_json,
 )
 from .lock import RecordingLock
 from .reader import Recording
 
-MUTABLE_KEYS = ("complete", "unsettled", "repeatability")
+MUTABLE_KEYS = ("complete", "unsettled", "repeatability_mm")
 """Keys of the index that change while poses are appended."""
 
 
@@ -80,7 +80,7 @@ class RecordingWriter:
         self.path, self.rig, self.info = path, rig, info
         self.complete = 0
         self.unsettled: list[int] = []
-        self.repeatability: Repeatability | None = None
+        self.repeatability_mm: float | None = None
         self._files: dict[str, io.BufferedRandom] = {}
         self._is_new = False
         self._new_folders = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
@@ -118,8 +118,7 @@ class RecordingWriter:
     def _read_previous(self, previous: dict) -> None:
         """Read the state of the recording at `path` from its index, and check that it can be continued."""
         self.complete, self.unsettled = previous["complete"], list(previous.get("unsettled", ()))
-        if "repeatability" in previous:
-            self.repeatability = Repeatability.from_json(previous["repeatability"], self.complete)
+        self.repeatability_mm = read_repeatability(previous)
         # The scale of an object may be animated; no array depends on it.
         self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
         # Convert it to JSON text and back, so that it equals what is read from a file.
@@ -186,7 +185,7 @@ class RecordingWriter:
             **({"alone": info.alone.to_json()} if info.alone else {}),
             **({"target": info.target.to_json()} if info.target else {}),
             **({"unsettled": self.unsettled} if self.unsettled else {}),
-            **({"repeatability": self.repeatability.to_json()} if self.repeatability else {}),
+            **({} if self.repeatability_mm is None else {"repeatability_mm": self.repeatability_mm}),
             "sampling": info.sampling.to_json(),
         }
 
@@ -230,13 +229,13 @@ class RecordingWriter:
             self.complete, self.unsettled = previous_counts
             raise self._write_error(error) from error
 
-    def set_repeatability(self, repeatability: Repeatability) -> None:
-        """Write the repeatability of the target to the index.
+    def set_repeatability(self, repeatability_mm: float) -> None:
+        """Write the repeatability of the target (`read_repeatability`) to the index.
 
         Raises:
             OutputError: the disk is full or was disconnected.
         """
-        self.repeatability = repeatability
+        self.repeatability_mm = repeatability_mm
         try:
             self._write_index()
         except OSError as error:

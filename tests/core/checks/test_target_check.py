@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The target of a recording: its data in the index, and the warnings about it."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from fdda_addon.core.checks.target import check_target, unsettled_sentence
 from fdda_addon.core.mathematics.skinning import LinearSkinning
-from fdda_addon.core.recording.index import ACTION, RecordedTarget, Repeatability, Source
+from fdda_addon.core.recording.index import ACTION, RecordedTarget, Source, read_repeatability, repeatability_sentence
 from fdda_addon.core.recording.skinned import SkinnedRecording
 
 from ..good_recording import good_recording, with_positions
@@ -80,24 +81,16 @@ def test_a_target_in_other_units_or_at_another_location_is_reported(factor, offs
 
 
 def test_a_low_repeatability_is_reported(swinging_recording):
-    def with_repeatability(mean: float) -> SkinnedRecording:
-        """Return the recording with a mean repeatability in millimeters."""
-        statistics = {"mean": mean, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
-        return replace(
-            swinging_recording,
-            info=replace(swinging_recording.info, repeatability=Repeatability((1, 2), statistics)),
-        )
+    def with_repeatability(mm: float) -> SkinnedRecording:
+        return replace(swinging_recording, info=replace(swinging_recording.info, repeatability_mm=mm))
 
-    linear_mm = 1000 * np.linalg.norm(swinging_recording.residuals[[1, 2]], axis=2).mean()
+    linear_mm = 1000 * np.linalg.norm(swinging_recording.residuals[:10], axis=2).mean()
     assert check_target(with_repeatability(0.19 * linear_mm)) == []
     mean = 0.21 * linear_mm
     assert single_warning_text(with_repeatability(mean), "hysteresis").startswith(
         f"The target is {mean:.2g} mm from itself when the same pose is"
     )
-    sentence = with_repeatability(1.1).info.repeatability.sentence()
-    assert sentence.startswith(
-        "The same pose from two directions: 1.1 mm apart on average, 4 mm at most (2 poses). No model"
-    )
+    assert repeatability_sentence(1.1).startswith("The same pose from two directions: 1.1 mm apart on average. No")
 
 
 def test_sentence_about_unsettled_poses():
@@ -106,13 +99,11 @@ def test_sentence_about_unsettled_poses():
     assert unsettled_sentence(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
 
 
-def test_repeatability_is_read_back_from_json():
-    statistics = {"mean": 0.5, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
-    repeatability = Repeatability((1, 2), statistics)
-    assert Repeatability.from_json(repeatability.to_json(), 3) == repeatability
-    for change in ({"poses": []}, {"poses": [3]}, {"distance_mm": statistics | {"max": -1}}):
-        with pytest.raises((ValueError, TypeError)):
-            Repeatability.from_json(repeatability.to_json() | change, 3)
+def test_repeatability_is_a_distance():
+    assert (read_repeatability({}), read_repeatability({"repeatability_mm": 0.5})) == (None, 0.5)
+    for value in (-1.0, "1", True, math.inf):
+        with pytest.raises(ValueError, match="mm apart"):
+            read_repeatability({"repeatability_mm": value})
 
 
 def test_target_is_read_back_from_json():
