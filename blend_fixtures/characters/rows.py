@@ -72,7 +72,7 @@ def _action_row(build: Callable[[], object], text: str) -> Row:
 
 def _settled_row(build: Callable[[], object], text: str) -> Row:
     """Return a row whose target is simulated; the model is trained and compared on settled poses."""
-    target = TargetSettings(targets.TARGET, settle_frames=80, repeatability_poses=0)
+    target = TargetSettings(targets.TARGET, settle_frames=80)
     return _tube_row(
         TARGETS,
         build,
