@@ -7,22 +7,17 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import bpy
 import numpy as np
 
 from ..core.errors import OutputError, os_error_text
 from ..core.files.output import TEMPORARY_PREFIX
-from ..core.mathematics.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, NO_ERROR_METRES, distances, heat_colors
-from ..core.mathematics.skinning import LinearSkinning
+from ..core.mathematics.metrics import distances, heat_colors
 from ..core.progress import Job, Progress
 from ..runtime.network import Network
-from ..runtime.opened_model import open_model
-from ..scene.mask import read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig
-from .colored_mesh import MeshFactory, set_colors
-from .picture import CELL_MARGIN_RATIO, Picture, View, check_can_render
-from .pictures import SURFACE_COLOR
+from .picture import Picture, View, check_can_render, set_colors
+from .pictures import SURFACE_COLOR, Deformations
 from .results import PoseErrors
 from .video import encode
 
@@ -132,8 +127,7 @@ def render_frames(
         The path of each file, and its width and height in pixels.
     """
     check_can_render()
-    source = _FrameSource(scene_rig, model, errors, settings.columns)
-    picture = _FilmPicture(scene_rig.mesh_object, source, settings)
+    picture = _FilmPicture(scene_rig, model, errors, settings)
     try:
         for index in range(0, len(errors.positions), step):
             picture.show(index, f"{errors.name}, frame {first_frame + index}")
@@ -142,37 +136,6 @@ def render_frames(
             yield path, (picture.scene.render.resolution_x, picture.scene.render.resolution_y)
     finally:
         picture.remove()
-
-
-class _FrameSource:
-    """Computes the positions and errors of a frame.
-
-    Attributes:
-        errors: the evaluated frames.
-        max_error: error with the last color of the heat map, meters.
-    """
-
-    def __init__(self, scene_rig: SceneRig, model: Path | Network, errors: PoseErrors, columns: tuple[str, ...]):
-        opened = open_model(scene_rig, model)
-        self._network, self._skinning = opened.network, LinearSkinning(opened.linear_rig)
-        self._mask, self._metres_per_unit = read_mask(scene_rig.mesh_object), opened.network.info.metres_per_unit
-        self.errors = errors
-        shown_errors = errors.linear if LINEAR_ERROR in columns else errors.fdda
-        self.max_error = round_up(float(np.percentile(shown_errors, COLOR_RANGE_PERCENTILE)))
-
-    def positions(self, index: int) -> dict[str, np.ndarray]:
-        """Return the positions of a frame by column, (V, 3) float32, mesh-object space, mesh units."""
-        errors = self.errors
-        matrices, controls = errors.pose_matrices[index : index + 1], errors.controls[index : index + 1]
-        linear = self._skinning.positions(matrices)[0]
-        fdda = self._network.positions(matrices, controls)[0].copy()
-        if self._mask is not None:
-            fdda = self._mask.blend(linear, fdda)
-        return {RIG: errors.positions[index], LINEAR: linear, FDDA: fdda, LINEAR_ERROR: linear, FDDA_ERROR: fdda}
-
-    def distances(self, positions: np.ndarray, index: int) -> np.ndarray:
-        """Return the distances of positions from the rig in a frame, (V,) float32, meters."""
-        return distances(positions, self.errors.positions[index], self._metres_per_unit)
 
 
 def round_up(meters: float) -> float:
@@ -184,53 +147,40 @@ def round_up(meters: float) -> float:
 class _FilmPicture(Picture):
     """A picture with a row of meshes that move from frame to frame."""
 
-    def __init__(self, mesh_object: bpy.types.Object, source: _FrameSource, settings: FilmSettings):
-        super().__init__(settings.view, mesh_object)
-        self._source, self._settings = source, settings
-        self._centers, cell_size = _centers_and_size(source.errors.positions, self.projection)
-        self._cells: list[tuple[str, bpy.types.Mesh, bpy.types.TextCurve]] = []
-        gap = cell_size[0] * CELL_MARGIN_RATIO
-        # A tall character gets wider margins, so that texts fit above it.
-        cell_width = max(cell_size[0] + gap, cell_size[1] * 0.5)
-        self.width = len(settings.columns) * cell_width + gap
-        size = self.width * TEXT_WIDTH_RATIO * settings.text_scale
-        self._title = self.add_text("", (gap, -2.2 * size), 1.3 * size)
-        mesh = mesh_object.data
-        factory, count = MeshFactory(mesh), len(mesh.vertices)
-        top = (3.4 + LABEL_LINES) * size
-        for column, name in enumerate(settings.columns):
-            left = gap + column * cell_width
-            curve = self.add_text("", (left, -4.2 * size), size)
-            cell_mesh = factory.create(np.zeros((count, 3), np.float32), np.tile(np.float32(SURFACE_COLOR), (count, 1)))
-            center = (left + (cell_width - gap) / 2, -(top + size + cell_size[1] / 2))
-            self.move(self.add_object("cell", cell_mesh), *center)
-            self._cells.append((name, cell_mesh, curve))
-        bottom = top + 2 * size + cell_size[1]
-        if {LINEAR_ERROR, FDDA_ERROR} & set(settings.columns):
-            # Add the colors of the heat map, from no error to `max_error`.
-            x, y = gap, -(bottom + size)
-            colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
-            self.add_strip((x, y), (size, size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
-            self.add_text(f"below {NO_ERROR_METRES * 1000:g} mm", (x + 1.5 * size, y), 0.9 * size)
-            self.add_strip((x + 12 * size, y), (16 * size, size), colors)
-            self.add_text(f"{self._source.max_error * 1000:g} mm and above", (x + 28.5 * size, y), 0.9 * size)
-            bottom += 2.6 * size
-        self.height = bottom + gap
+    def __init__(self, scene_rig: SceneRig, model: Path | Network, errors: PoseErrors, settings: FilmSettings):
+        super().__init__(settings.view, scene_rig.mesh_object)
+        self._deformations, self._errors, self._settings = Deformations(scene_rig, model), errors, settings
+        self._centers, cell_size = _centers_and_size(errors.positions, self.projection)
+        shown_errors = errors.linear if LINEAR_ERROR in settings.columns else errors.fdda
+        # The error in meters that has the last color of the heat map.
+        self._max_error = round_up(float(np.percentile(shown_errors, COLOR_RANGE_PERCENTILE)))
+        cells = self.add_cells(
+            scene_rig.mesh_object.data,
+            cell_size,
+            (1, len(settings.columns)),
+            self._max_error if {LINEAR_ERROR, FDDA_ERROR} & set(settings.columns) else None,
+            LABEL_LINES,
+            TEXT_WIDTH_RATIO * settings.text_scale,
+        )
+        self._cells = [(name, *cell) for name, cell in zip(settings.columns, cells, strict=True)]
+        for _, mesh, _ in self._cells:
+            set_colors(mesh, np.tile(np.float32(SURFACE_COLOR), (len(mesh.vertices), 1)))
         width = min(settings.width, int(MAX_HEIGHT * self.width / self.height))
         self.set_up_render(is_sculpted=False, width_pixels=width, antialiasing="FXAA")
 
     def show(self, index: int, title: str) -> None:
         """Show a frame, given its index, with a title."""
-        source, times = self._source, self._settings.times_ms
-        self._title.body = title
-        positions_by_column = source.positions(index)
+        times, rig = self._settings.times_ms, self._errors.positions[index]
+        self.title.body = title
+        linear, fdda = self._deformations.positions(self._errors.pose_matrices[index], self._errors.controls[index])
+        positions_by_column = {RIG: rig, LINEAR: linear, FDDA: fdda, LINEAR_ERROR: linear, FDDA_ERROR: fdda}
         for name, mesh, curve in self._cells:
             positions = positions_by_column[name]
             projected = (positions @ self.projection.T - self._centers[index]).astype(np.float32)
             set_mesh_positions(mesh, np.ascontiguousarray(projected))
-            errors = source.distances(positions, index)
+            errors = distances(positions, rig, self._deformations.metres_per_unit)
             if name in {LINEAR_ERROR, FDDA_ERROR}:
-                set_colors(mesh, heat_colors(errors, source.max_error))
+                set_colors(mesh, heat_colors(errors, self._max_error))
             mesh.update()
             label = self._settings.reference_label if name == RIG else LABELS[name]
             if name in times:

@@ -16,16 +16,18 @@ from mathutils import Matrix
 
 from ..core.errors import OutputError
 from ..core.files.output import atomic_write
-from ..core.mathematics.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
+from ..core.mathematics.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, NO_ERROR_METRES, heat_colors
+from ..scene.arrays import COLOR_ELEMENT, LOOP_START_ELEMENT, VERTEX_INDEX_ELEMENT, write
 from ..scene.blend_file import blender_path, silenced_stdout
-from ..scene.mesh import mesh_positions
-from .colored_mesh import MeshFactory, set_colors, srgb_to_linear
+from ..scene.mesh import mesh_positions, set_mesh_positions, topology
 
 WIDTH_PIXELS = 1440
 CELL_MARGIN_RATIO = 0.06
 """Space between cells, relative to the width of a cell."""
 TEXT_SIZE_RATIO = 0.0145
 """Height of a line of text, relative to the width of the picture."""
+MIN_CELL_ASPECT = 0.5
+"""Smallest ratio of width and height of a cell."""
 BACKGROUND_COLOR = (0.13, 0.14, 0.15)
 TEXT_COLOR = (0.92, 0.92, 0.92)
 PNG_END = b"IEND\xae\x42\x60\x82"
@@ -88,7 +90,7 @@ def draw(
 
     Args:
         mesh_object: the object with the faces; the picture shows it upright as it stands in the world.
-        rows: the cells, row by row.
+        rows: the cells, row by row, as many in each.
         path: path of the file.
         title: a line of text above all cells.
         has_heat_scale: whether to add the color scale of the heat map at the bottom.
@@ -97,7 +99,18 @@ def draw(
     check_can_render()
     picture = Picture(view, mesh_object)
     try:
-        picture.compose(mesh_object.data, rows, title, has_heat_scale)
+        cells = [cell for row in rows for cell in row]
+        projections = [cell.positions @ picture.projection.T for cell in cells]
+        cell_size = np.max([np.ptp(projected[:, :2], axis=0) for projected in projections], axis=0)
+        max_error = HEAT_MAP_STOPS[-1][0] if has_heat_scale else None
+        places = picture.add_cells(mesh_object.data, cell_size, (len(rows), len(rows[0])), max_error)
+        picture.title.body = title
+        for cell, projected, (mesh, label) in zip(cells, projections, places, strict=True):
+            label.body = cell.label
+            centered = projected - (projected.max(axis=0) + projected.min(axis=0)) / 2
+            set_mesh_positions(mesh, np.ascontiguousarray(centered, np.float32))
+            set_colors(mesh, cell.colors)
+            mesh.update()
         picture.set_up_render(is_sculpted)
         with atomic_write(path) as temporary_path:
             picture.render(temporary_path)
@@ -124,6 +137,7 @@ class Picture:
             The undeformed mesh has size 1.
         scene: the scene.
         width, height: size of the picture.
+        title: the line of text above all cells.
     """
 
     def __init__(self, view: View, mesh_object: bpy.types.Object):
@@ -137,43 +151,56 @@ class Picture:
         self._datablocks: list[bpy.types.ID] = []
         self.width = self.height = 0.0
 
-    def compose(self, mesh: bpy.types.Mesh, rows: list[list[Cell]], title: str, has_heat_scale: bool) -> None:
-        """Lay out the cells from the top left, with the title above and the color scale below the cells."""
-        projections = [cell.positions @ self.projection.T for row in rows for cell in row]
-        cell_size = np.max([np.ptp(projected[:, :2], axis=0) for projected in projections], axis=0)
-        column_count = max(len(row) for row in rows)
+    def add_cells(
+        self,
+        mesh: bpy.types.Mesh,
+        cell_size: np.ndarray,
+        shape: tuple[int, int],
+        max_error: float | None = None,
+        label_lines: int = 1,
+        text_ratio: float = TEXT_SIZE_RATIO,
+    ) -> list[tuple[bpy.types.Mesh, bpy.types.TextCurve]]:
+        """Lay out empty cells from the top left, below the title and above the color scale of the heat map.
+
+        Args:
+            mesh: the mesh with the faces.
+            cell_size: (2,) width and height of the largest projected mesh.
+            shape: number of rows and columns.
+            max_error: error in meters with the last color of the scale; None for no scale.
+            label_lines: number of lines of a label.
+            text_ratio: height of a line of text, relative to the width of the picture.
+
+        Returns:
+            The mesh of each cell, around the origin and without positions and colors, and its label above it.
+        """
         gap = cell_size[0] * CELL_MARGIN_RATIO
-        self.width = column_count * (cell_size[0] + gap) + gap
-        text_size = self.width * TEXT_SIZE_RATIO
-        cell_step = np.array([cell_size[0] + gap, cell_size[1] + 3.2 * text_size])
-        self.add_text(title, (gap, -2.0 * text_size), 1.3 * text_size)
-        top = 3.2 * text_size
-        factory = MeshFactory(mesh)
-        for row_index, row in enumerate(rows):
-            for column_index, cell in enumerate(row):
-                left, cell_top = gap + column_index * cell_step[0], top + row_index * cell_step[1]
-                self.add_text(cell.label, (left, -(cell_top + 1.4 * text_size)), text_size)
-                center = (left + cell_size[0] / 2, -(cell_top + 2.4 * text_size + cell_size[1] / 2))
-                projected = (cell.positions @ self.projection.T).astype(np.float32)
-                centered = projected - (projected.max(axis=0) + projected.min(axis=0)) / 2
-                self.move(self.add_object("cell", factory.create(centered, cell.colors)), *center)
-        bottom = top + len(rows) * cell_step[1]
-        if has_heat_scale:
-            # Add the colors of the heat map: a box for no error, and a strip from the first to the last stop.
-            x, y = gap, -(bottom + 1.2 * text_size)
-            box_size = 1.2 * text_size
-            self.add_strip((x, y - box_size), (box_size, box_size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
-            label_position = (x + 1.5 * box_size, y - box_size + 0.2 * text_size)
-            self.add_text("none (below 0.0001 cm)", label_position, 0.9 * text_size)
-            left, width = x + 16 * text_size, self.width * 0.35
-            strip_colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
-            self.add_strip((left, y - box_size), (width, box_size), strip_colors)
-            max_metres = HEAT_MAP_STOPS[-1][0]
-            for meters, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (max_metres, "1 cm and above")):
-                label_position = (left + width * meters / max_metres - 0.6 * text_size, y - box_size - 1.2 * text_size)
-                self.add_text(text, label_position, 0.9 * text_size)
-            bottom += 4.4 * text_size
+        # A tall character gets wider margins, so that texts fit above it.
+        column_width = max(cell_size[0] + gap, cell_size[1] * MIN_CELL_ASPECT)
+        self.width = shape[1] * column_width + gap
+        size = self.width * text_ratio
+        row_height = cell_size[1] + (2.2 + label_lines) * size
+        self.title = self.add_text("", (gap, -2.0 * size), 1.3 * size)
+        cells, bottom = [], 3.2 * size
+        for _ in range(shape[0]):
+            for column in range(shape[1]):
+                left = gap + column * column_width
+                label = self.add_text("", (left, -(bottom + 1.4 * size)), size)
+                cell_mesh = _copy_faces(mesh)
+                middle = bottom + (1.4 + label_lines) * size + cell_size[1] / 2
+                self.move(self.add_object("cell", cell_mesh), left + (column_width - gap) / 2, -middle)
+                cells.append((cell_mesh, label))
+            bottom += row_height
+        if max_error is not None:
+            # A box for no error, and a strip from the first to the last color.
+            y = -(bottom + size)
+            colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
+            self.add_strip((gap, y), (size, size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
+            self.add_text(f"below {NO_ERROR_METRES * 1000:g} mm", (gap + 1.5 * size, y), 0.9 * size)
+            self.add_strip((gap + 12 * size, y), (16 * size, size), colors)
+            self.add_text(f"{max_error * 1000:g} mm and above", (gap + 28.5 * size, y), 0.9 * size)
+            bottom += 2.6 * size
         self.height = bottom + gap
+        return cells
 
     def move(self, scene_object: bpy.types.Object, x: float, y: float, depth: float = 0.0) -> None:
         """Move an object to a position relative to the camera."""
@@ -268,3 +295,32 @@ class Picture:
     def remove(self) -> None:
         """Remove all datablocks of the picture from the file."""
         bpy.data.batch_remove([*self._datablocks, self.scene])
+
+
+def _copy_faces(mesh: bpy.types.Mesh) -> bpy.types.Mesh:
+    """Create a mesh with the vertices and faces of another, at the origin."""
+    loop_starts, loop_vertices = topology(mesh)
+    copied = bpy.data.meshes.new("cell")
+    copied.vertices.add(len(mesh.vertices))
+    copied.loops.add(len(loop_vertices))
+    copied.polygons.add(len(loop_starts))
+    write(copied.loops, VERTEX_INDEX_ELEMENT, loop_vertices)
+    write(copied.polygons, LOOP_START_ELEMENT, loop_starts)
+    copied.update(calc_edges=True)
+    copied.shade_smooth()
+    return copied
+
+
+def set_colors(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
+    """Set the colors of the vertices, (V, 3) sRGB."""
+    attribute = mesh.color_attributes.get("color") or mesh.color_attributes.new("color", "FLOAT_COLOR", "POINT")
+    rgba = np.ones((len(colors), 4), np.float32)
+    rgba[:, :3] = srgb_to_linear(colors)
+    write(attribute.data, COLOR_ELEMENT, rgba)
+    mesh.color_attributes.active_color = attribute
+
+
+def srgb_to_linear(srgb: object) -> np.ndarray:
+    """Convert sRGB to linear colors (IEC 61966-2-1)."""
+    srgb = np.asarray(srgb, np.float64)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -10,6 +10,7 @@ from ..core.mathematics.metrics import distances, heat_colors
 from ..core.mathematics.partition import make_merged_partitions, partition_colors
 from ..core.mathematics.skinning import LinearSkinning
 from ..rig.reading import read_rig
+from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
@@ -17,6 +18,30 @@ from .picture import Cell, View, draw
 from .results import PoseErrors
 
 SURFACE_COLOR = (0.78, 0.64, 0.55)
+
+
+class Deformations:
+    """Computes linear skinning and a model, with the mask of a mesh, in poses.
+
+    Attributes:
+        metres_per_unit: meters per mesh unit.
+    """
+
+    def __init__(self, scene_rig: SceneRig, model: Path | Network):
+        opened = open_model(scene_rig, model)
+        self._network, self._skinning = opened.network, LinearSkinning(opened.linear_rig)
+        self._mask, self.metres_per_unit = read_mask(scene_rig.mesh_object), opened.network.info.metres_per_unit
+
+    def positions(self, pose_matrices: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions of linear skinning and of the model, (V, 3) float32, mesh-object space, mesh units.
+
+        Args:
+            pose_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
+            controls: (C,) float32.
+        """
+        linear = self._skinning.positions(pose_matrices[None])[0]
+        fdda = self._network.positions(pose_matrices[None], controls[None])[0].copy()
+        return linear, fdda if self._mask is None else self._mask.blend(linear, fdda)
 
 
 @dataclass(frozen=True)
@@ -88,18 +113,13 @@ def draw_comparison(
         title: title of the picture; empty for a default.
         reference_label: label of the positions of the poses.
     """
-    opened = open_model(scene_rig, model)
-    network, skinning = opened.network, LinearSkinning(opened.linear_rig)
-    mask, rows = read_mask(scene_rig.mesh_object), []
+    deformations, rows = Deformations(scene_rig, model), []
     for pose in poses:
-        linear = skinning.positions(pose.pose_matrices[None])[0]
-        fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
-        if mask is not None:
-            fdda = mask.blend(linear, fdda)
+        linear, fdda = deformations.positions(pose.pose_matrices, pose.controls)
         cells = [(pose.positions, f"{pose.name}: {reference_label}"), (linear, "linear skinning"), (fdda, "FDDA")]
         rows.append([])
         for positions, label in cells:
-            errors = distances(positions, pose.positions, network.info.metres_per_unit)
+            errors = distances(positions, pose.positions, deformations.metres_per_unit)
             figures = f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm" if errors.any() else ""
             colors = heat_colors(errors) if is_heat_map else np.tile(np.float32(SURFACE_COLOR), (len(positions), 1))
             rows[-1].append(Cell(positions, colors, label + figures))
