@@ -11,7 +11,16 @@ from ..models.model_list import bound_model_name
 from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
 from .bone_names import short_bone_name
-from .section import Section, draw_button, draw_job, draw_wrapped, is_bound, panel_rig
+from .section import (
+    Section,
+    draw_assessment,
+    draw_button,
+    draw_job,
+    draw_table_row,
+    draw_wrapped,
+    is_bound,
+    panel_rig,
+)
 from .training import recording_warnings
 
 SHOWN_PARTITIONS = 5
@@ -115,14 +124,14 @@ def _draw_statistics(
         return
     draw_wrapped(body, context, f"{last.model} on {poses_text}")
     table = body.column(align=True)
-    _draw_table_row(table, "", [label for label, _ in STATISTICS])
+    draw_table_row(table, [label for label, _ in STATISTICS]).label(text="")
     for label, method in (("Model", "fdda"), ("Skinning", "linear")):
-        _draw_table_row(table, label, [_format_mm(getattr(last.total[method], name)) for _, name in STATISTICS])
+        texts = [_format_mm(getattr(last.total[method], name)) for _, name in STATISTICS]
+        draw_table_row(table, texts).label(text=label)
     assessment = _assess(rig, last)
-    draw_wrapped(body, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
-    for sentence in (*assessment.warnings, assessment.next_step):
-        if sentence:
-            draw_wrapped(body, context, sentence, "BLANK1")
+    draw_assessment(body, context, assessment)
+    if assessment.next_step:
+        draw_wrapped(body, context, assessment.next_step, "BLANK1")
     body.separator()
     row = body.row()
     row.label(text="Worst Body Parts")
@@ -137,14 +146,10 @@ def _draw_statistics(
     shown_partitions = last.partitions[: None if view.show_partitions else SHOWN_PARTITIONS]
     column = body.column(align=True)
     for partition in (*active_partitions, *(p for p in shown_partitions if p not in active_partitions)):
-        row = column.split(factor=0.4, align=True)
-        name = row.row(align=True)
-        name.alignment = "LEFT"
+        name = draw_table_row(column, [_format_mm(getattr(partition.fdda, statistic)) for _, statistic in STATISTICS])
         text = short_bone_name(rig.armature_object, partition.joint)
         icon = "BONE_DATA" if partition.joint == active else "NONE"
         name.operator("fdda.show_bone", text=text, icon=icon, emboss=False).bone = partition.joint
-        for _, statistic in STATISTICS:
-            row.label(text=_format_mm(getattr(partition.fdda, statistic)))
 
 
 def _assess(rig: SceneRig, last: last_evaluation.LastEvaluation) -> Assessment:
@@ -226,15 +231,6 @@ def _draw_worst(
     row.operator("fdda.add_worst_markers", text="Add Markers", icon="MARKER_HLT").count = view.markers
     if markers.find(context.scene):
         row.operator("fdda.remove_markers", text="", icon="X")
-
-
-def _draw_table_row(layout: bpy.types.UILayout, label: str, texts: list[str]) -> None:
-    row = layout.split(factor=0.4, align=True)
-    row.label(text=label)
-    for text in texts:
-        cell = row.row(align=True)
-        cell.alignment = "RIGHT"
-        cell.label(text=text)
 
 
 def _format_mm(value: float) -> str:

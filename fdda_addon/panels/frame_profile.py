@@ -8,7 +8,7 @@ import bpy
 from ..jobs import job
 from ..scene.scene_rig import SceneRig
 from ..timing import measurements
-from ..timing.benchmark import BONES, FDDA, FLOOR, INFERENCE, LINEAR, RIG, WITHOUT_MESHES, Benchmark
+from ..timing.benchmark import BONES, FDDA, INFERENCE, LINEAR, RIG, WITHOUT_MESHES, Benchmark
 from .section import draw_job, draw_wrapped
 
 MIN_SHOWN_SHARE = 0.01
@@ -17,48 +17,43 @@ MIN_LETTER_SHARE = 0.05
 """A segment of the bar with a smaller share has no room for its letter."""
 
 
-def draw_times(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    """Draw the last times of the character of a rig, and the button that measures them or the progress of its job."""
-    times, state = measurements.last(measurements.MEASURE, rig.armature_object), job.state_of("measure")
+def draw_times(layout: bpy.types.UILayout, context: bpy.types.Context, armature_object: bpy.types.Object) -> None:
+    """Draw the last times of the character of an armature, and the button that measures them or its progress."""
+    times, state = measurements.last(measurements.MEASURE, armature_object), job.state_of("measure")
     if state is not None and (state.is_running or state.outcome_level != "INFO"):
         draw_job(layout, context, "measure")
     if times is not None:
-        if len(times.meshes) > 1:
-            layout.label(text=f"{times.model_count} of {len(times.meshes)} Meshes with Models, ms per Frame")
-        suffix = " (estimate)" if times.is_estimate else ""
-        rows = [
-            ("Rig, per Frame", times.median(RIG)),
-            *([("Armature Only", times.median(LINEAR))] if LINEAR in times.times else []),
-            (("Model" if len(times.meshes) == 1 else "Models") + suffix, times.median(FDDA)),
-            ("   Bones", times.median(BONES)),
-            ("   Other Objects", max(times.median(WITHOUT_MESHES) - times.median(BONES), 0.0)),
-        ]
-        grid = layout.column(align=True)
-        for label, ms in rows:
-            _draw_time(grid, label, f"{ms:.2f} ms")
+        header, body = layout.panel("fdda_frame_times", default_closed=True)
+        header.label(text=f"{times.median(RIG):.2f} → {times.median(FDDA):.2f} ms per Frame", icon="TIME")
+        if body is not None:
+            _draw_parts(body, times)
         for mesh in times.meshes if len(times.meshes) > 1 else ():
             if mesh.reason:
                 draw_wrapped(layout, context, f"{mesh.name} has no model: {mesh.reason}", "ERROR")
-            elif mesh.variant in times.times:
-                _draw_time(grid, f"   Only {mesh.name}", f"{times.median(mesh.variant):.2f} ms")
         draw_wrapped(layout, context, times.sentence, "CHECKMARK" if times.is_worthwhile else "INFO")
     if state is None or not state.is_running:
         layout.operator("fdda.measure", text="Measure Speed", icon="TIME")
 
 
-def draw_model_times(layout: bpy.types.UILayout, times: Benchmark) -> None:
-    """Draw the sub-panel with the parts of the time of a frame with models."""
-    header, body = layout.panel("fdda_frame_times", default_closed=True)
-    header.label(text="Speed")
-    if body is None:
-        return
-    column = body.column(align=True)
-    for label, variant in (("Rig", RIG), ("Armature Only", LINEAR), ("Model", FDDA), ("   Blender", FLOOR)):
-        if variant in times.times:
-            _draw_time(column, label, f"{times.median(variant):.2f} ms")
-    _draw_time(column, "   Network", f"{times.median(INFERENCE):.2f} ms")
+def _draw_parts(layout: bpy.types.UILayout, times: Benchmark) -> None:
+    """Draw the times of a frame with the rig and with models, and what takes them."""
+    if len(times.meshes) > 1:
+        layout.label(text=f"{times.model_count} of {len(times.meshes)} Meshes with Models, ms per Frame")
+    suffix = " (estimate)" if times.is_estimate else ""
+    rows = [
+        ("Rig", times.median(RIG)),
+        *([("Armature Only", times.median(LINEAR))] if LINEAR in times.times else []),
+        (("Model" if len(times.meshes) == 1 else "Models") + suffix, times.median(FDDA)),
+        ("   Bones", times.median(BONES)),
+        ("   Other Objects", max(times.median(WITHOUT_MESHES) - times.median(BONES), 0.0)),
+        ("   Network", times.median(INFERENCE)),
+        *((f"   Only {mesh.name}", times.median(mesh.variant)) for mesh in times.meshes if mesh.variant in times.times),
+    ]
+    grid = layout.column(align=True)
+    for label, ms in rows:
+        _draw_time(grid, label, f"{ms:.2f} ms")
     if times.constant_bytes:
-        _draw_time(column, "   Memory", f"{times.constant_bytes / 1e6:.1f} MB")
+        _draw_time(grid, "   Memory", f"{times.constant_bytes / 1e6:.1f} MB")
 
 
 def _draw_time(layout: bpy.types.UILayout, label: str, text: str) -> None:

@@ -13,10 +13,8 @@ from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of, remaining_rig_note
 from ..scene.stored_paths import resolve_path
-from ..timing import measurements
-from ..timing.benchmark import FDDA, RIG
 from .bone_names import short_bone_name
-from .frame_profile import draw_model_times
+from .frame_profile import draw_times
 from .meshes import draw_meshes
 from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, is_bound, panel_rig
 from .timed_value import timed_values
@@ -146,16 +144,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             for mode, text in modes:
                 row.prop_enum(binding, "mode", mode, text=text)
         if not mesh_object.fdda.is_fast_rig:
-            armature_object = armature_of(mesh_object)
-            times = measurements.last(measurements.MEASURE, armature_object) if armature_object is not None else None
-            row = layout.row(align=True)
-            if times is not None:
-                row.label(text=f"{times.median(RIG):.2f} → {times.median(FDDA):.2f} ms per frame", icon="TIME")
-                row.operator("fdda.measure", text="", icon="FILE_REFRESH")
-                draw_wrapped(layout, context, times.sentence, "CHECKMARK" if times.is_worthwhile else "INFO")
-                draw_model_times(layout, times)
-            else:
-                row.operator("fdda.measure", text="Measure Speed", icon="TIME")
+            draw_times(layout, context, armature_of(mesh_object))
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         strength = column.row()

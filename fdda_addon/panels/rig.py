@@ -11,7 +11,7 @@ from . import checks, curves, findings, limits
 from .frame_profile import draw_profile, draw_times
 from .meshes import draw_meshes
 from .recording import has_recording, is_in_recording
-from .section import Section, draw_button, draw_job, draw_wrapped, is_recordable, panel_rig
+from .section import Section, draw_assessment, draw_button, draw_job, draw_wrapped, is_recordable, panel_rig
 from .trained_file import find_trained_file
 from .training import read_assessment
 
@@ -83,7 +83,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
                 count = len(mesh_object.data.shape_keys.key_blocks) - 1
                 column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
         if not is_fast_rig:
-            draw_times(layout, context, rig)
+            draw_times(layout, context, rig.armature_object)
             draw_profile(layout, context, rig)
 
 
@@ -115,11 +115,8 @@ def _draw_verdict(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     state, trained = job.state_of("build_model"), find_trained_file(rig)
     if state is None or state.outcome_level != "INFO" or trained is None:
         return
-    if (assessment := read_assessment(trained.path)) is None:
-        return
-    draw_wrapped(layout, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
-    for warning in assessment.warnings:
-        draw_wrapped(layout, context, warning, "BLANK1")
+    if (assessment := read_assessment(trained.path)) is not None:
+        draw_assessment(layout, context, assessment)
 
 
 CLASSES = (FDDA_PT_rig,)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Base class of all sections of the sidebar, and functions that draw wrapped text, paths and jobs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import blf
 import bpy
 
 from ..core.errors import RigError
+from ..core.sentences.assessment import Assessment
 from ..core.sentences.window import for_window
 from ..jobs import job
 from ..scene.active_rig import active_rig, cached_active_rig, cached_rigs_together
@@ -135,6 +136,25 @@ def _wrap(text: str, width: float, points: float) -> tuple[str, ...]:
         else:
             lines.append(word)
     return tuple(lines)
+
+
+def draw_assessment(layout: bpy.types.UILayout, context: bpy.types.Context, assessment: Assessment) -> None:
+    """Draw what errors mean, with the warnings."""
+    draw_wrapped(layout, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
+    for warning in assessment.warnings:
+        draw_wrapped(layout, context, warning, "BLANK1")
+
+
+def draw_table_row(layout: bpy.types.UILayout, texts: Iterable[str]) -> bpy.types.UILayout:
+    """Draw a row of a table with right-aligned texts, and return the layout for the name before them."""
+    row = layout.split(factor=0.4, align=True)
+    name = row.row(align=True)
+    name.alignment = "LEFT"
+    for text in texts:
+        cell = row.row(align=True)
+        cell.alignment = "RIGHT"
+        cell.label(text=text)
+    return name
 
 
 def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str, default: str) -> None:

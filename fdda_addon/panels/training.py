@@ -19,7 +19,17 @@ from ..training.environment import choice, session
 from . import curves
 from .bone_names import short_bone_name
 from .recording import has_recording, read_content
-from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
+from .section import (
+    Section,
+    draw_advanced,
+    draw_assessment,
+    draw_button,
+    draw_job,
+    draw_path,
+    draw_table_row,
+    draw_wrapped,
+    panel_rig,
+)
 from .trained_file import TrainedFile, find_trained_file
 
 SHOWN_PARTITIONS = 8
@@ -181,15 +191,13 @@ def _draw_assessment(
     layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile
 ) -> None:
     """Draw what the errors of the training mean, what its skin weights and key joints are, and what to do next."""
-    report, assessment = _read_report(report_path(trained.path)), read_assessment(trained.path)
-    if report is None or assessment is None:
+    report = _read_report(trained.path)
+    if report is None:
         return
-    box = layout.box()
-    draw_wrapped(box, context, assessment.sentence, "CHECKMARK" if assessment.is_good else "ERROR")
+    box, assessment = layout.box(), read_assessment(trained.path)
+    draw_assessment(box, context, assessment)
     if goal := report.get("goal"):
         draw_wrapped(box, context, *_describe_goal(goal))
-    for warning in assessment.warnings:
-        draw_wrapped(box, context, warning, "BLANK1")
     if assessment.next_step:
         is_bound = rig.mesh_object.fdda.is_bound
         text = "Next: compare it with the rig on an action." if is_bound else assessment.next_step
@@ -205,24 +213,20 @@ def _draw_assessment(
 
 def read_assessment(model: Path) -> Assessment | None:
     """Return what the report of a model means; None without a report. It is computed once for each report."""
-    path = report_path(model)
-    report = _read_report(path)
-    if report is None or report["model"] != model.name:
-        return None
-    return computed_once(("assessment", path), (report,), lambda: assess_training(report))
+    report = _read_report(model)
+    return report and computed_once(("assessment", model), (report,), lambda: assess_training(report))
 
 
 def recording_warnings(rig: SceneRig, model_name: str) -> list[dict]:
     """Return the warnings about the recording of a model, if it is the trained model of a rig with this name."""
     trained = find_trained_file(rig)
-    report = _read_report(report_path(trained.path)) if trained is not None else None
-    is_of_model = report is not None and report["model"].removesuffix(".onnx") == model_name
-    return report.get("warnings", []) if is_of_model else []
+    report = _read_report(trained.path) if trained is not None and trained.path.stem == model_name else None
+    return report.get("warnings", []) if report else []
 
 
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
-    report = _read_report(report_path(model))
-    if report is None or report["model"] != model.name:
+    report = _read_report(model)
+    if report is None:
         return
     header, body = layout.panel("fdda_held_out", default_closed=True)
     header.label(text="Error by Body Part")
@@ -230,28 +234,15 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         return
     partitions = sorted(report["partitions"], key=lambda partition: -partition["held_out"]["max"])
     shown_partitions = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
-    names, means, p999s, maxima = _table_columns(body.box())
-    for column, text in ((names, "Body Part"), (means, "Mean"), (p999s, "99.9 %"), (maxima, "Max")):
-        column.label(text=text)
+    table = body.box().column(align=True)
+    draw_table_row(table, ("Mean", "99.9 %", "Max")).label(text="Body Part")
     for partition in shown_partitions:
-        names.label(text=short_bone_name(rig.armature_object, partition["joint"]))
-        means.label(text=f"{partition['held_out']['mean']:.3f}")
-        p999s.label(text=f"{partition['held_out']['p999']:.2f}")
-        maxima.label(text=f"{partition['held_out']['max']:.2f}")
+        errors = partition["held_out"]
+        texts = f"{errors['mean']:.3f}", f"{errors['p999']:.2f}", f"{errors['max']:.2f}"
+        draw_table_row(table, texts).label(text=short_bone_name(rig.armature_object, partition["joint"]))
     if len(partitions) > SHOWN_PARTITIONS:
         text = f"Show All {len(partitions)} Body Parts"
         body.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
-
-
-def _table_columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
-    """Return the columns of a table: one for names, and three right-aligned ones for numbers."""
-    split = layout.split(factor=0.4)
-    columns = [split.column(align=True)]
-    right = split.row(align=True)
-    for _ in range(3):
-        columns.append(right.column(align=True))
-        columns[-1].alignment = "RIGHT"
-    return columns
 
 
 def _describe_goal(goal: dict) -> tuple[str, str]:
@@ -264,20 +255,22 @@ def _describe_goal(goal: dict) -> tuple[str, str]:
     }[Verdict(goal["verdict"])]
 
 
-def _read_report(path: Path) -> dict | None:
-    """Return a training report, None without a valid one. It is read again after a change of the file."""
+def _read_report(model: Path) -> dict | None:
+    """Return the training report of a model, None without a valid one. It is read again after a change of the file."""
+    path = report_path(model)
     try:
         modified_ns = os.stat(path).st_mtime_ns
     except OSError:
         return None
-    return computed_once(("report", path), (modified_ns,), lambda: _valid_report(path))
+    return computed_once(("report", model), (modified_ns,), lambda: _valid_report(path, model.name))
 
 
-def _valid_report(path: Path) -> dict | None:
+def _valid_report(path: Path, model_name: str) -> dict | None:
     try:
-        return read_report(path)
+        report = read_report(path)
     except TrainingError:
         return None
+    return report if report["model"] == model_name else None
 
 
 CLASSES = (FDDA_PT_training,)

@@ -189,18 +189,14 @@ class TestTraining:
         assert painted == [[0.9, 0.5], [0.9, 0.5, 0.4], *([0.9, 0.5, float(number)] for number in range(20))]
 
     def test_a_report_is_read_and_a_damaged_one_passed_over(self, elbow_files, tmp_path):
-        report = _read_report(elbow_files.model.with_name("report.json"))
+        report = _read_report(elbow_files.model)
         assert report["model"] == "elbow.onnx" and {p["joint"] for p in report["partitions"]} == {"upper", "lower"}
-        for number, text in enumerate(("{", "[]", '{"model": 1, "fdda": {}, "partitions": []}')):
-            path = tmp_path / f"{number}.json"
-            path.write_text(text)
-            assert _read_report(path) is None
-        assert _read_report(tmp_path / "none.json") is None
-        cases = (([{"name": "flips", "text": "…"}], True), ([{"text": "…"}], False), (7, False))
-        for number, (warnings, passed) in enumerate(cases):
-            path = tmp_path / f"warned_{number}.json"
-            path.write_text(json.dumps({**report, "warnings": warnings}))
-            assert (_read_report(path) is not None) is passed
+        assert _read_report(elbow_files.model.with_name("other.onnx")) is None, "the report is of another model"
+        warned = (json.dumps({**report, "warnings": value}) for value in ([{"text": "…"}], 7))
+        for number, text in enumerate(("{", "[]", '{"model": 1, "fdda": {}, "partitions": []}', *warned)):
+            (tmp_path / str(number)).mkdir()
+            (tmp_path / str(number) / "report.json").write_text(text)
+            assert _read_report(tmp_path / str(number) / "elbow.onnx") is None
 
     def test_its_trainer_ends_with_the_file(self, rig, elbow_files, tmp_path):
         from fdda_addon.training.process import Training
