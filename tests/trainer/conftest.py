@@ -11,6 +11,9 @@ import pytest
 
 from trainer.__main__ import main  # Imported first, because torch reads the variables that it sets.
 
+import trainer.train  # isort: skip
+from trainer.model import TrainedModel  # isort: skip
+
 from .chain import write_chain
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -38,12 +41,34 @@ def recording(tmp_path_factory) -> Path:
     return path
 
 
+def train_model(recording: Path, model: Path) -> TrainedModel:
+    """Train a model with the verb, and return what was exported."""
+    trained_models, make_trained_model = [], trainer.train.make_trained_model
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(
+            trainer.train,
+            "make_trained_model",
+            lambda *args: trained_models.append(make_trained_model(*args)) or trained_models[-1],
+        )
+        assert main([str(recording), str(model), *QUICK_OPTIONS]) == 0
+    return trained_models[0]
+
+
 @pytest.fixture(scope="session")
-def trained(recording, tmp_path_factory) -> Path:
-    """Folder of a finished training of the chain: model.onnx, report.json, report.html; read only."""
+def training(recording, tmp_path_factory) -> tuple[Path, TrainedModel]:
     folder = tmp_path_factory.mktemp("trained")
-    assert main([str(recording), str(folder / "model.onnx"), *QUICK_OPTIONS]) == 0
-    return folder
+    return folder, train_model(recording, folder / "model.onnx")
+
+
+@pytest.fixture(scope="session")
+def trained(training) -> Path:
+    """Folder of a finished training of the chain: model.onnx, report.json, report.html; read only."""
+    return training[0]
+
+
+@pytest.fixture(scope="session")
+def trained_model(training) -> TrainedModel:
+    return training[1]
 
 
 @pytest.fixture(scope="session")

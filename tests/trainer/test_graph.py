@@ -1,48 +1,45 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The graph agrees with PyTorch for all transforms of bones, and has few nodes and constants."""
+"""The graph agrees with PyTorch for all transforms, has few nodes and constants, and passes the add-on's checks."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
+from onnx import TensorProto, helper
 
-import trainer.train
-from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.formats.model import read_model_info
+from fdda_addon.core.errors import ModelError, TrainingError
+from fdda_addon.core.formats.model import check_model, read_model_info
+from fdda_addon.core.formats.onnx_file import FREE_ELEMENTS, infer_shapes, read_onnx
 from fdda_addon.core.mathematics.partition import make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning
 from trainer.__main__ import main
+from trainer.config import ACTIVATION
 from trainer.export import network_nodes
 from trainer.export.export import build_graph, check_parity, measure, open_session, reference_positions
+from trainer.export.skinning_nodes import VertexOrder, vertex_order
+from trainer.graph_builder import GraphBuilder
 from trainer.model import TrainedModel
 
 from ..recordings import read_skinned, write_recording
-from .chain import chain_angles, chain_info, chain_residuals, chain_rig, constant_names, pose_chain, rotation
+from .chain import (
+    chain_angles,
+    chain_info,
+    chain_residuals,
+    chain_rig,
+    constant_names,
+    pose_chain,
+    rotation,
+    write_chain,
+)
 from .conftest import QUICK_OPTIONS
 
 SHEAR = np.eye(4)
+
 SHEAR[0, 1] = 0.3
-
-
-def collect_trained_models(monkeypatch) -> list[TrainedModel]:
-    """Return a list to which every later training adds its model."""
-    trained_models, make_trained_model = [], trainer.train.make_trained_model
-    monkeypatch.setattr(
-        trainer.train,
-        "make_trained_model",
-        lambda *args: trained_models.append(make_trained_model(*args)) or trained_models[-1],
-    )
-    return trained_models
-
-
-@pytest.fixture(scope="module")
-def trained_model(recording, tmp_path_factory) -> TrainedModel:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        trained_models = collect_trained_models(monkeypatch)
-        assert main([str(recording), str(tmp_path_factory.mktemp("graph") / "model.onnx"), *QUICK_OPTIONS]) == 0
-    return trained_models[0]
 
 
 def run_graph(trained_model: TrainedModel, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,6 +78,7 @@ def test_a_character_that_is_scaled_as_a_whole_keeps_its_residuals(trained_model
 
 
 FAR_AWAY = np.eye(4)
+
 FAR_AWAY[:3, 3] = 60, -70, 40
 
 
@@ -188,3 +186,89 @@ def test_a_difference_from_pytorch_is_refused_unless_errors_or_residuals_are_far
         check_parity(source, replace(held_out, fdda=np.full((5, 1), 0.001)))
     check_parity(source, replace(held_out, fdda=np.full((5, 1), 0.1)))
     check_parity(source, replace(held_out, fdda=np.full((5, 1), 0.001), linear=np.full((5, 1), 0.5)))
+
+
+def assign_strips(vertex_count: int, strip_length: int, partition_count: int) -> list[np.ndarray]:
+    """Assign strips of adjacent vertices to partitions in rotation."""
+    partition_by_vertex = np.arange(vertex_count) // strip_length % partition_count
+    return [np.flatnonzero(partition_by_vertex == index) for index in range(partition_count)]
+
+
+def run_order_graph(order: VertexOrder, pose_count: int) -> np.ndarray:
+    """Return the (poses, V, 3) output of the graph for positions that encode their vertex and pose."""
+    graph, columns = GraphBuilder(), np.concatenate(order.columns)
+    order.add(graph, "joined", "positions")
+    inputs = [helper.make_tensor_value_info("joined", TensorProto.FLOAT, ["N", len(columns), 3])]
+    outputs = [helper.make_tensor_value_info("positions", TensorProto.FLOAT, ["N", order.vertex_count, 3])]
+    proto = helper.make_graph(graph.nodes, "order", inputs, outputs, graph.constants)
+    model = helper.make_model(proto, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.checker.check_model(model)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    ordered_positions = columns[None, :, None] + np.arange(3) * 0.25 + 100_000 * np.arange(pose_count)[:, None, None]
+    return session.run(None, {"joined": ordered_positions.astype(np.float32)})[0]
+
+
+@pytest.mark.parametrize(
+    ("vertices", "strip", "partitions"),
+    [(5, 1, 2), (90, 7, 3), (9_960, 61, 22), (50_001, 500, 7), (40_000, 40_000, 1), (20_000, 1, 9), (32_768, 64, 4)],
+)
+def test_vertices_are_in_mesh_order(vertices, strip, partitions):
+    order = vertex_order(assign_strips(vertices, strip, partitions))
+    expected = np.arange(vertices)[:, None] + np.arange(3) * 0.25
+    for pose, positions in enumerate(run_order_graph(order, 2)):
+        np.testing.assert_array_equal(positions, (expected + 100_000 * pose).astype(np.float32))
+
+
+def test_every_vertex_has_one_column():
+    order = vertex_order(assign_strips(50_001, 500, 7))
+    columns = np.concatenate(order.columns)
+    np.testing.assert_array_equal(np.sort(columns[columns >= 0]), np.arange(50_001))
+    assert (columns < 0).sum() < 7 * order.block_size
+
+
+@pytest.mark.parametrize(("strip", "uses_blocks"), [(500, True), (1, False), (100_000, True)])
+def test_blocks_are_used_only_for_long_strips(strip, uses_blocks):
+    assert (vertex_order(assign_strips(50_000, strip, 5)).block_size > 1) == uses_blocks
+
+
+def test_few_vertices_are_gathered_one_by_one():
+    assert vertex_order(assign_strips(300, 30, 3)).block_size == 1
+
+
+@pytest.fixture(scope="module")
+def models(recording, tmp_path_factory) -> list[bytes]:
+    """Models with each activation, with one and many joints, with deep and wide networks, and without components."""
+    folder = tmp_path_factory.mktemp("models")
+    for joints in (1, 12):
+        write_chain(folder / f"chain_{joints}", pose_count=60, joint_count=joints)
+    trainings = [(recording, "--activation", name, "--hidden", "24", "24") for name in ACTIVATION.choices]
+    trainings += [(folder / f"chain_{joints}", "--hidden", "16") for joints in (1, 12)]
+    trainings += [(recording, "--hidden", "300", "200", "100", "50"), (recording, "--detail-mm", "10000")]
+    contents = []
+    for index, (path, *options) in enumerate(trainings):
+        model = folder / f"{index}.onnx"
+        assert main([str(path), str(model), "--passes", "5", *options]) == 0
+        contents.append(model.read_bytes())
+    return contents
+
+
+def test_the_add_on_accepts_every_exported_model_with_a_margin(models):
+    """If the values of exported graphs come near the limit, it must be raised before it refuses a character."""
+    operators = {node.op_type for data in models for node in onnx.load_from_string(data).graph.node}
+    assert {"MatMul", "Gather", "Erf", "Tanh", "Relu", "Sigmoid"} <= operators
+    for data in models:
+        check_model(data, "m.onnx")
+        contents = read_onnx(data)
+        shapes = infer_shapes(contents, {name: (1, *shape[1:]) for name, shape in contents.inputs.items()}, 1)
+        loaded = constant_names(onnx.load_from_string(data).graph)
+        once = sum(math.prod(shapes[name]) for name in loaded - contents.constants.keys())
+        per_pose = sum(math.prod(shape) for name, shape in shapes.items() if name not in loaded)
+        assert max(once / 3, per_pose) < (len(data) + FREE_ELEMENTS) / 4
+
+
+def test_changed_weights_are_refused(trained):
+    data = bytearray((trained / "model.onnx").read_bytes())
+    largest_constant = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
+    data[bytes(data).index(bytes(largest_constant)) + len(largest_constant) // 2] ^= 1
+    with pytest.raises(ModelError, match="is damaged: its checksum is not that of its weights"):
+        check_model(bytes(data), "m.onnx")

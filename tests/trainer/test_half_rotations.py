@@ -27,8 +27,8 @@ from trainer.model import TrainedModel
 
 from ..recordings import read_skinned, write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, rotation, write_chain
-from .conftest import QUICK_OPTIONS
-from .test_graph import check_agreement, collect_trained_models, constant_bytes
+from .conftest import QUICK_OPTIONS, train_model
+from .test_graph import check_agreement, constant_bytes
 from .tube import write_tube
 
 POSES, RANGE_SCALE = 160, 1.8
@@ -94,10 +94,7 @@ def recording(tmp_path_factory) -> SkinnedRecording:
 def model_and_path(recording, tmp_path_factory) -> tuple:
     """A trained model and the path of its file."""
     path = tmp_path_factory.mktemp("models") / "volume.onnx"
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        trained_models = collect_trained_models(monkeypatch)
-        assert main([str(recording.path), str(path), *QUICK_OPTIONS]) == 0
-    return trained_models[0], path
+    return train_model(recording.path, path), path
 
 
 def half_rotations_are_selected(recording: SkinnedRecording) -> bool:
@@ -238,10 +235,8 @@ def test_the_graph_agrees_with_pytorch(model_and_path):
     check_agreement(trained_model, pose_second_joint(trained_model.rig, np.diag([-3, -3, -3, 1])))
 
 
-def test_sheared_bones_have_half_rotations(tmp_path, monkeypatch):
+def test_sheared_bones_have_half_rotations(tmp_path):
     slanted_scale = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
-    trained_models = collect_trained_models(monkeypatch)
     sheared = write_volume_recording(tmp_path / "volume", slanted_scale=slanted_scale)
-    assert main([str(sheared.path), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
-    assert len(trained_models[0].half_rotation_joints())
+    assert len(train_model(sheared.path, tmp_path / "model.onnx").half_rotation_joints())
     assert read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2

@@ -11,7 +11,6 @@ from fdda_addon.core.formats.onnx_file import infer_shapes, read_onnx
 from fdda_addon.core.mathematics.partition import Partition, make_partitions
 from fdda_addon.core.mathematics.skinning import LinearSkinning, skin_matrices
 from fdda_addon.core.rig import Rig
-from trainer.__main__ import main
 from trainer.export.export import build_graph
 from trainer.fits import low_rank
 from trainer.fits.basis import make_basis
@@ -21,8 +20,8 @@ from trainer.model import TrainedModel
 
 from ..recordings import write_recording
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
-from .conftest import QUICK_OPTIONS
-from .test_graph import check_agreement, collect_trained_models, run_graph
+from .conftest import train_model
+from .test_graph import check_agreement, run_graph
 
 JOINTS, VERTICES, POSES = 3, 6_000, 120
 INFLUENCING = {0: (1,), 1: (1, 2), 2: (2,)}
@@ -199,10 +198,7 @@ def trained_model(tmp_path_factory) -> TrainedModel:
         pose_chain(rig, angles),
         sliding_residuals(rig, angles),
     )
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        trained_models = collect_trained_models(monkeypatch)
-        assert main([str(path / "recording"), str(path / "model.onnx"), *QUICK_OPTIONS]) == 0
-    return trained_models[0]
+    return train_model(path / "recording", path / "model.onnx")
 
 
 def test_the_graph_agrees_with_pytorch(trained_model):

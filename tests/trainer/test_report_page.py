@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report's page is complete and self-contained, and can be written again with pictures and an evaluation."""
+"""The report's page is complete and self-contained; errors are analyzed by their causes."""
 
 import base64
 import json
@@ -8,12 +8,29 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from trainer.report.__main__ import main
+from fdda_addon.core.mathematics.partition import make_partitions
+from trainer.__main__ import main
+from trainer.report.__main__ import main as write_page
+from trainer.report.error_analysis import (
+    EXTREME_POSES,
+    HIGH_TRAINING_ERRORS,
+    NO_CLEAR_CAUSE,
+    REMEDY_BY_CAUSE,
+    TOO_FEW_COMPONENTS,
+    TOO_FEW_POSES,
+    UNPREDICTED_COMPONENTS,
+    _cause,
+)
+from trainer.report.page import render_html
 
 from .. import systems
+from ..recordings import write_recording
+from .chain import chain_angles, chain_info, chain_rig, pose_chain, write_chain
 from .conftest import REPOSITORY
 
 PNG = base64.b64decode(
@@ -63,7 +80,7 @@ def test_page_is_written_again_with_pictures_and_evaluation(trained, report, tmp
     evaluation = {"unit": "mm", "poses": 200, "vertices": 90, "fdda": statistics, "linear": statistics}
     (tmp_path / "evaluation.json").write_text(json.dumps(evaluation))
     arguments = ["--pictures", pictures, "--evaluation", tmp_path / "evaluation.json"]
-    assert main([str(tmp_path / "report.json"), *map(str, arguments)]) == 0
+    assert write_page([str(tmp_path / "report.json"), *map(str, arguments)]) == 0
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     images = [attributes for tag, attributes in TagCollector(text).tags if tag == "img"]
     assert [image["alt"] for image in images] == ["two poses"]
@@ -75,7 +92,7 @@ def test_names_from_the_rig_cannot_break_the_page(report, tmp_path):
     report = json.loads(json.dumps(report))
     report["partitions"][0]["joint"] = "<b>&bone</script>"
     (tmp_path / "report.json").write_text(json.dumps(report))
-    assert main([str(tmp_path / "report.json")]) == 0
+    assert write_page([str(tmp_path / "report.json")]) == 0
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "</script>" not in text and "&lt;b&gt;&amp;bone" in text
 
@@ -112,7 +129,7 @@ def test_a_report_with_hostile_values_cannot_break_the_page(report, tmp_path, ca
         set_value(changed_report, path, hostile_value)
         (tmp_path / "report.json").write_text(json.dumps(changed_report))
         (tmp_path / "report.html").unlink(missing_ok=True)
-        status = main([str(tmp_path / "report.json")])
+        status = write_page([str(tmp_path / "report.json")])
         error_text = capsys.readouterr().err
         if status:
             assert (
@@ -136,7 +153,7 @@ def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, hostile_
     statistics = {"mean": 0.125, "rms": 0.25, "p99": 0.5, "p999": 1.0, "max": 2.0}
     evaluation = {"poses": 200, "fdda": statistics, "linear": statistics, key: hostile_value}
     (tmp_path / "e.json").write_text(json.dumps(evaluation))
-    assert main([str(tmp_path / "report.json"), "--evaluation", str(tmp_path / "e.json")]) == 1
+    assert write_page([str(tmp_path / "report.json"), "--evaluation", str(tmp_path / "e.json")]) == 1
     assert capsys.readouterr().err.startswith(f"The evaluation '{tmp_path / 'e.json'}' is damaged: ")
     assert not (tmp_path / "report.html").exists()
 
@@ -145,15 +162,15 @@ def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, hostile_
 def test_named_pipes_are_refused(report, tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.png")
     for name in ("report.json", "pipe.png"):
-        assert main([str(tmp_path / name)]) == 1
+        assert write_page([str(tmp_path / name)]) == 1
     (tmp_path / "report.json").write_text(json.dumps(report))
-    assert main([str(tmp_path / "report.json"), "--pictures", str(tmp_path)]) == 1
+    assert write_page([str(tmp_path / "report.json"), "--pictures", str(tmp_path)]) == 1
     assert "it is not a regular file" in capsys.readouterr().err
 
 
 def test_the_page_does_not_overwrite_its_report(report, tmp_path, capsys):
     (tmp_path / "report.html").write_text(json.dumps(report))
-    assert main([str(tmp_path / "report.html")]) == 1
+    assert write_page([str(tmp_path / "report.html")]) == 1
     assert "it is read for this" in capsys.readouterr().err
     assert json.loads((tmp_path / "report.html").read_text()) == report
 
@@ -175,3 +192,76 @@ def test_a_python_without_jinja2_is_named(report, tmp_path):
     result = write_page_without("jinja2", tmp_path / "report.json")
     assert result.returncode == 1 and result.stderr.count("\n") == 1
     assert result.stderr.startswith(f"The page of a report needs the Python package 'jinja2', which {sys.executable}")
+
+
+def train_chain(folder: Path, poses: int, *options: str) -> list[dict]:
+    write_chain(folder / "chain", poses)
+    assert main([str(folder / "chain"), str(folder / "chain.onnx"), *options]) == 0
+    report = json.loads((folder / "report.json").read_text())
+    return report["partitions"]
+
+
+def test_too_few_components_are_the_cause(tmp_path):
+    """With a tolerance of two millimeters, components do not represent most of the error."""
+    partitions = train_chain(tmp_path, 200, "--passes", "60", "--detail-mm", "2")
+    analyses = [p["largest_errors"] for p in partitions if p["held_out"]["max"] > 1]
+    assert analyses and all(a["truncation"] > 0.8 and a["cause"] == TOO_FEW_COMPONENTS for a in analyses)
+
+
+def test_too_few_poses_are_the_cause(tmp_path):
+    """With forty poses and many epochs, the training poses are accurate and the other poses are not."""
+    partitions = train_chain(tmp_path, 40, "--passes", "300", "--detail-mm", "0.001", "--held-out-fraction", "0.4")
+    analysis = max(partitions, key=lambda p: p["held_out"]["max"])["largest_errors"]
+    assert analysis["generalization"] > 1.5 and analysis["cause"] in (TOO_FEW_POSES, EXTREME_POSES)
+
+
+@pytest.mark.parametrize(
+    ("detail_mm", "tolerance_mm", "cause"), [(0.0, 0.1, UNPREDICTED_COMPONENTS), (3.0, 3.2, TOO_FEW_COMPONENTS)]
+)
+def test_dropped_components_are_the_cause_only_if_most_of_the_error_is_in_them(
+    tmp_path, detail_mm, tolerance_mm, cause
+):
+    """One large pattern is random in each pose; so are many small ones, which are within the tolerance."""
+    rig, poses, rng = chain_rig(2), 200, np.random.default_rng(0)
+    angles, patterns = chain_angles(poses, 2, 0), rng.normal(size=(41, rig.vertex_count * 3)) / np.sqrt(3)
+    sizes = np.append(2.0, np.full(40, detail_mm / np.sqrt(40))) / 1000
+    residuals = ((rng.normal(size=(poses, 41)) * sizes) @ patterns).reshape(poses, rig.vertex_count, 3)
+    partitions = make_partitions(rig, {0: (1,), 1: (1,)})
+    write_recording(
+        tmp_path / "recording",
+        rig,
+        partitions,
+        chain_info(poses),
+        pose_chain(rig, angles),
+        residuals.astype(np.float32),
+    )
+    options = ("--passes", "60", "--detail-mm", str(tolerance_mm))
+    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *options]) == 0
+    dropped = [p for p in json.loads((tmp_path / "report.json").read_text())["partitions"] if p["dropped"]]
+    assert dropped and {p["largest_errors"]["cause"] for p in dropped} == {cause}
+
+
+@pytest.mark.parametrize(
+    ("truncation", "is_dropped", "distance", "generalization", "cause"),
+    [
+        (0.9, False, 3.0, 3.0, TOO_FEW_COMPONENTS),
+        (0.9, True, 3.0, 3.0, UNPREDICTED_COMPONENTS),
+        (0.1, True, 1.0, 3.0, TOO_FEW_POSES),
+        (0.1, False, 3.0, 3.0, EXTREME_POSES),
+        (0.1, False, 3.0, 1.0, EXTREME_POSES),
+        (0.1, False, 1.0, 1.0, HIGH_TRAINING_ERRORS),
+        (0.4, False, 1.0, 1.0, NO_CLEAR_CAUSE),
+    ],
+)
+def test_measured_ratios_determine_the_cause(truncation, is_dropped, distance, generalization, cause):
+    assert _cause(truncation, is_dropped, distance, generalization) == cause and cause in REMEDY_BY_CAUSE
+
+
+def test_the_page_shows_the_analysis(report):
+    page = render_html(report)
+    assert "The largest errors" in page
+    for partition in report["partitions"]:
+        assert partition["largest_errors"]["vertices"] <= partition["vertices"]
+        curve = partition["curve"]
+        assert len(curve["worst"]) == len(curve["validation"])
+        assert all(worst >= mean for worst, mean in zip(curve["worst"], curve["validation"], strict=True))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line of the trainer sends messages, returns exit statuses, and leaves no unfinished files."""
+"""The trainer as a process: messages, exit status, interruption, and text in any encoding."""
 
 import errno
 import io
@@ -7,15 +7,20 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from fdda_addon.core.formats.messages import STOP_FILE_VARIABLE, Message, MessageType
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.rig import Joint
 from trainer.__main__ import main
 from trainer.process import run_with_messages
 from trainer.progress import JsonMessageSink
 
-from .chain import write_chain
+from .. import systems
+from ..recordings import write_recording
+from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain, write_chain
 from .conftest import QUICK_OPTIONS, REPOSITORY, start_trainer
 
 ONLY_POSIX = pytest.mark.skipif(os.name != "posix", reason="Windows has no such signals.")
@@ -224,3 +229,41 @@ def test_the_error_for_missing_torch_names_what_to_install(recording, tmp_path):
     text = decode_messages(process.stdout)[-1].values["text"]
     assert "needs the Python package 'torch'" in text and "install torch" in text
     assert process.stderr.strip() == text
+
+
+ASCII_ENVIRONMENT = {
+    **os.environ,
+    "PYTHONIOENCODING": "ascii",
+    "LC_ALL": "C",
+    "PYTHONUTF8": "0",
+    "PYTHONCOERCECLOCALE": "0",
+}
+
+
+@pytest.fixture
+def unicode_recording(tmp_path):
+    """A recording of a chain with names in several scripts."""
+    rig = chain_rig(2)
+    mesh = replace(rig.meshes[0], name="Ärmel")
+    rig = replace(rig, joints=(Joint("Wurzel ß", -1), Joint("前腕.L", 0)), meshes=(mesh,))
+    angles = chain_angles(60, 2, 0)
+    path = tmp_path / "Aufnahme äöü"
+    arrays = pose_chain(rig, angles), chain_residuals(rig, angles)
+    write_recording(path, rig, make_partitions(rig, {0: (1,), 1: (1,)}), chain_info(60), *arrays)
+    return path
+
+
+def run_module(*arguments) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", *arguments]
+    return subprocess.run(command, cwd=REPOSITORY, env=ASCII_ENVIRONMENT, capture_output=True, check=False)
+
+
+def test_an_ascii_terminal_and_a_model_name_that_is_not_utf_8(unicode_recording, tmp_path):
+    name = "modèle.onnx".encode() if systems.WINDOWS else b"m\xff.onnx"  # On Windows every file name is text.
+    model = os.fsencode(tmp_path) + b"/" + name
+    process = run_module("trainer", unicode_recording, model, "--passes", "2", "--hidden", "8")
+    assert process.returncode == 0, process.stderr
+    assert rb"\u524d\u8155.L" in process.stdout and b"Wurzel \\xdf" in process.stdout
+    assert os.path.exists(model) and (tmp_path / "report.html").exists()
+    process = run_module("trainer.report", tmp_path / "réport.json")
+    assert process.returncode == 1 and process.stderr.startswith(b"The report '") and b"Traceback" not in process.stderr

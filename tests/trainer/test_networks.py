@@ -1,19 +1,28 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Networks that are trained as a batch learn, independently of padding, and the seed determines the result."""
+"""Networks of all partitions are trained together, on the chosen device, with an optimizer like PyTorch's."""
 
+import json
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data.split import split_poses
-from trainer.networks.loop import _Loop, train
+from trainer.device import CPU, GPU, TrainingDevice, choose_device
+from trainer.networks.loop import MIN_BETA_1, OneCycleAdamW, _Loop, train
 from trainer.networks.networks import ACTIVATION_FUNCTIONS, PartitionNetworks
 from trainer.preparation import PartitionData, prepare_partition
 
 from .chain import chain_angles
+from .conftest import QUICK_OPTIONS, REPOSITORY
 
 CONFIG = TrainingConfig(passes=30, hidden=(16, 16), batch_size=16, detail_mm=0.01, learning_rate=0.01)
 
@@ -158,3 +167,78 @@ def test_a_warm_start_keeps_the_outputs():
     for data, *partitions in zip(prepared, first, restarted, strict=True):
         expected, actual = (partition.network.evaluate(data.inputs) for partition in partitions)
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_parameters_equal_those_of_torch():
+    command = [sys.executable, "-m", "tests.trainer.optimizer_comparison"]
+    assert subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout == "equal\n"
+
+
+def test_a_warm_up_of_one_step_starts_at_the_maximum():
+    optimizer = OneCycleAdamW([torch.nn.Parameter(torch.zeros(1))], 0.01, 0.0, total_steps=4, warm_up_fraction=0.25)
+    assert optimizer.schedule(0) == (0.01, MIN_BETA_1)
+    assert optimizer.schedule(1)[0] < 0.01
+
+
+CARD = "GeForce GTX 960M"
+
+
+@pytest.fixture(autouse=True)
+def fresh_choice() -> Iterator[None]:
+    choose_device.cache_clear()
+    yield
+    choose_device.cache_clear()
+
+
+def raise_error(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("error", "problem"),
+    [
+        (
+            torch.AcceleratorError("CUDA error: no kernel image is available for execution on the device\nSearch for"),
+            "CUDA error: no kernel image is available for execution on the device",
+        ),
+        (
+            RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable\n"),
+            "CUDA error: all CUDA-capable devices are busy or unavailable",
+        ),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has"), "CUDA out of memory"),
+        (AssertionError("Torch not compiled with CUDA enabled"), "Torch not compiled with CUDA enabled"),
+    ],
+)
+def test_a_card_that_cannot_run_a_kernel_is_not_chosen(monkeypatch: pytest.MonkeyPatch, error: Exception, problem: str):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _index: CARD)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: raise_error(error))
+    ones = torch.ones
+    monkeypatch.setattr(torch, "ones", lambda *shape, device, **options: ones(*shape, **options))
+    assert choose_device() == TrainingDevice(CPU, CARD, problem)
+    choose_device.cache_clear()
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    assert choose_device() == TrainingDevice(GPU, CARD)
+
+
+def test_a_driver_that_is_too_old_is_named(monkeypatch: pytest.MonkeyPatch):
+    text = "CUDA initialization: The NVIDIA driver on your system is too old (found version 11040). Please update"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(warnings.warn(text, stacklevel=1)))
+    problem = "CUDA initialization: The NVIDIA driver on your system is too old (found version 11040)"
+    assert choose_device() == TrainingDevice(CPU, "the graphics card", problem)
+
+
+def test_the_cpu_trains_what_a_card_fails_to_train(
+    recording: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    """The device "meta" has no memory, so the training fails on it after its first steps."""
+    monkeypatch.setattr("trainer.train.choose_device", lambda: TrainingDevice("meta", CARD))
+    assert main([str(recording), str(tmp_path / "model.onnx"), "--messages", *QUICK_OPTIONS]) == 0
+    messages = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (text,) = [message["text"] for message in messages if message.get("name") == "graphics-card"]
+    assert text.startswith(f"{CARD} cannot be used (") and text.endswith(
+        "), so the CPU trains this model, more slowly."
+    )
+    assert [message["device"] for message in messages if message["type"] == "started"] == ["meta"]
+    assert json.loads((tmp_path / "report.json").read_text())["training"]["device"] == CPU
+    assert (tmp_path / "model.onnx").read_bytes() == (trained / "model.onnx").read_bytes()
