@@ -22,7 +22,6 @@ from difflib import SequenceMatcher
 
 from .controls import MESH_OBJECT, SHAPE_KEYS, Control
 
-MAX_ENTRIES = 100_000
 MAX_SHOWN_DIFFERENCES = 3
 SETTING_TOLERANCE = 1e-4
 """Largest relative difference of two settings that count as equal; rounding to float32 is smaller."""
@@ -32,6 +31,12 @@ _GROUP_LABELS = {
     "attributes": "attribute or vertex group",
     "unread_bones": "bone",
 }
+DEFORMATION_KEYS = {
+    "modifiers?": [{"name": str, "type": str, "settings": {}}],
+    "drivers?": {str: str},
+    **{f"{group}?": {str: {}} for group in _GROUP_LABELS},
+}
+"""Keys of a deformation and their values, as `check_json` describes them."""
 _DIGESTS = {"shape", "values", "inheritance or IK", "drivers"}
 """Settings that are digests, so that a user is not told their values."""
 _ARRAY_INDEX = re.compile(r"\[\d+\]$")
@@ -41,28 +46,6 @@ _NODE_INPUT_PATH = re.compile(r"\.properties\.inputs\.(\w+)\.value\b")
 def versionless_path(path: str) -> str:
     """Return the RNA path of an input of Geometry Nodes as Blender 4.5 has it; other paths are the same in 5.2."""
     return _NODE_INPUT_PATH.sub(r'["\1"]', path)
-
-
-def check_deformation(value: object) -> dict:
-    """Check a deformation from a file and return it; raise TypeError, KeyError or ValueError where it is damaged."""
-    if not isinstance(value, dict) or not value.keys() <= {"modifiers", "drivers", *_GROUP_LABELS}:
-        raise TypeError("its deformation is invalid")
-    if not isinstance(value.get("drivers", {}), dict):
-        raise TypeError("its drivers are invalid")
-    named_settings = [(modifier["name"], modifier["settings"]) for modifier in value.get("modifiers", [])]
-    named_settings += [entry for group in _GROUP_LABELS for entry in value.get(group, {}).items()]
-    drivers = value.get("drivers", {})
-    texts = [*drivers, *drivers.values(), *(modifier["type"] for modifier in value.get("modifiers", []))]
-    if (
-        len(named_settings) + len(drivers) > MAX_ENTRIES
-        or sum(len(settings) for _, settings in named_settings) > MAX_ENTRIES
-    ):
-        raise ValueError("its deformation has too many settings")
-    if not all(isinstance(text, str) for text in texts) or not all(
-        isinstance(name, str) and isinstance(settings, dict) for name, settings in named_settings
-    ):
-        raise TypeError("its deformation is damaged")
-    return value
 
 
 def deformation_differences(recorded: dict, current: dict, controls: Iterable[Control] = ()) -> list[str]:

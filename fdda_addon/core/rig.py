@@ -2,14 +2,14 @@
 """The rig as arrays: joints, rest pose and skin weights of the meshes of a character."""
 
 import hashlib
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from .controls import Control, controls_of_mesh
-from .deformation import check_deformation, deformation_differences
+from .deformation import DEFORMATION_KEYS, deformation_differences
+from .json_check import COUNT, NUMBER, POSITIVE, check_json
 from .wording import format_with_noun
 
 STATIC_JOINT = ""
@@ -19,7 +19,6 @@ Its rest and pose matrices are the identity, its parent is -1."""
 STATIC_JOINT_LABEL = "no bone"
 """Label of the static joint in messages."""
 
-MAX_HASH_LENGTH = 128
 KEY_JOINTS_PREFIX = "key-joints-"
 """Start of `Fingerprint.skin_weights` if a model reads fewer joints than those with skin weights."""
 REST_MATRIX_TOLERANCE = 1e-4
@@ -27,8 +26,6 @@ REST_MATRIX_TOLERANCE = 1e-4
 
 Versions of Blender compute a bone's matrix with different rounding, so the comparison cannot be exact."""
 
-MAX_NAME_LENGTH = 1000
-"""Largest number of characters of a name in a file; names in Blender have at most 255."""
 METRES_PER_UNIT = "metres_per_unit"
 """Key in `recording.json` and in a model's metadata; left out where a unit is one meter."""
 UNIT_TOLERANCE = 1e-6
@@ -46,19 +43,8 @@ def read_unit(value: dict) -> float:
     Raises:
         ValueError: the entry is not a positive number.
     """
-    meters = value.get(METRES_PER_UNIT, 1.0)
-    if type(meters) not in (int, float) or not math.isfinite(meters) or meters <= 0:
-        raise ValueError(f"'{METRES_PER_UNIT}' is {meters!r}, and must be a number above 0")
-    return float(meters)
-
-
-def read_name(value: object) -> str:
-    """Check a name that was read from a file, and return it; raise TypeError or ValueError where it is invalid."""
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is not a name")
-    if len(value) > MAX_NAME_LENGTH:
-        raise ValueError(f"a name has {len(value)} characters")
-    return value
+    check_json(value, {f"{METRES_PER_UNIT}?": POSITIVE})
+    return float(value.get(METRES_PER_UNIT, 1.0))
 
 
 @dataclass(frozen=True)
@@ -86,19 +72,17 @@ def read_joints(values: list) -> tuple[Joint, ...]:
     """Read the joints of a recording or model.
 
     Raises:
-        KeyError, TypeError, ValueError: the joints are damaged, two have the same name, or a joint comes before its
+        TypeError, ValueError: the joints are damaged, two have the same name, or a joint comes before its
             parent.
     """
-    if not isinstance(values, list):
-        raise TypeError("its joints are not a list")
-    joints = tuple(Joint(read_name(value["name"]), value["parent"], value.get("reference")) for value in values)
+    indices = range(-1, len(values))
+    check_json(values, [{"name": str, "parent": indices, "reference?": indices[1:]}], "joints")
+    joints = tuple(Joint(value["name"], value["parent"], value.get("reference")) for value in values)
     if not joints or len({joint.name for joint in joints}) != len(joints):
         raise ValueError("it has no joints, or two of one name")
     for index, joint in enumerate(joints):
-        if type(joint.parent) is not int or not -1 <= joint.parent < index:
+        if joint.parent >= index:
             raise ValueError(f"a joint comes before its parent: the parent of joint {joint.name!r} is {joint.parent!r}")
-        if joint.reference is not None and not (type(joint.reference) is int and 0 <= joint.reference < len(joints)):
-            raise ValueError(f"the reference joint of joint {joint.name!r} is {joint.reference!r}")
     reference_order(joints)
     return joints
 
@@ -144,11 +128,10 @@ class Fingerprint:
 
     @staticmethod
     def from_json(value: dict) -> "Fingerprint":
-        """Read a fingerprint from a file; raise KeyError, TypeError or ValueError where it is damaged."""
-        hashes = [value[name] for name in ("topology", "rest_positions", "skin_weights")]
-        if not all(isinstance(text, str) and len(text) <= MAX_HASH_LENGTH for text in hashes):
-            raise ValueError("its fingerprint has no valid hashes")
-        return Fingerprint(*hashes, check_deformation(value.get("deformation", {})))
+        """Read a fingerprint from a file; raise ValueError where it is damaged."""
+        names = ("topology", "rest_positions", "skin_weights")
+        check_json(value, {**dict.fromkeys(names, str), "deformation?": DEFORMATION_KEYS}, "fingerprint")
+        return Fingerprint(*(value[name] for name in names), value.get("deformation", {}))
 
     @staticmethod
     def digest(*arrays: np.ndarray) -> str:
@@ -200,13 +183,12 @@ def read_meshes(values: list) -> tuple[MeshPart, ...]:
     """Read the meshes of a recording or model.
 
     Raises:
-        KeyError, TypeError, ValueError: the meshes are damaged, or two have the same name.
+        ValueError: the meshes are damaged, or two have the same name.
     """
-    if not isinstance(values, list):
-        raise TypeError("its meshes are not a list")
+    check_json(values, [{"name": str, "vertices": COUNT[1:], "fingerprint": {}, "transform?": [NUMBER]}], "meshes")
     meshes = tuple(
         MeshPart(
-            read_name(value["name"]),
+            value["name"],
             value["vertices"],
             Fingerprint.from_json(value["fingerprint"]),
             tuple(map(float, value.get("transform", IDENTITY))),
@@ -216,9 +198,7 @@ def read_meshes(values: list) -> tuple[MeshPart, ...]:
     if not meshes or len({mesh.name for mesh in meshes}) != len(meshes):
         raise ValueError("it has no meshes, or two of one name")
     for mesh in meshes:
-        if type(mesh.vertices) is not int or mesh.vertices < 1:
-            raise ValueError(f"the mesh {mesh.name!r} has {mesh.vertices!r} vertices")
-        if len(mesh.transform) != 16 or not np.isfinite(mesh.transform).all() or not np.linalg.det(mesh.matrix[:3, :3]):
+        if len(mesh.transform) != 16 or not np.linalg.det(mesh.matrix[:3, :3]):
             raise ValueError(f"the transform of the mesh {mesh.name!r} is {mesh.transform}")
     if meshes[0].transform != IDENTITY:
         raise ValueError("its first mesh has a transform")

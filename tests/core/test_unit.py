@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The length of a mesh unit is stored in recordings and models, and errors in millimeters are computed with it."""
 
-import json
 from dataclasses import replace
 
 import pytest
 
-from fdda_addon.core.formats.model_info import ModelInfo
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .limb import make_rig, random_poses, random_positions, recording_info
-from .tiny_model import tiny_info
-
-INVALID_LENGTHS = (0, -0.01, float("nan"), float("inf"), "0.01", None, True, [0.01])
 
 
 def record_in_unit(path, metres_per_unit: float, complete: int = 6, resume: bool = False):
@@ -31,10 +26,3 @@ def test_a_resumed_recording_keeps_its_unit(tmp_path, first_unit, resumed_unit):
     record_in_unit(tmp_path / "recording", first_unit, complete=3)
     record_in_unit(tmp_path / "recording", resumed_unit, resume=True)
     assert read_recording(tmp_path / "recording").rig.metres_per_unit == first_unit
-
-
-@pytest.mark.parametrize("metres_per_unit", INVALID_LENGTHS)
-def test_model_metadata_with_an_invalid_unit_is_refused(metres_per_unit):
-    text = json.dumps({**json.loads(tiny_info().to_json()), "metres_per_unit": metres_per_unit})
-    with pytest.raises(ValueError, match=r"'metres_per_unit' is .*, and must be a number above 0"):
-        ModelInfo.from_json(text)

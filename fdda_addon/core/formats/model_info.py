@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from ..controls import Control, owners_from_mesh, read_controls
+from ..json_check import COUNT, NUMBER, check_json
 from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import Partition, make_partitions
 from ..mathematics.poses import CONTROL, Channel
@@ -186,47 +187,40 @@ class ModelInfo:
 def _read_info(value: dict) -> ModelInfo:
     if value["version"] != VERSION:
         raise ValueError(f"it is of version {value['version']!r} and this add-on reads version {VERSION}")
-    joints = read_joints(value["joints"])
+    joints, controls = read_joints(value["joints"]), read_controls(value.get("controls", []))
+    joint, control, ranges = range(len(joints)), range(len(controls)), [[NUMBER]]
+    partition_keys = {
+        **{"joint": joint, "influencing": [joint], "vertices": COUNT[1:], "basis": COUNT},
+        **{"controls?": [control], "merged?": [joint]},
+    }
+    keys = {
+        **{"rest_matrices": ranges, "meshes": [{}], "partitions": [partition_keys]},
+        **{"training_ranges": {"low": ranges, "high": ranges}, "held_out_mm": {str: NUMBER}, "parity_mm": NUMBER},
+        **{"training": {f"{LIMITS_KEY}?": [{}]}, "constant_bytes?": COUNT},
+    }
+    check_json(value, keys)
     partitions = tuple(
         ModelPartition(
-            *(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"])),
-            *(tuple(map(int, p.get(key, ()))) for key in ("controls", "merged")),
+            *(p["joint"], tuple(p["influencing"]), p["vertices"], p["basis"]),
+            *(tuple(p.get(key, ())) for key in ("controls", "merged")),
         )
         for p in value["partitions"]
     )
-    controls = read_controls(value.get("controls", []))
-    joint_count = len(joints)
-    if not all(0 <= joint < joint_count for p in partitions for joint in (p.joint, *p.influencing, *p.merged)):
-        raise ValueError("a partition names a joint that is none of its joints")
-    if not all(0 <= control < len(controls) for p in partitions for control in p.controls):
-        raise ValueError("a partition names a control that is none of its controls")
-    if not partitions or not all(p.vertices > 0 and p.basis >= 0 for p in partitions):
-        raise ValueError("it has no partitions, or one without vertices")
     meshes = read_meshes(value["meshes"])
     if sum(p.vertices for p in partitions) != sum(mesh.vertices for mesh in meshes):
         raise ValueError("the partitions do not add up to the vertices")
-    rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(joint_count, 4, 4)
-    if not np.isfinite(rest_matrices).all():
-        raise ValueError("its rest pose holds values that are not numbers")
     info = ModelInfo(
         joints,
-        rest_matrices,
+        np.array(value["rest_matrices"], np.float32).reshape(len(joints), 4, 4),
         meshes,
         partitions,
-        np.array(value["training_ranges"]["low"], np.float32).reshape(joint_count, 12),
-        np.array(value["training_ranges"]["high"], np.float32).reshape(joint_count, 12),
+        *(np.array(value["training_ranges"][key], np.float32).reshape(len(joints), 12) for key in ("low", "high")),
         controls,
-        {str(name): float(error) for name, error in value["held_out_mm"].items()},
-        float(value["parity_mm"]),
-        dict(value["training"]),
+        value["held_out_mm"],
+        value["parity_mm"],
+        value["training"],
         read_unit(value),
-        int(value.get("constant_bytes", 0)),
+        value.get("constant_bytes", 0),
     )
-    if info.constant_bytes < 0:
-        raise ValueError(f"its constants are said to take {info.constant_bytes} bytes")
-    if not isinstance(info.training.get(LIMITS_KEY, []), list) or not all(info.limits):
-        raise ValueError("its range of motion cannot be read")
-    info.skin_sentence  # noqa: B018 - raises an error if the metadata is damaged
-    if not np.isfinite([*info.held_out_mm.values()]).all():
-        raise ValueError("its errors are not numbers")
+    _ = info.limits, info.skin_sentence  # raises an error if the metadata is damaged
     return info

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from ..json_check import COUNT, NUMBER, check_json
 from ..rig import KEY_JOINTS_PREFIX, STATIC_JOINT, Fingerprint, Joint, Rig
 from ..settings import AUTO, parse_joints
 from ..wording import format_list
@@ -42,18 +43,15 @@ class KeyJointReport:
         """Read the JSON of `to_json`.
 
         Raises:
-            KeyError, TypeError, ValueError: the JSON is damaged.
+            ValueError: the JSON is damaged.
         """
-        counts = [value[name] for name in ("joints", "rig_joints")]
-        if any(type(count) is not int or count < 0 for count in counts):
-            raise ValueError("the key joints are not counted by numbers")
-        lost = [value[name] for name in ("independent", "still")]
-        if not all(isinstance(names, list | tuple) and all(isinstance(name, str) for name in names) for names in lost):
-            raise ValueError("the joints that are not read have no names")
-        distances = [float(value[name]) for name in ("unexplained_mm", "tolerance_mm")]
-        if not np.isfinite(distances).all() or not isinstance(value["requested"], str):
-            raise ValueError("the errors of key joints are not numbers")
-        return KeyJointReport(parse_joints(value["requested"]), *counts, *distances, *map(tuple, lost))
+        keys = {
+            **{"requested": str, "joints": COUNT, "rig_joints": COUNT, "unexplained_mm": NUMBER},
+            **{"tolerance_mm": NUMBER, "independent": [str], "still": [str]},
+        }
+        check_json(value, keys, "key joints")
+        values = {key: tuple(value[key]) if isinstance(value[key], list) else value[key] for key in keys}
+        return KeyJointReport(**values | {"requested": parse_joints(value["requested"])})
 
     def sentence(self) -> str:
         """Describe the choice, and what is lost."""

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from ..json_check import COUNT, NUMBER, Interval, check_json
 from ..settings import SPREAD
 
 ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL = "rotation", "rotation_vector", "location", "scale", "control"
@@ -13,8 +14,6 @@ CHANNEL_KINDS = (ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL)
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
 
-MAX_CHANNEL_NAME_LENGTH = 2100
-"""Largest number of characters of a channel's name in a file; the name of a control has an owner and a path."""
 OVERSHOOT_POSE_RATIO = 0.25
 """Ratio of the random poses that lie in the overshoot (`Overshoot`)."""
 MAX_OVERSHOOT = 4.0
@@ -69,19 +68,12 @@ class Channel:
         """Read a channel from a file.
 
         Raises:
-            KeyError, TypeError, ValueError: it is damaged.
+            TypeError, ValueError: it is damaged.
         """
+        kinds = {"kind": set(CHANNEL_KINDS), "axis": range(3), "is_key?": bool}
+        check_json(value, {"bone": str, **kinds, "low": NUMBER, "high": NUMBER}, "its range of motion")
         values = dict(value)
         channel = Channel(values.pop("bone"), **values)
-        if not isinstance(channel.name, str) or not 0 < len(channel.name) <= MAX_CHANNEL_NAME_LENGTH:
-            raise ValueError(f"its range of motion is of a bone called {channel.name!r}")
-        if channel.kind not in CHANNEL_KINDS or type(channel.axis) is not int or channel.axis not in range(3):
-            raise ValueError(f"its range of motion of {channel.name!r} is of {channel.kind!r}, axis {channel.axis!r}")
-        if type(channel.is_key) is not bool:
-            raise ValueError(f"its range of motion of {channel.name!r} has is_key {channel.is_key!r}")
-        for limit in (channel.low, channel.high):
-            if type(limit) not in (int, float) or not np.isfinite(float(limit)):
-                raise ValueError(f"its range of motion of {channel.name!r} ends at {limit!r}")
         if channel.low > channel.high:
             raise ValueError(f"its range of motion of {channel.name!r} is {channel.low} to {channel.high}")
         return channel
@@ -153,16 +145,11 @@ class Overshoot:
         """Read an overshoot from a file.
 
         Raises:
-            KeyError, TypeError, ValueError: it is damaged.
+            TypeError, ValueError: it is damaged.
         """
-        factor, poses = value["factor"], value["poses"]
-        if type(factor) not in (int, float) or not 1 < factor <= MAX_OVERSHOOT:
-            raise ValueError(f"its overshoot is {factor!r} times the range")
-        if type(poses) is not int or poses < 0:
-            raise ValueError(f"its overshoot has {poses!r} poses")
-        if not isinstance(value["limits"], list):
-            raise TypeError("the limits of its overshoot are not a list")
-        return Overshoot(float(factor), poses, tuple(Channel.from_json(channel) for channel in value["limits"]))
+        check_json(value, {"factor": Interval(1, MAX_OVERSHOOT), "poses": COUNT, "limits": [{}]}, "its overshoot")
+        channels = tuple(Channel.from_json(channel) for channel in value["limits"])
+        return Overshoot(float(value["factor"]), value["poses"], channels)
 
 
 def make_overshoot(

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from ..json_check import COUNT, NUMBER, check_json
 from .key_joints import KeyJointReport
 
 FIT_KINDS = ("hard", "smooth")
@@ -67,12 +68,13 @@ class SkinFit:
         """Read the JSON of `to_json`.
 
         Raises:
-            KeyError, TypeError, ValueError: the JSON is damaged.
+            ValueError: the JSON is damaged.
         """
-        if value["kind"] not in FIT_KINDS or type(value["poses"]) is not int or value["poses"] < 0:
-            raise ValueError(f"skin weights were fitted {value['kind']!r} to {value['poses']!r} poses")
+        distances = {"rig": NUMBER, "fitted": NUMBER}
+        errors = {"rms_mm": distances, "max_mm": distances}
+        check_json(value, {"kind": set(FIT_KINDS), "poses": COUNT, **errors, "training": errors}, "fit")
         key_joints = KeyJointReport.from_json(value["key_joints"]) if "key_joints" in value else None
-        reports = _read_fit_report(value), _read_fit_report(value["training"])
+        reports = (FitReport(errors["rms_mm"], errors["max_mm"]) for errors in (value, value["training"]))
         return SkinFit(value["kind"], value["poses"], *reports, key_joints)
 
     def sentence(self) -> str:
@@ -86,16 +88,6 @@ class SkinFit:
             f"{self.training.format_errors('fitted')} on the {training} poses of the fit, "
             f"{self.training.format_errors('rig')} with the rig's own."
         )
-
-
-def _read_fit_report(value: dict) -> FitReport:
-    distances = [
-        {weights_kind: float(value[name][weights_kind]) for weights_kind in ("rig", "fitted")}
-        for name in ("rms_mm", "max_mm")
-    ]
-    if not np.isfinite([list(values.values()) for values in distances]).all():
-        raise ValueError("the errors of a fit are not numbers")
-    return FitReport(*distances)
 
 
 def are_skin_weights(joints: np.ndarray, weights: np.ndarray, joint_count: int) -> bool:

@@ -2,7 +2,6 @@
 """The index of a recording, `recording.json`, and `bones.json`, which does not change while poses are appended."""
 
 import json
-import math
 from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,9 +10,10 @@ from ..controls import read_controls
 from ..errors import OutputError, RecordingError, os_error_text
 from ..files.input_file import read_input
 from ..files.output import atomic_write, to_json_text
+from ..json_check import COUNT, NOT_NEGATIVE, POSITIVE, WHOLE, check_json
 from ..mathematics.poses import CONTROL, Channel, Overshoot
 from ..mathematics.surface import MIN_CORNERS
-from ..rig import read_joints, read_meshes, read_name, read_unit
+from ..rig import read_joints, read_meshes, read_unit
 
 FORMAT = "fdda-recording"
 VERSION = 2
@@ -74,22 +74,11 @@ class RecordedTarget:
 
     @staticmethod
     def from_json(value: dict) -> "RecordedTarget":
-        """Read a target from a file; raise ValueError, TypeError or KeyError where it is damaged."""
-        target = RecordedTarget(
-            read_name(value["object"]),
-            value["follows"],
-            value["pre_roll"],
-            value.get("settle_frames", 0),
-            value.get("rest_threshold_mm", 0.0),
-        )
-        if target.follows not in FOLLOWS_VALUES:
-            raise ValueError(f"its target follows {target.follows!r}")
-        for frame_count in (target.pre_roll, target.settle_frames):
-            if type(frame_count) is not int or frame_count < 0:
-                raise ValueError(f"its target has {frame_count!r} frames")
-        if type(target.rest_threshold_mm) not in (int, float) or not 0 <= target.rest_threshold_mm < math.inf:
-            raise ValueError(f"its target rests below {target.rest_threshold_mm!r} mm")
-        return target
+        """Read a target from a file; raise ValueError where it is damaged."""
+        rest_keys = {"settle_frames?": COUNT, "rest_threshold_mm?": NOT_NEGATIVE}
+        check_json(value, {"object": str, "follows": set(FOLLOWS_VALUES), "pre_roll": COUNT, **rest_keys}, "target")
+        rest = value.get("settle_frames", 0), value.get("rest_threshold_mm", 0.0)
+        return RecordedTarget(value["object"], value["follows"], value["pre_roll"], *rest)
 
 
 def repeated_poses(count: int, unsettled: Collection[int]) -> list[int]:
@@ -100,20 +89,6 @@ def repeated_poses(count: int, unsettled: Collection[int]) -> list[int]:
         unsettled: indices of the poses in which the target did not come to rest.
     """
     return [index for index in range(count) if index not in unsettled][:REPEATED_POSES]
-
-
-def read_repeatability(index: dict) -> float | None:
-    """Return the mean distance of a target from itself in poses that are reached from two directions, mm.
-
-    No model can have a smaller error. It is None where it was not measured.
-
-    Raises:
-        ValueError: it is no distance.
-    """
-    repeatability_mm = index.get("repeatability_mm")
-    if repeatability_mm is not None and (type(repeatability_mm) is not float or not 0 <= repeatability_mm < math.inf):
-        raise ValueError(f"repeated poses are {repeatability_mm!r} mm apart")
-    return repeatability_mm
 
 
 def repeatability_sentence(repeatability_mm: float | None) -> str:
@@ -154,15 +129,12 @@ class RecordedBones:
         """Read the JSON of `to_json`.
 
         Raises:
-            KeyError, TypeError, ValueError: the JSON is damaged.
+            ValueError: the JSON is damaged.
         """
-        for key in ("dependencies", "fixed"):
-            if not all(type(joint) is int and 0 <= joint < joint_count for joint in value[key]):
-                raise ValueError(f"'{key}' are none of its {joint_count} joints")
-        sources = {read_name(name): list(map(read_name, names)) for name, names in value["sources"].items()}
-        settings = {read_name(name): dict(bone) for name, bone in value["settings"].items()}
-        joints = (tuple(value[key]) for key in ("dependencies", "fixed"))
-        return RecordedBones(*joints, tuple(map(read_name, value["controlled"])), sources, settings)
+        indices = [range(joint_count)]
+        keys = {"dependencies": indices, "fixed": indices, "controlled": [str]}
+        check_json(value, {**keys, "sources": {str: [str]}, "settings": {str: {}}})
+        return RecordedBones(*(tuple(value[key]) for key in keys), value["sources"], value["settings"])
 
 
 @dataclass(frozen=True)
@@ -239,17 +211,16 @@ class AloneMoves:
         """Read the JSON of `to_json`, given the numbers of joints and controls.
 
         Raises:
-            KeyError, TypeError, ValueError: the JSON is damaged.
+            TypeError, ValueError: the JSON is damaged.
         """
-        if type(value["bases"]) is not int or value["bases"] < 1:
-            raise ValueError(f"inputs move from {value['bases']!r} base poses")
+        control_indices = [range(controls)]
+        check_json(value, {"bases": COUNT[1:], "keys": control_indices, "undetectable": control_indices}, "alone")
         inputs = tuple((kind, tuple(indices)) for kind, *indices in value["inputs"])
-        others = tuple(value["keys"]), tuple(value["undetectable"])
-        for kind, indices in (*inputs, *((CONTROL, indices) for indices in others)):
+        for kind, indices in inputs:
             if kind not in (JOINT, CONTROL) or (kind == JOINT and len(indices) != 1):
                 raise ValueError(f"a moved input is {kind!r} {indices!r}")
-            _check_indices(list(indices), kind, joints if kind == JOINT else controls, "a moved input")
-        return AloneMoves(value["bases"], inputs, *others)
+            check_json(list(indices), [range(joints)] if kind == JOINT else control_indices, f"a moved {kind}")
+        return AloneMoves(value["bases"], inputs, tuple(value["keys"]), tuple(value["undetectable"]))
 
 
 @dataclass(frozen=True)
@@ -264,7 +235,8 @@ class RecordingInfo:
         bones: the bones of the rig.
         target: target whose surface was recorded; None where the rig itself was recorded.
         unsettled: ascending indices of the poses in which the target did not come to rest.
-        repeatability_mm: as of `read_repeatability`.
+        repeatability_mm: mean distance of the target from itself in poses that are reached from two directions, mm; None
+            where it was not measured.
         alone: the poses in which one input moves alone; None where the target depends on time.
     """
 
@@ -317,10 +289,7 @@ def read_index(path: Path) -> dict:
 def _read_json(path: Path, check: Callable[[dict], object]) -> dict:
     """Read a JSON file and check its value; `check` may raise the errors of damaged JSON."""
     try:
-        # Python accepts NaN and infinity, which JSON does not permit.
-        invalid_constants: list[str] = []
-        data = read_input(path, MAX_INDEX_BYTES, follow_links=False)
-        value = json.loads(data, parse_constant=lambda name: invalid_constants.append(name) or float(name.lower()))
+        value = json.loads(read_input(path, MAX_INDEX_BYTES, follow_links=False))
     except FileNotFoundError as error:
         raise RecordingError(
             f"'{path.parent}' is not a recording: it has no {path.name}; make one with record."
@@ -331,36 +300,33 @@ def _read_json(path: Path, check: Callable[[dict], object]) -> dict:
         raise RecordingError(f"'{path}' cannot be read ({error}); record again with --overwrite.") from error
     try:
         check(value)
-        if invalid_constants:
-            raise ValueError(f"it holds {invalid_constants[0]}, which is no number")
-    except KeyError as error:
-        raise RecordingError(f"'{path}' is damaged: it lacks {error}; record again.") from error
-    except (TypeError, AttributeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError) as error:
         raise RecordingError(f"'{path}' is damaged: {error}; record again.") from error
     return value
 
 
+_INDEX_KEYS = {
+    **{"poses": COUNT, "complete": COUNT, "influences": range(1, MAX_INFLUENCES + 1)},
+    **{"faces?": COUNT, "corners?": COUNT, "blender": str, "rig": {"file": str}, "unsettled?": [COUNT]},
+    "repeatability_mm?": NOT_NEGATIVE,
+    **{"joints": [{}], "meshes": [{}], "controls": [{}]},
+    "sampling": {
+        **{"seed": COUNT, "spread": POSITIVE, "limits": [{}]},
+        "sources": [{"kind": set(SOURCE_KINDS), "poses": COUNT, "name": str, "frames": [WHOLE]}],
+    },
+}
+
+
 def _check_index(index: dict) -> None:
-    for key in ("poses", "complete", "influences"):
-        if type(index[key]) is not int or index[key] < 0:
-            raise ValueError(f"'{key}' is {index[key]!r}")
-    if index["complete"] > index["poses"] or not index["influences"]:
+    check_json(index, _INDEX_KEYS)
+    if index["complete"] > index["poses"] or any(pose >= index["complete"] for pose in index.get("unsettled", ())):
         raise ValueError("its counts contradict each other")
-    if index["influences"] > MAX_INFLUENCES:
-        raise ValueError(f"its vertices have {index['influences']} skin weights each, and {MAX_INFLUENCES} is the most")
-    for key in ("faces", "corners"):
-        if type(index.get(key, 0)) is not int or index.get(key, 0) < 0:
-            raise ValueError(f"'{key}' is {index[key]!r}")
     if index.get("corners", 0) < MIN_CORNERS * index.get("faces", 0):
         raise ValueError(f"{index['faces']} faces cannot have {index.get('corners', 0)} corners")
     read_controls(index["controls"])
-    for text in (index["blender"], index["rig"]["file"]):
-        if not isinstance(text, str):
-            raise TypeError(f"{text!r} is not a string")
     read_joints(index["joints"])
     read_meshes(index["meshes"])
     read_unit(index)
-    _check_indices(index.get("unsettled", []), "unsettled pose", index["complete"], "it")
     info = read_info(index)
     alone_counts = [source.poses for source in info.sampling.sources if source.kind == ALONE]
     expected_counts = [info.alone.poses] if info.alone else []
@@ -368,59 +334,26 @@ def _check_index(index: dict) -> None:
         raise ValueError(f"it has {alone_counts} poses in which one input moves alone, not {expected_counts}")
 
 
-def _check_indices(values: list, noun: str, count: int, owner: str) -> None:
-    """Raise TypeError or ValueError where values are not a list of distinct indices below a count."""
-    if not isinstance(values, list):
-        raise TypeError(f"{owner} has {noun}s that are not a list")
-    for value in values:
-        if type(value) is not int or not 0 <= value < count:
-            raise ValueError(f"{owner} has {noun} {value!r} of {count}")
-    if len(set(values)) != len(values):
-        raise ValueError(f"{owner} has the same {noun} twice")
-
-
-def _read_source(value: dict) -> Source:
-    source = Source(value["kind"], value["poses"], read_name(value["name"]), tuple(value["frames"]))
-    if source.kind not in SOURCE_KINDS:
-        raise ValueError(f"a source is of the kind {source.kind!r}")
-    if type(source.poses) is not int or source.poses < 0:
-        raise ValueError(f"a source has {source.poses!r} poses")
-    if len(source.frames) != 2 or not all(type(frame) is int for frame in source.frames):
-        raise ValueError(f"a source has the frames {source.frames!r}")
-    return source
-
-
 def read_info(index: dict) -> RecordingInfo:
     """Return the pose counts and the origin of a recording from its index, which may lack its `bones`.
 
     Raises:
-        KeyError, TypeError, ValueError: the index is damaged.
+        TypeError, ValueError: the index is damaged.
     """
-    joint_count, control_count = len(index["joints"]), len(index["controls"])
-    value = index["sampling"]
-    seed, spread = value["seed"], value["spread"]
-    if type(seed) is not int or seed < 0:
-        raise ValueError(f"its seed is {seed!r}")
-    if type(spread) not in (int, float) or not 0 < spread < math.inf:
-        raise ValueError(f"its spread is {spread!r}")
-    if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
-        raise TypeError("its range of motion or its sources are not a list")
-    sources = tuple(_read_source(source) for source in value["sources"])
+    joint_count, control_count, value = len(index["joints"]), len(index["controls"]), index["sampling"]
+    sources = tuple(Source(s["kind"], s["poses"], s["name"], tuple(s["frames"])) for s in value["sources"])
     overshoot = Overshoot.from_json(value["overshoot"]) if "overshoot" in value else None
-    random_pose_count = sum(source.poses for source in sources if source.kind == RANDOM)
-    if overshoot and overshoot.poses > random_pose_count:
-        raise ValueError(f"{overshoot.poses} of its {random_pose_count} random poses lie in the overshoot")
     channels = tuple(Channel.from_json(channel) for channel in value["limits"])
     return RecordingInfo(
         index["poses"],
         index["complete"],
         index["rig"]["file"],
         index["blender"],
-        Sampling(seed, float(spread), channels, sources, overshoot),
+        Sampling(value["seed"], float(value["spread"]), channels, sources, overshoot),
         RecordedBones.from_json(index["bones"], joint_count) if "bones" in index else RecordedBones(),
         RecordedTarget.from_json(index["target"]) if "target" in index else None,
         tuple(index.get("unsettled", ())),
-        read_repeatability(index),
+        index.get("repeatability_mm"),
         AloneMoves.from_json(index["alone"], joint_count, control_count) if "alone" in index else None,
     )
 

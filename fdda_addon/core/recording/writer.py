@@ -37,7 +37,6 @@ from .index import (
     Source,
     find_different_keys,
     read_index,
-    read_repeatability,
     write_json,
 )
 from .lock import RecordingLock
@@ -118,7 +117,7 @@ class RecordingWriter:
     def _read_previous(self, previous: dict) -> None:
         """Read the state of the recording at `path` from its index, and check that it can be continued."""
         self.complete, self.unsettled = previous["complete"], list(previous.get("unsettled", ()))
-        self.repeatability_mm = read_repeatability(previous)
+        self.repeatability_mm = previous.get("repeatability_mm")
         # The scale of an object may be animated; no array depends on it.
         self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
         # Convert it to JSON text and back, so that it equals what is read from a file.
@@ -230,7 +229,7 @@ class RecordingWriter:
             raise self._write_error(error) from error
 
     def set_repeatability(self, repeatability_mm: float) -> None:
-        """Write the repeatability of the target (`read_repeatability`) to the index.
+        """Write the repeatability of the target (`RecordingInfo`) to the index.
 
         Raises:
             OutputError: the disk is full or was disconnected.

