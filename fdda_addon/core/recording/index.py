@@ -235,8 +235,8 @@ class RecordingInfo:
         bones: the bones of the rig.
         target: target whose surface was recorded; None where the rig itself was recorded.
         unsettled: ascending indices of the poses in which the target did not come to rest.
-        repeatability_mm: mean distance of the target from itself in poses that are reached from two directions, mm; None
-            where it was not measured.
+        repeatability_mm: mean distance of the target from itself in poses that are reached from two directions, mm;
+            None where it was not measured.
         alone: the poses in which one input moves alone; None where the target depends on time.
     """
 
