@@ -16,7 +16,7 @@ from ..rig.references import (
     references,
 )
 from ..rig.sources import Sources
-from ..scene.compatibility import accepts_slot, curves_of_slot, node_input
+from ..scene.compatibility import accepts_slot, curves_of_slot, node_input_settings
 from ..scene.node_groups import read_bone_names
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
@@ -151,10 +151,9 @@ def _modifier_needs(scene_object: bpy.types.Object, modifier: bpy.types.Modifier
     if modifier.type in _COLLIDING_MODIFIERS:
         yield from (Node(o) for o in bpy.data.objects if _moves_simulations(o))
     if modifier.type == "NODES" and modifier.node_group is not None:
-        for item in modifier.node_group.interface.items_tree:
-            value = node_input(modifier, item.identifier) if item.item_type == "SOCKET" else None
-            if isinstance(value, bpy.types.ID):
-                yield Node(value)
+        yield from (
+            Node(value) for _, value in node_input_settings(modifier).values() if isinstance(value, bpy.types.ID)
+        )
         if bone_names := set(read_bone_names(modifier.node_group)):
             bones = ((o, bone.name) for o in bpy.data.objects if is_armature(o) for bone in o.data.bones)
             yield from (Node(o, name) for o, name in bones if "" in bone_names or name in bone_names)

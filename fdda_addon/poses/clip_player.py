@@ -80,37 +80,26 @@ class Mirror:
         matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
         tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)
         reflection = np.diag([-1.0, 1.0, 1.0, 1.0])
-        mirror_images = reflection @ matrices[partner_indices] @ reflection
-        bone_ends = np.concatenate([matrices[:, :3, 3], tails])
-        metres_per_armature_unit = metres_per_unit(armature_object)
-        size = metres_per_armature_unit * float(np.ptp(bone_ends, axis=0).max())
-        tolerance = max(MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE * size)
-        distances = metres_per_armature_unit * np.maximum(
-            np.linalg.norm(mirror_images[:, :3, 3] - matrices[:, :3, 3], axis=1),
+        offsets = reflection @ matrices[partner_indices] @ reflection - matrices
+        distances = np.maximum(
+            np.linalg.norm(offsets[:, :3, 3], axis=1),
             np.linalg.norm(tails[partner_indices] * [-1, 1, 1] - tails, axis=1),
         )
-        axis_distances = np.linalg.norm(mirror_images[:, :3, :3] - matrices[:, :3, :3], axis=1).max(axis=1)
-        for index, bone in enumerate(bones):
-            partner = bones[int(partner_indices[index])]
-            if distances[index] > tolerance:
-                difference = f"by {distances[index] * 1000:.1f} mm"
-            elif axis_distances[index] > AXIS_TOLERANCE:
-                angle = np.degrees(2 * np.arcsin(min(1.0, axis_distances[index] / 2)))
-                difference = f"in roll or direction, by {angle:.1f}°"
-            elif (
-                armature_object.pose.bones[bone.name].rotation_mode
-                != armature_object.pose.bones[partner.name].rotation_mode
-            ):
-                difference = "in rotation mode"
-            else:
+        size = float(np.ptp(np.concatenate([matrices[:, :3, 3], tails]), axis=0).max())
+        tolerance = max(MIN_DISTANCE_TOLERANCE / metres_per_unit(armature_object), RELATIVE_DISTANCE_TOLERANCE * size)
+        is_apart = (distances > tolerance) | (np.linalg.norm(offsets[:, :3, :3], axis=1).max(axis=1) > AXIS_TOLERANCE)
+        for index, bone in enumerate(armature_object.pose.bones):
+            partner, expected_name = armature_object.pose.bones[int(partner_indices[index])], flipped_name(bone.name)
+            if not is_apart[index] and bone.rotation_mode == partner.rotation_mode:
                 continue
-            name, expected_partner_name = bone.name, flipped_name(bone.name)
+            problem = f"the bone '{bone.name}' differs from its mirror image; bring it into the middle"
             if partner != bone:
-                problem = f"the bones '{name}' and '{partner.name}' differ {difference}; symmetrize the armature"
-            elif expected_partner_name != name:
-                problem = f"there is no bone '{expected_partner_name}' for '{name}'; add it"
-            else:
-                problem = f"the bone '{name}' differs from its mirror image {difference}; bring it into the middle"
+                problem = (
+                    f"the bones '{bone.name}' and '{partner.name}' differ in place, roll, direction or rotation mode; "
+                    "symmetrize the armature"
+                )
+            elif expected_name != bone.name:
+                problem = f"there is no bone '{expected_name}' for '{bone.name}'; add it"
             raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
         escape = bpy.utils.escape_identifier
         paths = {

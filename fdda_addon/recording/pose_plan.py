@@ -5,9 +5,10 @@ In some of these, the reference joints of the rig are found. A user can see rand
 """
 
 from collections.abc import Callable, Collection, Container, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from copy import copy
 from dataclasses import replace
+from functools import partial
 
 import bpy
 import numpy as np
@@ -80,28 +81,18 @@ class PosePlan:
 
         Limit constraints are disabled while an overshoot pose is set.
         """
-        random_count, overshoot = self.random_count, self._overshoot
-        with self._random_poses_prepared():
-            set_pose = Poser(self._scene_rig, self._channels).set
-            for index in range(self.in_range_count):
+        overshoot, channels = self._overshoot, self._channels
+        with self._random_poses_prepared(), ExitStack() as stack:
+            set_pose = Poser(self._scene_rig, channels).set
+            for index in range(self.random_count):
+                if overshoot and index == self.in_range_count:
+                    channels = overshoot.channels
+                    limits = stack.enter_context(SuspendedLimits(self._scene_rig.armature_object, channels))
+                    set_pose = partial(_set_beyond_range, Poser(self._scene_rig, channels), limits)
                 if index in pose_indices:
-                    self.pose_setter.set_pose(self._make_transition(self._channels, index, set_pose))
+                    self.pose_setter.set_pose(self._make_transition(channels, index, set_pose))
                     yield index
-            if overshoot:
-                set_pose = Poser(self._scene_rig, overshoot.channels).set
-                with SuspendedLimits(self._scene_rig.armature_object, overshoot.channels) as limits:
-
-                    def set_beyond_range(values: np.ndarray) -> None:
-                        set_pose(values)
-                        limits.suspend(values)
-
-                    for index in range(self.in_range_count, random_count):
-                        if index in pose_indices:
-                            self.pose_setter.set_pose(
-                                self._make_transition(overshoot.channels, index, set_beyond_range)
-                            )
-                            yield index
-        clip_start = random_count
+        clip_start = self.random_count
         for clip in self._clips:
             frame_indices = [index for index in range(len(clip.frames)) if clip_start + index in pose_indices]
             for index in self.pose_setter.show_frames(player, clip, frame_indices):
@@ -129,6 +120,11 @@ class PosePlan:
         is_in_range = index < self.in_range_count or index >= REPEATABILITY_INDEX_OFFSET
         sampler = self._sampler if is_in_range else replace(self._sampler, remix=None)
         return blend_from_rest(set_pose, channels, sampler.draw_pose(channels, index))
+
+
+def _set_beyond_range(poser: Poser, limits: SuspendedLimits, values: np.ndarray) -> None:
+    poser.set(values)
+    limits.suspend(values)
 
 
 MAX_POSES = 24

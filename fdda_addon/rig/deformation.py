@@ -118,9 +118,7 @@ def _copy(value: object) -> object:
 def _read_modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
     """Read name, type and settings of a modifier; animated settings are None."""
     if modifier.type == "NODES":
-        items = modifier.node_group.interface.items_tree if modifier.node_group is not None else ()
-        sockets = [item for item in items if item.item_type == "SOCKET" and item.in_out == "INPUT"]
-        settings = {k: v for socket in sockets for k, v in node_input_settings(modifier, socket.identifier).items()}
+        settings = node_input_settings(modifier)
     else:
         properties = [p for p in modifier.bl_rna.properties if p.identifier not in _COMMON_PROPERTIES]
         bind_property = BIND_PROPERTIES.get(modifier.type)

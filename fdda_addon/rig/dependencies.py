@@ -41,9 +41,8 @@ def controls_of_other_armatures(scene_rig: SceneRig, sources: Sources) -> Iterat
                 if bounds is not None and bounds[0] < bounds[1]:
                     owner = f"{OTHER_OBJECT}{armature_object.name}"
                     yield make_control(scene_rig, owner, f"{bone.path_from_id()}.{channel}[{axis}]", bounds)
-    for armature_object, bone, path in _channels_read_by_drivers(scene_rig, sources):
-        bounds = _channel_range(bone, path)
-        if bounds is not None and bounds[0] < bounds[1]:
+    for armature_object, path, bounds in _channels_read_by_drivers(scene_rig, sources):
+        if bounds is not None:
             yield make_control(scene_rig, f"{OTHER_OBJECT}{armature_object.name}", path, bounds)
 
 
@@ -77,7 +76,7 @@ def check_other_armatures(
                 f"'{armature_object.name}', which can {' and '.join(_VERBS[kind] for kind in free_kinds)}, but is no "
                 f"input of the model; {' and '.join(_remedies(bone, free_kinds))}, or join the armatures."
             )
-    for armature_object, _, path in _channels_read_by_drivers(scene_rig, sources):
+    for armature_object, path, _ in _channels_read_by_drivers(scene_rig, sources):
         if fcurve_target(armature_object, path) not in input_keys:
             raise RigError(
                 f"A driver of '{scene_rig.mesh_object.name}' reads '{path}' of a second armature, "
@@ -103,27 +102,16 @@ def _deforming_bones(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bp
 
 def _channels_read_by_drivers(
     scene_rig: SceneRig, sources: Sources
-) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone, str]]:
-    """Yield the unlocked channels of bones of other armatures that drivers read by path."""
+) -> Iterator[tuple[bpy.types.Object, str, tuple[float, float] | None]]:
+    """Yield the free channels of bones of other armatures that drivers read by path, with their ranges."""
     for datablock, path in sources.numbers:
         name, subpath = split_bone_path(datablock, path)
-        if name and datablock != scene_rig.armature_object and is_transform_channel(subpath):
-            bone = datablock.pose.bones.get(name)
-            if bone is not None and _can_vary(_channel_range(bone, path)):
-                yield datablock, bone, path
-
-
-def _channel_range(bone: bpy.types.PoseBone, path: str) -> tuple[float, float] | None:
-    """Return the range of one component of a channel; None without a range, and an empty range if it is locked."""
-    channel, axis = path.rpartition(".")[2][:-3], int(path[-2])
-    if channel == LOCATION:
-        return (0.0, 0.0) if bone.lock_location[axis] else location_ranges(bone).get(axis)
-    if channel == SCALE:
-        return (0.0, 0.0) if bone.lock_scale[axis] else scale_ranges(bone).get(axis)
-    if channel == "rotation_euler" and bone.rotation_mode not in FOUR_COMPONENT_ROTATIONS:
-        rotation_range = rotation_ranges(bone)[axis]
-        return (rotation_range.low, rotation_range.high) if rotation_range.moves else (0.0, 0.0)
-    return (0.0, 0.0) if all(bone.lock_rotation) else None
+        bone = datablock.pose.bones.get(name) if name and is_transform_channel(subpath) else None
+        if bone is not None and datablock != scene_rig.armature_object:
+            channel, axis = subpath[1:-3], int(subpath[-2])
+            ranges = next((ranges for _, other, ranges in _free_channels(bone) if other == channel), {})
+            if axis in ranges and _can_vary(ranges[axis]):
+                yield datablock, path, ranges[axis]
 
 
 def _can_vary(bounds: tuple[float, float] | None) -> bool:

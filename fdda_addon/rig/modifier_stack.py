@@ -177,9 +177,7 @@ def read_names(modifier: bpy.types.Modifier) -> set[str]:
 
 def _node_input_texts(modifier: bpy.types.NodesModifier) -> set[str]:
     """Return the texts in the inputs of Geometry Nodes, among them the names of the attributes that inputs read."""
-    sockets = [s for s in modifier.node_group.interface.items_tree if s.item_type == "SOCKET" and s.in_out == "INPUT"]
-    settings = [node_input_settings(modifier, socket.identifier).values() for socket in sockets]
-    return {value for values in settings for _, value in values if isinstance(value, str)}
+    return {value for _, value in node_input_settings(modifier).values() if isinstance(value, str)}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import bpy
 
 from ..core.controls import EVALUATION_TIME, SHAPE_KEY_PATH
-from ..scene.compatibility import node_input
+from ..scene.compatibility import node_input_settings
 from ..scene.controls import canonical_path, fcurve_target, owner_name
 from ..scene.scene_rig import SceneRig
 from .modifier_stack import is_fdda_modifier
@@ -203,8 +203,7 @@ class Sources:
                 self._follow_values([value])
             elif isinstance(value, bpy.types.NodeTree):
                 self._follow_nodes(value, f"{path}{prop.identifier}.")
-                sockets = [i for i in value.interface.items_tree if i.item_type == "SOCKET" and i.in_out == "INPUT"]
-                self._follow_values(node_input(modifier, socket.identifier) for socket in sockets)
+                self._follow_values(setting for _, setting in node_input_settings(modifier).values())
             elif isinstance(value, bpy.types.Texture | bpy.types.CacheFile):
                 self._add_datablock(value, f"{path}{prop.identifier}.")
                 if getattr(value, "node_tree", None):

@@ -224,7 +224,7 @@ def find_target(scene_rig: SceneRig, name: str, controls: Iterable[Control] = ()
     target = Target(
         scene_rig,
         target_object,
-        tuple(dict.fromkeys([*caches, *(Cache(time_input.description) for time_input in inputs)])),
+        tuple(dict.fromkeys([*caches, *(Cache(description) for description, _ in inputs)])),
     )
     if not target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).is_evaluated:
         raise RigError(f"The target '{name}' is hidden, so Blender does not evaluate it; show it in the viewport.")

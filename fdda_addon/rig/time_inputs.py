@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the keyframes, drivers and modifiers that change a surface with time, besides the pose and the controls."""
 
-import ast
+import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import bpy
 
@@ -94,6 +93,7 @@ def _follows(scene_object: bpy.types.Object, followed: set[bpy.types.Object]) ->
 
 
 _FRAME_PROPERTIES = {"frame", "frame_current", "frame_current_final", "frame_float", "frame_subframe"}
+_QUOTED_TEXT = re.compile(r"""(["']).*?\1""")
 _TIME_CONSTRAINTS = {"FOLLOW_TRACK", "CAMERA_SOLVER", "OBJECT_SOLVER", "TRANSFORM_CACHE"}
 _MOVING_IMAGE_SOURCES = {"MOVIE", "SEQUENCE"}
 _DRIVER_REMEDY = "mute it, or let it read a number that is a control"
@@ -102,17 +102,8 @@ PropertyKey = tuple[bpy.types.ID, str, int]
 """Datablock, path and array index of a number, as `scene.controls.fcurve_target` returns them."""
 
 
-@dataclass(frozen=True)
-class TimeInput:
-    """Something that changes a surface with time.
-
-    Attributes:
-        description: such as "the driver of 'location' of 'handle'".
-        remedy: an instruction to the user, such as "remove them".
-    """
-
-    description: str
-    remedy: str
+TimeInput = tuple[str, str]
+"""What changes a surface with time, such as "the driver of 'location' of 'handle'", and what the user can do."""
 
 
 def check_time_inputs(
@@ -145,10 +136,10 @@ def check_time_inputs(
     sources = Sources(scene_rig, mesh_object, followed_modifiers, follows_shape_keys=False)
     keys = control_keys(scene_rig, controls)
     curves_by_action = curves_of_actions(actions, mesh_object, scene_rig.armature_object)
-    for time_input in (*_time_modifiers(sources), *time_inputs(sources, keys, curves_by_action)):
+    for description, remedy in (*_time_modifiers(sources), *time_inputs(sources, keys, curves_by_action)):
         raise RigError(
-            f"The surface of '{mesh_object.name}' changes with time through {time_input.description}, so it does not "
-            f"follow from the pose; {time_input.remedy}."
+            f"The surface of '{mesh_object.name}' changes with time through {description}, so it does not follow from "
+            f"the pose; {remedy}."
         )
     check_other_armatures(scene_rig, sources, keys)
     notes = describe_independent_objects(scene_rig, sources, keys), describe_missing_ranges(scene_rig, sources, keys)
@@ -202,14 +193,14 @@ def time_inputs(
         object_name = scene_object.name
         world = bpy.context.scene.rigidbody_world
         if scene_object.rigid_body and world and world.enabled and scene_object.rigid_body.type == "ACTIVE":
-            yield TimeInput(f"the rigid body of '{object_name}'", "bake it to a pose, or remove it")
+            yield (f"the rigid body of '{object_name}'", "bake it to a pose, or remove it")
         for constraint in scene_object.constraints:
             if constraint.type in _TIME_CONSTRAINTS and not constraint.mute:
-                yield TimeInput(f"the constraint '{constraint.name}' of '{object_name}'", "mute it, or remove it")
+                yield (f"the constraint '{constraint.name}' of '{object_name}'", "mute it, or remove it")
     for texture in sources.datablocks:
         image = getattr(texture, "image", None)
         if image is not None and image.source in _MOVING_IMAGE_SOURCES:
-            yield TimeInput(f"the image '{image.name}' of '{texture.name}'", "choose a still image")
+            yield (f"the image '{image.name}' of '{texture.name}'", "choose a still image")
 
 
 def _time_modifiers(sources: Sources) -> Iterator[TimeInput]:
@@ -218,38 +209,32 @@ def _time_modifiers(sources: Sources) -> Iterator[TimeInput]:
         for modifier in scene_object.modifiers if uses_geometry else ():
             if modifier.show_viewport and (dependence := time_dependence(modifier)):
                 description = f"the modifier '{modifier.name}' of '{scene_object.name}', which {dependence}"
-                yield TimeInput(description, "switch it off in the viewport, or remove it")
+                yield (description, "switch it off in the viewport, or remove it")
 
 
 def _keyed_input(sources: Sources, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> TimeInput:
     description = f"the keys of '{curve.data_path}' of '{datablock.name}'"
     name = sources.control_name(datablock, curve.data_path)
     if not name:
-        return TimeInput(description, "remove them")
+        return description, "remove them"
     try:
         is_array = hasattr(datablock.path_resolve(curve.data_path), "__len__")
     except ValueError:
-        return TimeInput(description, "remove them")
+        return description, "remove them"
     low, high = value_range(curve)
     path = f"{name}[{curve.array_index}]" if is_array else name
     remedy = f"name what they set as a control (--extra-input '{path}={low:g}:{high:g}'), or remove them"
-    return TimeInput(description, remedy)
+    return description, remedy
 
 
 def _driver_input(owned_curve: OwnedCurve) -> TimeInput:
     datablock, curve = owned_curve
     description = f"the driver of '{curve.data_path}' of '{datablock.name}', which reads the frame"
-    return TimeInput(description, _DRIVER_REMEDY)
+    return description, _DRIVER_REMEDY
 
 
 def _reads_frame(driver: bpy.types.Driver) -> bool:
     """Return whether the expression of a driver reads the frame itself, not through a variable."""
-    if driver.type != "SCRIPTED":
-        return False
-    try:
-        nodes = list(ast.walk(ast.parse(driver.expression.strip(), mode="eval")))
-    except (SyntaxError, ValueError):
-        return False
-    variables = {variable.name for variable in driver.variables}
-    names = {node.id for node in nodes if isinstance(node, ast.Name)} - variables
-    return "frame" in names or any(isinstance(node, ast.Attribute) and node.attr in _FRAME_PROPERTIES for node in nodes)
+    expression = _QUOTED_TEXT.sub("", driver.expression) if driver.type == "SCRIPTED" else ""
+    names = set(re.findall(r"\w+", expression)) - {variable.name for variable in driver.variables}
+    return not names.isdisjoint(_FRAME_PROPERTIES)

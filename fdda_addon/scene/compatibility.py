@@ -36,33 +36,34 @@ def node_input(modifier: bpy.types.NodesModifier, identifier: str) -> object:
     return modifier.get(identifier)
 
 
-def node_input_settings(modifier: bpy.types.NodesModifier, identifier: str) -> dict[str, tuple[str, object]]:
-    """Return what defines an input of a Geometry Nodes modifier, by names that are the same in all versions.
+def node_input_settings(modifier: bpy.types.NodesModifier) -> dict[str, tuple[str, object]]:
+    """Return what defines the inputs of a Geometry Nodes modifier, by names that are the same in all versions.
 
-    IDENTIFIER is its value; it is left out if the input reads an attribute. IDENTIFIER_attribute is the name of this
-    attribute, or empty.
+    IDENTIFIER is the value of an input; it is left out if the input reads an attribute. IDENTIFIER_attribute is the
+    name of this attribute, or empty.
 
     Returns:
         The RNA path by which each is animated, and its value; nothing for geometry, which has no value.
     """
-    path = modifier.path_from_id()
-    if hasattr(modifier, "properties") and hasattr(modifier.properties, "inputs"):
-        socket, path = getattr(modifier.properties.inputs, identifier, None), f"{path}.properties.inputs.{identifier}"
-        if not hasattr(socket, "value"):
-            return {}
-        attribute = socket.attribute_name if getattr(socket, "type", "") == "ATTRIBUTE" else ""
-        settings = {identifier: (f"{path}.value", socket.value), f"{identifier}_attribute": (f"{path}.type", attribute)}
-    elif identifier in modifier:
-        reads_attribute = modifier.get(f"{identifier}_use_attribute", False)
-        attribute = modifier.get(f"{identifier}_attribute_name", "") if reads_attribute else ""
-        settings = {
-            identifier: (f'{path}["{identifier}"]', modifier[identifier]),
-            f"{identifier}_attribute": (f'{path}["{identifier}_use_attribute"]', attribute),
-        }
-    else:
-        return {}
-    if attribute:
-        del settings[identifier]
+    settings: dict[str, tuple[str, object]] = {}
+    path, has_properties = modifier.path_from_id(), hasattr(getattr(modifier, "properties", None), "inputs")
+    for item in modifier.node_group.interface.items_tree if modifier.node_group is not None else ():
+        if item.item_type != "SOCKET" or item.in_out != "INPUT":
+            continue
+        name = item.identifier
+        if has_properties and hasattr(socket := getattr(modifier.properties.inputs, name, None), "value"):
+            attribute = socket.attribute_name if getattr(socket, "type", "") == "ATTRIBUTE" else ""
+            socket_path = f"{path}.properties.inputs.{name}"
+            value_path, attribute_path, value = f"{socket_path}.value", f"{socket_path}.type", socket.value
+        elif not has_properties and name in modifier:
+            reads_attribute = modifier.get(f"{name}_use_attribute", False)
+            attribute = modifier.get(f"{name}_attribute_name", "") if reads_attribute else ""
+            value_path, attribute_path, value = f'{path}["{name}"]', f'{path}["{name}_use_attribute"]', modifier[name]
+        else:
+            continue
+        if not attribute:
+            settings[name] = value_path, value
+        settings[f"{name}_attribute"] = attribute_path, attribute
     return settings
 
 

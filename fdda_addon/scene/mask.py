@@ -2,9 +2,9 @@
 """Reads the mask of a bound object: the vertex group that limits the model to a part of the mesh (`Object.fdda`)."""
 
 import bpy
-import numpy as np
 
 from ..core.mathematics.mask import Mask
+from .mesh import group_weights
 
 
 def mask_key(mesh_object: bpy.types.Object) -> tuple[int, bool]:
@@ -23,13 +23,6 @@ def read_mask(mesh_object: bpy.types.Object) -> Mask | None:
         mesh_object: the original object, not an evaluated one. In edit mode, the weights are those before
             the edit.
     """
-    group_index, is_inverted = mask_key(mesh_object)
-    if group_index < 0:
-        return None
-    weights = np.zeros(len(mesh_object.data.vertices), np.float32)
-    for vertex in mesh_object.data.vertices:
-        for group_element in vertex.groups:
-            if group_element.group == group_index:
-                weights[vertex.index] = group_element.weight
-                break
-    return Mask.from_weights(1 - weights if is_inverted else weights)
+    binding = mesh_object.fdda
+    weights = group_weights(mesh_object, {binding.mask} - {""}).get(binding.mask)
+    return None if weights is None else Mask.from_weights(1 - weights if binding.invert_mask else weights)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reads rest positions, topology and evaluated positions of meshes, and writes positions."""
 
+from collections.abc import Collection
+
 import bpy
 import numpy as np
 
@@ -37,19 +39,27 @@ def topology(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
     return read(mesh.polygons, LOOP_START_ELEMENT), read(mesh.loops, VERTEX_INDEX_ELEMENT)
 
 
+def group_weights(mesh_object: bpy.types.Object, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Read the weights of the vertex groups with some names, (V,) float32; 0 for vertices that are in no such group.
+
+    In edit mode, the weights are those before the edit.
+    """
+    groups = {group.index: group.name for group in mesh_object.vertex_groups if group.name in names}
+    weights = {name: np.zeros(len(mesh_object.data.vertices), np.float32) for name in groups.values()}
+    for vertex in mesh_object.data.vertices if groups else ():
+        for element in vertex.groups:
+            if element.group in groups:
+                weights[groups[element.group]][vertex.index] = element.weight
+    return weights
+
+
 def vertex_layers(mesh_object: bpy.types.Object, names: set[str]) -> dict[str, np.ndarray]:
     """Read the vertex groups and attributes of a mesh object that have one of some names.
 
     Returns:
-        Values by name: (V,) float32 weights of a vertex group, 0 for vertices that are not in it; or the values of the
-        elements of an attribute, one row each.
+        The weights of vertex groups (`group_weights`), and the values of the elements of attributes, one row each.
     """
-    groups = {group.index: group.name for group in mesh_object.vertex_groups if group.name in names}
-    layers = {name: np.zeros(len(mesh_object.data.vertices), np.float32) for name in groups.values()}
-    for vertex in mesh_object.data.vertices if groups else ():
-        for element in vertex.groups:
-            if element.group in groups:
-                layers[groups[element.group]][vertex.index] = element.weight
+    layers = group_weights(mesh_object, names)
     for attribute in mesh_object.data.attributes:
         if attribute.name in names and len(attribute.data):
             properties = attribute.data[0].bl_rna.properties

@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ..core.rig import STATIC_JOINT
-from .mesh import rest_positions
+from .mesh import group_weights, rest_positions
 
 MIN_INFLUENCES = 4
 """Smallest number of columns of skin weight arrays (docs/formats.md)."""
@@ -169,10 +169,8 @@ def _modifier_factors(
     """Return the factor by which the modifier's vertex group scales the deformation of each vertex, (V,) float64."""
     if modifier is None:
         return np.zeros(vertex_count)
-    group = mesh_object.vertex_groups.get(modifier.vertex_group) if modifier.vertex_group else None
-    if group is None:
+    weights = group_weights(mesh_object, {modifier.vertex_group} - {""}).get(modifier.vertex_group)
+    if weights is None:
         return np.ones(vertex_count)
-    weights = np.zeros(vertex_count)
-    for vertex in mesh_object.data.vertices:
-        weights[vertex.index] = next((element.weight for element in vertex.groups if element.group == group.index), 0.0)
+    weights = weights.astype(np.float64)
     return 1 - weights if modifier.invert_vertex_group else weights

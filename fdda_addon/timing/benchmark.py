@@ -6,7 +6,6 @@ The variants are measured alternately, so that other work on the machine slows a
 
 import os
 import platform
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
@@ -38,8 +37,6 @@ MIN_WORTHWHILE_RATIO = 1.5
 """Smallest ratio of the frame times of rig and models at which models are worth it."""
 MAX_RATIO_RANGE = 1.6
 """Largest ratio of the quartiles of the ratios of all rounds that allows a verdict."""
-MIN_PROCESSOR_SHARE = 0.8
-"""Smallest `Benchmark.processor_share` on a machine that counts as idle."""
 RIG, LINEAR, FDDA, FLOOR, WITHOUT_MESHES, BONES = "rig", "linear", "fdda", "floor", "without_meshes", "bones"
 INFERENCE = "inference"
 LABELS = {
@@ -91,8 +88,6 @@ class Benchmark:
         rounds: the median time of each variant but `INFERENCE` in each round.
         constant_bytes: size of the constants of the models' graphs, which each frame reads; 0 if unknown.
         is_estimate: whether the models are untrained.
-        processor_share: processor time of the models alone, as a ratio of the time that passed. Models of some thousand
-            vertices run on one thread, so less than 1 means that other programs run.
     """
 
     armature: str
@@ -103,7 +98,6 @@ class Benchmark:
     rounds: Mapping[str, list[float]]
     constant_bytes: int
     is_estimate: bool
-    processor_share: float = 1.0
 
     def median(self, variant: str) -> float:
         """Return the median time of a variant, ms; 0 if it was not measured.
@@ -136,11 +130,7 @@ class Benchmark:
         low, high = self.quartiles
         note = " (estimate)" if self.is_estimate else ""
         if self.is_worthwhile:
-            is_busy = self.processor_share < MIN_PROCESSOR_SHARE
-            return (
-                f"{'Worth it: ' if self.is_estimate else ''}{self.ratio:.1f}x faster than the rig{note}."
-                f"{' Other programs run, so the factor is rough.' if is_busy else ''}"
-            )
+            return f"{'Worth it: ' if self.is_estimate else ''}{self.ratio:.1f}x faster than the rig{note}."
         if high > MAX_RATIO_RANGE * low and high >= 1:
             return (
                 f"The machine is busy: {low:.1f} to {high:.1f}x as fast as the rig in repeated measurements{note}. "
@@ -208,7 +198,6 @@ class Benchmark:
             "ratio_quartiles": [_round(ratio) for ratio in self.quartiles],
             "is_faster": self.ratio > 1,
             "is_estimate": self.is_estimate,
-            "processor_share": _round(self.processor_share),
             "constant_bytes": self.constant_bytes,
         }
 
@@ -330,9 +319,7 @@ def benchmark(
             index += 1
         # Meshes may share a model, which runs once.
         networks = list(dict.fromkeys(network.model for network in networks))
-        start, processor_start = time.perf_counter(), time.process_time()
         times[INFERENCE] = list(np.sum([_inference_times(network, frames) for network in networks], axis=0))
-        processor_share = (time.process_time() - processor_start) / (time.perf_counter() - start)
     described = [MeshTimes(o.name, len(o.data.vertices), o in meshes, reasons.get(o, "")) for o in mesh_objects]
     return Benchmark(
         armature_object.name,
@@ -343,7 +330,6 @@ def benchmark(
         rounds,
         sum(network.info.constant_bytes for network in networks),
         is_estimate,
-        processor_share,
     )
 
 

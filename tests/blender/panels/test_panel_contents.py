@@ -2,7 +2,6 @@
 """The content of the sections from Rig to Training, computed without a window."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -230,10 +229,6 @@ def times_of(
     ("times", "sentence"),
     [
         (times_of(2.0), "Worth it: 5.0x faster than the rig (estimate)."),
-        (
-            replace(times_of(2.0), processor_share=0.5),
-            "Worth it: 5.0x faster than the rig (estimate). Other programs run, so the factor is rough.",
-        ),
         (
             times_of(8.0, linear_ms=7.0, bones_ms=6.5),
             "Little difference: 1.2x faster than the rig (estimate). The bones take 6.50 of 10.00 ms, which models do "

@@ -238,7 +238,7 @@ def add_nodes(mesh_object: bpy.types.Object, socket_type: str = "Float") -> tupl
 
 
 def path_of_input(modifier: bpy.types.Modifier, identifier: str) -> str:
-    return node_input_settings(modifier, identifier)[identifier][0]
+    return node_input_settings(modifier)[identifier][0]
 
 
 def set_attribute(modifier: bpy.types.Modifier, identifier: str, name: str) -> None:
