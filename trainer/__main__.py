@@ -21,10 +21,8 @@ if __name__ == "__main__":
     # Before the other imports: a signal during an import would otherwise end in a traceback.
     exit_on_stop_signal()
 
-from fdda_addon.core.recording.folder import recordings_in
-
 from .config import add_options, config_from_arguments
-from .outputs import check_batch, check_training_outputs
+from .outputs import check_training_outputs
 from .process import StopRequest, missing_package_error, run_with_messages
 from .progress import JsonMessageSink, MessageSink, TextMessageSink
 
@@ -42,32 +40,27 @@ def _train(options: argparse.Namespace, sink: MessageSink, stop_request: StopReq
     config = config_from_arguments(options)
     check_temporary_folder()  # torch fails without a temporary folder.
     # Files are checked first, because loading torch takes seconds.
-    if recordings := recordings_in(options.recording):
-        check_batch(recordings, options.model, options.overwrite)
-    else:
-        check_training_outputs(options.model, options.overwrite)
+    check_training_outputs(options.model, options.overwrite)
     try:
         with stop_request.exit_immediately():
-            from .train import train_model, train_models
+            from .train import train_model
     except ModuleNotFoundError as error:
         raise missing_package_error("Training", error) from error
-    settings = (config, sink, stop_request.exit_immediately, options.warm_start, options.strict)
-    if recordings:
-        train_models(recordings, options.model, *settings)
-    else:
-        train_model(options.recording, options.model, *settings)
+    train_model(
+        options.recording,
+        options.model,
+        config,
+        sink,
+        stop_request.exit_immediately,
+        options.warm_start,
+        options.strict,
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("trainer", description="Train a model from a recording.")
-    parser.add_argument(
-        "recording", type=Path, help="folder that record wrote, or a folder with a recording for each of several meshes"
-    )
-    parser.add_argument(
-        "model",
-        type=Path,
-        help="the .onnx file to write, with its report beside it; a folder for the models of several meshes",
-    )
+    parser.add_argument("recording", type=Path, help="folder that record wrote")
+    parser.add_argument("model", type=Path, help="the .onnx file to write, with its report beside it")
     parser.add_argument(
         "--messages", action="store_true", help="JSON messages on stdout, for a program, in place of text"
     )

@@ -7,14 +7,12 @@ from typing import Protocol
 
 from fdda_addon.core.formats.messages import WARNING_LINE, Message, MessageType
 
-FINISHED_LINE = "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s."
 LINE_FORMATS = {
     MessageType.STARTED: "Training {partitions} partitions, {vertices} vertices, {poses} poses, on {device}.",
     MessageType.PARTITION_FINISHED: "  {joint}: {basis} components, held-out error {held_out_mm:.4f} mm",
     MessageType.LOG: "{text}",
     MessageType.WARNING: WARNING_LINE,
-    MessageType.MODEL_FINISHED: FINISHED_LINE,
-    MessageType.FINISHED: FINISHED_LINE,
+    MessageType.FINISHED: "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s.",
     MessageType.CANCELLED: "Cancelled before the model was written.",
 }
 LINE_EPOCH_INTERVAL = 0.1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs a training, or one for each of several recordings: all steps from the recording to the written files."""
+"""Runs a training: all steps from the recording to the written files."""
 
 import time
 from collections.abc import Callable
@@ -37,7 +37,7 @@ from .networks.checkpoint import Checkpoint, write_checkpoint
 from .networks.loop import train
 from .networks.networks import TrainedPartition
 from .networks.warm_start import checkpoint_parts, initial_networks, read_initial_checkpoint, warm_start_config
-from .outputs import batch_model_path, training_outputs
+from .outputs import training_outputs
 from .preparation import PartitionData, choose_details, make_parts, partition_data, prepare_partitions
 from .progress import MessageSink
 from .report.contents import make_report
@@ -54,21 +54,16 @@ def train_model(
     stoppable: Callable[[], AbstractContextManager] = nullcontext,
     warm_start: bool = False,
     strict: bool = False,
-    last_message: MessageType = MessageType.FINISHED,
-) -> dict:
+) -> None:
     """Train a model, and write it with its checkpoint and its report beside it.
 
     Args:
         recording_path: folder of a complete recording.
         model_path: the .onnx file; `check_training_outputs` has checked it. All files are written at the end.
-        sink: receives the messages from `STARTED` to `last_message`. Errors are raised, not sent.
+        sink: receives the messages from `STARTED` to `FINISHED`. Errors are raised, not sent.
         stoppable: makes the context in which the process may be ended, because it writes nothing there.
         warm_start: start from the checkpoint of the model, on a recording that may have grown since.
         strict: treat warnings about the recording as errors.
-        last_message: `FINISHED`, or `MODEL_FINISHED` in a batch.
-
-    Returns:
-        The values of the last message.
 
     Raises:
         FDDAError: the recording or the settings cannot be used, or a file cannot be written.
@@ -108,35 +103,7 @@ def train_model(
         write_checkpoint(checkpoint_file, trained_model.checkpoint(recording.digest(), holdout, config, history))
         report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
-    return _send_final_messages(sink, model_path, report, goal_text, start_time, last_message)
-
-
-def train_models(
-    recordings: list[Path],
-    folder: Path,
-    config: TrainingConfig,
-    sink: MessageSink,
-    stoppable: Callable[[], AbstractContextManager],
-    warm_start: bool,
-    strict: bool,
-) -> None:
-    """Train a model on each recording. Finished models are kept when a later training fails.
-
-    Args:
-        recordings: folders of complete recordings, which `check_batch` has checked.
-        folder: folder of the models; the model of recording NAME is FOLDER/NAME/NAME.onnx.
-        config, sink, stoppable, warm_start, strict: as in `train_model`.
-    """
-    start_time = time.perf_counter()
-    settings = (config, sink, stoppable, warm_start, strict, MessageType.MODEL_FINISHED)
-    results = [train_model(recording, batch_model_path(recording, folder), *settings) for recording in recordings]
-    sink.send(
-        MessageType.FINISHED,
-        model=str(folder),
-        models=len(recordings),
-        seconds=round(time.perf_counter() - start_time, 2),
-        **{key: max(values[key] for values in results) for key in ("held_out_mm", "held_out_p999_mm")},
-    )
+    _send_final_messages(sink, model_path, report, goal_text, start_time)
 
 
 @dataclass
@@ -305,10 +272,8 @@ def _training_size_sentence(recording: SkinnedRecording) -> str:
     )
 
 
-def _send_final_messages(
-    sink: MessageSink, model_path: Path, report: dict, goal_text: str, start_time: float, last_message: MessageType
-) -> dict:
-    """Send the messages after the files are written; arguments and result as in `train_model`."""
+def _send_final_messages(sink: MessageSink, model_path: Path, report: dict, goal_text: str, start_time: float) -> None:
+    """Send the messages after the files are written; arguments as in `train_model`."""
     for partition in report["partitions"]:
         sink.send(
             MessageType.PARTITION_FINISHED,
@@ -329,5 +294,4 @@ def _send_final_messages(
         "held_out_p999_mm": report["fdda"]["held_out"]["p999"],
         **({"verdict": report["goal"]["verdict"]} if "goal" in report else {}),
     }
-    sink.send(last_message, **values)
-    return values
+    sink.send(MessageType.FINISHED, **values)

@@ -32,9 +32,7 @@ def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:
     folder = options.model
     paths = sorted([*folder.glob("*.onnx"), *folder.glob("*/*.onnx")])
     if not paths:
-        raise ModelError(
-            f"The folder '{folder}' contains no model; give a folder that train has written for several recordings."
-        )
+        raise ModelError(f"The folder '{folder}' contains no model; give a folder of models, or one model.")
     models: dict[str, Path] = {}
     for path in paths:
         for name in (mesh.name for mesh in read_model_info(path).meshes):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """`train RECORDING MODEL.onnx …`: starts the trainer, which parses the options, in the Python that has torch.
 
-RECORDING may be a folder of recordings; then MODEL.onnx is a folder of models. With `--refine RIG.blend` the verb adds
-poses at the worst errors and continues the training, until the goal is met or more poses no longer help.
+With `--refine RIG.blend` the verb adds poses at the worst errors and continues the training, until the goal is met or
+more poses no longer help.
 """
 
 import argparse
@@ -14,7 +14,6 @@ from ..core.errors import WrongUsageError
 from ..core.files.stop_signals import INTERRUPTED
 from ..core.formats.messages import WARNING_LINE, MessageType
 from ..core.formats.report import Verdict
-from ..core.recording.folder import recordings_in
 from ..core.settings import REFINEMENT_POSES
 from ..core.wording import format_count
 from ..training.process import Training, trainer_command
@@ -78,21 +77,10 @@ def _train(arguments: list[str]) -> tuple[int, dict]:
                 progress.say(values["text"])
             elif message.type is MessageType.WARNING:
                 progress.say(WARNING_LINE.format(**values))
-            elif message.type is MessageType.MODEL_FINISHED:
-                progress.end_line()
-                print(_finished_line(values), flush=True)
             elif message.type is MessageType.CANCELLED:
                 return INTERRUPTED, values
-    if models := values.get("models"):
-        print(f"{values['model']}: {format_count(models, 'model')} in {values['seconds']:.1f} s")
-    else:
-        print(_finished_line(values))
+    print(f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm")
     return 0, values
-
-
-def _finished_line(values: dict) -> str:
-    """Return a line about a trained model."""
-    return f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm"
 
 
 def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
@@ -102,10 +90,6 @@ def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
     if not any(argument.partition("=")[0] == GOAL for argument in arguments):
         raise WrongUsageError(f"--refine trains until an accuracy goal is met; give the goal with {GOAL}.")
     recording, model = map(Path, arguments[:2])
-    if recordings_in(recording):
-        raise WrongUsageError(
-            f"--refine takes one recording, and '{recording}' holds several; give one of them and its model."
-        )
     # Imported here, because a training without refinement needs no Blender.
     from .main import registered
 

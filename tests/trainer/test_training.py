@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdda_addon.core.errors import OutputError, TrainingError
+from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.messages import Message, MessageType
 from fdda_addon.core.formats.report import Verdict
 from fdda_addon.core.mathematics.poses import Overshoot
@@ -21,10 +21,8 @@ from trainer.__main__ import main
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data.split import BLOCK_FRAMES, Split, split_recording
 from trainer.goal import evaluate_goal
-from trainer.outputs import check_batch
 from trainer.preparation import PartitionData, choose_details, prepare_partition
 
-from ..core.limb import record_limb
 from ..recordings import read_skinned
 from .chain import write_chain
 from .conftest import QUICK_OPTIONS
@@ -252,18 +250,6 @@ def test_an_exhausted_goal_names_the_reason():
         "training poses are at 0.85 mm, so the networks are too small"
         in evaluate_errors(0.9, 0.9, 0.9, training=0.85)[1]
     )
-
-
-def test_a_file_of_another_kind_is_refused_before_the_first_training(tmp_path):
-    recordings = [tmp_path / "r" / name for name in ("body", "sleeve")]
-    for recording in recordings:
-        record_limb(recording, 4)
-    check_batch(recordings, tmp_path / "models")
-    (tmp_path / "models" / "sleeve").mkdir(parents=True)
-    (tmp_path / "models" / "sleeve" / "report.json").write_text('{"mine": 1}')
-    with pytest.raises(OutputError, match=r"report\.json': another file is there, which is not a training report"):
-        check_batch(recordings, tmp_path / "models")
-    check_batch(recordings, tmp_path / "models", overwrite=True)
 
 
 @pytest.fixture(scope="module")

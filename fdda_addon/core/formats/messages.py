@@ -35,13 +35,9 @@ class MessageType(enum.Enum):
     WARNING = "warning"
     """name: str, text: str. A property of the recording that makes a bad model likely (`core.checks.warning`), or a
     graphics card that cannot be used. Then the next `PROGRESS` may have epoch 1 again."""
-    MODEL_FINISHED = "model_finished"
-    """The keys of `FINISHED`, for one of several models that are trained one after the other. Each of these models
-    has its own `STARTED` message."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
-    verdict: str, "met", "missed" or "exhausted", where there is a goal. For several models, `model` is their folder,
-    the errors are the largest ones, and `models` is their number."""
+    verdict: str, "met", "missed" or "exhausted", where there is a goal."""
     CANCELLED = "cancelled"
     """No keys. The trainer was asked to stop and wrote no model."""
     FAILED = "failed"

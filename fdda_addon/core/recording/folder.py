@@ -228,13 +228,6 @@ def is_recorded(path: Path) -> bool:
     return index["complete"] >= index["poses"]
 
 
-def recordings_in(folder: Path) -> list[Path]:
-    """List the recordings in the subfolders of a folder; empty where the folder is a recording itself."""
-    if os.path.exists(folder / INDEX_NAME) or not os.path.isdir(folder):
-        return []
-    return sorted(path for path in folder.iterdir() if os.path.isfile(path / INDEX_NAME))
-
-
 def remove_recording(path: Path) -> None:
     """Remove the files of a recording, and the folder where it has no other files.
 

@@ -12,7 +12,6 @@ SAMPLE_MESSAGES = [
     Message(MessageType.PARTITION_FINISHED, {"joint": "elbow.L ü", "basis": 24, "held_out_mm": 0.125}),
     Message(MessageType.LOG, {"text": 'two\nlines, "quoted"'}),
     Message(MessageType.WARNING, {"name": "flips", "text": "The joint 'a' flips."}),
-    Message(MessageType.MODEL_FINISHED, {"model": "/a.onnx", "seconds": 1, "held_out_mm": 0.1, "held_out_p999_mm": 1}),
     Message(MessageType.FINISHED, {"model": "/a b.onnx", "seconds": 1.5, "held_out_mm": 0.1, "held_out_p999_mm": 1}),
     Message(MessageType.CANCELLED),
     Message(MessageType.FAILED, {"text": "The disk is full."}),
