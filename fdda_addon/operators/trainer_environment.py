@@ -52,37 +52,33 @@ class _EnvironmentOperator:
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
             return self.execute(context)
-        runner = self._begin()
-        if runner.work(0):
-            return self._end(runner.state)
+        if self._begin() is None:
+            return {"CANCELLED"}
         # Blender frees the operator before the job ends, so the job must not refer to it.
         run_in_background()
         return {"FINISHED"}
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        runner, printed_stage = self._begin(), ""
+        if (runner := self._begin()) is None:
+            return {"CANCELLED"}
+        printed_stage = ""
         while not runner.work(WAIT_SECONDS):
             if runner.state.stage != printed_stage:
                 printed_stage = runner.state.stage
                 print(f"{self.bl_label}: {printed_stage}")
             time.sleep(WAIT_SECONDS)
-        return self._end(runner.state)
+        self.report({runner.state.outcome_level}, runner.state.outcome)
+        return {"FINISHED"} if runner.state.outcome_level == "INFO" else {"CANCELLED"}
 
-    def _begin(self) -> JobRunner:
+    def _begin(self) -> JobRunner | None:
+        """Start the job; return None if it cannot start, which is reported and stored."""
         try:
             job, cancel = self.steps()
         except FDDAError as error:
-            job, cancel = _failed_job(error), None
+            self.store_result(CheckResult("ERROR", str(error)))
+            self.report({"ERROR"}, str(error))
+            return None
         return start_job(self.bl_idname.partition("_OT_")[2], self.bl_label, job, cancel, type(self).store_result)
-
-    def _end(self, state: JobState) -> set[str]:
-        self.report({state.outcome_level}, state.outcome)
-        return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
-
-
-def _failed_job(error: FDDAError) -> Job[CheckResult]:
-    yield None
-    raise error
 
 
 def start_job(

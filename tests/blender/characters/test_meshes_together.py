@@ -14,7 +14,7 @@ from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from ..conftest import ELBOW, ELBOW_RIG
 from ..drawing import texts_of
-from ..panels.test_panel_drawing import draw_section
+from ..panels.test_sidebar import draw_section
 from ..scene_state import fresh_elbow
 
 

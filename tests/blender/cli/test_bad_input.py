@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Verbs that refuse bad rigs, recordings and outputs with one error message, and change no file.
-
-Bad models are in test_bad_models.py, bad trainers in test_bad_trainers.py.
-"""
+"""Verbs that refuse bad rigs, models, recordings and outputs with one error message, and change no file."""
 
 import shutil
 from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.scene_rig import find_rig
 
 from ... import systems
+from ..conftest import write_edited
 from ..refusals import file_contents, limited_file_size, save_elbow
 
 pytestmark = pytest.mark.one_blender_version
@@ -67,17 +70,6 @@ def test_a_file_without_a_character_is_refused(refusal, verb, tmp_path, change, 
     assert message in refusal(*verb(save_elbow(tmp_path / "rig.blend", change), *options))
 
 
-def lock_all_rotations(rig) -> None:
-    for bone in rig.armature_object.pose.bones:
-        bone.lock_rotation = (True, True, True)
-
-
-def test_a_rig_whose_bones_are_all_locked_is_refused(refusal, elbow_files, tmp_path):
-    path = save_elbow(tmp_path / "rig.blend", lock_all_rotations)
-    expected = "No bone of 'elbow_rig' may be sampled: all 2 are locked or moved by constraints; unlock an axis"
-    assert refusal("record", path, tmp_path / "r").startswith(expected)
-
-
 @pytest.fixture(params=["build-arm", "record", "bind", "evaluate", "heatmap", "benchmark"])
 def writing_verb(request, elbow_files, tmp_path_factory):
     """Return, for each verb that writes a file, a function from the output path to the verb's arguments."""
@@ -108,13 +100,9 @@ def test_an_output_that_cannot_be_written_is_refused(refusal, writing_verb, tmp_
     assert refusal(*writing_verb(tmp_path / "file" / "out")).startswith("Cannot write")
     assert refusal(*writing_verb(systems.UNWRITABLE)).startswith("Cannot write")
     assert refusal(*writing_verb(tmp_path / "folder")).startswith("Cannot ")
-
-
-def test_an_output_in_a_missing_folder_is_refused(refusal, writing_verb, tmp_path):
-    if writing_verb("")[0] == "record":
-        pytest.skip("record makes its folder")
-    text = refusal(*writing_verb(tmp_path / "none" / "out"))
-    assert f"the folder '{tmp_path / 'none'}' does not exist; create it first" in text
+    if writing_verb("")[0] != "record":  # It makes its folder.
+        text = refusal(*writing_verb(tmp_path / "none" / "out"))
+        assert f"the folder '{tmp_path / 'none'}' does not exist; create it first" in text
 
 
 def deep_path(folder: Path) -> Path:
@@ -149,3 +137,72 @@ def test_a_model_that_cannot_be_copied_beside_the_bound_file_is_refused(refusal,
     (tmp_path / elbow_files.model.name).write_bytes(b"another model")
     text = refusal("bind", elbow_files.rig, elbow_files.model, tmp_path / "b.blend")
     assert f"there is another '{elbow_files.model.name}'; remove it or choose another folder" in text
+
+
+@pytest.fixture(params=["bind", "evaluate", "benchmark"])
+def model_verb(request, tmp_path):
+    """Return, for each verb that reads a model, a function from the paths of rig and model to its arguments."""
+    more_arguments = {
+        "bind": [tmp_path / "bound.blend"],
+        "evaluate": ["--json", tmp_path / "e.json", "--poses", "2"],
+        "benchmark": ["--json", tmp_path / "b.json", "--frames", "5"],
+    }[request.param]
+    return lambda rig, model: [request.param, rig, model, *more_arguments]
+
+
+def rename_bone(rig) -> None:
+    rig.armature_object.data.bones["lower"].name = "forearm"
+
+
+def test_a_model_of_another_rig_is_refused(refusal, model_verb, elbow_files, tmp_path):
+    text = refusal(*model_verb(save_elbow(tmp_path / "rig.blend", rename_bone), elbow_files.model))
+    words = "the armature lacks the joint 'lower'; it does not know the joint 'forearm'. Record and train this rig."
+    assert text == f"The model '{elbow_files.model}' was trained for another rig: {words}"
+
+
+def test_a_missing_model_is_refused(refusal, model_verb, elbow_files, tmp_path):
+    path = tmp_path / "none.onnx"
+    text = refusal(*model_verb(elbow_files.rig, path))
+    assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
+
+
+def remove_metadata(model) -> None:
+    del model.metadata_props[:]
+
+
+def use_double_input(model) -> None:
+    model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
+
+
+@pytest.mark.parametrize(
+    ("change", "start", "end"),
+    [
+        (remove_metadata, "The model '", " is an ONNX file but not a model of this add-on; give one that train made."),
+        (use_double_input, "ONNX Runtime refuses the model '", "); train it again."),
+    ],
+)
+def test_onnx_files_that_are_not_models_are_refused(refusal, model_verb, elbow_files, tmp_path, change, start, end):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", change)
+    text = refusal(*model_verb(elbow_files.rig, path))
+    assert text.startswith(start + str(path)) and text.endswith(end)
+
+
+def output_nan(model) -> None:
+    """Multiply the output positions by NaN."""
+    last = next(node for node in model.graph.node if "positions" in node.output)
+    last.output[list(last.output).index("positions")] = "good"
+    model.graph.initializer.append(numpy_helper.from_array(np.float32([np.nan]), "nan"))
+    model.graph.node.append(helper.make_node("Mul", ["good", "nan"], ["positions"]))
+
+
+def test_evaluation_of_a_model_that_returns_nan_is_refused(refusal, elbow_files, tmp_path):
+    path = write_edited(elbow_files.model, tmp_path / "m.onnx", output_nan)
+    text = refusal("evaluate", elbow_files.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
+    assert f"The model '{path}' gives positions that are not numbers (held-out poses, pose 0)" in text
+
+
+def test_playing_a_model_that_returns_nan_shows_an_error(bound_elbow, elbow_files, tmp_path):
+    bind(find_rig(), write_edited(elbow_files.model, tmp_path / "m.onnx", output_nan))
+    bpy.context.view_layer.update()
+    assert "gives positions that are not numbers; train it again." in bound_elbow.fdda.status
+    assert bound_elbow.fdda.mode == "FDDA"

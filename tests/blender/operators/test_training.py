@@ -18,7 +18,7 @@ from fdda_addon.scene.scene_rig import SceneRig
 
 from .. import conftest
 from ..drawing import texts_of
-from ..panels.test_panel_drawing import draw_section
+from ..panels.test_sidebar import draw_section
 from ..scene_state import assert_same_state, scene_state
 
 
