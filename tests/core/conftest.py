@@ -50,6 +50,6 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     if not hasattr(libc, "mount") or libc.mount(
         b"tmpfs", os.fsencode(folder), b"tmpfs", 0, f"size={SMALL_DISK_BYTES}".encode()
     ):
-        pytest.skip("Only root may mount a disk; one test of test_full_disk.py limits the size of files instead.")
+        pytest.skip("Only root may mount a disk; one test of test_output.py limits the size of files instead.")
     yield folder
     libc.umount2(os.fsencode(folder), 2)

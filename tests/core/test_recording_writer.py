@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writing a recording: its content is read back unchanged, and an interrupted recording can be resumed."""
+"""Writing, resuming and extending a recording: it is read back unchanged, and interruptions lose nothing complete."""
 
 import errno
 import json
@@ -13,19 +13,12 @@ import pytest
 from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
 from fdda_addon.core.recording.arrays import array_header
 from fdda_addon.core.recording.folder import check_recordable
-from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.index import INDEX_NAME, REFINED, Source, read_index
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
 
 from .. import systems
-from .limb import (
-    JOINTS,
-    make_rig,
-    random_poses,
-    random_positions,
-    record_limb,
-    recording_info,
-)
+from .limb import JOINTS, make_rig, random_poses, random_positions, record_limb, recording_info
 
 POSE_COUNT = 12
 
@@ -224,3 +217,78 @@ def test_non_finite_values_are_refused_with_the_pose(tmp_path, name, value):
         with pytest.raises(FDDAError, match=rf"Pose 7 of the rig .* not numbers \({name}\)"):
             writer.append(*(array[5:10] for array in arrays.values()))
     assert read_index(tmp_path / "r")["complete"] == 5
+
+
+ADDED_COUNT = 5
+
+
+def append_poses(path, count: int = ADDED_COUNT, seed: int = 7) -> None:
+    """Append random poses to the recording as those of a refinement."""
+    with RecordingExtension(read_recording(path), count, "limb.onnx") as extension:
+        extension.append(random_poses(count, seed), random_positions(count, seed))
+
+
+def assert_poses(path, *parts: tuple[int, int]) -> None:
+    """Check that the recording has its first poses, then those that `append_poses` adds for each (count, seed)."""
+    recording = read_recording(path)
+    matrices = [random_poses(POSE_COUNT), *(random_poses(count, seed) for count, seed in parts)]
+    positions = [random_positions(POSE_COUNT), *(random_positions(count, seed) for count, seed in parts)]
+    assert np.array_equal(recording.pose_matrices, np.concatenate(matrices))
+    assert np.array_equal(recording.positions, np.concatenate(positions))
+
+
+def test_poses_are_appended_and_counted(recording):
+    append_poses(recording)
+    assert_poses(recording, (ADDED_COUNT, 7))
+    assert read_recording(recording).info.sampling.sources[2:] == (Source(REFINED, ADDED_COUNT, "limb.onnx"),)
+    with RecordingExtension(read_recording(recording), 4, "again.onnx") as extension:
+        for seed in (8, 9):
+            extension.append(random_poses(2, seed), random_positions(2, seed))
+            assert extension.complete == POSE_COUNT + ADDED_COUNT + 2 * (seed - 7)
+    assert_poses(recording, (ADDED_COUNT, 7), (2, 8), (2, 9))
+    assert [s.poses for s in read_recording(recording).info.sampling.sources] == [POSE_COUNT - 2, 2, ADDED_COUNT, 4]
+
+
+def test_poses_beyond_the_index_are_ignored_and_overwritten(recording):
+    index_before = (recording / INDEX_NAME).read_bytes()
+    append_poses(recording)
+    # This is the state after the machine stopped between writing the arrays and writing the index.
+    (recording / INDEX_NAME).write_bytes(index_before)
+    assert_poses(recording)
+    append_poses(recording, 3, seed=8)
+    assert_poses(recording, (3, 8))
+
+
+def test_poses_that_another_process_appended_are_not_overwritten(recording):
+    recording_before = read_recording(recording)
+    append_poses(recording)
+    with pytest.raises(
+        RecordingError, match=f"had {POSE_COUNT} poses when it was read and has {POSE_COUNT + ADDED_COUNT} now"
+    ):
+        RecordingExtension(recording_before, ADDED_COUNT, "limb.onnx")
+    assert_poses(recording, (ADDED_COUNT, 7))
+    append_poses(recording, 2, seed=8)
+    assert_poses(recording, (ADDED_COUNT, 7), (2, 8))
+
+
+def test_resuming_an_extended_recording_is_refused(recording):
+    append_poses(recording)
+    with pytest.raises(RecordingError, match=r"recorded differently \(poses, sampling\.sources\)"):
+        RecordingWriter(recording, make_rig(), recording_info(POSE_COUNT), resume=True)
+
+
+def record_in_unit(path, metres_per_unit: float, complete: int = 6, resume: bool = False):
+    """Record the first `complete` of six poses of the limb in a unit, and return the folder."""
+    rig = replace(make_rig(), metres_per_unit=metres_per_unit)
+    with RecordingWriter(path, rig, recording_info(6), resume) as writer:
+        pose_slice = slice(writer.complete, complete)
+        writer.append(random_poses(6)[pose_slice], random_positions(6)[pose_slice])
+    return path
+
+
+@pytest.mark.parametrize(("first_unit", "resumed_unit"), [(0.01, 1.0), (1.0, 0.01), (0.01, 0.02)])
+def test_a_resumed_recording_keeps_its_unit(tmp_path, first_unit, resumed_unit):
+    """The unit may differ when a recording is resumed, because the scale of an object may be animated."""
+    record_in_unit(tmp_path / "recording", first_unit, complete=3)
+    record_in_unit(tmp_path / "recording", resumed_unit, resume=True)
+    assert read_recording(tmp_path / "recording").rig.metres_per_unit == first_unit

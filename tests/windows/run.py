@@ -63,7 +63,7 @@ SMALL = {
     "core": (
         "tests/core/files/test_output.py",
         "tests/core/test_recording_writer.py",
-        "tests/core/test_recording_lock.py",
+        "tests/core/test_recording_folder.py",
     ),
     "blender": ("tests/blender/runtime/test_playback.py", "-k", "strength"),
 }

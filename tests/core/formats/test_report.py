@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The training report: it is read back unchanged, and a damaged report is refused with the path of the damage."""
+"""Reports, messages and JSON from files: read back unchanged, and refused with the path of the damage."""
 
 import json
 from pathlib import Path
@@ -8,9 +8,12 @@ import pytest
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.files.output import write_text
+from fdda_addon.core.formats.messages import Message, MessageType
 from fdda_addon.core.formats.report import checkpoint_path, page_path, read_report, report_path, report_text
+from fdda_addon.core.json_check import COUNT, NUMBER, POSITIVE, Interval, check_json
 
 ERRORS = {"mean": 0.1, "rms": 0.2, "p99": 0.5, "p999": 1, "max": 2.5}
+
 REPORT = {
     "unit": "mm",
     "model": "elbow.onnx",
@@ -121,3 +124,93 @@ def test_other_formats_and_versions_are_refused(tmp_path, text):
     (tmp_path / "report.json").write_text(text)
     with pytest.raises(TrainingError, match="is not a training report of this version; train again"):
         read_report(tmp_path / "report.json")
+
+
+SAMPLE_MESSAGES = [
+    Message(MessageType.STARTED, {"partitions": 3, "poses": 100, "vertices": 90, "device": "cpu"}),
+    Message(MessageType.PREPARING, {"done": 1, "total": 3}),
+    Message(MessageType.PROGRESS, {"epoch": 1, "epochs": 200, "training_mm": 0.25, "validation_mm": 0.125}),
+    Message(MessageType.PARTITION_FINISHED, {"joint": "elbow.L ü", "basis": 24, "held_out_mm": 0.125}),
+    Message(MessageType.LOG, {"text": 'two\nlines, "quoted"'}),
+    Message(MessageType.WARNING, {"name": "flips", "text": "The joint 'a' flips."}),
+    Message(MessageType.FINISHED, {"model": "/a b.onnx", "seconds": 1.5, "held_out_mm": 0.1, "held_out_p999_mm": 1}),
+    Message(MessageType.CANCELLED),
+    Message(MessageType.FAILED, {"text": "The disk is full."}),
+]
+
+
+@pytest.mark.parametrize("message", SAMPLE_MESSAGES, ids=lambda message: message.type.value)
+def test_encoding_and_decoding_keep_a_message(message):
+    line = message.encode()
+    assert "\n" not in line
+    assert Message.decode(line) == message
+    assert Message.decode(line + "\n") == message
+
+
+def test_every_type_has_a_sample_message():
+    assert [message.type for message in SAMPLE_MESSAGES] == list(MessageType)
+
+
+@pytest.mark.parametrize(
+    "line", ["", "hello", "{", "[]", "3", "null", "{}", '{"type": "lunch"}', '{"type": null}', '{"type": ["log"]}']
+)
+def test_invalid_lines_are_refused(line):
+    with pytest.raises(ValueError):
+        Message.decode(line)
+
+
+DESCRIPTION = {
+    "name": str,
+    "is_key?": bool,
+    "count": COUNT,
+    "joints": [range(-1, 3)],
+    "kind": {"hard", "smooth"},
+    "error": (NUMBER, None),
+    "unit?": POSITIVE,
+    "sources": {str: [{"factor": Interval(1, 4)}]},
+}
+
+VALUE = {
+    **{"name": "a", "count": 3, "joints": [-1, 2], "kind": "hard", "error": 0.5, "other": []},
+    **{"sources": {"b": [{"factor": 2}]}},
+}
+
+
+@pytest.mark.parametrize("change", [{}, {"error": None}, {"is_key": True, "unit": 0.01}, {"joints": [], "sources": {}}])
+def test_a_value_as_described_is_accepted(change):
+    check_json(VALUE | change, DESCRIPTION)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ([], "it is []"),
+        ({"name": "a"}, "it lacks 'count'"),
+        (VALUE | {"name": 3}, "name is 3"),
+        (VALUE | {"name": None}, "name is None"),
+        (VALUE | {"is_key": 1}, "is_key is 1"),
+        (VALUE | {"count": -1}, "count is -1"),
+        (VALUE | {"count": True}, "count is True"),
+        (VALUE | {"count": 1.0}, "count is 1.0"),
+        (VALUE | {"count": 10**30}, "count is 1000000000000000000000000000000"),
+        (VALUE | {"joints": {}}, "joints is {}"),
+        (VALUE | {"joints": [0, 3]}, "joints[1] is 3"),
+        (VALUE | {"kind": []}, "kind is []"),
+        (VALUE | {"error": float("nan")}, "error is nan"),
+        (VALUE | {"error": True}, "error is True"),
+        (VALUE | {"unit": 0}, "unit is 0"),
+        (VALUE | {"unit": float("inf")}, "unit is inf"),
+        (VALUE | {"sources": {"b": [{"factor": "2"}]}}, "sources.b[0].factor is '2'"),
+        (VALUE | {"sources": {"b": [{}]}}, "sources.b[0] lacks 'factor'"),
+    ],
+)
+def test_another_value_is_refused_with_its_path(value, words):
+    with pytest.raises(ValueError, match=r".") as error:
+        check_json(value, DESCRIPTION)
+    assert str(error.value) == words
+
+
+def test_a_long_value_is_quoted_in_part():
+    with pytest.raises(ValueError, match=r"^it is \['x+\.\.\.x+'\]$") as error:
+        check_json(["x" * 10**6], {})
+    assert len(str(error.value)) < 100

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sentences about differences between a rig and the rig that a model was trained for."""
+"""The rig of a recording or model: differences from another rig, key joints, controls and the dependency graph."""
 
 from dataclasses import replace
 
@@ -7,9 +7,18 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.controls import Control
+from fdda_addon.core.mathematics.key_joints import KeyJointReport, select_joints
+from fdda_addon.core.mathematics.partition import make_partitions
+from fdda_addon.core.mathematics.skin_fit import FitReport
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
+from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
 from fdda_addon.core.rig import REST_MATRIX_TOLERANCE, Fingerprint, Joint, MeshPart, Rig, rig_differences
+from fdda_addon.core.settings import parse_joints
+from fdda_addon.rig.references import DependencyGraph, Node
 
-from .limb import JOINTS, make_rig
+from ..recordings import read_skinned, write_recording
+from .limb import JOINTS, make_rig, partitions_of, random_poses, random_positions, recording_info
 
 
 def differences(rig: Rig, **changes) -> list[str]:
@@ -128,6 +137,7 @@ MODIFIERS = [
     {"name": "Armature", "type": "ARMATURE", "settings": {"object": "the rig's armature", "use_vertex_groups": True}},
     {"name": "Mush", "type": "CORRECTIVE_SMOOTH", "settings": {"factor": 0.5, "iterations": 10, "scale": None}},
 ]
+
 DEFORMATION = {
     "modifiers": MODIFIERS,
     "shape_keys": {"smile": {"value": 0.0, "mute": False, "shape": "a"}},
@@ -155,6 +165,7 @@ def with_additional_key(**settings: object) -> dict:
 
 
 NEW_MODIFIER = {"name": "New", "type": "CAST", "settings": {}}
+
 CHANGED_DEFORMATIONS = {
     "the same": (DEFORMATION, []),
     "one that says nothing": ({}, []),
@@ -233,3 +244,187 @@ def test_a_damaged_deformation_is_refused(value):
     assert Fingerprint.from_json({**hashes, "deformation": DEFORMATION}).deformation == DEFORMATION
     with pytest.raises(ValueError, match=r"fingerprint\.deformation"):
         Fingerprint.from_json({**hashes, "deformation": value})
+
+
+REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
+
+ERRORS = FitReport({"rig": 2.0, "fitted": 1.0}, {"rig": 20.0, "fitted": 10.0})
+
+
+def chain_rig(*names: str, weighted: tuple[str, ...] = ("a", "b", "c", "d")) -> Rig:
+    """Return a chain of joints with names; four vertices follow `weighted` joints, each with some of the next."""
+    joints = tuple(Joint(name, index - 1) for index, name in enumerate(names))
+    matrices = np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1))
+    matrices[:, 0, 3] = np.arange(len(names))
+    skin_joints = np.zeros((4, 4), np.int32)
+    skin_joints[:, 0] = [names.index(name) for name in weighted]
+    skin_joints[:, 1] = [names.index(name) for name in (*weighted[1:], weighted[0])]
+    weights = np.tile(np.array([0.75, 0.25, 0, 0], np.float32), (4, 1))
+    positions = np.arange(12, dtype=np.float32).reshape(4, 3)
+    return Rig(joints, positions, matrices, skin_joints, weights, (MeshPart("mesh", 4, Fingerprint("t", "r", "s")),))
+
+
+@pytest.mark.parametrize("text", ["all", "auto", "1", "50", "0050"])
+def test_the_option_is_read(text):
+    assert parse_joints(text) == text.lstrip("0")
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "1.5", "Auto", "1e3", "²", "1000000"])
+def test_other_options_are_refused(text):
+    with pytest.raises(ValueError, match=r"joints are auto, all, or a number from 1, and not "):
+        parse_joints(text)
+
+
+def test_weights_of_other_joints_count_for_the_nearest_ancestor():
+    rig = chain_rig("a", "b", "c", "d")
+    selected = select_joints(rig, (Joint("a", -1), Joint("c", 0)))
+    assert selected.joint_names == ("a", "c")
+    assert selected.skin_joints[:, :2].tolist() == [[0, 0], [0, 1], [1, 1], [1, 0]]
+    np.testing.assert_array_equal(selected.rest_matrices, rig.rest_matrices[[0, 2]])
+    assert selected.meshes[0].fingerprint.has_key_joints and not rig.meshes[0].fingerprint.has_key_joints
+
+
+def test_the_fingerprint_depends_on_all_weights_but_not_on_joints_without_weights():
+    joints = (Joint("a", -1), Joint("c", 0))
+
+    def fingerprint(rig: Rig) -> str:
+        return select_joints(rig, joints).meshes[0].fingerprint.skin_weights
+
+    rig = chain_rig("a", "b", "c", "d")
+    assert fingerprint(chain_rig("root", "a", "b", "x", "c", "d")) == fingerprint(rig)
+    # The other slots of a vertex may have another order.
+    swapped = replace(rig, skin_joints=rig.skin_joints[:, [1, 0, 2, 3]], skin_weights=rig.skin_weights[:, [1, 0, 2, 3]])
+    assert fingerprint(swapped) == fingerprint(rig)
+    changed = rig.skin_weights.copy()
+    changed[3, :2] = 0.5
+    others = [
+        replace(rig, skin_weights=changed),
+        chain_rig("a", "b", "c", "d", weighted=("a", "c", "b", "d")),
+        chain_rig("a", "b", "c", "e", weighted=("a", "b", "c", "e")),
+    ]
+    assert len({fingerprint(rig), *map(fingerprint, others)}) == 4
+    selected = select_joints(others[0], joints)
+    recorded = select_joints(rig, joints)
+    assert rig_differences(recorded.joints, recorded.rest_matrices, recorded.meshes, selected) == [
+        "the skin weights differ"
+    ]
+
+
+def test_the_report_is_read_back_and_says_what_is_lost():
+    assert KeyJointReport.from_json(REPORT.to_json()) == REPORT
+    assert REPORT.sentence() == (
+        "Key joints: the model reads 60 of 500 joints; in random poses the others follow from these within 0.40 mm "
+        "(rms). No random pose moves 5 of the others ('a', 'b', 'c' and 2 more) relative to their parents, so the "
+        "model does not show their own motion."
+    )
+    assert replace(REPORT, requested="600", joints=500).sentence() == (
+        "Key joints: all 500 joints are read, because 600 were asked for."
+    )
+    assert replace(REPORT, independent=("x", "y"), still=()).sentence() == (
+        "Key joints: the model reads 60 of 500 joints, but 2 of the others ('x' and 'y') move independently of these, "
+        "by up to 0.40 mm (rms), and the model cannot learn that; read more joints, add their controls as inputs, or "
+        "leave the choice to auto."
+    )
+
+
+@pytest.mark.parametrize(("key", "value"), [("still", "ab"), ("rig_joints", -1), ("requested", "none")])
+def test_damaged_reports_are_refused(key, value):
+    with pytest.raises((TypeError, ValueError)):
+        KeyJointReport.from_json({**REPORT.to_json(), key: value})
+
+
+SMILE = Control("shape_keys", 'key_blocks["Smile"].value', 0.0, 1.0)
+
+FIST = Control("armature_object", 'pose.bones["hand.L"]["fist"]', -1.0, 1.0)
+
+POSE_COUNT = 6
+
+
+def control_values(count: int) -> np.ndarray:
+    """Return (count, 2) float32 values of `SMILE` and `FIST`."""
+    return np.random.default_rng(3).uniform(-1, 1, (count, 2)).astype(np.float32)
+
+
+@pytest.fixture
+def controlled_recording(tmp_path):
+    """Folder of a recording with two controls."""
+    rig = replace(make_rig(), controls=(SMILE, FIST))
+    with RecordingWriter(tmp_path / "recording", rig, recording_info(POSE_COUNT)) as writer:
+        writer.append(random_poses(POSE_COUNT), random_positions(POSE_COUNT), control_values(POSE_COUNT))
+    return tmp_path / "recording"
+
+
+def test_influences_follow_from_poses_in_which_inputs_move_alone(tmp_path):
+    """Partitions are merged as the settings of the training say, and keep what influences any of their vertices."""
+    rig = replace(make_rig(), controls=(SMILE, FIST))
+    partitions = make_partitions(rig, {0: (1,), 1: (2,)}, {1: (1,), 3: (0,)})
+    arrays = random_poses(POSE_COUNT), random_positions(POSE_COUNT), control_values(POSE_COUNT)
+    write_recording(tmp_path / "r", rig, partitions, recording_info(POSE_COUNT), *arrays)
+    skinned = read_skinned(tmp_path / "r", min_vertices_per_part=0)
+    assert [(p.joint, p.influencing, p.controls) for p in skinned.partitions] == [
+        *((0, (1,), ()), (1, (2,), (1,)), (2, (), ()), (3, (), (0,)))
+    ]
+    np.testing.assert_allclose(skinned.residuals, arrays[1], atol=1e-5)
+    for partition in skinned.partitions:
+        residuals = SkinnedRecording.compute_partition_residuals(skinned, partition)
+        np.testing.assert_allclose(residuals, skinned.residuals[:, partition.vertices], atol=1e-6)
+    (merged,) = read_skinned(tmp_path / "r", min_vertices_per_part=100).partitions
+    assert merged.influencing == (1, 2) and merged.controls == (0, 1)
+    assert read_skinned(tmp_path / "r", influence_tolerance=2.0).partitions[0].influencing == ()
+
+
+def test_positions_that_stop_being_finite_are_influenced(tmp_path):
+    rig, notes = make_rig(), []
+    write_recording(tmp_path / "r", rig, partitions_of(rig), recording_info(6), random_poses(6), random_positions(6))
+    positions = np.load(tmp_path / "r" / "positions.npy")
+    first_vertex = make_partitions(rig)[3].vertices[0]
+    positions[6 + 1 + 0, first_vertex] = np.nan
+    np.save(tmp_path / "r" / "positions.npy", positions)
+    skinned = skin_recording(read_recording(tmp_path / "r"), min_vertices_per_part=0, note=notes.append)
+    assert skinned.partitions[3].influencing == (0,) and len(skinned.rows) == 6
+    assert "are not finite in 1 test of its influences, as when 'root' moves from the rest pose" in notes[0]
+
+
+def test_controls_are_read_back_and_appended(controlled_recording):
+    with RecordingExtension(read_recording(controlled_recording), 2, "model.onnx") as extension:
+        extension.append(random_poses(2), random_positions(2), control_values(2))
+    read_back = read_recording(controlled_recording)
+    assert read_back.rig.controls == (SMILE, FIST)
+    assert np.array_equal(read_back.controls, np.concatenate([control_values(POSE_COUNT), control_values(2)]))
+
+
+RIG = "rig"
+
+PARENTS = {"hips": "", "thigh": "hips", "shin": "thigh", "foot": "shin", "toe": "foot"}
+
+
+def bone(name: str) -> Node:
+    return Node(RIG, bone=name)
+
+
+def test_a_node_keeps_what_it_needs_directly_and_through_others():
+    graph = DependencyGraph()
+    graph.add(bone("hand"), bone("forearm"), bone("target"))
+    graph.add(bone("forearm"), bone("shoulder"))
+    graph.add(bone("finger"), bone("hand"))
+    assert graph.kept([bone("hand")]) == {bone("hand"), bone("forearm"), bone("target"), bone("shoulder")}
+
+
+def test_nodes_that_need_each_other_are_kept_together():
+    graph = DependencyGraph()
+    graph.add(bone("a"), bone("b"))
+    graph.add(bone("b"), bone("a"))
+    assert graph.kept([bone("b")]) == {bone("a"), bone("b")}
+
+
+@pytest.mark.parametrize("member", ["foot", "shin", "thigh"])
+def test_each_bone_of_a_chain_keeps_the_owner_and_its_target(member):
+    """A bone in an IK chain depends on the bone below it that has the constraint."""
+    graph = DependencyGraph()
+    for name, parent in PARENTS.items():
+        graph.add(bone(name), *([bone(parent)] if parent else []))
+    graph.add(bone("foot"), bone("ik_target"))
+    graph.add_chain(map(bone, ("foot", "shin", "thigh")))
+    kept = graph.kept([bone(member)])
+    assert kept == {bone(name) for name in ("foot", "shin", "thigh", "hips", "ik_target")}
+    assert bone("ik_target") not in graph.kept([bone("hips")])
