@@ -10,13 +10,25 @@ from ..core.wording import format_count
 from ..poses.clip_player import flipped_name
 from ..poses.human_ranges import human_ranges
 from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
+from ..scene import draw_cache
 from ..scene.compatibility import is_selected
-from .poses import LimitsOperator
+from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator
 
 AXES = "XYZ"
 
 
-class _SelectedBonesOperator(LimitsOperator):
+class _LimitsOperator(RigOperator):
+    """Mixin for an operator that changes limits."""
+
+    modes = OBJECT_OR_POSE_MODE
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        result = super().execute(context)
+        draw_cache.clear()
+        return result
+
+
+class _SelectedBonesOperator(_LimitsOperator):
     """Mixin for an operator on the limits of the selected bones."""
 
     def selected_bones(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
@@ -160,7 +172,7 @@ class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
         return f"Mirrored the limits of {format_count(len(pairs), 'bone')}."
 
 
-class FDDA_OT_human_limits(LimitsOperator, bpy.types.Operator):
+class FDDA_OT_human_limits(_LimitsOperator, bpy.types.Operator):
     bl_idname = "fdda.human_limits"
     bl_label = "Human Limits"
     bl_description = (

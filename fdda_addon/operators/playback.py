@@ -27,22 +27,13 @@ def _has_model(mesh_object: bpy.types.Object) -> bool:
     return active_entry(mesh_object) is not None or trained_file(mesh_object) is not None
 
 
-def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
-    """Return the file of the model that Bind would use; None if there is no model, or it is packed."""
-    entry = active_entry(mesh_object)
-    if entry is None:
-        return trained_file(mesh_object)
-    return None if entry.packed else model_list.entry_path(mesh_object, entry)
-
-
 def bind_model(
-    scene_rig: SceneRig, path: Path | None = None, pack_large: bool = False, is_alone: bool = False
+    scene_rig: SceneRig, path: Path | None = None, is_alone: bool = False
 ) -> tuple[str, list[bpy.types.Object]]:
     """Bind a model to all its meshes on the armature of a rig, and pack it if the preferences say so.
 
     Args:
         path: file of the model; None for the active model of the Model Library, or else the trained model.
-        pack_large: whether to pack a large model too.
         is_alone: whether to bind the mesh of the rig alone.
 
     Returns:
@@ -61,7 +52,7 @@ def bind_model(
         entry = model_list.add_model(mesh_object, path)
     else:
         entry = model_list.require_active_entry(mesh_object)
-    notes = [model_list.bind_entry(scene_rig, entry), pack_by_default(mesh_object, entry, pack_large).strip()]
+    notes = [model_list.bind_entry(scene_rig, entry), pack_by_default(mesh_object, entry).strip()]
     info, mesh_objects = model_list.entry_info(mesh_object, entry), [mesh_object]
     if len(info.meshes) > 1 and not is_alone:
         rigs = find_model_rigs(model_list.entry_path(mesh_object, entry), info, scene_rig.armature_object)
@@ -80,12 +71,12 @@ def bind_model(
     return " ".join(filter(None, [message, *notes])), mesh_objects
 
 
-def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pack_large: bool = False) -> str:
+def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> str:
     """Pack a model if the preferences say so and it is not large; return a text to append to the message."""
     if entry.packed or not packs_models():
         return ""
     size = model_list.entry_path(mesh_object, entry).stat().st_size
-    if size > LARGE_MODEL_BYTES and not pack_large:
+    if size > LARGE_MODEL_BYTES:
         return f" It is large ({format_file_size(size)}) and was not packed; pack it in the Model Library."
     model_list.pack_entry(mesh_object, entry)
     return ""
@@ -105,11 +96,6 @@ class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
-    pack_large: bpy.props.BoolProperty(
-        name="Pack into the .blend File",
-        description="Store the model in the .blend file although it is large",
-        options={"SKIP_SAVE"},
-    )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         try:
@@ -118,24 +104,7 @@ class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
             has_model = None
         if not (self.filepath or has_model):
             return self.open_file_browser(context)
-        self._size = self._largest_unpacked_bytes(context)
-        if self._size > LARGE_MODEL_BYTES and packs_models() and context.window is not None:
-            return context.window_manager.invoke_props_dialog(self, title="Large Model", confirm_text="Bind")
         return self.execute(context)
-
-    def draw(self, _context: bpy.types.Context) -> None:
-        if size := getattr(self, "_size", 0):
-            self.layout.label(text=f"The model has {format_file_size(size)}. Packed, it is written with every save.")
-            self.layout.prop(self, "pack_large")
-
-    def _largest_unpacked_bytes(self, context: bpy.types.Context) -> int:
-        """Return the size of the largest unpacked model to bind, bytes; 0 without one."""
-        try:
-            rigs = self.rigs(context)
-        except FDDAError:
-            return 0
-        paths = [self.chosen_path() if self.filepath else _unpacked_file(rig.mesh_object) for rig in rigs]
-        return max((path.stat().st_size for path in paths if path is not None and path.is_file()), default=0)
 
     def apply(self, context: bpy.types.Context) -> str:
         rigs = self.rigs(context)
@@ -146,7 +115,7 @@ class FDDA_OT_bind(ModelFileOperator, bpy.types.Operator):
         for rig in rigs:
             if rig.mesh_object not in bound_objects:
                 try:
-                    message, mesh_objects = bind_model(rig, path, self.pack_large, is_alone=bool(self.object))
+                    message, mesh_objects = bind_model(rig, path, is_alone=bool(self.object))
                 except FDDAError as error:
                     # What is bound already stays bound, as one undo step.
                     if not bound_objects:

@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators on poses and limits: reset the pose, make an action of poses, set limits from actions, select a bone."""
+"""Operators on poses: reset the pose, make an action of poses, select bones."""
 
 from collections.abc import Collection
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 
 import bpy
 
-from ..core.errors import FDDAError, RigError
+from ..core.errors import RigError
 from ..core.progress import Job
 from ..core.wording import format_count
 from ..properties.recording_options import complete_settings, recording_settings
-from ..recording.pose_plan import show_random_pose, show_rest_pose, shows_random_pose
+from ..recording.pose_plan import show_rest_pose
 from ..recording.posed_action import make_posed_action
 from ..runtime.binding import model_disabled
-from ..scene import draw_cache
 from ..scene.compatibility import select_bone
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
@@ -54,26 +53,6 @@ class FDDA_OT_poses_to_action(JobOperator, bpy.types.Operator):
         action, driven = result
         note = f" Keyed, with their drivers muted: {', '.join(driven)}." if driven else ""
         return f"The action '{action.name}' has {format_count(context.scene.frame_end, 'pose')}.{note}"
-
-
-class LimitsOperator(RigOperator):
-    """Mixin for an operator that changes limits. A random pose that the rig shows is then posed within the new ones."""
-
-    modes = OBJECT_OR_POSE_MODE
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            rig = self.rig(context)
-            is_preview = shows_random_pose(rig)
-        except FDDAError:
-            is_preview = False
-        result = super().execute(context)
-        draw_cache.clear()
-        if is_preview and result == {"FINISHED"}:
-            # If all axes are locked now, there is no random pose.
-            with suppress(FDDAError):
-                show_random_pose(rig, recording_settings(rig), context.window_manager.fdda.pose_index)
-        return result
 
 
 class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):

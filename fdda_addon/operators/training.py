@@ -25,7 +25,7 @@ from ..core.settings import (
 from ..jobs.job import current
 from ..jobs.state import JobStep
 from ..models.former_model import add_former_model, keep_former_model
-from ..models.model_list import add_model, check_matches_rig
+from ..models.model_list import add_model
 from ..properties.character import model_file, recording_folder
 from ..runtime.model_meshes import has_shape
 from ..scene.scene_rig import armature_of, describe_left_out
@@ -202,7 +202,6 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
         description="Continue from the last training, on a recording with more poses",
         options={"SKIP_SAVE"},
     )
-    replace: bpy.props.BoolProperty(options={"SKIP_SAVE", "HIDDEN"})
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -211,25 +210,6 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
                 "Continue from the last training, on a recording with more poses. Takes half as long as a new training"
             )
         return cls.bl_description
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if not (self.replace or bpy.app.background) and (message := self._models_of_other_rigs(context)):
-            self.is_confirming = self.replace = True
-            return context.window_manager.invoke_confirm(
-                self, event, title="Overwrite Another Model?", message=message, confirm_text="Overwrite", icon="WARNING"
-            )
-        return super().invoke(context, event)
-
-    def _models_of_other_rigs(self, context: bpy.types.Context) -> str:
-        """Return a message about models of other rigs that training would overwrite; empty without one."""
-        try:
-            for rig in self.rigs(context):
-                model = self._files(rig.mesh_object)[1]
-                if model.is_file() and not is_detached(model):
-                    check_matches_rig(rig, model)
-        except FDDAError as error:
-            return f"{error} Training will overwrite it; to keep it, choose another file under Model."
-        return ""
 
     def _files(self, mesh_object: bpy.types.Object) -> tuple[Path, Path]:
         """Return the folder of the recording and the file of the model of a mesh."""
@@ -285,7 +265,7 @@ def _follow_detached_training() -> None:
             continue
         if has_detached_training and mesh_object.name in bpy.context.scene.objects:
             with bpy.context.temp_override(window=windows[0]):
-                bpy.ops.fdda.train("INVOKE_DEFAULT", object=mesh_object.name, replace=True)
+                bpy.ops.fdda.train("INVOKE_DEFAULT", object=mesh_object.name)
             return
 
 

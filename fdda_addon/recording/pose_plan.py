@@ -25,7 +25,7 @@ from ..rig.reading import PoseReader
 from ..rig.references import split_bone_path
 from ..rig.shape_keys import set_keys_undriven
 from ..rig.sources import Sources
-from ..scene.armature import Poser, clear_pose, pose_values
+from ..scene.armature import Poser, clear_pose
 from ..scene.control_names import control_default
 from ..scene.controls import can_be_set, is_driven, owner_of, set_control
 from ..scene.scene_rig import SceneRig
@@ -185,10 +185,6 @@ def find_references(
     return choose_references(rig, is_fixed, np.stack(pose_matrices))
 
 
-_shown_pose: "tuple[int, np.ndarray] | None" = None
-"""Session id of the armature object that shows a random pose, and the values of the pose."""
-
-
 def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: int) -> int:
     """Set one of the random poses of a recording.
 
@@ -202,8 +198,6 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
     Returns:
         The index of the pose that is shown: `index`, or the index of the last random pose if that is smaller.
     """
-    global _shown_pose
-
     settings = replace(settings, poses=max(1, settings.poses))
     index = min(index, settings.poses - 1)
     _, channels = read_sampled_rig(scene_rig, settings)
@@ -214,17 +208,7 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
     clear_pose(scene_rig.armature_object)
     Poser(scene_rig, channels).set(sampler.draw_pose(channels, index))
     scene_rig.armature_object.update_tag(refresh={"DATA"})
-    _shown_pose = scene_rig.armature_object.session_uid, pose_values(scene_rig.armature_object)
     return index
-
-
-def shows_random_pose(scene_rig: SceneRig) -> bool:
-    """Return whether the rig is still in the pose that `show_random_pose` has set."""
-    armature_object = scene_rig.armature_object
-    if _shown_pose is None or _shown_pose[0] != armature_object.session_uid:
-        return False
-    values = pose_values(armature_object)
-    return values.shape == _shown_pose[1].shape and bool((values == _shown_pose[1]).all())
 
 
 def show_rest_pose(scene_rig: SceneRig, settings: "RecordingSettings | None") -> None:

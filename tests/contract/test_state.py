@@ -20,7 +20,6 @@ STATE = {
     "panels/checks.py": {"_changes": "what changed since the checks of rigs, until another file is opened"},
     "panels/curves.py": {"image": "made by the first drawing, freed by unregister"},
     "panels/timed_value.py": {"timed_values": "values that panels draw, until their object is removed, or unregister"},
-    "recording/pose_plan.py": {"_shown_pose": "the last previewed pose, until the next"},
     "runtime/session.py": {"session": "the characters of the open file; another file resets it"},
     "scene/draw_cache.py": {"_cache": "what drawing has read; another file drops all of it"},
     "scene/stored_paths.py": {"_running_saves": "each from save_pre to save_post"},

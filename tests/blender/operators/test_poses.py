@@ -64,16 +64,6 @@ def set_limit(axis: str, low: float, high: float) -> None:
     assert bpy.ops.fdda.set_limits("INVOKE_DEFAULT", **options) == {"FINISHED"}
 
 
-def test_the_previewed_pose_follows_changed_limits_and_a_pose_by_hand_does_not(saved):
-    bone = saved.armature_object.pose.bones["upper"]
-    bpy.context.window_manager.fdda.preview_pose = 2
-    set_limit("Y", math.radians(70), math.radians(80))
-    assert math.radians(70) <= bone.rotation_euler[1] <= math.radians(80)
-    bone.rotation_euler = (0.1, 0.2, 0.3)
-    set_limit("Y", math.radians(10), math.radians(20))
-    np.testing.assert_allclose(bone.rotation_euler, (0.1, 0.2, 0.3), atol=1e-6)
-
-
 def test_rest_pose_resets_the_bones_and_can_be_undone(saved):
     bpy.context.window_manager.fdda.preview_pose = 2
     bpy.ops.ed.undo_push()

@@ -76,8 +76,6 @@ def test_a_large_model_is_not_packed_and_this_is_reported(rig, model, monkeypatc
     monkeypatch.setattr(playback, "LARGE_MODEL_BYTES", 1000)
     assert playback.bind_model(rig, model_files.Path(model))[0].endswith("pack it in the Model Library.")
     assert rig.mesh_object.fdda.is_bound and rig.mesh_object.fdda.packed is None
-    bpy.ops.fdda.bind(pack_large=True)
-    assert rig.mesh_object.fdda.packed is not None
 
 
 def test_models_are_not_packed_if_the_preferences_say_so(rig, model, monkeypatch):
