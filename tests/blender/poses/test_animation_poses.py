@@ -223,21 +223,27 @@ def test_random_controls_are_reset_before_actions(figure, tmp_path):
     assert np.ptp(values[:5]) > 0 and (values[5:] == 0.5).all()
 
 
-def test_resumed_recordings_have_the_same_bytes(figure, tmp_path):
-    """Recording stops during the random poses, the action, and the mirrored action."""
+def test_resumed_recordings_have_the_same_bytes_and_restore_the_scene(figure, tmp_path):
+    """Recording stops during the random poses, those beyond the limits, the action, and the mirrored action."""
     add_strips(figure, bpy.data.actions[WAVE])
+    limits = [bone.constraints.new("LIMIT_ROTATION") for bone in figure.armature_object.pose.bones]
+    for constraint in limits:
+        constraint.owner_space, constraint.use_limit_x, constraint.max_x = "LOCAL", True, 0.5
     name = 'armature_object/pose.bones["arm.R"]["fist"]=0:1'
-    settings = {"poses": 10, "actions": (WAVE,), "strips": ("swing",), "mirror": True, "influence_poses": 1}
-    settings = RecordingSettings(**settings, extra_inputs=(name,))
+    settings = {"poses": 12, "overshoot": 2.0, "actions": (WAVE,), "strips": ("swing",), "mirror": True}
+    settings = RecordingSettings(**settings, influence_poses=1, extra_inputs=(name,))
+    before = scene_state(figure)
     drain(record(figure, tmp_path / "whole", settings))
-    for stop_pose in (8, 30, 55):
+    for stop_pose in (5, 10, 30, 57):
         resumed = tmp_path / f"resumed from {stop_pose}"
         steps = record(figure, resumed, settings)
         for step in steps:
             if step.stage == "poses" and step.done == stop_pose:
                 steps.close()
+        assert_same_state(before, scene_state(figure))
+        assert not any(constraint.mute for constraint in limits)
         index = json.loads((resumed / "recording.json").read_text())
-        assert stop_pose <= index["complete"] < index["poses"] and index["poses"] > 10 + 4 * FRAMES
+        assert stop_pose <= index["complete"] < index["poses"] and index["poses"] > 12 + 4 * FRAMES
         drain(record(figure, resumed, replace(settings, resume=True)))
         assert file_contents(resumed) == file_contents(tmp_path / "whole")
 

@@ -20,8 +20,8 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from ..conftest import run, train
-from ..refusals import file_contents, save_elbow
-from ..scene_state import assert_same_state, drain, fresh_elbow, scene_state
+from ..refusals import save_elbow
+from ..scene_state import drain, fresh_elbow
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -82,33 +82,6 @@ def test_poses_inside_and_frames_are_those_of_a_recording_without_an_overshoot(r
         assert np.array_equal(ours[SETTINGS.poses :], theirs[SETTINGS.poses :])
     assert without.info.sampling.overshoot is None
     assert recording.info.sampling.channels == without.info.sampling.channels
-
-
-def test_the_scene_is_restored_after_a_whole_and_an_interrupted_recording(rig, tmp_path):
-    found = opened(rig)
-    muted = {c.name: c.mute for bone in found.armature_object.pose.bones for c in bone.constraints}
-    before = scene_state(found)
-    drain(record(found, tmp_path / "whole", SETTINGS))
-    steps = record(found, tmp_path / "broken", SETTINGS)
-    for step in steps:
-        if step.stage == "poses" and step.done == INSIDE + 5:
-            break
-    steps.close()
-    assert {c.name: c.mute for bone in found.armature_object.pose.bones for c in bone.constraints} == muted
-    assert_same_state(before, scene_state(found))
-
-
-def test_a_resumed_recording_equals_an_uninterrupted_one_bit_for_bit(rig, tmp_path):
-    drain(record(opened(rig), tmp_path / "whole", SETTINGS))
-    for at in (12, INSIDE + 3, SETTINGS.poses + 4):
-        path = tmp_path / f"broken at {at}"
-        steps = record(opened(rig), path, SETTINGS)
-        for step in steps:
-            if step.stage == "poses" and step.done == at:
-                break
-        steps.close()
-        drain(record(opened(rig), path, replace(SETTINGS, resume=True)))
-        assert file_contents(path) == file_contents(tmp_path / "whole")
 
 
 def test_only_limits_that_would_change_a_pose_are_muted():

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surfaces that depend on time are refused with the name of the cause, unless the cause is a control."""
+"""Surfaces that depend on time are refused, unless the cause is a control; numbers without a range are named."""
+
+from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
 from blend_fixtures.characters import in_time, targets
-from blend_fixtures.characters.base import link
+from blend_fixtures.characters.base import link, tube
 from blend_fixtures.characters.bones import NewBone, add_bones
+from blend_fixtures.characters.controls import add_cast, drive_by_property
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.recording.plan import RecordingSettings
@@ -25,11 +28,14 @@ from ..scene_state import assert_same_state, drain, scene_state
 APART = 1e-4
 """Meters by which a surface differs between two frames, at the least, so that a case is one."""
 
-
 SURFACE = "The surface of 'elbow' changes with time through {}, so it does not follow from the pose; {}."
+
 FACTOR = "'modifiers[\"Smooth\"].factor' of 'elbow'"
+
 STRENGTH = 'mesh_object/modifiers["Smooth"].factor'
+
 MUTE = "mute it, or let it read a number that is a control"
+
 READS = f"the driver of {FACTOR}, which reads the frame", MUTE
 
 
@@ -72,7 +78,6 @@ CASES = {
     ),
 }  # fmt: skip
 
-
 HELD = {
     in_time.keyed_property_without_a_range,
     in_time.through_a_property,
@@ -114,8 +119,11 @@ def test_changes_with_time_are_also_detected_in_a_held_pose(build, tmp_path, mon
 
 
 THICK = 'object:lattice/data.shape_keys.key_blocks["thick"].value'
+
 MUSCLE = 'object:muscle_rig/pose.bones["muscle"].rotation_euler[{}]'
+
 NODE = 'mesh_object/modifiers["Ripple"].node_group.nodes["Vector Math.001"].inputs[3].default_value'
+
 PLAYED = {
     in_time.keyed_shape: ((), {f'shape_keys/key_blocks["{name}"].value' for name in ("flexed", "thin")}),
     in_time.keyed_shape_of_a_lattice: ((), {THICK}),
@@ -203,3 +211,61 @@ def test_surfaces_that_depend_on_the_pose_alone_are_recorded(build, tmp_path):
     rig = build_rig(build)
     assert check_recordable_rig(rig).problems == ()
     drain(record(rig, tmp_path / "recording", FEW_POSES))
+
+
+def notes_of_recording(folder: Path, *controls: str) -> str:
+    settings = RecordingSettings(poses=4, influence_poses=1, extra_inputs=controls)
+    return " ".join(step.note for step in record(find_rig("elbow"), folder / "recording", settings))
+
+
+def drive_strength(owner: bpy.types.ID, path: str, expression: str = "value") -> None:
+    """Let the strength of a modifier of the tube follow an expression of the number `value` at a path, from 0 to 1."""
+    drive_by_property(add_cast(bpy.data.objects["elbow"]), "factor", owner, path)
+    bpy.data.objects["elbow"].animation_data.drivers[0].driver.expression = f"min(max({expression}, 0), 1)"
+    bpy.context.view_layer.update()
+
+
+@pytest.mark.parametrize(
+    ("value", "limits", "expression", "note"),
+    [
+        (0.0, (-10_000.0, 10_000.0), "value", "number 'armature_object/[\"fat\"]' without a range"),
+        (0.0, None, "value", "number 'armature_object/[\"fat\"]' without a range"),
+        (0, None, "value", "number 'armature_object/[\"fat\"]' without a range"),
+        (0.0, (-1000.0, 1000.0), "value", "changes only between 0 and 1.46 in the range -1000 to 1000"),
+        (0.0, (0.0, 360.0), "min(max((value - 90) / 10, 0), 1)", "changes only between 90 and 101 in the range 0 to"),
+        (0.0, (-180.0, 180.0), "(value + 180) / 360", ""),
+        (0.0, (0.0, 1.0), "value > 0.5", ""),
+    ],
+)
+def test_a_custom_property_is_an_input_or_is_named(
+    value: float, limits: tuple[float, float] | None, expression: str, note: str, tmp_path: Path
+):
+    _, armature_object = tube()
+    armature_object["fat"] = value
+    if limits:
+        armature_object.id_properties_ui("fat").update(min=limits[0], max=limits[1])
+    armature_object.update_tag()
+    drive_strength(armature_object, '["fat"]', expression)
+    notes = notes_of_recording(tmp_path)
+    assert note in notes and bool(note) == ("'elbow'" in notes)
+    assert armature_object["fat"] == value
+    if note:
+        assert "surface" not in notes_of_recording(tmp_path / "named", 'armature_object/["fat"]=0:5')
+
+
+def test_other_numbers_are_named(tmp_path: Path):
+    _, armature_object = tube()
+    dial = bpy.data.objects.new("dial", None)
+    bpy.context.scene.collection.objects.link(dial)
+    drive_strength(dial, "location[0]")
+    assert "number 'object:dial/location[0]' without a range" in notes_of_recording(tmp_path)
+    # A driven number is no input; the number that its driver reads is.
+    armature_object["strength"] = 0.0
+    variable = dial.driver_add("location", 0).driver.variables.new()
+    variable.targets[0].id, variable.targets[0].data_path = armature_object, '["strength"]'
+    notes = notes_of_recording(tmp_path / "driven")
+    assert "dial" not in notes and "number 'armature_object/[\"strength\"]' without a range" in notes
+    target = bpy.data.objects["elbow"].animation_data.drivers[0].driver.variables[0].targets[0]
+    target.id_type, bpy.context.scene["fat"] = "SCENE", 0.0
+    target.id, target.data_path = bpy.context.scene, '["fat"]'
+    assert "number '[\"fat\"] of Scene', which cannot be an input" in notes_of_recording(tmp_path / "scene")
