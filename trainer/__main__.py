@@ -24,14 +24,14 @@ if __name__ == "__main__":
 from .config import add_options, config_from_arguments
 from .outputs import check_training_outputs
 from .process import StopRequest, missing_package_error, run_with_messages
-from .progress import JsonMessageSink, MessageSink, TextMessageSink
+from .progress import MessageSink
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, and return the exit status."""
     escape_unencodable_output()
     options = _parser().parse_args(arguments)
-    sink: MessageSink = JsonMessageSink() if options.messages else TextMessageSink()
+    sink = MessageSink()
     stop_request = StopRequest(sink)
     return run_with_messages(lambda: _train(options, sink, stop_request), sink)
 
@@ -61,9 +61,6 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("trainer", description="Train a model from a recording.")
     parser.add_argument("recording", type=Path, help="folder that record wrote")
     parser.add_argument("model", type=Path, help="the .onnx file to write, with its report beside it")
-    parser.add_argument(
-        "--messages", action="store_true", help="JSON messages on stdout, for a program, in place of text"
-    )
     parser.add_argument(
         "--warm-start", action="store_true", help="start from the checkpoint of the model, on a recording that grew"
     )

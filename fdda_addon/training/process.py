@@ -57,13 +57,11 @@ class TrainerProcess:
 
     Attributes:
         module: name of the module that `python -m` runs.
-        prefix: its first arguments.
         failure_message: error message if the process gives none.
         loss_advice: end of the error message if the process ended without a result.
     """
 
     module = "trainer"
-    prefix: tuple[str, ...] = ()
     _finalizer: weakref.finalize | None = None
     failure_message = "The training failed."
     loss_advice = "no model was written, train again"
@@ -80,7 +78,7 @@ class TrainerProcess:
             OutputError: the file for stderr cannot be written.
         """
         advice = select_python().origin.value if python is None else "name a Python that has torch"
-        command, _ = trainer_command([*self.prefix, *arguments], python, self.module)
+        command, _ = trainer_command(arguments, python, self.module)
         self._stop_file, self._errors = self._new_stop_file(), self._new_errors()
         # Ctrl-C may arrive between the start of the process and the `with` block that ends it.
         self._finalizer = weakref.finalize(self, Path.touch, self._stop_file)
@@ -222,5 +220,3 @@ class TrainerProcess:
 
 class Training(TrainerProcess):
     """Context manager for the process of a training, whose arguments are recording, model and options."""
-
-    prefix = ("--messages",)

@@ -233,7 +233,7 @@ def test_the_cpu_trains_what_a_card_fails_to_train(
 ):
     """The device "meta" has no memory, so the training fails on it after its first steps."""
     monkeypatch.setattr("trainer.train.choose_device", lambda: TrainingDevice("meta", CARD))
-    assert main([str(recording), str(tmp_path / "model.onnx"), "--messages", *QUICK_OPTIONS]) == 0
+    assert main([str(recording), str(tmp_path / "model.onnx"), *QUICK_OPTIONS]) == 0
     messages = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     (text,) = [message["text"] for message in messages if message.get("name") == "graphics-card"]
     assert text.startswith(f"{CARD} cannot be used (") and text.endswith(

@@ -23,7 +23,7 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import STATIC_JOINT
 
 from ..process import StopRequest, missing_package_error, run_with_messages
-from ..progress import JsonMessageSink
+from ..progress import MessageSink
 from .fit_poses import choose_fit_poses, select_poses
 
 
@@ -34,7 +34,7 @@ def main() -> int:
     parser.add_argument("out", type=Path)
     parser.add_argument("--influences", type=int, required=True, help="largest number of joints per vertex")
     parser.add_argument("--hold-out", action="append", default=[], metavar="NAME", help="action to hold out")
-    options, sink = parser.parse_args(), JsonMessageSink()
+    options, sink = parser.parse_args(), MessageSink()
     stop_request = StopRequest(sink)
 
     def fit() -> None:
@@ -45,7 +45,7 @@ def main() -> int:
     return run_with_messages(fit, sink)
 
 
-def _fit(options: argparse.Namespace, sink: JsonMessageSink) -> None:
+def _fit(options: argparse.Namespace, sink: MessageSink) -> None:
     try:
         from .solver import fit_skin
     except ModuleNotFoundError as error:
