@@ -8,8 +8,7 @@ from ..baking.export import write_bake
 from ..baking.run import BakeSettings, bake_file
 from ..core.files.stop_signals import exit_on_stop_signal
 from ..core.wording import format_count
-from .files import add_model_argument, add_overwrite_option, add_rig_options
-from .folders import open_rigs
+from .files import add_model_argument, add_overwrite_option, add_rig_options, open_rigs
 from .progress import ProgressPrinter
 
 

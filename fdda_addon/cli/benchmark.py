@@ -20,8 +20,7 @@ from ..fast_rig.saving import measure_saving
 from ..scene.scene_rig import find_rig, find_rigs
 from ..timing.benchmark import benchmark
 from ..timing.profiling import profile_frame
-from .files import add_overwrite_option, add_rig_options, open_file
-from .folders import open_rigs, to_json_by_object, with_heading
+from .files import add_overwrite_option, add_rig_options, open_file, open_rigs, to_json_by_object, with_heading
 from .progress import ProgressPrinter
 
 

@@ -17,8 +17,7 @@ from ..runtime.model_meshes import describe_missing_meshes, find_mesh
 from ..scene.blend_file import save_copy
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import stored_path
-from .files import add_model_argument, add_overwrite_option, add_rig_options
-from .folders import open_rigs
+from .files import add_model_argument, add_overwrite_option, add_rig_options, open_rigs
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

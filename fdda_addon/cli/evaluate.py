@@ -25,10 +25,17 @@ from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from ..scene.time_stretching import time_ratio
 from ..timing.benchmark import benchmark
-from .files import add_model_argument, add_overwrite_option, add_repeatable_option, add_rig_options
-from .folders import open_rigs, to_json_by_object, with_heading
+from .files import (
+    add_model_argument,
+    add_overwrite_option,
+    add_repeatable_option,
+    add_rig_options,
+    open_rigs,
+    to_json_by_object,
+    with_heading,
+)
+from .pose_options import add_target_options, target_settings
 from .progress import ProgressPrinter
-from .target import add_target_options, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -11,8 +11,7 @@ from ..core.wording import format_count, format_list
 from ..fast_rig.controls import check_choices
 from ..fast_rig.frame_times import measure_frames
 from ..fast_rig.run import FastRig, make_fast_rig
-from .files import add_model_argument, add_overwrite_option, add_rig_options
-from .folders import open_rigs
+from .files import add_model_argument, add_overwrite_option, add_rig_options, open_rigs
 from .progress import ProgressPrinter
 
 MAX_LISTED = 10

@@ -15,9 +15,8 @@ from ..runtime.binding import model_disabled
 from ..scene.blend_file import save_copy
 from ..scene.scene_rig import find_character
 from .files import add_overwrite_option, add_rig_options, open_file
-from .pose_options import add_pose_options
+from .pose_options import add_pose_options, pose_settings
 from .progress import ProgressPrinter
-from .target import pose_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -24,9 +24,8 @@ from ..recording.run import record
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, find_character, find_whole_character
 from .files import add_repeatable_option, add_rig_argument, open_file
-from .pose_options import add_pose_options
+from .pose_options import add_pose_options, add_target_options, pose_settings, target_settings
 from .progress import ProgressPrinter
-from .target import add_target_options, pose_settings, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,6 @@ from ..jobs import job
 from ..models.model_list import bound_model_name
 from ..scene.active_rig import cached_rigs_together
 from ..scene.scene_rig import SceneRig
-from .bone_names import short_bone_name
 from .section import (
     Section,
     draw_assessment,
@@ -20,6 +19,7 @@ from .section import (
     draw_wrapped,
     is_bound,
     panel_rig,
+    short_bone_name,
 )
 from .training import recording_warnings
 
@@ -147,7 +147,7 @@ def _draw_statistics(
     column = body.column(align=True)
     for partition in (*active_partitions, *(p for p in shown_partitions if p not in active_partitions)):
         name = draw_table_row(column, [_format_mm(getattr(partition.fdda, statistic)) for _, statistic in STATISTICS])
-        text = short_bone_name(rig.armature_object, partition.joint)
+        text = short_bone_name(partition.joint)
         icon = "BONE_DATA" if partition.joint == active else "NONE"
         name.operator("fdda.show_bone", text=text, icon=icon, emboss=False).bone = partition.joint
 

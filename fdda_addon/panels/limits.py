@@ -21,8 +21,7 @@ from ..scene.compatibility import is_selected, selection_owner
 from ..scene.draw_cache import computed_once, draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks, sampling
-from .bone_names import short_bone_name
-from .section import panel_rig
+from .section import panel_rig, short_bone_name
 
 AXES = "xyz"
 WIDE_SIDEBAR_PIXELS = 380
@@ -78,7 +77,7 @@ def _visible_bone_flags(rig: SceneRig, search_text: str, flag: int) -> tuple[int
 @draw_cached
 def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
     """Return icon, name and limits of a bone for the list, and whether limits are set for the bone."""
-    name = short_bone_name(rig.armature_object, bone.name)
+    name = short_bone_name(bone.name)
     channels = sampled_channels_by_bone(rig)
     if channels is not None:
         return "NONE", name, _format_channels(channels.get(bone.name, ()), is_wide), True

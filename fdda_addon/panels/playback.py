@@ -13,16 +13,14 @@ from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of, remaining_rig_note
 from ..scene.stored_paths import resolve_path
-from .bone_names import short_bone_name
 from .frame_profile import draw_times
 from .meshes import draw_meshes
-from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, is_bound, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_wrapped, is_bound, panel_rig, short_bone_name
 from .timed_value import timed_values
 from .trained_file import find_trained_file
 
 FULL_CONFIDENCE = 0.995
 MAX_SHOWN_PARTITIONS = 6
-MODES = (("RIG", "Rig"), ("LINEAR", "Skinning"), ("FDDA", "Model"))
 
 
 @draw_cached
@@ -135,14 +133,15 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         row = layout.row(align=True)
         row.scale_y = 1.4
-        modes = [(mode, text) for mode, text in MODES if mode != "RIG" or not mesh_object.fdda.is_fast_rig]
+        modes = binding.bl_rna.properties["mode"].enum_items
+        modes = [mode for mode in modes if mode.identifier != "RIG" or not mesh_object.fdda.is_fast_rig]
         if cached_rigs_together(context):
-            for mode, text in modes:
-                properties = row.operator("fdda.set_mode", text=text, depress=binding.mode == mode)
-                properties.mode, properties.all_meshes = mode, True
+            for mode in modes:
+                properties = row.operator("fdda.set_mode", text=mode.name, depress=binding.mode == mode.identifier)
+                properties.mode, properties.all_meshes = mode.identifier, True
         else:
-            for mode, text in modes:
-                row.prop_enum(binding, "mode", mode, text=text)
+            for mode in modes:
+                row.prop_enum(binding, "mode", mode.identifier)
         if not mesh_object.fdda.is_fast_rig:
             draw_times(layout, context, armature_of(mesh_object))
         column = layout.column()
@@ -176,7 +175,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         column = body.column(align=True)
         for name, value in partitions_beyond_range[:MAX_SHOWN_PARTITIONS]:
             row = column.split(factor=0.5, align=True)
-            row.label(text=short_bone_name(armature_of(mesh_object), name))
+            row.label(text=short_bone_name(name))
             row.progress(factor=value, text=f"{100 * value:.0f} %")
         if len(partitions_beyond_range) > MAX_SHOWN_PARTITIONS:
             column.label(text=f"and {len(partitions_beyond_range) - MAX_SHOWN_PARTITIONS} more")

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Base class of all sections of the sidebar, and functions that draw wrapped text, paths and jobs."""
 
+import re
 from collections.abc import Callable, Iterable
 
 import blf
@@ -18,6 +19,8 @@ from . import checks
 TEXT_MARGIN, ICON_WIDTH = 74, 22
 """Width of both margins of a text together, and width of an icon, pixels at a UI scale of 1."""
 MIN_TEXT_WIDTH = 60
+USUAL_PREFIX = re.compile(r"(.*:|DEF-|CC_Base_|Bip0*1[ _])?")
+"""Prefix of a bone name that says nothing about the bone: "mixamorig:", "DEF-" of Rigify."""
 OUTCOME_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 
 
@@ -155,6 +158,11 @@ def draw_table_row(layout: bpy.types.UILayout, texts: Iterable[str]) -> bpy.type
         cell.alignment = "RIGHT"
         cell.label(text=text)
     return name
+
+
+def short_bone_name(name: str) -> str:
+    """Return the name of a bone for narrow tables, without a namespace or a usual prefix."""
+    return name[USUAL_PREFIX.match(name).end() :] or name
 
 
 def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str, default: str) -> None:

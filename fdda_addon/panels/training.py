@@ -17,7 +17,6 @@ from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
-from .bone_names import short_bone_name
 from .recording import has_recording, read_content
 from .section import (
     Section,
@@ -29,6 +28,7 @@ from .section import (
     draw_table_row,
     draw_wrapped,
     panel_rig,
+    short_bone_name,
 )
 from .trained_file import TrainedFile, find_trained_file
 
@@ -239,7 +239,7 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     for partition in shown_partitions:
         errors = partition["held_out"]
         texts = f"{errors['mean']:.3f}", f"{errors['p999']:.2f}", f"{errors['max']:.2f}"
-        draw_table_row(table, texts).label(text=short_bone_name(rig.armature_object, partition["joint"]))
+        draw_table_row(table, texts).label(text=short_bone_name(partition["joint"]))
     if len(partitions) > SHOWN_PARTITIONS:
         text = f"Show All {len(partitions)} Body Parts"
         body.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)

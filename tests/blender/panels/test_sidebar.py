@@ -19,9 +19,8 @@ from fdda_addon.jobs.job import JobRunner
 from fdda_addon.jobs.state import JobState, format_duration
 from fdda_addon.operators.meshes import MENU_OPERATORS
 from fdda_addon.panels import MODULES, checks, curves, findings, limits, models, playback
-from fdda_addon.panels.bone_names import common_prefix
 from fdda_addon.panels.recording import cached_content
-from fdda_addon.panels.section import panel_rig
+from fdda_addon.panels.section import panel_rig, short_bone_name
 from fdda_addon.panels.timed_value import TimedValues, timed_values
 from fdda_addon.panels.training import _read_report
 from fdda_addon.poses.motion_range import clear_rotation_range, set_rotation_range
@@ -679,20 +678,6 @@ def test_merging_keeps_normals_and_the_cuts_that_weights_or_shape_keys_open(save
     assert sorted(heights)[-2:] == pytest.approx([0.0, 0.1])
 
 
-@pytest.mark.parametrize(
-    ("names", "prefix"),
-    [
-        (["mixamorig:Hips", "mixamorig:LeftArm", "mixamorig:LeftHandIndex1"], "mixamorig:"),
-        (["root", *(f"char01:body:{n}" for n in "abcdefg")], "char01:body:"),
-        (["DEF-spine", "DEF-upper_arm.L", "DEF-upper_arm.R"], "DEF-"),
-        (["CC_Base_Hip", "CC_Base_Waist", "CC_Base_L_Thigh"], "CC_Base_"),
-        (["upper", "lower"], ""),
-        (["thumb_1", "thumb_2"], "thumb_"),
-        (["a_1", "a_2"], ""),
-        (["arm"], ""),
-        (["x:a", "b", "c", "d"], ""),
-        ([], ""),
-    ],
-)
-def test_the_common_prefix_of_bone_names_is_omitted(names, prefix):
-    assert common_prefix(names) == prefix
+def test_usual_prefixes_of_bone_names_are_omitted():
+    names = ("mixamorig:LeftArm", "char01:body:arm", "DEF-spine.L", "CC_Base_L_Thigh", "Bip001 R Calf", "upper", "a:")
+    assert [*map(short_bone_name, names)] == ["LeftArm", "arm", "spine.L", "L_Thigh", "R Calf", "upper", "a:"]
