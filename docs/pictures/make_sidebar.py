@@ -24,7 +24,7 @@ SECTION_PICTURES = {
 }
 """Steps of the test whose sections are shown side by side, by the name of the picture."""
 WINDOW_PICTURES = {
-    "sidebar_evaluation": "04_mark_the_worst_frames",
+    "sidebar_evaluation": "04_jump_to_the_worst_frame",
     "manual_heat_map": "03_show_the_heat_map",
     "simulation_settling": "settling",
     "simulation_plays": "flesh_plays",

@@ -229,8 +229,6 @@ EVALUATION_SEED = 1
 """Seed of the poses of an evaluation; it differs from the default seed of a recording."""
 FILM_TIMED_FRAMES = 50
 """Number of frames that are timed for the frame times in a film."""
-MARKERS = 5
-"""Number of frames that an evaluation marks in the timeline, those with the largest errors."""
 
 ALL, AUTO = "all", "auto"
 """Values of the setting `bones_to_read`, the joints that a model reads, besides a number of joints."""

@@ -19,7 +19,6 @@ MODULES: tuple[str, ...] = (
     "fast_rig",
     "evaluation",
     "film",
-    "worst_poses",
     "models",
     "help",
     "meshes",

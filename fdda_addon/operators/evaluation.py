@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section "Compare with Rig": evaluate the model, color the mesh, show the rig, open the report."""
 
+import math
 from dataclasses import replace
 
 import bpy
@@ -12,7 +13,7 @@ from ..core.progress import Job
 from ..core.settings import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..evaluation import heat_map, last_evaluation, side_by_side
 from ..evaluation.results import Evaluation
-from ..evaluation.run import evaluate_meshes
+from ..evaluation.run import evaluate_meshes, set_held_out_pose
 from ..evaluation.settings import EvaluationSettings
 from ..models import model_list
 from ..models.model_list import bound_entry, bound_model_name
@@ -22,7 +23,7 @@ from ..properties.view import active_action_name, show_graph
 from ..runtime.binding import model_disabled
 from ..runtime.model_files import network_of
 from ..scene.scene_rig import SceneRig, check_full_rig
-from ..scene.viewport import redraw_views
+from ..scene.viewport import center_views, redraw_views
 from .job import JobOperator
 from .rig_operator import NEEDS_MODEL, RigOperator
 
@@ -175,6 +176,52 @@ class FDDA_OT_fit_color_range(EvaluationOperator, bpy.types.Operator):
         return f"Max color: {view.range_mm:.3g} mm."
 
 
+class FDDA_OT_jump_to_worst(EvaluationOperator, bpy.types.Operator):
+    bl_idname = "fdda.jump_to_worst"
+    bl_label = "Jump to Worst"
+    bl_description = "Go to the frame, or show the random pose, with the largest error"
+
+    rank: bpy.props.IntProperty(name="Rank", description="1 is the worst, 2 the next", default=1, min=1, max=50)
+
+    zoom: bpy.props.BoolProperty(
+        name="Zoom to Vertex", description="Look at the vertex with the largest error", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        if properties.zoom:
+            return "Go to this frame or random pose, and look at the vertex with the largest error"
+        return cls.bl_description
+
+    def apply(self, context: bpy.types.Context) -> str:
+        scene_rig, last = self.last_evaluation(context)
+        poses = last.worst_poses(self.rank)
+        if not poses:
+            raise ModelError("The model is exact in all compared poses; there is no worst one.")
+        pose, error_mm = poses[-1]
+        message = self._show_pose(context, scene_rig, last, pose)
+        if self.zoom:
+            index = int(last.errors["fdda"][pose].argmax())
+            evaluated_object = scene_rig.mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+            # Modifiers that add vertices, such as a subdivision, keep the first ones.
+            position = evaluated_object.matrix_world @ evaluated_object.data.vertices[index].co
+            center_views(position, max(max(evaluated_object.dimensions) / 20, 1e-4))
+        return f"{message}: max error {error_mm:.2f} mm."
+
+    def _show_pose(
+        self, context: bpy.types.Context, scene_rig: SceneRig, last: last_evaluation.LastEvaluation, pose: int
+    ) -> str:
+        """Show a pose of an evaluation, given its index, and return its name."""
+        if last.name:
+            frame = last.scene_frame(pose)
+            context.scene.frame_set(math.floor(frame), subframe=frame - math.floor(frame))
+            return f"Frame {round(frame)}"
+        set_held_out_pose(scene_rig, last.channels, last.seed, pose)
+        context.view_layer.update()
+        context.window_manager.fdda_view.pose = pose
+        return f"Random pose {pose + 1}"
+
+
 class FDDA_OT_open_report(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.open_report"
     bl_label = "Open Training Report"
@@ -240,6 +287,7 @@ CLASSES = (
     FDDA_OT_show_rig,
     FDDA_OT_color_mesh,
     FDDA_OT_fit_color_range,
+    FDDA_OT_jump_to_worst,
     FDDA_OT_open_report,
 )
 

@@ -22,7 +22,7 @@ MENU_OPERATORS = (
     ("fdda.check_trainer", "fdda.train", "fdda.refine", "fdda.create_trainer_environment"),
     ("fdda.bind", "fdda.set_mode", "fdda.bake", "fdda.fast_rig", "fdda.relink", "fdda.unbind"),
     ("fdda.evaluate", "fdda.render_comparison", "fdda.show_rig", "fdda.color_mesh", "fdda.fit_color_range"),
-    ("fdda.jump_to_worst", "fdda.add_worst_markers", "fdda.remove_markers", "fdda.open_report"),
+    ("fdda.jump_to_worst", "fdda.open_report"),
     ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model"),
     ("fdda.help",),
 )

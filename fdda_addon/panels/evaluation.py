@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Compare with Rig": shows the errors of the model as numbers, colors and timeline markers."""
+"""Section "Compare with Rig": shows the errors of the model as numbers and colors, and the worst frames."""
 
 import bpy
 
 from ..core.sentences.assessment import Assessment, PartErrors, assess_evaluation
 from ..core.wording import format_count
-from ..evaluation import heat_map, last_evaluation, markers, side_by_side
+from ..evaluation import heat_map, last_evaluation, side_by_side
 from ..jobs import job
 from ..models.model_list import bound_model_name
 from ..scene.active_rig import cached_rigs_together
@@ -23,7 +23,7 @@ from .section import (
 )
 from .training import recording_warnings
 
-SHOWN_PARTITIONS = 5
+SHOWN_PARTITIONS, SHOWN_POSES = 5, 5
 STATISTICS = (("Mean", "mean"), ("99.9 %", "p999"), ("Max", "max"))
 
 
@@ -68,7 +68,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             _draw_statistics(layout, context, view, last, scene_rig)
         _draw_colors(layout, context, view, scene_rig.mesh_object, last)
         if last is not None:
-            _draw_worst(layout, context, view, last)
+            _draw_worst(layout, view, last)
         if scene_rig.mesh_object.fdda.is_bound:
             if not scene_rig.mesh_object.fdda.is_fast_rig:
                 state = job.state_of("render_comparison")
@@ -209,28 +209,20 @@ def _draw_colors(
     row.operator("fdda.fit_color_range", text="", icon="FULLSCREEN_EXIT")
 
 
-def _draw_worst(
-    layout: bpy.types.UILayout, context: bpy.types.Context, view: object, last: last_evaluation.LastEvaluation
-) -> None:
+def _draw_worst(layout: bpy.types.UILayout, view: object, last: last_evaluation.LastEvaluation) -> None:
     header, body = layout.panel("fdda_worst", default_closed=False)
     header.label(text="Worst Frames" if last.name else "Worst Poses")
     if body is None:
         return
     column = body.column(align=True)
-    for rank, (index, error_mm) in enumerate(last.worst_poses(view.markers), 1):
+    for rank, (index, error_mm) in enumerate(last.worst_poses(SHOWN_POSES), 1):
         pose_label = f"Frame {round(last.scene_frame(index))}" if last.name else f"Pose {index + 1}"
         row = column.row(align=True)
         row.operator("fdda.jump_to_worst", text=f"{pose_label}: {error_mm:.2f} mm").rank = rank
         zoom_button = row.operator("fdda.jump_to_worst", text="", icon="ZOOM_SELECTED")
         zoom_button.rank, zoom_button.zoom = rank, True
-    if not last.name:
-        return
-    body.prop(view, "graph")
-    row = body.row(align=True)
-    row.prop(view, "markers")
-    row.operator("fdda.add_worst_markers", text="Add Markers", icon="MARKER_HLT").count = view.markers
-    if markers.find(context.scene):
-        row.operator("fdda.remove_markers", text="", icon="X")
+    if last.name:
+        body.prop(view, "graph")
 
 
 def _format_mm(value: float) -> str:

@@ -7,7 +7,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from ..core.errors import RigError
-from ..core.settings import EVALUATION_SEED, MARKERS, SIDEBAR_EVALUATION_POSES
+from ..core.settings import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..evaluation.timeline import graph
 from ..scene import undo
 from ..scene.action_slots import active_action, dependencies, slots_of_action
@@ -62,7 +62,7 @@ def _set_active_action(_view: "FDDA_PG_view", name: str) -> None:
 
 
 class FDDA_PG_view(bpy.types.PropertyGroup):
-    """Settings of the evaluation, of the colors in the viewport, and of the markers and graph in the timeline."""
+    """Settings of the evaluation, of the colors in the viewport, and of the graph in the timeline."""
 
     source: EnumProperty(
         name="Compare On",
@@ -120,7 +120,6 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
         update=lambda view, _context: show_graph(view.graph),
     )
     pose: IntProperty(name="Pose", description="Random pose that is shown", default=-1, options={"HIDDEN"})
-    markers: IntProperty(name="Markers", description="Number of worst frames to mark", default=MARKERS, min=1, max=50)
     show_partitions: BoolProperty(name="All Body Parts", description="List all body parts, not only the five worst")
 
 

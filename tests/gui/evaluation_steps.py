@@ -70,15 +70,9 @@ def _show_colors(colors: str, folder: Path) -> Iterator[float]:
     require(ratio > MIN_COLORED_RATIO, f"{100 * ratio:.2f} % of the viewport has a color")
 
 
-def mark_the_worst_frames(folder: Path) -> Iterator[float]:
-    """Press Add Markers, jump to the worst frame, and show the errors of that frame only."""
-    yield from sidebar.press_button("fdda.add_worst_markers", across=0.8)
+def jump_to_the_worst_frame(folder: Path) -> Iterator[float]:
+    """Jump to the worst frame, and show the errors of that frame only."""
     worst = extension_module("evaluation.last_evaluation").get(arm_object()).worst_poses(5)
-    timeline_markers = extension_module("evaluation.markers").find(bpy.context.scene)
-    require(
-        {marker.frame for marker in timeline_markers} == {index + 1 for index, _ in worst},
-        f"markers are at {sorted(marker.frame for marker in timeline_markers)}, the worst frames are {worst}",
-    )
     region3d = view_area().spaces[0].region_3d
     initial_location, initial_distance = region3d.view_location.copy(), region3d.view_distance
     yield from sidebar.press_button("fdda.jump_to_worst")

@@ -26,7 +26,7 @@ STEPS = (
     evaluation_steps.evaluate,
     evaluation_steps.show_the_partitions,
     evaluation_steps.show_the_heat_map,
-    evaluation_steps.mark_the_worst_frames,
+    evaluation_steps.jump_to_the_worst_frame,
     model_steps.unpack_and_pack_the_model,
     model_steps.unbind,
     model_steps.undo,

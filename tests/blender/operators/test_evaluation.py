@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators of the section Compare with Rig: figures, colors and markers are those of the evaluation itself."""
+"""The operators of the section Compare with Rig: figures and colors are those of the evaluation itself."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ import pytest
 
 from fdda_addon.core.mathematics.metrics import error_statistics, viewport_colors
 from fdda_addon.core.mathematics.partition import make_partitions
-from fdda_addon.evaluation import heat_map, last_evaluation, markers
+from fdda_addon.evaluation import heat_map, last_evaluation
 from fdda_addon.evaluation.run import evaluate, evaluate_action
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.rig.reading import read_rig
@@ -69,7 +69,7 @@ def test_an_evaluation_without_action_or_results_is_refused(active):
         bpy.ops.fdda.evaluate,
         "'elbow_rig' has no active action; choose one under Compare On, or compare on random poses.",
     )
-    for name in ("fit_color_range", "add_worst_markers", "jump_to_worst"):
+    for name in ("fit_color_range", "jump_to_worst"):
         refused(getattr(bpy.ops.fdda, name), "Nothing has been compared in this session; press Evaluate first")
     refused(lambda: bpy.ops.fdda.color_mesh(colors="ERRORS"), "'elbow' has not been compared in this session")
     assert last_evaluation.get(active) is None and active.fdda.mode == "FDDA"
@@ -155,19 +155,11 @@ def test_colors_do_not_change_the_file(active, evaluated_action):
 
 
 @pytest.mark.parametrize("stretch", [1, 3])
-def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action, view, stretch):
+def test_worst_frames_are_jumped_to(active, evaluated_action, view, stretch):
     scene = bpy.context.scene
     scene.render.frame_map_new = 100 * stretch
-    own = scene.timeline_markers.new("FDDA notes", frame=3)
     largest = evaluated_action.errors["fdda"].max(axis=1)
     worst = stretch * (evaluated_action.first_frame + int(largest.argmax()))
-    assert bpy.ops.fdda.add_worst_markers(count=3) == {"FINISHED"}
-    found = markers.find(scene)
-    assert found[0].frame == worst and found[0].name == f"FDDA 1: {largest.max() * 1000:.2f} mm"
-    frames = sorted(marker.frame for marker in found)
-    assert 1 < len(found) <= 3 and min(np.diff(frames)) >= last_evaluation.MIN_FRAMES_APART
-    bpy.ops.fdda.add_worst_markers(count=1)
-    assert [marker.frame for marker in markers.find(scene)] == [worst]
     bpy.ops.fdda.jump_to_worst()
     assert scene.frame_current == worst
     bpy.ops.fdda.color_mesh()
@@ -176,16 +168,12 @@ def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action, view, s
     np.testing.assert_array_equal(heat_map.colors_of(active), expected)
     bpy.ops.fdda.jump_to_worst(rank=2)
     assert abs(scene.frame_current - worst) >= last_evaluation.MIN_FRAMES_APART
-    bpy.ops.fdda.remove_markers()
-    assert [marker.name for marker in scene.timeline_markers] == [own.name]
-    refused(bpy.ops.fdda.remove_markers, "There are no markers at worst frames")
 
 
 def test_jumping_to_the_worst_random_pose_sets_the_pose(active, view):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=9)
     last = last_evaluation.get(active)
     worst = int(last.errors["fdda"].max(axis=1).argmax())
-    refused(bpy.ops.fdda.add_worst_markers, "Random poses have no frames to mark")
     pose(angle=0.0)
     bpy.data.objects[ELBOW_RIG].animation_data.action = None
     assert bpy.ops.fdda.jump_to_worst() == {"FINISHED"}
