@@ -3,7 +3,6 @@
 
 import math
 import shutil
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -23,7 +22,6 @@ from fdda_addon.evaluation.pictures import draw_comparison, draw_partitions, mak
 from fdda_addon.evaluation.results import Evaluation
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.scene.scene_rig import find_rig
-from fdda_addon.training.process import trainer_command
 
 POSES, REFINED_POSES, HELD_OUT_POSES = 3000, 1000, 200
 OVERSHOOT = 2.0
@@ -80,14 +78,6 @@ def main(folder: Path) -> int:
 
     print("\n== 4. Evaluation", flush=True)
     evaluation = _evaluate(rig, model, evaluation_path, pictures)
-    # Write the report page again, now with the held-out errors and the pictures.
-    report_options = ["-P", "-m", "trainer.report", str(folder / "report.json")]
-    command, environment = trainer_command([])
-    subprocess.run(
-        [command[0], *report_options, "--pictures", str(pictures), "--evaluation", str(evaluation_path)],
-        env=environment,
-        check=True,
-    )
 
     print("\n== 5. Runtime", flush=True)
     if status := run_verb(["bind", str(rig), str(model), str(bound)], "python -m fdda_addon"):
@@ -98,7 +88,7 @@ def main(folder: Path) -> int:
         (recording, f"{POSES + REFINED_POSES} poses and their residuals"),
         (model, "the model"),
         (folder / "report.json", "figures of the training"),
-        (folder / "report.html", "a page with the training, the errors and the pictures"),
+        (folder / "report.html", "a page with the training and the errors"),
         (evaluation_path, "the errors above and the errors of each partition"),
         (bound, "the character bound to the model: open it and play"),
         (pictures, "partitions, comparisons and heat maps"),

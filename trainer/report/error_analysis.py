@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Analysis of the largest errors of each partition. The report shows what is likely to lower them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,10 +13,8 @@ from fdda_addon.core.recording.skinned import SkinnedRecording
 from ..data.split import Split
 from ..fits.half_rotations import regression_matrices
 from ..inputs.network_inputs import NetworkInputs
+from ..model import TrainedModel
 from ..preparation import PreparedPartition
-
-if TYPE_CHECKING:  # The page of a report needs no torch.
-    from ..model import TrainedModel
 
 TOO_FEW_COMPONENTS, UNPREDICTED_COMPONENTS, EXTREME_POSES, TOO_FEW_POSES, HIGH_TRAINING_ERRORS, NO_CLEAR_CAUSE = (
     *("components", "unpredicted", "extremes", "poses", "steep", "none"),

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Renders the report of a training as one self-contained HTML page, from the template `page.html`."""
 
-import base64
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -10,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
-from fdda_addon.core.files.input_file import read_input
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 from fdda_addon.core.wording import format_count
 
@@ -84,9 +82,8 @@ class HistogramChart:
         }
 
 
-MAX_PICTURE_BYTES = 256 << 20
 STATISTIC_LABELS = {"mean": "mean", "rms": "rms", "p99": "99 %", "p999": "99.9 %", "max": "max"}
-"""Heading of each error statistic in tables, by the key of the statistic in reports and evaluations."""
+"""Heading of each error statistic in tables, by the key of the statistic."""
 NUMBER_FILTERS = {
     "number": "{:,}".format,
     "count": format_count,
@@ -96,21 +93,10 @@ NUMBER_FILTERS = {
 }
 
 
-def render_html(report: dict, pictures: Sequence[Path] = (), evaluation: dict | None = None) -> str:
-    """Render the page. The template escapes all text.
-
-    Args:
-        report: content of `report.json`.
-        pictures: PNG or JPEG files, shown in this order with their names.
-        evaluation: content of the JSON that `evaluate` wrote; None without one.
-
-    Returns:
-        The HTML.
-    """
+def render_html(report: dict) -> str:
+    """Return the HTML of the page for the content of `report.json`. The template escapes all text."""
     return _template().render(
         report=report,
-        pictures=[(path.stem.replace("_", " "), _data_url(path)) for path in pictures],
-        evaluation=evaluation,
         statistic_labels=STATISTIC_LABELS,
         remedies=REMEDY_BY_CAUSE,
         LogAxis=LogAxis,
@@ -130,8 +116,3 @@ def _template() -> Template:
     )
     environment.filters |= {**NUMBER_FILTERS, "joint_label": lambda name: name or STATIC_JOINT_LABEL}
     return environment.get_template("page.html")
-
-
-def _data_url(picture: Path) -> str:
-    image_type = "png" if picture.suffix.lower() == ".png" else "jpeg"
-    return f"data:image/{image_type};base64,{base64.b64encode(read_input(picture, MAX_PICTURE_BYTES)).decode('ascii')}"

@@ -86,8 +86,6 @@ _REPORT_KEYS = {
     "goal?": {"goal": NUMBER, "p999": NUMBER, "verdict": {verdict.value for verdict in Verdict}},
 }
 """Keys of a report and their values, as `check_json` describes them."""
-_EVALUATION_KEYS = {"poses": WHOLE, "fdda": _ERROR_STATISTICS, "linear": _ERROR_STATISTICS}
-"""Keys of the JSON that `evaluate` writes, as far as the page of a report shows them."""
 
 
 def report_path(model_path: Path) -> Path:
@@ -120,7 +118,12 @@ def read_report(path: Path) -> dict:
     Raises:
         TrainingError: the report cannot be read, is of another version, or is damaged.
     """
-    report = _read_json(path, f"The report '{path}'", "train again")
+    try:
+        report = json.loads(read_input(path, MAX_BYTES))
+    except OSError as error:
+        raise TrainingError(f"The report '{path}' cannot be read ({os_error_text(error)}); train again.") from error
+    except (ValueError, RecursionError) as error:
+        raise TrainingError(f"The report '{path}' cannot be read ({error}); train again.") from error
     if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):
         raise TrainingError(f"'{path}' is not a training report of this version; train again.")
     try:
@@ -128,27 +131,3 @@ def read_report(path: Path) -> dict:
     except ValueError as error:
         raise TrainingError(f"The report '{path}' is damaged: {error}; train again.") from error
     return report
-
-
-def read_evaluation(path: Path) -> dict:
-    """Read the JSON that `evaluate` wrote; returns at least `_EVALUATION_KEYS`.
-
-    Raises:
-        TrainingError: the file cannot be read, is damaged, or is of another kind.
-    """
-    evaluation = _read_json(path, f"The evaluation '{path}'", "evaluate again")
-    try:
-        check_json(evaluation, _EVALUATION_KEYS)
-    except ValueError as error:
-        raise TrainingError(f"The evaluation '{path}' is damaged: {error}; evaluate again.") from error
-    return evaluation
-
-
-def _read_json(path: Path, file_text: str, advice: str) -> object:
-    """Read a JSON file; its errors start with `file_text` and end with `advice`."""
-    try:
-        return json.loads(read_input(path, MAX_BYTES))
-    except OSError as error:
-        raise TrainingError(f"{file_text} cannot be read ({os_error_text(error)}); {advice}.") from error
-    except (ValueError, RecursionError) as error:
-        raise TrainingError(f"{file_text} cannot be read ({error}); {advice}.") from error
