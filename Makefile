@@ -58,9 +58,8 @@ farm: .venv .venv-farm  ## record, train, evaluate and bind the characters of a 
 test-farm: .venv .venv-farm  ## run the tests of the farm: on this machine, on a stand-in for a cluster, and as jobs of OpenJD and Flamenco
 	.venv-farm/bin/python -m pytest tests/farm
 
-test-gui: package  ## press the buttons of the sidebar in a Blender with a window, and update the add-on, into out/gui (BLENDER=/path/to/blender)
+test-gui: package  ## press the buttons of the sidebar in a Blender with a window, into out/gui (BLENDER=/path/to/blender)
 	.venv/bin/python tests/gui/run.py out/gui $(BLENDER)
-	.venv/bin/python tests/gui/run_update.py out/gui/update out/gui/work/arm.blend $(BLENDER)
 
 test-windows: .venv  ## run the tests in Python for Windows under Wine, as root on Debian (LINE=5.2: only that LTS line; 40 minutes)
 	setup/windows/setup $(PYTHON_$(LINE))

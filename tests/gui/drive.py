@@ -24,7 +24,6 @@ import manual_story
 import path_story
 import session_story
 import shot_story
-import update_story
 import work_story
 from window import StepError, park_mouse, save_screenshot
 
@@ -35,7 +34,6 @@ STEPS = {
     "work": work_story.STEPS,
     "shot": shot_story.STEPS,
     "session": session_story.STEPS,
-    "update": update_story.STEPS,
     "manual": manual_story.STEPS,
 }[STORY_NAME]
 MAX_SECONDS = 1790
