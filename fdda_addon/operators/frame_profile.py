@@ -18,7 +18,6 @@ from .job import JobOperator
 
 STEPS = (
     ("timing objects", ("objects",)),
-    ("timing modifiers", ("modifiers",)),
     *([] if bpy.app.background else [("timing drawing", ("drawing",))]),
     ("timing models", ("benchmark",)),
     ("timing a fast rig", ("frames",)),

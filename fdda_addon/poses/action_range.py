@@ -16,7 +16,7 @@ from mathutils import Euler, Quaternion, Vector
 from ..core.controls import OTHER_OBJECT, Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
-from ..core.mathematics.rotations import euler_angles, rotation_vectors, total_range_width
+from ..core.mathematics.rotations import rotation_vectors
 from ..scene.action_slots import CurvesByDatablock, curves_of_actions
 from ..scene.armature import FOUR_COMPONENT_ROTATIONS
 from ..scene.arrays import REST_MATRIX_ELEMENT, read
@@ -25,9 +25,6 @@ from ..scene.draw_cache import actions_state, computed_once
 from ..scene.scene_rig import SceneRig
 
 _CONTROL_PATH = re.compile(r'.*(?:\]\.influence|key_blocks\["(?:[^"\\]|\\.)*"\]\.value|\["(?:[^"\\]|\\.)*"\])')
-
-CONTINUOUS_ANGLES_PREFERENCE = 0.9
-"""Euler angles that are continuous over frames are used unless wrapped angles have ranges narrower by this factor."""
 
 Value = TypeVar("Value")
 ChannelRanges = dict[tuple[str, str, int], tuple[float, float]]
@@ -165,12 +162,9 @@ def _measure_ranges(armature_object: bpy.types.Object, actions: list[bpy.types.A
         for bone, quaternions in keyed_rotations.items():
             rotations.setdefault(bone, []).append(quaternions)
     for bone, arrays in rotations.items():
-        quaternions = np.concatenate(arrays)
-        angles = euler_angles(quaternions)
-        width = sum(high - low for low, high in (ranges[bone, ROTATION, axis] for axis in range(3)))
-        if total_range_width(angles) < CONTINUOUS_ANGLES_PREFERENCE * width:
-            ranges |= _ranges_by_axis(bone, ROTATION, angles)
-        ranges |= _ranges_by_axis(bone, ROTATION_VECTOR, rotation_vectors(quaternions))
+        vectors = rotation_vectors(np.concatenate(arrays))
+        bounds = zip(vectors.min(axis=0).tolist(), vectors.max(axis=0).tolist(), strict=True)
+        ranges |= {(bone, ROTATION_VECTOR, axis): low_high for axis, low_high in enumerate(bounds)}
     return ranges
 
 
@@ -196,12 +190,6 @@ def computed_for_actions(
     )
     key = (name, *(d.session_uid for d in (*datablocks, *actions)))
     return computed_once(key, state, compute)
-
-
-def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> ChannelRanges:
-    """Return the ranges of (n, 3) values of a bone."""
-    bounds = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
-    return {(bone, kind, axis): low_high for axis, low_high in enumerate(bounds)}
 
 
 def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Control, ...]:

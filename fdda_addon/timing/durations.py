@@ -2,7 +2,7 @@
 """Times the evaluation of scenes and the drawing of windows."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -32,7 +32,7 @@ class Duration:
     spread: float
 
     @staticmethod
-    def of(rounds: list[float]) -> "Duration":
+    def of(rounds: Sequence[float]) -> "Duration":
         """Return the duration for the times of several rounds, ms."""
         first_quartile, median, third_quartile = np.percentile(rounds, (25, 50, 75))
         return Duration(max(float(median), 0.0), float(third_quartile - first_quartile) / 2)

@@ -6,11 +6,13 @@ whole frame, so that other work on the machine slows both. The median over sever
 the rounds tells how sure it is.
 """
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
+from itertools import product
 
 import bpy
+import numpy as np
 
 from ..core.errors import FDDAError
 from ..core.progress import Job, Progress
@@ -26,7 +28,7 @@ from .frame_profile import BONES, DRAWING, KEY_DRIVERS, MODIFIER, REST, ROUNDS, 
 
 FRAMES_PER_ROUND, TIMED_FRAMES = 8, 30
 MIN_SHARE = 0.01
-"""Smallest share of an object in a frame that is divided into its modifiers."""
+"""Smallest share of an object in a frame that is shown by itself."""
 
 
 def profile_frame(armature_object: bpy.types.Object) -> Job[FrameProfile]:
@@ -49,103 +51,54 @@ def profile_frame(armature_object: bpy.types.Object) -> Job[FrameProfile]:
 
 
 def _profile_shown_rig(rigs: list[SceneRig]) -> Job[FrameProfile]:
-    armature_object = rigs[0].armature_object
-    with temporary_animation(main_rig(rigs)) as frames:
-        measurement = _Measurement(rigs, frames)
-        with temporary_armature_scene(armature_object) as armature_scene:
-            yield from measurement.measure_objects(armature_scene)
-            yield from measurement.measure_parts()
+    """Measure each part as a ratio of a whole frame that is measured just before."""
+    armature_object, mesh_objects = rigs[0].armature_object, {rig.mesh_object for rig in rigs}
+    frame_rounds: list[float] = []
+    bone_ratios: list[float] = []
+    part_ratios: dict[bpy.types.Object, dict[tuple[str, str], list[float]]] = {}
+    with temporary_animation(main_rig(rigs)) as frames, temporary_armature_scene(armature_object) as armature_scene:
+        evaluated = [d.original for d in bpy.context.evaluated_depsgraph_get().ids if isinstance(d, bpy.types.Object)]
+        objects = {o.name: o for o in evaluated if o.type != "ARMATURE" and _removable_parts(o)}
+        measured = [None, *(objects[name] for name in sorted(objects))]
+        for step, (round_index, scene_object) in enumerate(product(range(ROUNDS), measured), 1):
+            measure = partial(
+                frame_ms,
+                animation_frames=frames,
+                first_index=round_index * FRAMES_PER_ROUND,
+                count=FRAMES_PER_ROUND,
+            )
+            whole_ms = previous_ms = measure(bpy.context.scene)
+            frame_rounds.append(whole_ms)
+            if scene_object is None:
+                bone_ratios.append(measure(armature_scene) / whole_ms)
+            else:
+                ratios = part_ratios.setdefault(scene_object, {})
+                with ExitStack() as stack:
+                    # From the last modifier to the first, because the result of the first is the input of the next.
+                    for part in _removable_parts(scene_object):
+                        _disable_part(stack, scene_object, *part)
+                        remaining_ms = measure(bpy.context.scene)
+                        ratios.setdefault(part, []).append((previous_ms - remaining_ms) / whole_ms)
+                        previous_ms = remaining_ms
+            yield Progress("objects", step, ROUNDS * len(measured))
         redraw_rounds = yield from time_redraws(frames, ROUNDS, FRAMES_PER_ROUND)
-    parts = measurement.parts()
+    rows, rest = {(BONES, armature_object.name, ""): bone_ratios}, 1 - np.array(bone_ratios)
+    for scene_object, ratios in part_ratios.items():
+        object_ratios = np.sum(list(ratios.values()), axis=0)
+        share = Duration.of(object_ratios)
+        # Objects within the noise belong to the rest.
+        if share.median > max(share.spread, MIN_SHARE) or scene_object in mesh_objects:
+            rows |= {(kind, scene_object.name, name): each for (kind, name), each in ratios.items()}
+            rest -= object_ratios
+    frame = Duration.of(frame_rounds)
+    parts = [
+        FramePart(*key, Duration.of(np.multiply(ratios, frame.median)))
+        for key, ratios in (rows | {(REST, "", ""): rest}).items()
+    ]
+    parts.sort(key=lambda part: -part.duration.median)
     if redraw_rounds:
         parts.append(FramePart(DRAWING, "", "", Duration.of(redraw_rounds)))
-    return FrameProfile(Duration.of(measurement.frame_rounds), tuple(parts))
-
-
-class _Measurement:
-    """Times of the parts of a frame, each as a ratio of a whole frame that was measured just before.
-
-    Attributes:
-        frame_rounds: times of the whole evaluation, ms.
-    """
-
-    def __init__(self, rigs: list[SceneRig], frames: range):
-        self._armature_object, self._frames = rigs[0].armature_object, frames
-        self._mesh_objects = {rig.mesh_object for rig in rigs}
-        self.frame_rounds: list[float] = []
-        self._bone_ratios: list[float] = []
-        # The objects that Blender evaluates and that have modifiers or shape keys.
-        objects = [
-            datablock.original
-            for datablock in bpy.context.evaluated_depsgraph_get().ids
-            if isinstance(datablock, bpy.types.Object) and datablock.original.type != "ARMATURE"
-        ]
-        removable = {o.name: o for o in objects if _removable_parts(o)}
-        self._object_ratios: dict[bpy.types.Object, list[float]] = {removable[name]: [] for name in sorted(removable)}
-        self._part_ratios: dict[tuple[str, str, str], list[float]] = {}
-
-    def _frame_ms(self, round_index: int, scene: bpy.types.Scene | None = None) -> float:
-        return frame_ms(scene or bpy.context.scene, self._frames, round_index * FRAMES_PER_ROUND, FRAMES_PER_ROUND)
-
-    def _whole_frame_ms(self, round_index: int) -> float:
-        self.frame_rounds.append(self._frame_ms(round_index))
-        return self.frame_rounds[-1]
-
-    def measure_objects(self, armature_scene: bpy.types.Scene) -> Iterator[Progress]:
-        """Measure the bones, and all modifiers and shape keys of each object together."""
-        steps_per_round = 1 + len(self._object_ratios)
-        for round_index in range(ROUNDS):
-            frame_ms = self._whole_frame_ms(round_index)
-            self._bone_ratios.append(self._frame_ms(round_index, armature_scene) / frame_ms)
-            yield Progress("objects", round_index * steps_per_round + 1, ROUNDS * steps_per_round)
-            for index, (scene_object, ratios) in enumerate(self._object_ratios.items(), 2):
-                frame_ms = self._whole_frame_ms(round_index)
-                with ExitStack() as stack:
-                    for kind, name in _removable_parts(scene_object):
-                        _disable_part(stack, scene_object, kind, name)
-                    ratios.append(1 - self._frame_ms(round_index) / frame_ms)
-                yield Progress("objects", round_index * steps_per_round + index, ROUNDS * steps_per_round)
-
-    def measure_parts(self) -> Iterator[Progress]:
-        """Measure each modifier and the shape keys of the objects that take a clear share of the frame."""
-        objects = [o for o in self._object_ratios if self._is_clear(o) and len(_removable_parts(o)) > 1]
-        for round_index in range(ROUNDS):
-            for index, scene_object in enumerate(objects, 1):
-                with ExitStack() as stack:
-                    frame_ms = previous_ms = self._whole_frame_ms(round_index)
-                    # From the last modifier to the first, because the result of the first is the input of the next.
-                    for kind, name in _removable_parts(scene_object):
-                        _disable_part(stack, scene_object, kind, name)
-                        remaining_ms = self._frame_ms(round_index)
-                        ratios = self._part_ratios.setdefault((kind, scene_object.name, name), [])
-                        ratios.append((previous_ms - remaining_ms) / frame_ms)
-                        previous_ms = remaining_ms
-                yield Progress("modifiers", round_index * len(objects) + index, ROUNDS * len(objects))
-
-    def _is_clear(self, scene_object: bpy.types.Object) -> bool:
-        """Return whether the share of an object is larger than the noise; meshes of the character count anyway."""
-        share = Duration.of(self._object_ratios[scene_object])
-        return share.median > max(share.spread, MIN_SHARE) or scene_object in self._mesh_objects
-
-    def parts(self) -> list[FramePart]:
-        """Return the parts of the evaluation, largest first. Objects within the noise belong to the rest."""
-        clear_objects = [o for o in self._object_ratios if self._is_clear(o)]
-        ratios_by_part = {(BONES, self._armature_object.name, ""): self._bone_ratios, **self._part_ratios}
-        divided_objects = {name for _, name, _ in self._part_ratios}
-        for scene_object in clear_objects:
-            if scene_object.name not in divided_objects:
-                kind, name = _removable_parts(scene_object)[0]
-                ratios_by_part[kind, scene_object.name, name] = self._object_ratios[scene_object]
-        ratios_by_part[REST, "", ""] = [
-            1 - bones_ratio - sum(self._object_ratios[o][index] for o in clear_objects)
-            for index, bones_ratio in enumerate(self._bone_ratios)
-        ]
-        frame_ms = Duration.of(self.frame_rounds).median
-        parts = [
-            FramePart(*key, Duration.of([ratio * frame_ms for ratio in ratios]))
-            for key, ratios in ratios_by_part.items()
-        ]
-        return sorted(parts, key=lambda part: -part.duration.median)
+    return FrameProfile(frame, tuple(parts))
 
 
 def _removable_parts(scene_object: bpy.types.Object) -> list[tuple[str, str]]:

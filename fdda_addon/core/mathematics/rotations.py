@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rotation vectors and Euler angles of many quaternions, chosen without jumps.
+"""Rotation vectors of many quaternions, chosen without jumps.
 
-A rotation has several rotation vectors and several triples of Euler angles. For each quaternion, the
-vector or triple nearest to those of the other quaternions is chosen, so that the range over all quaternions is narrow.
+A rotation has several rotation vectors. For each quaternion, the vector nearest to those of the other quaternions is
+chosen, so that the range over all quaternions is narrow.
 """
 
 import numpy as np
@@ -12,8 +12,6 @@ MAX_ITERATIONS = 10
 """Largest number of iterations of the search for a range's center. It converges after a few iterations."""
 MAX_CENTER_CANDIDATES = 8
 """Number of rotations tried as the center where a range is wider than 180 degrees."""
-GIMBAL_LOCK_TOLERANCE = 1e-12
-"""Euler angles are in gimbal lock where the absolute sine of the middle angle differs from 1 by less than this."""
 MIN_ANGLE_RADIANS = 1e-9
 """The axis of a rotation by a smaller angle is undefined."""
 
@@ -39,50 +37,30 @@ def rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
     )
 
 
-def euler_angles(quaternions: np.ndarray) -> np.ndarray:
-    """Compute XYZ Euler angles without jumps between them.
-
-    Args:
-        quaternions: as for `rotation_vectors`.
-
-    Returns:
-        (F, 3) float64, radians.
-    """
-    unit_quaternions = _normalize(quaternions)
-    angles = _to_euler_angles(unit_quaternions)
-    alternatives = angles * (1, -1, 1) + np.pi
-    return _choose_narrow_range(
-        np.stack([angles, alternatives], axis=1),
-        _to_euler_angles(_mean_quaternion(unit_quaternions)[None])[0],
-        FULL_TURN,
-    )
-
-
 def total_range_width(values: np.ndarray) -> float:
     """Return the sum of the three range widths of (F, 3) values."""
     return float(np.ptp(values, axis=0).sum())
 
 
-def _choose_narrow_range(candidates: np.ndarray, mean_rotation: np.ndarray, period: float = 0.0) -> np.ndarray:
+def _choose_narrow_range(candidates: np.ndarray, mean_rotation: np.ndarray) -> np.ndarray:
     """Choose (F, 3) of (F, 2, 3) candidates with narrow ranges; ranges around the rest pose are preferred."""
-    best_values = _choose_nearest(np.zeros(3), candidates, period)
+    best_values = _choose_nearest(np.zeros(3), candidates)
     if np.ptp(best_values, axis=0).max() <= np.pi:
         return best_values
     centers = candidates[np.linspace(0, len(candidates) - 1, MAX_CENTER_CANDIDATES).astype(int), 0]
     for center in (mean_rotation, *centers):
-        candidate_values = _choose_nearest(center, candidates, period)
+        candidate_values = _choose_nearest(center, candidates)
         if total_range_width(candidate_values) < total_range_width(best_values) - MIN_ANGLE_RADIANS:
             best_values = candidate_values
     return best_values
 
 
-def _choose_nearest(center: np.ndarray, candidates: np.ndarray, period: float) -> np.ndarray:
+def _choose_nearest(center: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     """Choose the (F, 3) candidates nearest to the center of their range; the search starts at `center`."""
     best_values = None
     for _ in range(MAX_ITERATIONS):
-        shifted = candidates - period * np.round((candidates - center) / period) if period else candidates
-        nearest = np.square(shifted - center).sum(axis=2).argmin(axis=1)
-        values = shifted[np.arange(len(shifted)), nearest]
+        nearest = np.square(candidates - center).sum(axis=2).argmin(axis=1)
+        values = candidates[np.arange(len(candidates)), nearest]
         if best_values is not None and total_range_width(values) >= total_range_width(best_values) - MIN_ANGLE_RADIANS:
             break
         best_values, center = values, (values.min(axis=0) + values.max(axis=0)) / 2
@@ -130,22 +108,4 @@ def to_rotation_vectors(unit_quaternions: np.ndarray) -> np.ndarray:
     angles = 2 * np.arctan2(sines, unit_quaternions[:, :1])
     return unit_quaternions[:, 1:] * np.where(
         sines > MIN_ANGLE_RADIANS, angles / np.maximum(sines, MIN_ANGLE_RADIANS), 2.0
-    )
-
-
-def _to_euler_angles(unit_quaternions: np.ndarray) -> np.ndarray:
-    """Compute (F, 3) XYZ Euler angles, the middle angle within 90 degrees."""
-    w, x, y, z = unit_quaternions.T
-    middle_sine = np.clip(2 * (y * w - x * z), -1, 1)
-    first_angle = np.arctan2(2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
-    last_angle = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
-    # In gimbal lock the first and the last angle rotate about the same axis.
-    is_locked = np.abs(middle_sine) > 1 - GIMBAL_LOCK_TOLERANCE
-    return np.stack(
-        [
-            np.where(is_locked, 2 * np.arctan2(x, w), first_angle),
-            np.arcsin(middle_sine),
-            np.where(is_locked, 0, last_angle),
-        ],
-        1,
     )

@@ -335,20 +335,6 @@ def test_random_poses_are_close_to_the_poses_of_actions(figure, motion, mode):
     assert np.degrees(apart.max()) < 20
 
 
-def test_euler_angles_of_several_actions_do_not_wrap(figure):
-    bone = figure.armature_object.pose.bones[ARM]
-    for turns in MOTIONS["half a turn away"]:
-        figure.armature_object.animation_data_create().action = bpy.data.actions.new("turns")
-        for frame, turn in enumerate(turns):
-            key_channel(bone, frame, "rotation_quaternion", turn)
-    found = measured_ranges(figure.armature_object, bpy.data.actions)
-    assert found[ARM, "rotation", 0] == pytest.approx((math.radians(165), math.radians(195)), abs=1e-4)
-    assert found[ARM, "rotation", 1] == pytest.approx((math.radians(-5), math.radians(5)), abs=1e-4)
-    # A bone with a limit is sampled about its axes, so that the limit narrows the range.
-    limit(bone, "LIMIT_ROTATION", x=(0.0, math.radians(180)))
-    assert channel_ranges(sampled(figure), ARM)["rotation", 0] == pytest.approx((math.radians(165), math.pi), abs=1e-4)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
