@@ -38,6 +38,8 @@ VERBS = {
     "poses": ("poses", "save a copy of a file with an action of recorded or random poses, one per frame"),
     "bake": ("bake", "write the deformed mesh of an action to a file that plays without the add-on"),
 }
+INTERNAL_VERBS = {"encode-video": "encode_video"}
+"""Verbs that only the add-on runs, in another Blender, with their modules."""
 TRAIN = "train"
 """The verb that starts another process, which parses its options."""
 
@@ -62,19 +64,22 @@ def main(arguments: list[str], program: str) -> int:
 
 
 def _run(arguments: list[str], program: str) -> int:
-    verb = arguments[0] if arguments and arguments[0] in VERBS else None
+    modules = {name: module for name, (module, _) in VERBS.items()} | INTERNAL_VERBS
+    verb = arguments[0] if arguments and arguments[0] in modules else None
     parser = argparse.ArgumentParser(prog=program, description="Fast and Deep Deformation Approximations.")
     verbs = parser.add_subparsers(metavar="VERB", required=True)
-    for name, (module_name, summary) in VERBS.items():
-        subparser = verbs.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
-        if name == verb and verb != TRAIN:
-            # The modules of other verbs are not imported, so that the verb starts fast.
-            import_module(f".{module_name}", __package__).add_options(subparser)
+    for name, (_, summary) in VERBS.items():
+        verbs.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
+    for name in INTERNAL_VERBS:
+        verbs.add_parser(name)
+    if verb not in (None, TRAIN):
+        # The modules of other verbs are not imported, so that the verb starts fast.
+        import_module(f".{modules[verb]}", __package__).add_options(verbs.choices[verb])
     try:
         if verb == TRAIN:
             return import_module(f".{verb}", __package__).run(arguments[1:])
         options = parser.parse_args(arguments)
-        module = import_module(f".{VERBS[verb][0]}", __package__)
+        module = import_module(f".{modules[verb]}", __package__)
         with registered():
             module.run(options)
         return 0

@@ -98,18 +98,14 @@ def film(
         with tempfile.TemporaryDirectory(
             prefix=TEMPORARY_PREFIX, dir=path.parent, ignore_cleanup_errors=True
         ) as folder_name:
-            pictures: list[Path] = []
-            folder, size = Path(folder_name), (0, 0)
+            folder, count, size = Path(folder_name), 0, (0, 0)
             with closing(render_frames(scene_rig, model, errors, first_frame, folder, settings)) as frames:
-                for picture, size in frames:  # noqa: B007 - used after the loop
-                    pictures.append(picture)
-                    yield Progress("film", len(pictures), len(errors.positions))
-            with closing(encode(pictures, path, size, settings.fps)) as counts:
-                for count in counts:
-                    yield Progress("encoding", count, len(pictures))
+                for count, (_, size) in enumerate(frames, 1):  # noqa: B007 - used after the loop
+                    yield Progress("film", count, len(errors.positions))
+            yield from encode(folder, path, size, settings.fps)
     except OSError as error:
         raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; nothing was changed.") from error
-    return Film(len(pictures), size)
+    return Film(count, size)
 
 
 def render_frames(

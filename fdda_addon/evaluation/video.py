@@ -1,29 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Encodes pictures as a video, with the FFmpeg that is part of Blender, in another Blender that can be ended."""
 
-import json
-import re
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import OutputError, WrongUsageError
-from ..core.files.child_process import OutputLines, child_options, end_process
+from ..core.errors import FDDAError, OutputError, WrongUsageError
 from ..core.files.output import atomic_write
-from ..scene.blend_file import blender_path
+from ..core.progress import Job
+from ..jobs.verb_process import VerbProcess
+from ..scene.blend_file import blender_path, report_message
+from ..scene.compatibility import set_video_format
 
 ENCODINGS = {".mp4": ("MPEG4", "H264", "H.264"), ".webm": ("WEBM", "WEBM", "VP9")}
 """Blender's names of container and codec, and the name of the codec in messages, by the extension of the file."""
 INDEXES = {".mp4": b"moov", ".webm": b"\x1c\x53\xbb\x6b"}
 """Identifier of the index of frames, by extension. FFmpeg writes the index last, so a file without it is incomplete."""
-WAIT_SECONDS = 0.05
-"""Longest time between two steps while the other Blender encodes."""
-_ENCODED_LINE = re.compile(r"encoded (?P<count>\d+)")
-_FAILURE_LINE = re.compile(r"encoding failed: (?P<text>.+)")
 
 
 def check_video_path(path: Path) -> None:
@@ -39,42 +32,27 @@ def check_video_path(path: Path) -> None:
         raise OutputError("This Blender was built without FFmpeg and writes no videos; use Blender from blender.org.")
 
 
-def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) -> Iterator[int]:
-    """Encode pictures as a video, as a generator; closing it ends the other Blender and leaves no file.
+def encode(folder: Path, path: Path, size: tuple[int, int], fps: float) -> Job[None]:
+    """Encode pictures as a video in another Blender; closing the generator ends it and leaves no file.
 
     Args:
-        pictures: PNG files in one folder, one for each frame.
+        folder: folder of PNG files, one for each frame, in the order of their names.
         path: path of the video, with an extension of `ENCODINGS`.
         size: width and height, even numbers of pixels.
         fps: frames per second.
 
-    Yields:
-        The number of encoded frames, also while it does not change.
-
     Raises:
         OutputError: the video cannot be written, or this Blender lacks the encoder.
     """
-    suffix = path.suffix.lower()
+    suffix, problem = path.suffix.lower(), ""
     container, codec, codec_name = ENCODINGS[suffix]
     with atomic_write(path) as temporary_path:
-        job = {
-            "pictures": [blender_path(picture) for picture in pictures],
-            "path": blender_path(temporary_path),
-            "size": size,
-            "fps": fps,
-            "container": container,
-            "codec": codec,
-        }
-        count, problem = 0, ""
-        with _other_blender(json.dumps(job)) as (process, lines):
-            while (line := lines.next(WAIT_SECONDS)) is not None:
-                if match := _ENCODED_LINE.match(line):
-                    count = int(match["count"])
-                elif match := _FAILURE_LINE.match(line):
-                    problem = match["text"].rstrip(".")
-                yield count
-            if (status := process.wait()) and not problem:
-                problem = f"the other Blender ended with status {status}"
+        arguments = (folder, temporary_path, container, codec, *size, fps)
+        try:
+            with VerbProcess("encode-video", [*map(str, arguments)]) as process:
+                yield from process.steps()
+        except FDDAError as error:
+            problem = str(error).rstrip(".")
         if problem or INDEXES[suffix] not in temporary_path.read_bytes():
             other = next(other for other in ENCODINGS if other != suffix)
             raise OSError(
@@ -83,33 +61,40 @@ def encode(pictures: list[Path], path: Path, size: tuple[int, int], fps: float) 
             )
 
 
-@contextmanager
-def _other_blender(job: str) -> Iterator[tuple[subprocess.Popen, OutputLines]]:
-    """Start a Blender that encodes, and end it afterwards; yield its process, and the lines that it prints."""
-    package = Path(__file__).resolve().parents[1]
-    script = (
-        f"import importlib, sys; sys.path.insert(0, {str(package.parent)!r}); "
-        f"importlib.import_module('{package.name}.evaluation.video_encoder').main()"
-    )
-    if bpy.app.binary_path:
-        command = [bpy.app.binary_path, "--background", "--factory-startup", "--python-exit-code", "1"]
-        command += ["--python-expr", script]
-    else:
-        # The bpy module in a Python has no program.
-        command = [sys.executable, "-c", script]
-    options = child_options() | {"stdin": subprocess.PIPE}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options)
-    lines = OutputLines(_communicate(process, job))
+def write_video(
+    folder: Path,
+    path: Path,
+    encoding: tuple[str, str],
+    size: tuple[int, int],
+    fps: float,
+    show: Callable[[int, int], None],
+) -> None:
+    """Encode pictures in this Blender; arguments as of `encode`.
+
+    Args:
+        encoding: Blender's names of container and codec.
+        show: is called with the number of encoded frames, and of all.
+
+    Raises:
+        OutputError: the reason of Blender.
+    """
+    pictures = sorted(folder.glob("*.png"))
+    scene = bpy.data.scenes.new("FDDA video")
+    strip = scene.sequence_editor_create().strips.new_image("film", blender_path(pictures[0]), 1, 1)
+    for picture in pictures[1:]:
+        strip.elements.append(picture.name)
+    scene.frame_start, scene.frame_end = 1, len(pictures)
+    render = scene.render
+    render.resolution_x, render.resolution_y = size
+    render.fps = max(1, round(fps))
+    render.fps_base = render.fps / fps
+    scene.view_settings.view_transform = "Standard"
+    set_video_format(render.image_settings)
+    render.ffmpeg.format, render.ffmpeg.codec = encoding
+    render.ffmpeg.audio_codec, render.ffmpeg.constant_rate_factor, render.ffmpeg.gopsize = "NONE", "HIGH", 12
+    render.use_file_extension, render.filepath = False, blender_path(path)
+    bpy.app.handlers.render_write.append(lambda shown, _: show(shown.frame_current, len(pictures)))
     try:
-        yield process, lines
-    finally:
-        end_process(process)
-        lines.join()
-        process.stdout.close()
-
-
-def _communicate(process: subprocess.Popen, job: str) -> Iterator[str]:
-    # A Blender that has ended already says why in its output.
-    with suppress(OSError), process.stdin:
-        process.stdin.write(job)
-    yield from process.stdout
+        bpy.ops.render.render(animation=True, scene=scene.name)
+    except RuntimeError as error:
+        raise OutputError(report_message(error)) from error

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Films: the verb and the button write videos that Blender can read, or nothing at all."""
 
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import bpy
@@ -125,48 +122,13 @@ def test_a_closed_film_leaves_nothing(errors: PoseErrors, rig: SceneRig, elbow_f
     assert list(tmp_path.iterdir()) == [] and datablocks() == before
 
 
-def test_a_long_list_of_pictures_does_not_wait_for_the_other_blender(monkeypatch: pytest.MonkeyPatch):
-    """The pipe to a Blender that is still starting holds 64 kB, on Windows less."""
-    start, seconds = subprocess.Popen, 20
-    command = [sys.executable, "-c", f"import time; time.sleep({seconds})"]
-    monkeypatch.setattr(subprocess, "Popen", lambda _, **options: start(command, **options))
-    started = time.monotonic()
-    with video._other_blender("x" * 2**20) as (process, _):
-        assert process.poll() is None
-    assert time.monotonic() - started < seconds / 2
-
-
 def test_a_film_that_is_closed_while_it_is_encoded_leaves_nothing(
-    errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path
 ):
-    """The other Blender ends at once."""
-    out, processes, start = tmp_path / "film.mp4", [], subprocess.Popen
-
-    def start_process(*arguments, **options):
-        processes.append(start(*arguments, **options))
-        return processes[-1]
-
-    monkeypatch.setattr(subprocess, "Popen", start_process)
-    steps = film(rig, elbow_files.model, errors, FIRST, out, SMALL)
-    while next(steps).stage != "encoding":
+    steps = film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL)
+    while next(steps) is not None:
         pass
-    assert processes[-1].poll() is None
     steps.close()
-    assert processes[-1].poll() is not None
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_blender_that_does_not_start_is_reported(
-    errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    with monkeypatch.context() as context:
-        context.setattr(video.sys, "executable", str(tmp_path / "missing"))
-        with pytest.raises(OutputError, match=r"Cannot write '.+film\.mp4': .*No such file.*; nothing was changed\."):
-            list(film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL))
-    # An add-on that cannot be imported
-    monkeypatch.setattr(video, "__file__", str(tmp_path / "missing" / "evaluation" / "video.py"))
-    with pytest.raises(OutputError, match="the other Blender ended with status 1; the disk may be full"):
-        list(film(rig, elbow_files.model, errors, FIRST, tmp_path / "film.mp4", SMALL))
     assert list(tmp_path.iterdir()) == []
 
 

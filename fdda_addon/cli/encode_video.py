@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`encode-video FOLDER OUT CONTAINER CODEC WIDTH HEIGHT FPS`: encodes the pictures of a film (`evaluation.video`)."""
+
+import argparse
+from pathlib import Path
+
+from ..core.files.stop_signals import exit_on_stop_signal
+from ..evaluation.video import write_video
+from .progress import ProgressPrinter
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    for name, kind in (("folder", Path), ("out", Path), ("container", str), ("codec", str), ("width", int)):
+        parser.add_argument(name, type=kind)
+    parser.add_argument("height", type=int)
+    parser.add_argument("fps", type=float)
+
+
+def run(options: argparse.Namespace) -> None:
+    # The process that started this one removes the file.
+    exit_on_stop_signal()
+    encoding, size = (options.container, options.codec), (options.width, options.height)
+    with ProgressPrinter() as progress:
+        write_video(
+            options.folder, options.out, encoding, size, options.fps, lambda *counts: progress.show("encoding", *counts)
+        )
