@@ -2,10 +2,10 @@
 """Builds the action `arm_drive`: reach, flex, fist, spread, and twenty frames outside of the range of motion."""
 
 import math
-from contextlib import contextmanager
 
 import bpy
 
+from ..scene.compatibility import animation_curves
 from .joints import ACTION_NAME, FINGERS, JOINTS
 
 LAST_FRAME = 250
@@ -81,23 +81,6 @@ POSES_BY_FRAME: dict[int, Pose] = {
 }
 
 
-@contextmanager
-def _bezier_keyframes_by_default():
-    """Insert Bezier keyframes with clamped handles, whatever the preferences are, so that curves do not overshoot."""
-    edit_preferences = bpy.context.preferences.edit
-    names = ("keyframe_new_interpolation_type", "keyframe_new_handle_type")
-    previous_values = [getattr(edit_preferences, name) for name in names]
-    edit_preferences.keyframe_new_interpolation_type, edit_preferences.keyframe_new_handle_type = (
-        "BEZIER",
-        "AUTO_CLAMPED",
-    )
-    try:
-        yield
-    finally:
-        for name, value in zip(names, previous_values, strict=True):
-            setattr(edit_preferences, name, value)
-
-
 def assign_drive_action(armature_object: bpy.types.Object):
     """Create the action and assign it to an armature object, set the scene's frame range, and show frame 1."""
     action = bpy.data.actions.new(ACTION_NAME)
@@ -105,10 +88,15 @@ def assign_drive_action(armature_object: bpy.types.Object):
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, LAST_FRAME
     bones = armature_object.pose.bones
-    with _bezier_keyframes_by_default():
-        for frame, pose in POSES_BY_FRAME.items():
-            for joint in JOINTS:
-                bone = bones[joint.name]
-                bone.rotation_euler = [math.radians(angle) for angle in pose[joint.name]]
-                bone.keyframe_insert("rotation_euler", frame=frame, group=joint.name)
+    for frame, pose in POSES_BY_FRAME.items():
+        for joint in JOINTS:
+            bone = bones[joint.name]
+            bone.rotation_euler = [math.radians(angle) for angle in pose[joint.name]]
+            bone.keyframe_insert("rotation_euler", frame=frame, group=joint.name)
+    # Whatever the preferences say, curves are smooth and do not overshoot.
+    for curve in animation_curves(action):
+        for point in curve.keyframe_points:
+            point.interpolation = "BEZIER"
+            point.handle_left_type = point.handle_right_type = "AUTO_CLAMPED"
+        curve.update()
     scene.frame_set(1)
