@@ -123,76 +123,66 @@ def _add_deformation(
             values = graph.add("Mul", [values, sigmoid], f"hidden_{index}")
     coefficients = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
     coefficients = graph.reshape(coefficients, [0, part_count * COMPONENTS], "coefficient_row")
-    # The rows: poses of joints, multiplied by the coefficients, the values of shape keys, the confidence, or 1.
-    poses = graph.reshape(POSE_INPUT, [0, 16 * joint_count], "pose_row")
-    ones = graph.add("Gather", [poses, graph.integers("last_element", np.array([15]))], "ones", axis=1)
-    scalars = [ones, CONFIDENCE_OUTPUT, coefficients, *([CONTROLS_INPUT] if rig.controls else [])]
+    _add_products(graph, rig, partitions, coefficients, key_distances)
+
+
+def _add_products(
+    graph: "_Graph",
+    rig: Rig,
+    partitions: tuple[Partition, ...],
+    coefficients: str,
+    key_distances: Mapping[str, np.ndarray],
+) -> None:
+    """Add the products of constant matrices and rows: the columns of poses of joints, multiplied by scalars.
+
+    The scalars are coefficients, the values of shape keys, the confidence, and 1.
+    """
+    pose_row = graph.reshape(POSE_INPUT, [0, 16 * len(rig.joints)], "pose_row")
+    one = graph.add("Gather", [pose_row, graph.integers("last_element", np.array([15]))], "one", axis=1)
+    scalars = [one, CONFIDENCE_OUTPUT, coefficients, *([CONTROLS_INPUT] if rig.controls else [])]
     scalars = graph.add("Concat", scalars, "scalars", axis=1)
-    distances = {i: key_distances[c.name] for i, c in enumerate(rig.controls) if c.name in key_distances}
-    parts = [
-        _Part(rig, index, p, part_count, [i for i in distances if distances[i][p.vertices].any()])
-        for index, p in enumerate(partitions)
-    ]
-    factors = graph.integers("row_factors", np.concatenate([part.factors for part in parts])[:, None])
+    inverse_rest = np.linalg.inv(rig.rest_matrices.astype(np.float64))
+    row_joints, row_scalars, matrices = [], [], []
+    for index, part in enumerate(partitions):
+        skin = SkinBlock(rig, part.joint, part.vertices)
+        fit_joints = (part.joint + np.arange(min(FIT_JOINTS, len(rig.joints)))) % len(rig.joints)
+        first_coefficient, first_control = 1 + len(partitions) + COMPONENTS * np.array([index, len(partitions)])
+        distances = ((i, key_distances.get(control.name)) for i, control in enumerate(rig.controls))
+        keys = [i for i, distance in distances if distance is not None and distance[part.vertices].any()]
+        others = [*(first_coefficient + np.arange(COMPONENTS)), *(first_control + key for key in keys)]
+        row_joints.append(np.concatenate([skin.joints, fit_joints, np.full(len(others), part.joint)]))
+        row_scalars.append([0] * len(skin.joints) + [1 + index] * len(fit_joints) + others)
+        weighted_rest = skin.weighted_rest.reshape(len(skin.joints), 4, -1)
+        skin_rows = (inverse_rest[skin.joints] @ weighted_rest).reshape(-1, len(part.vertices))
+        row_count, rank = 4 * len(row_joints[-1]), len(skin_rows) + RANK
+        if row_count <= max(MAX_ROWS, rank):
+            matrices.append([np.concatenate([skin_rows, np.zeros((row_count - len(skin_rows), len(part.vertices)))])])
+        else:
+            left = np.eye(row_count, len(skin_rows))
+            factors = np.pad(left, ((0, 0), (0, RANK))), np.pad(skin_rows, ((0, RANK), (0, 0)))
+            matrices.append(list(factors))
+    factors = graph.integers("row_scalars", np.concatenate(row_scalars)[:, None])
     factors = graph.add("Gather", [scalars, factors], "factors", axis=1)
     factors = graph.add("MatMul", [factors, graph.floats("twelve_ones", np.ones((1, 12)))], "factors_of_rows")
     columns = graph.add("Transpose", [POSE_INPUT], "pose_columns", perm=[0, 1, 3, 2])
     bounds = [graph.integers(name, np.array([bound])) for name, bound in (("start", 0), ("end", 3), ("axis", 3))]
     columns = graph.add("Slice", [columns, *bounds], "affine_columns")
-    columns = graph.reshape(columns, [0, joint_count, 12], "column_rows")
-    joints = graph.integers("row_joints", np.concatenate([part.joints for part in parts]))
+    columns = graph.reshape(columns, [0, len(rig.joints), 12], "column_rows")
+    joints = graph.integers("row_joints", np.concatenate(row_joints))
     rows = graph.add("Mul", [graph.add("Gather", [columns, joints], "unscaled", axis=1), factors], "scaled")
-    rows = graph.reshape(rows, [0, 4 * sum(len(part.joints) for part in parts), 3], "rows")
+    rows = graph.reshape(rows, [0, 4 * sum(map(len, row_joints)), 3], "rows")
     rows = graph.add("Transpose", [rows], "rows_by_axis", perm=[0, 2, 1])
-    sizes = graph.integers("row_counts", np.array([4 * len(part.joints) for part in parts]))
-    blocks = [f"rows_{index}" for index in range(part_count)]
+    sizes = graph.integers("row_counts", np.array([4 * len(joints) for joints in row_joints]))
+    blocks = [f"rows_{index}" for index in range(len(partitions))]
     graph.add("Split", [rows, sizes], *blocks, axis=2)
-    products = [
-        graph.product(name, part.matrices(rig), f"block_{index}")
-        for index, (name, part) in enumerate(zip(blocks, parts, strict=True))
-    ]
-    positions = graph.add("Concat", products, "blocks", axis=2)
+    for index, constants in enumerate(matrices):
+        for number, matrix in enumerate(constants):
+            name = f"block_{index}_{number}"
+            blocks[index] = graph.add("MatMul", [blocks[index], graph.floats(f"{name}_matrix", matrix)], name)
+    positions = graph.add("Concat", blocks, "blocks", axis=2)
     positions = graph.add("Transpose", [positions], "positions_by_part", perm=[0, 2, 1])
-    order = np.argsort(np.concatenate([partition.vertices for partition in partitions]))
+    order = np.argsort(np.concatenate([part.vertices for part in partitions]))
     graph.add("Gather", [positions, graph.integers("order", order)], POSITIONS_OUTPUT, axis=1)
-
-
-class _Part:
-    """The rows of a body part, four for each matrix.
-
-    Attributes:
-        joints: the joint of each matrix; those of the skin weights come first.
-        factors: index of the scalar that multiplies each matrix.
-    """
-
-    def __init__(self, rig: Rig, index: int, partition: Partition, part_count: int, keys: list[int]):
-        self._skin = SkinBlock(rig, partition.joint, partition.vertices)
-        fit_count = min(FIT_JOINTS, len(rig.joints))
-        fit_joints = (partition.joint + np.arange(fit_count)) % len(rig.joints)
-        others = np.full(COMPONENTS + len(keys), partition.joint)
-        self.joints = np.concatenate([self._skin.joints, fit_joints, others])
-        first_coefficient = 1 + part_count + COMPONENTS * index
-        first_control = 1 + part_count + COMPONENTS * part_count
-        self.factors = np.concatenate(
-            [
-                np.zeros(len(self._skin.joints), np.int64),
-                np.full(fit_count, 1 + index),
-                first_coefficient + np.arange(COMPONENTS),
-                first_control + np.array(keys, np.int64),
-            ]
-        )
-
-    def matrices(self, rig: Rig) -> list[np.ndarray]:
-        """Return the constant matrix of the part, (rows, vertices), or its two factors."""
-        inverse_rest = np.linalg.inv(rig.rest_matrices.astype(np.float64))
-        weighted_rest = self._skin.weighted_rest.reshape(len(self._skin.joints), 4, -1)
-        skin_rows = (inverse_rest[self._skin.joints] @ weighted_rest).reshape(-1, weighted_rest.shape[2])
-        row_count, vertex_count = 4 * len(self.joints), skin_rows.shape[1]
-        if row_count <= max(MAX_ROWS, len(skin_rows) + RANK):
-            return [np.concatenate([skin_rows, np.zeros((row_count - len(skin_rows), vertex_count))])]
-        left = np.zeros((row_count, len(skin_rows) + RANK))
-        left[: len(skin_rows), : len(skin_rows)] = np.eye(len(skin_rows))
-        return [left, np.concatenate([skin_rows, np.zeros((RANK, vertex_count))])]
 
 
 class _Graph:
@@ -228,12 +218,6 @@ class _Graph:
     def reshape(self, value: str, shape: list[int], name: str) -> str:
         """Add a Reshape; a size of 0 keeps the size of the input."""
         return self.add("Reshape", [value, self.integers(f"{name}_shape", np.array(shape))], name)
-
-    def product(self, value: str, matrices: list[np.ndarray], name: str) -> str:
-        """Add the product with constant matrices, and return its name."""
-        for index, matrix in enumerate(matrices):
-            value = self.add("MatMul", [value, self.floats(f"{name}_matrix_{index}", matrix)], f"{name}_{index}")
-        return value
 
     def to_bytes(self, inputs: list[tuple[str, tuple]], outputs: list[tuple[str, tuple]]) -> bytes:
         """Return the GraphProto; the first dimension of inputs and outputs is the number of poses."""
