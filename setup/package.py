@@ -14,12 +14,10 @@ import json
 import platform
 import re
 import shutil
-import struct
 import subprocess
 import sys
 import sysconfig
 import tomllib
-import zipfile
 from pathlib import Path
 
 from manual_page import make_page
@@ -41,37 +39,6 @@ ALL_PLATFORMS = "all"
 # the system's Python: in 2026 Debian, Arch and Fedora have 3.14.
 PYTHON_VERSIONS = ("3.11", "3.13")
 SYSTEM_PYTHON_VERSIONS = ("3.14",)
-# By platform and Python version: the oldest version of Microsoft's C++ library that a Blender from blender.org brings.
-# Crash reports of Blender list the version of MSVCP140.dll: 4.5 and 5.0 have 14.29, 5.1 and 5.2 have 14.44. On ARM, the
-# linker of the DLLs of Blender 4.5 has version 14.42.
-CPP_LIBRARY_VERSIONS = {
-    ("windows-x64", "3.11"): (14, 29),
-    ("windows-x64", "3.13"): (14, 44),
-    ("windows-arm64", "3.11"): (14, 42),
-    ("windows-arm64", "3.13"): (14, 44),
-}
-CPP_LIBRARY = "msvcp140.dll"
-# Version of the newest linker whose DLLs were tried with older C++ libraries.
-NEWEST_KNOWN_TOOLSET = (14, 44)
-# Since this version the compiler initializes mutexes, in a way that older C++ libraries cannot lock.
-MUTEX_VERSION = (14, 40)
-MUTEX_FUNCTIONS = {"_Mtx_lock", "_Mtx_trylock", "_Mtx_timedlock", "_Cnd_wait", "_Cnd_timedwait"}
-# Function that initializes mutexes for earlier compilers, and for later ones if a build asks for it.
-MUTEX_INITIALIZER = "_Mtx_init_in_situ"
-IMPORT_DIRECTORY, DELAYED_IMPORT_DIRECTORY = 1, 13
-# Names of libraries of Microsoft's compilers, and those that each Blender brings.
-COMPILER_LIBRARY = re.compile(r"(msvc[pr]|vcruntime|concrt|vccorlib|vcomp|mfc|atl)\d+\w*\.dll")
-BLENDERS_COMPILER_LIBRARIES = {
-    "concrt140.dll",
-    "msvcp140.dll",
-    "msvcp140_1.dll",
-    "msvcp140_2.dll",
-    "msvcp140_atomic_wait.dll",
-    "msvcp140_codecvt_ids.dll",
-    "vccorlib140.dll",
-    "vcruntime140.dll",
-    "vcruntime140_1.dll",
-}
 # Limit for the size of a zip. Users download the zip by hand, and Blender keeps a second copy when it installs it.
 MAX_PACKAGE_MB = 60
 
@@ -122,7 +89,6 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
     The dependencies of onnxruntime are left out: Blender includes numpy, and playback needs no other package.
 
     Raises:
-        PackageError: a wheel does not run in all Blenders, as for `check_wheel`.
         CalledProcessError: pip failed.
     """
     wheels = []
@@ -137,118 +103,8 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
             command += [f"--dest={folder}", f"--python-version={python}", requirement]
             command += [f"--platform={tag}" for tag in PLATFORMS[name]]
             subprocess.run(command, check=True)
-        for wheel in folder.glob("*.whl"):
-            check_wheel(wheel, name, python)
-            wheels.append(wheel)
+        wheels += folder.glob("*.whl")
     return wheels
-
-
-def read_imports(data: bytes) -> tuple[tuple[int, int], dict[str, set[str]]]:
-    """Read the import tables of a 64-bit DLL.
-
-    Args:
-        data: content of the file.
-
-    Returns:
-        The version of the linker, and the imported functions by the name of the DLL in lower case. Functions that are
-        imported by number are left out.
-
-    Raises:
-        ValueError: the data is no DLL, is damaged, or is for 32 bits.
-
-    References:
-        https://learn.microsoft.com/en-us/windows/win32/debug/pe-format
-    """
-    try:
-        (header,) = struct.unpack_from("<I", data, 0x3C)
-        signature, section_count, optional_size, magic, *linker_version = struct.unpack_from(
-            "<I2xH12xH2xH2B", data, header
-        )
-        if signature != 0x4550 or magic != 0x20B:
-            raise ValueError("no 64-bit DLL")
-        sections = [
-            struct.unpack_from("<8x4I", data, header + 24 + optional_size + 40 * index)
-            for index in range(section_count)
-        ]
-
-        def offset(address: int) -> int:
-            for size, start, file_size, file_start in sections:
-                if start <= address < start + max(size, file_size):
-                    return address - start + file_start
-            raise ValueError("an address outside of all sections")
-
-        def text(address: int) -> str:
-            start = offset(address)
-            end = data.find(b"\0", start)
-            if end < 0:
-                raise ValueError("a name that does not end")
-            return data[start:end].decode("ascii")
-
-        imports: dict[str, set[str]] = {}
-        # Of a descriptor: its format, and the positions of the address of the DLL's name and of its table of functions.
-        layouts = {IMPORT_DIRECTORY: ("<5I", 3, 0), DELAYED_IMPORT_DIRECTORY: ("<8I", 1, 4)}
-        for directory, (layout, name_position, table_position) in layouts.items():
-            (address,) = struct.unpack_from("<I", data, header + 24 + 112 + 8 * directory)
-            descriptor = offset(address) if address else None
-            while descriptor is not None and any(fields := struct.unpack_from(layout, data, descriptor)):
-                functions = imports.setdefault(text(fields[name_position]).lower(), set())
-                entry = offset(fields[table_position])
-                while function := struct.unpack_from("<Q", data, entry)[0]:
-                    if not function >> 63:
-                        functions.add(text(function + 2))
-                    entry += 8
-                descriptor += struct.calcsize(layout)
-    except (struct.error, IndexError, UnicodeDecodeError) as error:
-        raise ValueError("damaged") from error
-    return tuple(linker_version), imports
-
-
-def needed_cpp_library_version(data: bytes) -> tuple[int, int]:
-    """Return the oldest version of the C++ library with which a DLL runs; (14, 0) where any will do.
-
-    Microsoft promises only that a library as new as the linker will do. But all versions have the same functions, and
-    those up to `NEWEST_KNOWN_TOOLSET` differ only in their mutexes.
-    """
-    linker_version, imports = read_imports(data)
-    if CPP_LIBRARY not in imports:
-        return (14, 0)
-    if linker_version > NEWEST_KNOWN_TOOLSET:
-        return linker_version
-    functions = imports[CPP_LIBRARY]
-    return MUTEX_VERSION if functions & MUTEX_FUNCTIONS and MUTEX_INITIALIZER not in functions else (14, 0)
-
-
-def check_wheel(wheel: Path, name: str, python: str) -> None:
-    """Check that each Blender with a Python version on a platform can load the DLLs of a wheel.
-
-    Raises:
-        PackageError: a DLL needs a library that Blender does not bring, or a newer one than Blender has.
-    """
-    if (name, python) not in CPP_LIBRARY_VERSIONS:
-        return
-    brought_version = CPP_LIBRARY_VERSIONS[name, python]
-    with zipfile.ZipFile(wheel) as archive:
-        dlls = [path for path in archive.namelist() if path.lower().endswith((".dll", ".pyd"))]
-        available = BLENDERS_COMPILER_LIBRARIES | {path.rpartition("/")[2].lower() for path in dlls}
-        for path in dlls:
-            data = archive.read(path)
-            try:
-                needed_version, (_, imports) = needed_cpp_library_version(data), read_imports(data)
-            except ValueError as error:
-                raise PackageError(
-                    f"'{path}' of {wheel.name} cannot be read ({error}); download the wheel again."
-                ) from error
-            lacking = sorted(
-                library for library in imports if COMPILER_LIBRARY.fullmatch(library) and library not in available
-            )
-            if needed_version > brought_version:
-                lacking = ["msvcp140.dll {}.{}".format(*needed_version)]
-            if lacking:
-                raise PackageError(
-                    f"'{path}' of {wheel.name} needs {lacking[0]}, and the Blenders with Python {python} bring "
-                    "msvcp140.dll {}.{}; ".format(*brought_version)
-                    + f"pin another version in pyproject.toml for Python {python}, and try it with make test-windows."
-                )
 
 
 def stage_manual(folder: Path) -> None:
@@ -341,7 +197,7 @@ def build_packages(names: list[str], website: str = "") -> list[Path]:
         The paths of the zips.
 
     Raises:
-        PackageError: there are no wheels for a platform, one does not run in Blender, or a zip is too large.
+        PackageError: there are no wheels for a platform, or a zip is too large.
         CalledProcessError: pip or the extension tool failed.
     """
     packages = []

@@ -12,6 +12,8 @@ from types import ModuleType
 import pytest
 from packaging.markers import Marker
 
+from fdda_addon.core.files.native_library import LAST_OLD_RUNTIME
+
 from ..systems import WINDOWS, symbolic_links
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -117,6 +119,14 @@ def test_requirements_of_the_project_are_pinned(version: str):
         package, _, marker = requirement.partition("; ")
         if not marker or Marker(marker).evaluate({"python_version": version}):
             assert re.search(rf"^{re.escape(package)}(==|$)", PINS[version], re.MULTILINE), requirement
+
+
+def test_the_pinned_runtimes_run_with_the_cpp_library_of_each_blender():
+    """On Windows, a runtime that needs a newer one ends Blender (docs/release.md, Microsoft's libraries)."""
+    newest = {"3.11": LAST_OLD_RUNTIME, "3.13": (1, 31)}
+    for version, known in newest.items():
+        pinned = re.search(r"^onnxruntime==(\d+)\.(\d+)", PINS[version], re.MULTILINE)
+        assert tuple(map(int, pinned.groups())) <= known, "look at the DLLs of its wheel for Windows first"
 
 
 def test_the_staged_extension_has_the_files_that_blender_expects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -9,7 +9,7 @@ from importlib import metadata
 
 OLD_CPP_LIBRARY, LAST_OLD_RUNTIME = (14, 40), (1, 20)
 """ONNX Runtime after the second version ends the process if the C++ library is older than the first.
-`setup/package.py` refuses wheels that need more than Blender brings, but another extension may have brought one."""
+The wheels of the extension are older for such a Blender, but another extension may have brought one."""
 _ADVICE = {
     r"((?:GLIBC|GLIBCXX|CXXABI)_[\d.]+)' not found": (
         "this Linux is too old, or LD_LIBRARY_PATH names an older library: {0} is needed",

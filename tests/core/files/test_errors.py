@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Exit statuses of errors, advice on libraries that cannot be loaded, and processes that end."""
+"""Exit statuses of errors, libraries that cannot be loaded, and processes that end."""
 
 import errno
+import importlib.util
 import json
 import os
 import subprocess
@@ -21,8 +22,11 @@ from fdda_addon.core.errors import (
     exit_status,
     os_error_text,
 )
+from fdda_addon.core.files import native_library
 from fdda_addon.core.files.child_process import OutputLines, child_options, end_process
-from fdda_addon.core.files.native_library import runtime_advice
+from fdda_addon.core.files.native_library import check_cpp_library, loaded_cpp_library_version, runtime_advice
+
+from ...systems import WINDOWS
 
 
 def error_caused_by(cause: BaseException) -> OutputError:
@@ -134,3 +138,30 @@ def test_lines_are_read_while_the_child_runs_and_it_is_killed():
     end_process(process, 0.01)
     assert process.returncode and lines.join(30) and lines.next() is None
     process.stdout.close()
+
+
+@pytest.mark.parametrize(
+    ("loaded", "version", "is_refused"),
+    [
+        ((14, 29), "1.21.0", True),
+        ((14, 29), "1.20.1", False),
+        ((14, 40), "1.31.1", False),
+        (None, "1.31.1", False),
+    ],
+)
+def test_a_runtime_that_would_end_the_process_is_not_imported(monkeypatch, loaded, version, is_refused):
+    monkeypatch.setattr(native_library, "loaded_cpp_library_version", lambda: loaded)
+    monkeypatch.setattr(native_library.metadata, "version", lambda _: version)
+    if not is_refused:
+        check_cpp_library()
+        return
+    with pytest.raises(ImportError, match=r"1\.21\.0 needs msvcp140\.dll 14\.40, and Blender has loaded 14\.29"):
+        check_cpp_library()
+
+
+@pytest.mark.skipif(not WINDOWS, reason="Only Windows has this library.")
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is not installed.")
+def test_the_version_of_the_loaded_library_is_read():
+    import bpy  # noqa: F401 - loads Blender's library
+
+    assert loaded_cpp_library_version() == ((14, 29) if sys.version_info < (3, 13) else (14, 44))
