@@ -16,10 +16,10 @@ from ..core.errors import TRY_AGAIN, FDDAError, RigError, WrongUsageError, exit_
 from ..core.files.file_kind import BENCHMARK
 from ..core.files.output import check_outputs, write_json
 from ..core.files.temporary import check_temporary_folder
-from ..fast_rig.saving import measure_saving
+from ..fast_rig.frame_times import measure_saving
 from ..scene.scene_rig import find_rig, find_rigs
 from ..timing.benchmark import benchmark
-from ..timing.profiling import profile_frame
+from ..timing.frame_profile import profile_frame
 from .files import add_overwrite_option, add_rig_options, open_file, open_rigs, to_json_by_object, with_heading
 from .progress import ProgressPrinter
 

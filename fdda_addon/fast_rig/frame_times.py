@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Times the frames of a full rig and of its fast rig, by opening both files in turns."""
+"""Times the frames of a full rig and of its fast rig, by opening both files in turns; also without models."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,18 +9,22 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..core.errors import FDDAError
+from ..core.errors import FDDAError, RigError
+from ..core.files.temporary import temporary_folder
 from ..core.progress import Job, Progress
 from ..poses.action_range import action_frames
-from ..runtime.binding import model_disabled
+from ..runtime.binding import model_disabled, unbind
 from ..scene.action_slots import dependencies, slots_of_action
-from ..scene.blend_file import blender_path, report_message, silenced_stdout
-from ..scene.scene_rig import find_rig
+from ..scene.blend_file import blender_path, report_message, save_copy, silenced_stdout
+from ..scene.scene_rig import check_full_rig, find_rig, rigs_of_armature
 from ..scene.temporary_state import assign_action
 from ..scene.time_stretching import unstretched_time
+from ..timing.benchmark import untrained_models
 from ..timing.durations import WARM_UP_FRAMES, time_calls
-from .compared_poses import set_random_pose
-from .controls import animating_actions
+from ..timing.frame_profile import FastRigSaving
+from .compared_poses import rig_size, set_random_pose
+from .controls import VISIBLE, animating_actions, control_bones
+from .run import bind_packed_models, remove_unneeded_parts
 
 ROUNDS = 3
 
@@ -112,3 +116,40 @@ def _frame_calls(
     frames = action_frames(action)
     for index in indices:
         yield partial(bpy.context.scene.frame_set, frames[index % len(frames)])
+
+
+SAVING_ROUNDS, FRAMES_PER_ROUND = 5, 12
+"""Each round opens both files, and measures them one after the other."""
+
+
+def measure_saving(armature_object: bpy.types.Object, file: Path) -> Job[FastRigSaving]:
+    """Time a rig, and a fast rig of it whose meshes play untrained models.
+
+    The fast rig keeps the visible bones, and what the meshes need that no model can deform. The open file is changed
+    and replaced by others, so run this in a process of its own.
+
+    Args:
+        armature_object: the armature of the rig.
+        file: the open file, as it is saved.
+
+    Raises:
+        FDDAError: no mesh can have a model, bones cannot be removed, or a file cannot be written or opened.
+    """
+    rigs = rigs_of_armature(armature_object)
+    for scene_rig in rigs:
+        check_full_rig(scene_rig.mesh_object)
+        unbind(scene_rig.mesh_object)
+    bone_count, controls = len(armature_object.data.bones), tuple(sorted(control_bones(armature_object, (VISIBLE,))))
+    with temporary_folder() as folder, untrained_models(rigs) as (models, reasons):
+        if not models:
+            raise RigError(next(iter(reasons.values())))
+        rigs_and_models = [(rig, models[rig.mesh_object]) for rig in rigs if rig.mesh_object in models]
+        joints = bind_packed_models(rigs_and_models)
+        remove_unneeded_parts([rig for rig, _ in rigs_and_models], joints, controls)
+        kept_count, size = len(armature_object.data.bones), rig_size(armature_object)
+        object_name, fast_file = rigs_and_models[0][0].mesh_object.name, folder / "fast.blend"
+        save_copy(fast_file)
+        frames = SAVING_ROUNDS * FRAMES_PER_ROUND
+        times = yield from measure_frames(file, fast_file, object_name, controls, frames, size, SAVING_ROUNDS)
+    medians = (round(float(np.median(each)), 4) for each in (times.full, times.fast))
+    return FastRigSaving(bone_count, kept_count, len(joints), len(controls), *medians)

@@ -12,8 +12,7 @@ from ..core.progress import Job
 from ..jobs.verb_process import VerbProcess
 from ..scene.blend_file import save_copy
 from ..timing import measurements
-from ..timing.frame_profile import FastRigSaving, FrameProfile
-from ..timing.profiling import profile_frame
+from ..timing.frame_profile import FastRigSaving, FrameProfile, profile_frame
 from .job import JobOperator
 
 STEPS = (

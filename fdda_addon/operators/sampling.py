@@ -10,7 +10,7 @@ from ..poses.sample_selection import describe_control_bones
 from ..properties.recording_options import recorded_actions, recording_settings
 from ..recording.plan import RecordingSettings, listed_controls
 from ..scene.compatibility import is_selected
-from ..scene.control_names import control_at
+from ..scene.controls import control_at
 from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator
 
 

@@ -10,9 +10,8 @@ from ..core.controls import ARMATURE_OBJECT, Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.mathematics.remix import Remix
-from ..scene.bone_transform import MATRIX, MATRIX_ELEMENT_RANGE
 from ..scene.compatibility import is_selected
-from ..scene.controls import canonical_path, custom_properties, is_driven, make_control
+from ..scene.controls import MATRIX, MATRIX_ELEMENT_RANGE, canonical_path, custom_properties, is_driven, make_control
 from ..scene.scene_rig import SceneRig
 from .action_range import constant_controls, keyed_controls, keyed_ranges, measured_controls
 from .clip import find_action

@@ -19,7 +19,7 @@ from bpy.props import (
 
 from ..core import settings
 from ..core.errors import OutputError
-from ..scene.control_names import control_at, suggested_controls
+from ..scene.controls import control_at, suggested_controls
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
 

@@ -25,9 +25,8 @@ from ..poses.motion_range import is_moved_by_constraints
 from ..rig.references import ik_chain, is_transform_channel, split_bone_path
 from ..rig.shape_keys import muted_key_drivers
 from ..scene.armature import PoseMatrixReader, Poser, clear_pose, rest_matrices
-from ..scene.bone_transform import controls_by_bone
 from ..scene.control_reader import ControlReader
-from ..scene.controls import is_driven, number_at, owner_of, set_control
+from ..scene.controls import controls_by_bone, is_driven, number_at, owner_of, set_control
 from ..scene.scene_rig import MIN_VOLUME, SceneRig, is_flat
 from .plan import RecordingSettings, make_pose_sampler
 

@@ -26,8 +26,7 @@ from ..rig.references import split_bone_path
 from ..rig.shape_keys import set_keys_undriven
 from ..rig.sources import Sources
 from ..scene.armature import Poser, clear_pose
-from ..scene.control_names import control_default
-from ..scene.controls import can_be_set, is_driven, owner_of, set_control
+from ..scene.controls import can_be_set, control_default, is_driven, owner_of, set_control
 from ..scene.scene_rig import SceneRig
 from .plan import (
     RecordingSettings,

@@ -18,8 +18,7 @@ from ..rig.pose_setter import temporary_rig_state
 from ..scene.animated_values import read_value
 from ..scene.armature import FOUR_COMPONENT_ROTATIONS, clear_pose, pose_values
 from ..scene.arrays import KEY_INTERPOLATION_ELEMENT, KEY_POSITION_ELEMENT, POSE_CHANNELS, write
-from ..scene.bone_transform import bone_transform
-from ..scene.controls import can_be_set, is_driven, owner_of
+from ..scene.controls import bone_transform, can_be_set, is_driven, owner_of
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import assign_action
 from .plan import RecordingSettings, make_pose_sampler, make_sampling, read_sampled_rig

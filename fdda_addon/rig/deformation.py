@@ -18,9 +18,8 @@ from ..core.deformation import versionless_path
 from ..core.mathematics.key_joints import with_sources
 from ..core.recording.index import RecordedBones
 from ..core.rig import Fingerprint, Rig
-from ..scene.bone_transform import controls_by_bone
 from ..scene.compatibility import node_input_settings
-from ..scene.controls import owner_name
+from ..scene.controls import controls_by_bone, owner_name
 from ..scene.mesh import vertex_layers
 from ..scene.node_groups import read_texts
 from ..scene.scene_rig import SceneRig, armature_of

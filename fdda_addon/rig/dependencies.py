@@ -16,8 +16,7 @@ from ..core.controls import EVALUATION_TIME, OTHER_OBJECT, SHAPE_KEYS, Control
 from ..core.errors import RigError
 from ..core.mathematics.poses import LOCATION, ROTATION, SCALE
 from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
-from ..scene.action_slots import CurvesByDatablock, curves_of_actions, is_overridden
-from ..scene.animation import changes_value, curves_with_actions
+from ..scene.action_slots import CurvesByDatablock, changes_value, curves_of_actions, curves_with_actions, is_overridden
 from ..scene.armature import FOUR_COMPONENT_ROTATIONS
 from ..scene.controls import canonical_path, driven_numbers, fcurve_target, make_control, owner_name
 from ..scene.scene_rig import SceneRig

@@ -9,8 +9,7 @@ import bpy
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.wording import format_with_noun
-from ..scene.action_slots import CurvesByDatablock, curves_of_actions
-from ..scene.animation import changes_value, curves_with_actions, value_range
+from ..scene.action_slots import CurvesByDatablock, changes_value, curves_of_actions, curves_with_actions, value_range
 from ..scene.controls import canonical_path, fcurve_target, is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
 from .dependencies import check_other_armatures

@@ -11,8 +11,7 @@ from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT
 from .armature import PoseMatrixReader, rest_matrices
 from .arrays import KEY_VALUE_ELEMENT, POSE_CHANNELS, read
-from .bone_transform import BoneTransform, bone_transform
-from .controls import canonical_path, number_at, owner_of
+from .controls import BoneTransform, bone_transform, canonical_path, number_at, owner_of
 from .scene_rig import MIN_VOLUME, SceneRig
 
 MAX_HIDDEN_MOTION = 1e-3

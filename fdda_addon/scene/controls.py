@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds and sets controls: numbers of a rig that are inputs of a model besides its joints."""
+"""Finds, reads the defaults of, and sets controls: numbers of a rig that are inputs of a model besides its joints."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import bpy
@@ -17,21 +18,83 @@ from ..core.controls import (
     MESH_OWNER,
     OTHER_OBJECT,
     OWNERS,
+    SHAPE_KEY_PATH,
     SHAPE_KEYS,
     Control,
 )
 from ..core.errors import RigError
-from .bone_transform import MATRIX_ELEMENT_RANGE, bone_transform
 from .scene_rig import SceneRig, armature_of, name_without_number
 from .temporary_state import animation_state, restore_animation
+
+_BONE_TRANSFORM_PATH = re.compile(
+    r'(?P<bone>pose\.bones\["(?P<name>(?:[^"\\]|\\.)*)"\])\.'
+    r"(?P<property>location|scale|rotation_\w+|matrix_basis)\[(?P<index>\d)\](?:\[(?P<row>[0-3])\])?"
+)
+
+MATRIX = "matrix_basis"
+"""RNA property of a pose bone: the 4x4 transform that its channels define, relative to its rest pose, without its
+constraints. `matrix_basis[C][R]` is the element in column C and row R. A control on it can be read but not set."""
+
+MATRIX_ELEMENT_RANGE = (-1.0, 1.0)
+"""Range of an element of a rotation matrix."""
+
+
+@dataclass(frozen=True)
+class BoneTransform:
+    """The number of a bone's transform that a control is.
+
+    Attributes:
+        bone_path: RNA path of the pose bone in its armature object.
+        bone_name: name of the bone.
+        element: column and row of the number in `MATRIX`; None for a scale or a rotation channel.
+        is_matrix: the path of the control is an element of `MATRIX`.
+        scale_axis: axis of a scale; None for any other number.
+    """
+
+    bone_path: str
+    bone_name: str
+    element: tuple[int, int] | None
+    is_matrix: bool
+    scale_axis: int | None
+
+
+def bone_transform(path: str) -> BoneTransform | None:
+    """Return the number of a bone's transform at the path of a control; None for any other number."""
+    match = _BONE_TRANSFORM_PATH.fullmatch(path)
+    is_matrix = match is not None and match["property"] == MATRIX
+    if match is None or is_matrix != (match["row"] is not None):
+        return None
+    element = (int(match["index"]), int(match["row"])) if is_matrix else None
+    if match["property"] == "location":
+        element = 3, int(match["index"])
+    scale_axis = int(match["index"]) if match["property"] == "scale" else None
+    return BoneTransform(match["bone"], bpy.utils.unescape_identifier(match["name"]), element, is_matrix, scale_axis)
+
+
+def controls_by_bone(controls: Iterable[Control]) -> dict[str, tuple[int, ...]]:
+    """Return the indices of the controls that are numbers of a bone's transform, by the name of the bone.
+
+    Bones of other armatures are left out.
+    """
+    indices: dict[str, list[int]] = {}
+    for index, control in enumerate(controls):
+        transform = bone_transform(control.path) if control.owner == ARMATURE_OBJECT else None
+        if transform is not None:
+            indices.setdefault(transform.bone_name, []).append(index)
+    return {name: tuple(bone_indices) for name, bone_indices in indices.items()}
+
 
 MAX_RANGE_WIDTH = 1e4
 """A property with a wider range is treated as a property without a range."""
 
 _CONTROL_TEXT = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
+
 _CUSTOM_PROPERTY_PATH = re.compile(r'(?P<owner>.*)\["(?P<name>(?:[^"\\]|\\.)*)"\]')
+
 _ARRAY_ELEMENT_PATH = re.compile(r"(?P<array>.+)\[(?P<index>\d+)\]")
+
 _STRUCT_INDEX = re.compile(r"\.?\[\s*(?P<index>\d+)\s*\](?=[.\[])")
+
 _AXIS_PATH = re.compile(r"(?P<array>.+)\.(?P<axis>[wxyz])")
 
 
@@ -339,3 +402,59 @@ def temporary_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[No
             restore_animation(owner, state)
         for name, value in values.items():
             set_control(scene_rig, name, value)
+
+
+_FULL_DATA_PATH = re.compile(r'bpy\.data\.(?P<collection>\w+)\["(?P<name>(?:[^"\\]|\\.)*)"\]\.?(?P<path>.+)', re.DOTALL)
+
+
+def control_at(scene_rig: SceneRig, full_data_path: str) -> str:
+    """Return the name of the control at a full data path, as Blender's operator Copy Full Data Path writes it.
+
+    Args:
+        full_data_path: for example `bpy.data.objects["arm"].data.shape_keys.key_blocks["smile"].value`.
+
+    Returns:
+        The name of a shape key, or OWNER/PATH; the text itself if it is not the path of a number of the rig.
+    """
+    match = _FULL_DATA_PATH.fullmatch(full_data_path.strip())
+    collection = getattr(bpy.data, match["collection"], None) if match else None
+    if not isinstance(collection, bpy.types.bpy_prop_collection):
+        return full_data_path
+    datablock = collection.get(bpy.utils.unescape_identifier(match["name"]))
+    if not is_number(datablock, match["path"]):
+        return full_data_path
+    struct_owner, path, _ = fcurve_target(datablock, match["path"])
+    index = parent_and_name(datablock, match["path"])[2]
+    owner = owner_name(scene_rig, struct_owner)
+    shape_key = SHAPE_KEY_PATH.fullmatch(path) if owner == SHAPE_KEYS else None
+    if shape_key:
+        return bpy.utils.unescape_identifier(shape_key["name"])
+    return f"{owner}/{path}{'' if index is None else f'[{index}]'}" if owner else full_data_path
+
+
+def suggested_controls(scene_rig: SceneRig) -> list[str]:
+    """Suggest the custom properties that no driver sets, and bone collections, as users list them."""
+    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    names = []
+    for owner, datablock in ((ARMATURE_OBJECT, armature_object), (MESH_OBJECT, mesh_object)):
+        names += [f"{owner}/{path}" for path in custom_properties(datablock, "")]
+    for bone in armature_object.pose.bones:
+        names += [f"{ARMATURE_OBJECT}/{path}" for path in custom_properties(armature_object, bone.path_from_id())]
+    return [*names, *(f"collection:{collection.name}" for collection in armature_object.data.collections_all)]
+
+
+def control_default(scene_rig: SceneRig, name: str) -> float:
+    """Return the default value of a control; 0 for a shape key."""
+    owner, _, path = name.partition("/")
+    transform = bone_transform(path)
+    if transform is not None and transform.is_matrix:
+        return float(transform.element[0] == transform.element[1])
+    struct, attribute, index = parent_and_name(owner_of(scene_rig, owner), path)
+    if isinstance(struct, bpy.types.ShapeKey):
+        return 0.0
+    if is_custom_property(attribute):
+        key = custom_property_key(attribute)
+        default = False if isinstance(struct[key], bool) else struct.id_properties_ui(key).as_dict()["default"]
+        return float(default[index] if hasattr(default, "__len__") else default)
+    prop = struct.bl_rna.properties[attribute]
+    return float(prop.default if index is None else prop.default_array[index])

@@ -2,13 +2,14 @@
 """Times frames of a character, which is all meshes of one armature, with its rig and with models.
 
 The variants are measured alternately, so that other work on the machine slows all of them and their ratios stay right.
+Without a model, an untrained one measures how fast a trained model will be on this machine.
 """
 
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,29 +17,40 @@ import bpy
 import numpy as np
 
 from ..core.errors import FDDAError, RigError
+from ..core.files.temporary import temporary_folder
+from ..core.formats.untrained_model import build_untrained_model
 from ..core.progress import Job, Progress
 from ..core.wording import format_count
 from ..poses.sampling import model_channels
+from ..rig.dependencies import read_dependencies
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
+from ..rig.reading import read_rig
+from ..rig.shape_keys import key_distances
+from ..rig.time_inputs import check_time_inputs
 from ..runtime import model_files, playback
 from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import read_matching_rig
-from ..scene.scene_rig import armature_modifier, check_full_rig, rigs_of_armature
+from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig, join_rigs, rigs_of_armature
 from ..scene.temporary_state import deformation_disabled, temporary_attributes
 from .animation import main_rig, temporary_animation
 from .durations import WARM_UP_FRAMES, temporary_armature_scene, temporary_scene, time_calls, time_frames
-from .untrained_models import untrained_models
 
 ROUNDS, MAX_ROUNDS = 5, 15
 """Smallest and largest number of rounds. Each round measures all variants, one after the other."""
+
 MAX_RATIO_SPREAD = 0.1
 """Spread of the ratio of two times (`_ratio_spread`) at which no further round is measured."""
+
 MIN_WORTHWHILE_RATIO = 1.5
 """Smallest ratio of the frame times of rig and models at which models are worth it."""
+
 MAX_RATIO_RANGE = 1.6
 """Largest ratio of the quartiles of the ratios of all rounds that allows a verdict."""
+
 RIG, LINEAR, FDDA, FLOOR, WITHOUT_MESHES, BONES = "rig", "linear", "fdda", "floor", "without_meshes", "bones"
+
 INFERENCE = "inference"
+
 LABELS = {
     RIG: "rig",
     LINEAR: "Armature modifiers alone",
@@ -372,3 +384,41 @@ def _skinning_shown(mesh_objects: list[bpy.types.Object]) -> Iterator[None]:
                 stack.enter_context(temporary_attributes(skin_modifier, use_deform_preserve_volume=False))
             stack.enter_context(deformation_disabled(mesh_object, other_modifiers))
         yield
+
+
+@contextmanager
+def untrained_models(
+    rigs: Iterable[SceneRig],
+) -> Iterator[tuple[dict[bpy.types.Object, Path], dict[bpy.types.Object, str]]]:
+    """Write an untrained model of the meshes of an armature to a temporary folder; remove the folder afterwards.
+
+    Yields:
+        The path of the model, and why other meshes can have none, by mesh object.
+    """
+    rigs_of_model, reasons = [], {}
+    for scene_rig in rigs:
+        try:
+            check_time_inputs(scene_rig, read_dependencies(scene_rig).controls, check_evaluable(scene_rig))
+            read_rig(scene_rig)
+        except FDDAError as error:
+            reasons[scene_rig.mesh_object] = str(error)
+        else:
+            rigs_of_model.append(scene_rig)
+    with temporary_folder() as folder:
+        path = folder / "untrained.onnx"
+        try:
+            if rigs_of_model:
+                character = join_rigs(rigs_of_model)
+                dependencies = read_dependencies(character)
+                rig = read_rig(character, dependencies.bones)
+                distances = {}
+                for mesh_object, vertices in zip(character.mesh_objects, rig.mesh_slices, strict=True):
+                    for name, values in key_distances(character, mesh_object).items():
+                        distances[name] = np.zeros(rig.vertex_count, np.float32)
+                        distances[name][vertices] = values
+                controls = (c for c in dependencies.controls if c.name not in distances or distances[c.name].any())
+                path.write_bytes(build_untrained_model(replace(rig, controls=tuple(controls)), distances))
+        except FDDAError as error:
+            reasons |= {scene_rig.mesh_object: str(error) for scene_rig in rigs_of_model}
+            rigs_of_model = []
+        yield {scene_rig.mesh_object: path for scene_rig in rigs_of_model}, reasons

@@ -23,9 +23,8 @@ from fdda_addon.rig.dependencies import read_dependencies
 from fdda_addon.runtime import driver
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.compatibility import animation_curves
-from fdda_addon.scene.control_names import control_default
 from fdda_addon.scene.control_reader import ControlReader
-from fdda_addon.scene.controls import canonical_path, is_driven, parse_controls, set_control
+from fdda_addon.scene.controls import canonical_path, control_default, is_driven, parse_controls, set_control
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import ELBOW_RIG, assert_plays, run, train

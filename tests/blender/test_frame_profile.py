@@ -29,8 +29,8 @@ from fdda_addon.timing.frame_profile import (
     SHAPE_KEYS,
     FramePart,
     FrameProfile,
+    profile_frame,
 )
-from fdda_addon.timing.profiling import profile_frame
 
 from .conftest import ELBOW_RIG, run
 from .drawing import Layout

@@ -27,7 +27,7 @@ from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene import undo
 from fdda_addon.scene.active_rig import active_rig
 from fdda_addon.scene.compatibility import animation_curves, is_selected, select_bone
-from fdda_addon.scene.control_names import control_default, suggested_controls
+from fdda_addon.scene.controls import control_default, suggested_controls
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from ..arm_and_face import IK, recorded, saved
