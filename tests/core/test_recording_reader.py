@@ -5,14 +5,12 @@ import json
 import os
 import re
 import shutil
-import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.recording.folder import check_recordable
 from fdda_addon.core.recording.reader import check_resumable, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
@@ -124,19 +122,7 @@ def test_counts_larger_than_the_arrays_are_refused(recording, counts):
     assert_refused(recording, "cannot be used: it holds")
 
 
-def test_huge_counts_in_index_and_header_are_refused(recording):
-    """Index and header agree, and the byte count overflows 64 bits to 0, so only the size of the file contradicts."""
-    poses = 1 << 57
-    edit_index(recording, poses=poses, complete=poses)
-    for name, shape in (("pose_matrices", (poses, 4, 4, 4)), ("positions", (poses, 40, 3))):
-        header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n"
-        (recording / f"{name}.npy").write_bytes(npy_bytes(header, b"\0" * 4096))
-    assert_refused(recording, "pose_matrices.npy' cannot be used: it is truncated")
-
-
-@pytest.mark.parametrize(
-    "name", ["positions", "pose_matrices", "rest_positions", "skin_joints", "face_starts", "face_vertices"]
-)
+@pytest.mark.parametrize("name", ["positions", "rest_positions"])
 def test_a_truncated_array_is_refused(recording, name):
     path = recording / f"{name}.npy"
     path.write_bytes(path.read_bytes()[:-1])
@@ -149,8 +135,7 @@ def test_a_missing_array_is_refused(recording, name):
     assert_refused(recording, f"{name}.npy' cannot be used", systems.NOT_FOUND)
 
 
-@pytest.mark.parametrize("name", ["positions", "pose_matrices"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(("name", "value"), [("positions", np.nan), ("pose_matrices", -np.inf)])
 def test_non_finite_values_are_refused(recording, name, value):
     array = np.load(recording / f"{name}.npy")
     array[11, 3, 1] = value
@@ -160,7 +145,7 @@ def test_non_finite_values_are_refused(recording, name, value):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [*(("skin_weights", value) for value in (np.nan, -0.5, 3.0)), *(("skin_joints", j) for j in (-1, 4, 1 << 30))],
+    [("skin_weights", np.nan), ("skin_weights", 3.0), ("skin_joints", -1), ("skin_joints", 4)],
 )
 def test_invalid_weights_are_refused(recording, name, value):
     array = np.load(recording / f"{name}.npy")
@@ -169,7 +154,7 @@ def test_invalid_weights_are_refused(recording, name, value):
     assert_refused(recording, "The rest pose or skin weights of", "are damaged; record again")
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.int32, ">f4", np.complex64])
+@pytest.mark.parametrize("dtype", [np.float64, ">f4"])
 def test_another_dtype_is_refused(recording, dtype):
     array = np.load(recording / "positions.npy")
     np.save(recording / "positions.npy", array.astype(dtype))
@@ -184,34 +169,13 @@ def test_another_shape_or_memory_order_is_refused(recording):
     assert_refused(recording, "positions.npy' cannot be used")
 
 
-class Unpickled:
-    """An object that sets `is_unpickled` of its class when it is unpickled."""
-
-    is_unpickled = False
-
-    def __reduce__(self):
-        return _mark_unpickled, ()
-
-
-def _mark_unpickled() -> None:
-    """Set `Unpickled.is_unpickled`; unpickling calls this function."""
-    Unpickled.is_unpickled = True
-
-
-def test_pickled_objects_are_not_loaded(recording):
-    array = np.empty((12, 40, 3), object)
-    array[:] = Unpickled()
-    np.save(recording / "positions.npy", array)
-    assert_refused(recording, "positions.npy' cannot be used: it holds (12, 40, 3) object")
-    assert not Unpickled.is_unpickled
-
-
 INVALID_HEADERS = {
     "empty": "",
-    "no dictionary": "[1, 2]",
     "unclosed": "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 40, 3",
     "nested": "(" * 9000,
     "code": "__import__('os').abort()",
+    "no array": b"PK\x03\x04zip",
+    "another version": npy_bytes("{}", version=b"\x02\x00"),
 }
 
 
@@ -219,57 +183,18 @@ INVALID_HEADERS = {
 @pytest.mark.parametrize("name", ["positions", "face_vertices"])
 @pytest.mark.parametrize("header", INVALID_HEADERS.values(), ids=INVALID_HEADERS.keys())
 def test_invalid_array_headers_are_refused(recording, name, header):
-    (recording / f"{name}.npy").write_bytes(npy_bytes(header, b"\0" * 5760))
+    data = header if isinstance(header, bytes) else npy_bytes(header, b"\0" * 5760)
+    (recording / f"{name}.npy").write_bytes(data)
     with pytest.raises(RecordingError, match=re.escape(f"{name}.npy' cannot be used: ")):
         read_recording(recording)
 
 
-@pytest.mark.parametrize("data", [b"", b"\x93NUMPY", b"PK\x03\x04zip", npy_bytes("{}", version=b"\x02\x00")])
-def test_files_that_are_not_arrays_are_refused(recording, data):
-    (recording / "positions.npy").write_bytes(data)
-    assert_refused(recording, "positions.npy' cannot be used: ")
-
-
-@pytest.mark.parametrize(
-    ("name", "index", "value"),
-    [
-        ("face_starts", 0, 1),
-        ("face_starts", 3, 0),
-        ("face_starts", 3, -(1 << 31)),
-        ("face_starts", -1, 1 << 30),
-        ("face_starts", 3, 9),
-        ("face_vertices", 7, -1),
-        ("face_vertices", 7, 40),
-        ("face_vertices", -1, (1 << 31) - 1),
-    ],
-)
+@pytest.mark.parametrize(("name", "index", "value"), [("face_starts", 3, 9), ("face_vertices", 7, 40)])
 def test_invalid_faces_are_refused(recording, name, index, value):
     array = np.load(recording / f"{name}.npy")
     array[index] = value
     np.save(recording / f"{name}.npy", array)
     assert_refused(recording, f"The faces of '{recording}' are damaged; record again.")
-
-
-RECORDING_FILES = ("recording.json", "positions.npy", "pose_matrices.npy", "rest_positions.npy", "skin_weights.npy")
-
-NOT_REGULAR_FILE_ERROR = "it is not a regular file"
-
-
-@pytest.fixture(autouse=True)
-def _time_limit():
-    """Fail a test that blocks for 20 seconds. Windows has no alarm signal, and no test blocks there."""
-    if not hasattr(signal, "SIGALRM"):
-        yield
-        return
-
-    def fail_test(*_):
-        raise TimeoutError("The test blocks.")
-
-    previous_handler = signal.signal(signal.SIGALRM, fail_test)
-    signal.alarm(20)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, previous_handler)
 
 
 def resume_recording(path, complete=12):
@@ -279,52 +204,32 @@ def resume_recording(path, complete=12):
 
 
 @systems.named_pipes
-@pytest.mark.parametrize("name", RECORDING_FILES)
+@pytest.mark.parametrize("name", ["recording.json", "positions.npy"])
 def test_a_named_pipe_is_refused(recording, name):
     (recording / name).unlink()
     os.mkfifo(recording / name)
-    assert_refused(recording, name, NOT_REGULAR_FILE_ERROR)
+    assert_refused(recording, name, "it is not a regular file")
     with pytest.raises(RecordingError):
         resume_recording(recording)
 
 
 @systems.symbolic_links
-@pytest.mark.parametrize("name", RECORDING_FILES)
-@pytest.mark.parametrize("target", ["/dev/zero", "another recording"])
-def test_a_link_to_another_folder_is_refused(recording, tmp_path, name, target):
-    """Links to valid files are refused too, because a resumed recording would write through them."""
-    if target == "another recording":
-        target = shutil.copytree(recording, tmp_path / "other") / name
-    (recording / name).unlink()
-    (recording / name).symlink_to(target)
-    assert_refused(recording, name, "it is a link to another place")
-    with pytest.raises(RecordingError):
-        check_recordable(recording, resume=True)
-
-
-@systems.symbolic_links
-@pytest.mark.parametrize("name", ["positions.npy", "rest_positions.npy", "recording.json"])
-def test_resuming_does_not_write_through_links(recording, tmp_path, name):
-    """All arrays are written again if no pose is complete."""
-    victim = tmp_path / "victim"
-    victim.write_text("precious")
+@pytest.mark.parametrize("name", ["recording.json", "positions.npy", "rest_positions.npy"])
+def test_a_link_to_another_folder_is_refused(recording, tmp_path, name):
+    """A resumed recording would write through links to valid files. All arrays are written if no pose is complete."""
     edit_index(recording, complete=0)
-    if name != "recording.json":
-        (recording / name).unlink()
-        (recording / name).symlink_to(victim)
+    victim = shutil.move(recording / name, tmp_path / "victim")
+    content = victim.read_bytes()
+    (recording / name).symlink_to(victim)
+    if name == "recording.json":
+        for read in (read_recording, resume_recording):
+            with pytest.raises(RecordingError, match="it is a link to another place"):
+                read(recording)
+    else:
         with resume_recording(recording) as writer:
             writer.append(random_poses(12), random_positions(12))
-        assert read_recording(recording).positions.shape[0] == 12
-    else:
-        shutil.copy(recording / name, victim)
-        text = victim.read_text()
-        (recording / name).unlink()
-        (recording / name).symlink_to(victim)
-        with pytest.raises(RecordingError):
-            resume_recording(recording)
-        assert victim.read_text() == text
-        return
-    assert victim.read_text() == "precious"
+        assert len(read_recording(recording).positions) == 12
+    assert victim.read_bytes() == content
 
 
 def flatten_axis(matrix):

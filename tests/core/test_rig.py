@@ -9,7 +9,6 @@ import pytest
 from fdda_addon.core.controls import Control
 from fdda_addon.core.mathematics.key_joints import KeyJointReport, select_joints
 from fdda_addon.core.mathematics.partition import make_partitions
-from fdda_addon.core.mathematics.skin_fit import FitReport
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.skinned import SkinnedRecording, skin_recording
 from fdda_addon.core.recording.writer import RecordingExtension, RecordingWriter
@@ -38,14 +37,6 @@ def rig() -> Rig:
     return make_rig()
 
 
-def test_the_same_rig_has_no_differences(rig):
-    assert differences(rig) == []
-
-
-def test_another_vertex_count_is_named(rig):
-    assert differences(rig, meshes=(replace(rig.meshes[0], vertices=37),)) == ["it has 40 vertices, the mesh has 37"]
-
-
 def joints_with_names(*names: str) -> tuple[Joint, ...]:
     """Return the joints of the limb with other names, the first few if there are fewer names."""
     return tuple(Joint(name, joint.parent) for name, joint in zip(names, JOINTS, strict=False))
@@ -59,11 +50,6 @@ def joints_with_names(*names: str) -> tuple[Joint, ...]:
             joints_with_names("root", "a", "b", "thumb"),
             ["the armature lacks the 2 joints 'lower' and 'upper'", "it does not know the 2 joints 'a' and 'b'"],
         ),
-        (joints_with_names("a", "b", "c", "d"), [
-            "the armature lacks the 4 joints 'lower', 'root', 'thumb' and 1 more",
-            "it does not know the 4 joints 'a', 'b', 'c' and 1 more",
-        ]),
-        ((*JOINTS, Joint("tail", 0)), ["it does not know the joint 'tail'"]),
         ((*JOINTS[:3], Joint("thumb", 2)), ["its joints have other parents"]),
     ],
 )  # fmt: skip
@@ -121,16 +107,8 @@ def test_other_fingerprints_are_named(rig, part, sentence):
 
 def test_digest_depends_on_values_shapes_and_types():
     array = np.arange(12, dtype=np.int32)
-    digests = {
-        Fingerprint.digest(array),
-        Fingerprint.digest(array + 1),
-        Fingerprint.digest(array.reshape(3, 4)),
-        Fingerprint.digest(array.astype(np.int64)),
-        Fingerprint.digest(array, array),
-    }
-    assert len(digests) == 5
-    assert all(len(digest) == 16 and int(digest, 16) >= 0 for digest in digests)
-    assert Fingerprint.digest(array.reshape(3, 4).T.copy().T) == Fingerprint.digest(array.reshape(3, 4))
+    others = ((array,), (array + 1,), (array.reshape(3, 4),), (array.astype(np.int64),), (array, array))
+    assert len({Fingerprint.digest(*arrays) for arrays in others}) == 5
 
 
 MODIFIERS = [
@@ -168,7 +146,6 @@ NEW_MODIFIER = {"name": "New", "type": "CAST", "settings": {}}
 
 CHANGED_DEFORMATIONS = {
     "the same": (DEFORMATION, []),
-    "one that says nothing": ({}, []),
     "rounding": (with_mush_settings(factor=0.500001), []),
     "what was animated": (with_mush_settings(scale=3.0), []),
     "a control": (with_mush_settings(iterations=None), []),
@@ -176,20 +153,13 @@ CHANGED_DEFORMATIONS = {
     "keys": (
         with_mush_settings(factor=None), ["'factor' of the modifier 'Mush' is animated and is no control of the model"],
     ),
-    "a name": ({**DEFORMATION, "modifiers": [MODIFIERS[0], MODIFIERS[1] | {"name": "Other"}]}, []),
     "order": ({**DEFORMATION, "modifiers": MODIFIERS[::-1]}, ["the modifiers are in another order"]),
     "new": (
         {**DEFORMATION, "modifiers": [NEW_MODIFIER, *MODIFIERS]}, ["it was recorded without the modifier 'New'"]
     ),
-    "gone": (
-        {**DEFORMATION, "modifiers": MODIFIERS[:1]},
-        ["the modifier 'Mush' is gone, switched off or behind the modifier FDDA"],
-    ),
     "a shape": (with_key_settings(shape="b"), ["'shape' of the shape key 'smile' differs"]),
-    "a value": (with_key_settings(value=1.0), ["'value' of the shape key 'smile' was 0.0 and is 1.0"]),
     "another key": (with_additional_key(value=1.0), ["it was recorded without the shape key 'frown'"]),
     "a key that is muted": (with_additional_key(value=1.0, mute=True), []),
-    "no key": ({**DEFORMATION, "shape_keys": {}}, ["the shape key 'smile' is gone"]),
     "B-Bones": (
         {**DEFORMATION, "b_bones": {"tail": {"segments": 4, "curve": [0.0, 1.0]}, "arm": {"segments": 2}}},
         ["'curve' of the bone 'tail' differs", "the bone 'arm' was no B-Bone when it was recorded"],
@@ -248,8 +218,6 @@ def test_a_damaged_deformation_is_refused(value):
 
 REPORT = KeyJointReport("auto", 60, 500, 0.4, 0.5, still=("a", "b", "c", "d", "e"))
 
-ERRORS = FitReport({"rig": 2.0, "fitted": 1.0}, {"rig": 20.0, "fitted": 10.0})
-
 
 def chain_rig(*names: str, weighted: tuple[str, ...] = ("a", "b", "c", "d")) -> Rig:
     """Return a chain of joints with names; four vertices follow `weighted` joints, each with some of the next."""
@@ -264,12 +232,12 @@ def chain_rig(*names: str, weighted: tuple[str, ...] = ("a", "b", "c", "d")) -> 
     return Rig(joints, positions, matrices, skin_joints, weights, (MeshPart("mesh", 4, Fingerprint("t", "r", "s")),))
 
 
-@pytest.mark.parametrize("text", ["all", "auto", "1", "50", "0050"])
+@pytest.mark.parametrize("text", ["all", "auto", "0050"])
 def test_the_option_is_read(text):
     assert parse_joints(text) == text.lstrip("0")
 
 
-@pytest.mark.parametrize("text", ["", "0", "-1", "1.5", "Auto", "1e3", "²", "1000000"])
+@pytest.mark.parametrize("text", ["", "0", "1.5", "²", "1000000"])
 def test_other_options_are_refused(text):
     with pytest.raises(ValueError, match=r"joints are auto, all, or a number from 1, and not "):
         parse_joints(text)

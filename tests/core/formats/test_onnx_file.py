@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """ONNX files: what is found in valid ones, and which content could run code or fill the memory."""
 
-from dataclasses import replace
-
 import numpy as np
 import onnx
 import onnxruntime
@@ -11,7 +9,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import CHECKSUM_KEY, check_model
-from fdda_addon.core.formats.model_info import ModelPartition
 from fdda_addon.core.formats.onnx_file import OnnxContents, infer_shapes, read_onnx
 
 from ..tiny_model import JOINT_COUNT, VERTEX_COUNT, in_subgraph, tiny_info, tiny_model, with_external_data, zeros_tensor
@@ -44,12 +41,6 @@ def test_shapes_of_inputs():
     assert scanned_inputs == {"controls": ("N", 2), "scalar": (), "shapeless": (), "unnamed": ("?", 2)}
 
 
-def node_with_tensors(*tensors: TensorProto) -> onnx.NodeProto:
-    node = helper.make_node("Constant", [], ["c"])
-    node.attribute.append(helper.make_attribute("values", list(tensors)))
-    return node
-
-
 def model_with_function() -> onnx.ModelProto:
     model = tiny_model()
     function = helper.make_function("com.example", "Run", ["x"], ["y"], [helper.make_node("Relu", ["x"], ["y"])], [])
@@ -63,20 +54,6 @@ def model_with_training() -> onnx.ModelProto:
     return model
 
 
-def sparse_tensor(external_part: str = "") -> onnx.SparseTensorProto:
-    values, indices = numpy_helper.from_array(np.ones(1, np.float32), "s"), zeros_tensor("i")
-    if external_part:
-        with_external_data({"values": values, "indices": indices}[external_part])
-    return helper.make_sparse_tensor(values, numpy_helper.from_array(np.zeros(1, np.int64), "i"), [4])
-
-
-def with_location(location: int) -> TensorProto:
-    """Return a tensor that says where its data is, without a file; 0 is in the model, 1 outside."""
-    tensor = with_external_data(zeros_tensor("w"))
-    tensor.data_location = location
-    return tensor
-
-
 FOREIGN_CONTENT = {
     "operator of a domain": (tiny_model(nodes=[CUSTOM_NODE]), "the operator 'com.example::Run'"),
     "operator of another spelling": (
@@ -84,28 +61,17 @@ FOREIGN_CONTENT = {
         "the operator 'AI.ONNX::Relu'",
     ),
     "subgraph": (tiny_model(nodes=[in_subgraph(CUSTOM_NODE, 1)]), "graphs inside of nodes"),
-    "list of subgraphs": (
-        tiny_model(nodes=[helper.make_node("Choose", [], [], branches=[helper.make_graph([], "inner", [], [])] * 2)]),
-        "graphs inside of nodes",
-    ),
     "functions": (model_with_function(), "functions of its own"),
     "training": (model_with_training(), "a training of its own"),
     "external data": (tiny_model(initializers=[with_external_data(zeros_tensor("w"))]), "data in other files"),
-    "external data marked as internal": (tiny_model(initializers=[with_location(0)]), "data in other files"),
     "tensor in a node": (
         tiny_model(nodes=[helper.make_node("Constant", [], ["c"], value=zeros_tensor("w"))]),
         "tensors inside of nodes",
-    ),
-    "tensors in a node": (
-        tiny_model(nodes=[node_with_tensors(zeros_tensor("v"), with_external_data(zeros_tensor("w")))]),
-        "a AttributeProto with the field 10",
     ),
     "typed elements": (
         tiny_model(initializers=[helper.make_tensor("w", TensorProto.FLOAT, [2], [1.0, 2.0])]),
         "a TensorProto with the field 4",
     ),
-    "sparse tensor": (tiny_model(sparse=[sparse_tensor()]), "sparse tensors"),
-    "sparse tensor with external data": (tiny_model(sparse=[sparse_tensor("values")]), "sparse tensors"),
     "text of a node": (
         tiny_model(nodes=[helper.make_node("Relu", ["positions"], ["y"], mode="x")]),
         "a AttributeProto with the field 4",
@@ -169,24 +135,11 @@ def test_a_field_with_an_overlong_key_is_refused(key_bits):
 INVALID_FILES = {
     "empty": b"",
     "text": b"this is not a model, whatever its name says\n" * 20,
-    "zeros": bytes(1000),
-    "ones": b"\xff" * 1000,
-    "zip": b"PK\x03\x04" + bytes(100),
     "no graph": onnx.ModelProto(ir_version=8).SerializeToString(),
     "cut": VALID_MODEL[: len(VALID_MODEL) // 2],
-    "cut by one": VALID_MODEL[:-1],
-    "endless number": b"\x08" + b"\x80" * 1_000_000,
     "long message": VALID_MODEL + b"\x3a" + varint(2**62) + b"abc",
-    "longest message": VALID_MODEL + b"\x3a" + b"\xff" * 9 + b"\x01" + b"abc",
-    "cut key": VALID_MODEL + b"\x80",
-    "cut double": VALID_MODEL + b"\x09abc",
     "group": VALID_MODEL + b"\x0b",
     "number for graph": VALID_MODEL + b"\x38\x05",
-    "number for name": VALID_MODEL + protobuf_field(14, b"\x08" + varint(2**62) + b"\x12\x00"),
-    "number for property": VALID_MODEL + b"\x70" + varint(2**40),
-    "number for node": VALID_MODEL + protobuf_field(7, b"\x08\x01"),
-    "number for domain": VALID_MODEL + protobuf_field(7, protobuf_field(1, b"\x38" + varint(2**61))),
-    "number for shape": VALID_MODEL + protobuf_field(7, protobuf_field(11, b"\x10\x05")),
     "name that is no text": VALID_MODEL + protobuf_field(7, protobuf_field(11, protobuf_field(1, b"\xff\xfe"))),
 }
 
@@ -245,25 +198,7 @@ def integer_tensor(name: str, *values: int) -> TensorProto:
     return numpy_helper.from_array(np.array(values, np.int64), name)
 
 
-FORBIDDEN_OPERATORS = (
-    "ConstantOfShape",
-    "Expand",
-    "Tile",
-    "Range",
-    "Identity",
-    "RandomNormal",
-    "Conv",
-    "Scan",
-    "SequenceEmpty",
-    "Unsqueeze",
-    "DequantizeLinear",
-    "DynamicQuantizeLinear",
-    "MatMulInteger",
-    "x" * 500,
-)
-
-
-@pytest.mark.parametrize("operator", FORBIDDEN_OPERATORS, ids=lambda name: name[:20])
+@pytest.mark.parametrize("operator", ["ConstantOfShape", "Scan", "x" * 500], ids=lambda name: name[:20])
 def test_a_forbidden_operator_is_refused(operator):
     model = tiny_model(nodes=[make_node(operator, "shape")])
     assert_refused(model, f"it has the operator '{operator[:100]}", "which train does not write")
@@ -284,24 +219,6 @@ def test_a_product_of_constants_is_refused():
     )
 
 
-def test_a_growing_pose_is_refused():
-    """Each node is valid, but the product squares the number of values, again and again."""
-    tensors = [integer_tensor("row_matrix", 1, -1), integer_tensor("column_matrix", -1, 1)]
-    nodes, input_name = [], "pose_matrices"
-    for repetition in range(4):
-        for orientation in ("row_matrix", "column_matrix"):
-            nodes.append(helper.make_node("Reshape", [input_name, orientation], [f"{orientation}_{repetition}"]))
-        nodes.append(
-            helper.make_node(
-                "MatMul", [f"column_matrix_{repetition}", f"row_matrix_{repetition}"], [f"square_{repetition}"]
-            )
-        )
-        input_name = f"square_{repetition}"
-    assert "than its" in assert_refused(tiny_model(nodes=nodes, initializers=tensors))
-    nodes[2].op_type = "Add"
-    assert_refused(tiny_model(nodes=nodes[:6], initializers=tensors), "than its")
-
-
 def test_a_product_of_poses_with_each_other_is_refused():
     """The product is small for one pose and grows with the square of the number of poses."""
     wide_matrix = np.zeros((1, 16 * JOINT_COUNT, 3000), np.float32)
@@ -320,55 +237,15 @@ def test_a_product_of_poses_with_each_other_is_refused():
     assert_refused(tiny_model(nodes=nodes, initializers=tensors), "bytes explain")
 
 
-def test_many_large_values_are_refused():
-    """Each value is allowed, but together they fill the memory."""
-    tensors = [
-        integer_tensor("row_shape", -1, 1, 16 * JOINT_COUNT),
-        numpy_helper.from_array(np.zeros((4000, 1), np.float32), "zero_column"),
-    ]
-    nodes = [helper.make_node("Reshape", ["pose_matrices", "row_shape"], ["row"])]
-    nodes += [helper.make_node("Add", ["row", "zero_column"], [f"table_{i}"]) for i in range(10)]
-    check_model(tiny_model(nodes=nodes[:3], initializers=tensors).SerializeToString(), "m.onnx")
-    assert_refused(tiny_model(nodes=nodes, initializers=tensors), "computes more numbers for 1 poses than its")
-
-
-def damaged_tensor(tensor: TensorProto, **changes) -> TensorProto:
-    """Change fields of a tensor and return it."""
-    for name, value in changes.items():
-        if name == "dims":
-            tensor.ClearField("dims")
-            tensor.dims.extend(value)
-        else:
-            setattr(tensor, name, value)
-    return tensor
-
-
 @pytest.mark.parametrize(
-    "tensor",
-    [
-        damaged_tensor(zeros_tensor("w"), dims=[1 << 40]),
-        damaged_tensor(zeros_tensor("w"), dims=[1 << 62, 4]),
-        damaged_tensor(zeros_tensor("w"), dims=[-1, 12]),
-        damaged_tensor(zeros_tensor("w"), dims=[1] * 40),
-        damaged_tensor(zeros_tensor("w"), raw_data=b""),
-        damaged_tensor(zeros_tensor("w"), data_type=TensorProto.STRING),
-        damaged_tensor(zeros_tensor("w"), data_type=TensorProto.DOUBLE),
-        damaged_tensor(zeros_tensor("w"), data_type=TensorProto.FLOAT16, raw_data=b""),
-        numpy_helper.from_array(np.zeros(4, np.float16), "w"),
-        damaged_tensor(zeros_tensor("w"), data_type=999),
-    ],
+    "changes",
+    [{"raw_data": b""}, {"data_type": TensorProto.STRING}, {"data_type": TensorProto.FLOAT16, "raw_data": b""}],
 )
-def test_constants_with_a_wrong_type_or_size_are_refused(tensor):
+def test_constants_with_a_wrong_type_or_size_are_refused(changes):
+    tensor = zeros_tensor("w")
+    for name, value in changes.items():
+        setattr(tensor, name, value)
     assert_refused(tiny_model(initializers=[tensor]), "a constant 'w'")
-
-
-def test_metadata_with_a_huge_vertex_count_is_refused():
-    """The metadata of a file of a few kilobytes claims a billion vertices."""
-    vertex_count = 10**9
-    meshes = (replace(tiny_info().meshes[0], vertices=vertex_count),)
-    partitions = (ModelPartition(0, (), 1, 0), ModelPartition(2, (1, 2), vertex_count - 1, 17))
-    model = tiny_model(tiny_info(meshes=meshes, partitions=partitions).to_json())
-    assert_refused(model, "its output 'positions' comes out as (1, 4, 3), not as (1, 1000000000, 3)")
 
 
 def test_two_constants_with_one_name_are_refused():
@@ -389,21 +266,12 @@ def test_unknown_versions_are_refused(version: int):
         make_node("Add"),
         make_node("Relu", "positions"),  # added twice below, so that two values have one name
         make_node("Reshape", "positions", "axes"),
-        make_node("Reshape", "positions", "zeros"),
-        make_node("Reshape", "positions"),
-        make_node("Transpose", "positions", perm=[0, 0, 1]),
         make_node("Transpose", "positions", perm=[0]),
-        make_node("Concat", "positions", "axes", axis=0),
         make_node("Concat", "positions", axis=9),
         make_node("Split", "positions", "axes", axis=1),
-        make_node("Slice", "positions", "axes"),
-        make_node("Slice", "positions", "axes", "axes", "axes", "zeros"),
         make_node("Gather", "positions", "axes", axis=7),
         make_node("ReduceSum", "positions", "axes"),
         make_node("MatMul", "positions", "positions"),
-        make_node("MatMul", "positions"),
-        make_node("Gemm", "positions", "positions"),
-        make_node("Add", "positions", "pose_matrices"),
     ],
 )  # fmt: skip
 def test_nodes_with_wrong_inputs_or_attributes_are_refused(wrong_node):
@@ -415,15 +283,6 @@ def test_nodes_with_wrong_inputs_or_attributes_are_refused(wrong_node):
         session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
         session.run(None, {"pose_matrices": np.zeros((2, JOINT_COUNT, 4, 4), np.float32)})
     assert isinstance(error.value, ModelError) or type(error.value).__module__.startswith("onnxruntime")
-
-
-def test_an_output_of_another_shape_is_refused():
-    model = tiny_model()
-    model.graph.node[1].input[1] = "other"
-    model.graph.initializer.append(integer_tensor("other", 1, -1, 1))
-    model.graph.node[2].input[1] = "one"
-    model.graph.initializer.append(numpy_helper.from_array(np.float32(0), "one"))
-    assert_refused(model, "its output 'positions' comes out as (1, 1, 1), not as (1, 4, 3)")
 
 
 def test_a_wrong_checksum_is_refused():
@@ -487,7 +346,3 @@ def test_computed_shapes_equal_those_of_onnx_runtime():
         )
         values = session.run(outputs, {"pose_matrices": rng.normal(size=(poses, JOINT_COUNT, 4, 4)).astype(np.float32)})
         assert [shapes[name] for name in outputs] == [value.shape for value in values]
-
-
-def test_the_tiny_model_is_accepted():
-    assert check_model(tiny_model().SerializeToString(), "m.onnx").vertex_count == VERTEX_COUNT

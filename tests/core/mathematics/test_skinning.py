@@ -11,7 +11,6 @@ from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.features import joint_features, joint_features_in_metres
 from fdda_addon.core.mathematics.metrics import (
     NO_ERROR_COLOR,
-    distances,
     error_statistics,
     heat_colors,
     viewport_colors,
@@ -19,7 +18,7 @@ from fdda_addon.core.mathematics.metrics import (
 )
 from fdda_addon.core.mathematics.references import choose_references, has_reference_choice, minimum_arborescence
 from fdda_addon.core.mathematics.rotations import rotation_vectors
-from fdda_addon.core.mathematics.skinning import LinearSkinning, SkinBlock, skin_matrices
+from fdda_addon.core.mathematics.skinning import LinearSkinning, SkinBlock
 from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig, read_joints
 
 from ..limb import (
@@ -58,12 +57,6 @@ def test_linear_skinning_is_the_weighted_sum_of_the_joints(rig):
         np.testing.assert_allclose(result, reference_skinning(rig, pose), atol=2e-6)
 
 
-def test_skin_matrices_of_the_rest_pose_are_the_identity(rig):
-    skin = skin_matrices(rig.rest_matrices[None], rig.rest_matrices)
-    assert skin.dtype == np.float32
-    np.testing.assert_allclose(skin[0], np.tile(np.eye(4), (len(JOINTS), 1, 1)), atol=1e-6)
-
-
 def test_local_residuals_are_in_the_space_of_the_main_joint(rig):
     poses = random_poses(3)
     positions = np.random.default_rng(5).uniform(-1, 1, (3, VERTEX_COUNT, 3)).astype(np.float32)
@@ -87,18 +80,6 @@ def test_complex_positions_invert_local_residuals(rig):
     np.testing.assert_allclose(
         skinning.complex_positions(poses, skinning.local_residuals(poses, positions)), positions, atol=2e-6
     )
-
-
-def test_local_residuals_do_not_depend_on_the_motion_of_the_whole_rig(rig):
-    """Rotating, scaling and moving everything changes the residuals, but not the local residuals."""
-    skinning, poses, local_residuals = LinearSkinning(rig), random_poses(4), random_positions(4)
-    positions = skinning.complex_positions(poses, local_residuals)
-    motion = random_transforms(np.random.default_rng(9))
-    moved_poses = (motion @ poses).astype(np.float32)
-    moved_positions = (positions @ motion[:3, :3].T + motion[:3, 3]).astype(np.float32)
-    np.testing.assert_allclose(skinning.local_residuals(moved_poses, moved_positions), local_residuals, atol=5e-6)
-    residual_change = (moved_positions - skinning.positions(moved_poses)) - (positions - skinning.positions(poses))
-    assert np.abs(residual_change).max() > 1e-3
 
 
 def test_local_residuals_with_a_joint_scale_of_zero_are_refused(rig):
@@ -143,13 +124,6 @@ def reference_features(pose: np.ndarray, rest: np.ndarray) -> np.ndarray:
     return np.array(feature_rows)
 
 
-def test_features_of_the_rest_pose_are_the_identity():
-    rig = make_rig()
-    features = joint_features(rig.rest_matrices[None], rig.rest_matrices, rig.parents)
-    assert features.shape == (1, len(JOINTS), 12) and features.dtype == np.float32
-    np.testing.assert_allclose(features[0], np.tile(np.eye(4)[:3].reshape(12), (len(JOINTS), 1)), atol=1e-6)
-
-
 def test_features_equal_the_formula():
     rig, poses = make_rig(), random_poses(8)
     features = joint_features(poses, rig.rest_matrices, rig.parents)
@@ -157,15 +131,6 @@ def test_features_equal_the_formula():
         np.testing.assert_allclose(
             pose_features, reference_features(pose, rig.rest_matrices.astype(np.float64)), atol=1e-5
         )
-
-
-def test_moving_the_root_changes_only_the_features_of_the_root():
-    rig, poses = make_rig(), random_poses(3)
-    features = joint_features(poses, rig.rest_matrices, rig.parents)
-    moved_poses = random_transforms(np.random.default_rng(3)) @ poses
-    moved_features = joint_features(moved_poses, rig.rest_matrices, rig.parents)
-    np.testing.assert_allclose(moved_features[:, 1:], features[:, 1:], atol=1e-5)
-    assert np.abs(moved_features[:, 0] - features[:, 0]).max() > 0.1
 
 
 def test_translations_are_in_metres():
@@ -314,13 +279,6 @@ def test_an_arborescence_has_the_smallest_sum_of_costs(seed: int):
     assert np.isclose(cost_of(tuple(sources.tolist())), best)
 
 
-def test_distances_are_computed_per_vertex():
-    positions = np.zeros((2, 3, 3), np.float32)
-    moved_positions = positions.copy()
-    moved_positions[1, 2] = (0.003, 0, 0.004)
-    assert distances(positions, moved_positions) == pytest.approx(np.array([[0, 0, 0], [0, 0, 0.005]]))
-
-
 def test_statistics_are_in_millimeters():
     errors = np.linspace(0, 0.010, 10_001).reshape(73, 137)
     statistics = error_statistics(errors)
@@ -330,34 +288,11 @@ def test_statistics_are_in_millimeters():
     assert list(statistics.to_json()) == ["mean", "rms", "p99", "p999", "max"]
 
 
-def test_statistics_of_float32_errors_are_exact():
-    assert error_statistics(np.full(3_000_000, 1e-5, np.float32)).mean == pytest.approx(0.01, rel=1e-6)
-
-
-BLUE, VIOLET, RED = (0.10, 0.25, 0.95), (0.60, 0.10, 0.80), (0.95, 0.05, 0.05)
-
-
-@pytest.mark.parametrize(
-    ("error", "color"),
-    [
-        (0.0, NO_ERROR_COLOR),
-        (0.99e-6, NO_ERROR_COLOR),
-        (1e-6, BLUE),
-        (0.005, VIOLET),
-        (0.0075, np.mean([VIOLET, RED], axis=0)),
-        (0.010, RED),
-        (3.0, RED),
-    ],
-)
-def test_heat_colors_at_the_stops(error, color):
-    computed_color = heat_colors(np.array([error]))
-    assert computed_color.shape == (1, 3) and computed_color.dtype == np.float32
-    np.testing.assert_allclose(computed_color[0], color, atol=1e-5)
-
-
-def test_a_narrower_range_changes_colors_but_not_the_zero_threshold():
-    np.testing.assert_allclose(heat_colors(np.array([0.0005, 0.001]), 0.001), [VIOLET, RED], atol=1e-5)
-    assert np.array_equal(heat_colors(np.array([0.5e-6]), 0.001)[0], np.float32(NO_ERROR_COLOR))
+def test_heat_colors_are_green_without_an_error_then_blue_violet_and_red():
+    colors = heat_colors(np.array([0.9e-6, 1e-6, 0.005, 0.010, 3.0]))
+    blue, violet, red = (0.10, 0.25, 0.95), (0.60, 0.10, 0.80), (0.95, 0.05, 0.05)
+    np.testing.assert_allclose(colors, [NO_ERROR_COLOR, blue, violet, red, red], atol=1e-5)
+    np.testing.assert_allclose(heat_colors(np.array([0.0005]), 0.001), [violet], atol=1e-5)
 
 
 def test_worst_poses_keep_a_distance_and_are_sorted():

@@ -43,18 +43,6 @@ def test_a_bent_quad_has_the_normal_of_its_diagonals():
     np.testing.assert_allclose(make_surface((0, 1, 2, 3)).normals(positions), np.tile(expected, (4, 1)), atol=1e-6)
 
 
-def test_a_concave_pentagon_has_one_normal_at_all_corners():
-    positions = np.float32([(0, 0, 0), (2, 0, 0), (2, 2, 0), (1, 0.2, 0), (0, 2, 0)])
-    np.testing.assert_allclose(make_surface((0, 1, 2, 3, 4)).normals(positions), [(0, 0, 1)] * 5, atol=1e-7)
-
-
-def test_vertices_without_faces_are_left_out_and_edges_are_unique():
-    surface = make_surface((5, 2, 7), (7, 2, 9))
-    assert surface.vertices.tolist() == [2, 5, 7, 9]
-    assert surface.edges.tolist() == [[2, 5], [2, 7], [2, 9], [5, 7], [7, 9]]
-    assert surface.normals(np.random.default_rng(0).normal(size=(12, 3))).shape == (4, 3)
-
-
 def test_faces_without_area_have_zero_normals():
     surface = make_surface((0, 1, 2))
     positions = np.float32([(0, 0, 0), (1, 1, 1), (2, 2, 2)])
