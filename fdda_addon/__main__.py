@@ -8,7 +8,5 @@ from .core.files.stop_signals import exit_on_stop_signal
 if __name__ == "__main__":
     exit_on_stop_signal()
     from .cli.main import main
-    from .core.files.terminal import restart_in_utf8_mode
 
-    restart_in_utf8_mode()
     sys.exit(main(sys.argv[1:], "python -m fdda_addon"))

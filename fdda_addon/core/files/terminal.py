@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Output to a terminal whose encoding lacks characters of a name: they are escaped, so that printing never fails."""
 
-import os
 import sys
 
 
@@ -11,13 +10,3 @@ def escape_unencodable_output() -> None:
         # A caller may have replaced the stream by an object without this method.
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-
-
-def restart_in_utf8_mode() -> None:
-    """Restart this Python program in UTF-8 mode where it decodes names and paths as ASCII.
-
-    Names of objects are UTF-8. With LC_ALL=C Python chooses UTF-8 mode itself, unless PYTHONUTF8=0 is set. Blender
-    always uses UTF-8.
-    """
-    if sys.getfilesystemencoding() == "ascii":
-        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """`python -m fdda_addon` as a process: exit statuses, stop signals, and names outside ASCII."""
 
-import json
 import os
 import signal
 import subprocess
@@ -180,12 +179,3 @@ def test_error_messages_on_an_ascii_terminal(unicode_rig):
     assert result.returncode == 1
     assert b"no mesh object 'Handschuh" in result.stderr and b"'\\xc4rmel'" in result.stderr
     assert result.stderr.count(b"\n") == 1
-
-
-def test_arguments_without_utf_8_mode(unicode_rig, tmp_path):
-    """Without UTF-8 mode, Python cannot decode the bytes of the arguments."""
-    recording = tmp_path / "Aufnahme ß"
-    arguments = ("record", unicode_rig, recording, "--poses", 12, "--object", "Ärmel")
-    result = run_verb(*arguments, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
-    assert result.returncode == 0 and b"Traceback" not in result.stderr, result.stderr
-    assert json.loads((recording / "recording.json").read_text(encoding="utf-8"))["meshes"][0]["name"] == "Ärmel"
