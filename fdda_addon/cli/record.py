@@ -111,8 +111,8 @@ def check_options(options: argparse.Namespace) -> None:
         )
     if options.all and options.object:
         raise WrongUsageError("--all records all meshes, and --object those that it names; give one of them.")
-    if options.overwrite and (options.resume or options.refine):
-        raise WrongUsageError("--overwrite makes a new recording; leave --resume and --refine out.")
+    if options.overwrite + options.resume + (options.refine is not None) > 1:
+        raise WrongUsageError("--overwrite, --resume and --refine exclude each other; give one of them.")
 
 
 def _find_rig(options: argparse.Namespace) -> SceneRig:
@@ -130,7 +130,7 @@ def _find_rig(options: argparse.Namespace) -> SceneRig:
 def _make_job(scene_rig: SceneRig, options: argparse.Namespace) -> Iterator[Progress]:
     if options.refine:
         pose_options = {} if options.poses is None else {"poses": options.poses}
-        settings = RefinementSettings(seed=options.seed, resume=options.resume, **pose_options)
+        settings = RefinementSettings(seed=options.seed, **pose_options)
         return refine(scene_rig, options.recording, options.refine, settings)
     settings = RecordingSettings(
         resume=options.resume,

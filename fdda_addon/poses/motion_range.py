@@ -4,13 +4,10 @@
 The range is stored in Limit constraints in local space, or else in the bone's IK limits. Without these the bone
 has the default range. Locked axes do not move. A Limit constraint with an influence of 0 stores a range without
 enforcing it.
-
-While a pose exceeds Limit constraints, they are muted.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Self
 
 import bpy
 import numpy as np
@@ -24,8 +21,6 @@ from ..scene.armature import FOUR_COMPONENT_ROTATIONS
 AXES = "xyz"
 CONSTRAINT, IK, DEFAULT = "CONSTRAINT", "IK", "DEFAULT"
 """Where a range is stored: in a Limit constraint, as IK limits, or nowhere, so that the default range applies."""
-LIMIT_CONSTRAINT_TYPES = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
-"""Type of the constraint that limits each kind of channel."""
 
 
 @dataclass(frozen=True)
@@ -209,43 +204,3 @@ def limited_bones(armature_object: bpy.types.Object) -> set[str]:
 def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
     """Return whether a constraint other than a limit moves a bone."""
     return any(c.type not in LIMIT_CONSTRAINTS and not c.mute and c.influence > 0 for c in bone.constraints)
-
-
-class SuspendedLimits:
-    """Mutes Limit constraints in local space that a pose exceeds. As a context manager, it unmutes them at the end."""
-
-    def __init__(self, armature_object: bpy.types.Object, channels: tuple[Channel, ...]):
-        """Find the constraints that limit channels.
-
-        Args:
-            armature_object: the armature object with the bones.
-            channels: C channels of the poses.
-        """
-        channel_indices: dict[tuple[str, str], list[int]] = {}
-        """Indices of channels by the name of the bone and the type of the constraint."""
-        for index, channel in enumerate(channels):
-            if channel.kind in LIMIT_CONSTRAINT_TYPES:
-                channel_indices.setdefault((channel.name, LIMIT_CONSTRAINT_TYPES[channel.kind]), []).append(index)
-        self._limits: list[tuple[bpy.types.Constraint, list[int], np.ndarray]] = [
-            (constraint, indices, np.array([axis_limits(constraint, channels[index].axis) for index in indices]))
-            for (name, constraint_type), indices in channel_indices.items()
-            for constraint in armature_object.pose.bones[name].constraints
-            if constraint.type == constraint_type
-            and constraint.owner_space == "LOCAL"
-            and constraint.influence > 0
-            and not constraint.mute
-        ]
-
-    def suspend(self, values: np.ndarray) -> None:
-        """Mute the constraints that the (C,) channel values exceed, and unmute the others."""
-        for constraint, indices, limits in self._limits:
-            is_exceeded = bool(((values[indices] < limits[:, 0]) | (values[indices] > limits[:, 1])).any())
-            if constraint.mute != is_exceeded:
-                constraint.mute = is_exceeded
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for constraint, *_ in self._limits:
-            constraint.mute = False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of a rig before its first pose is recorded: controls, the target, and what changes with the frame."""
+"""Checks of a rig before its first pose is recorded: the target, the time of a pose, and changes with the frame."""
 
 import time
 from collections.abc import Iterator
@@ -17,7 +17,6 @@ from ..core.recording.index import SIMULATION
 from ..poses.clip_player import ClipPlayer
 from ..rig.reading import PoseEvaluator
 from ..scene.armature import clear_pose
-from ..scene.controls import can_be_set, is_driven, number_at, owner_of, set_control
 from .pose_plan import PosePlan
 
 MAX_TARGET_POSES, TIMED_POSES = 20, 12
@@ -27,13 +26,6 @@ MIN_RIG_MOTION_RATIO, MAX_STILL_TARGET_RATIO = 0.02, 1e-5
 moves by more than the first ratio."""
 POSE_TOLERANCE = 1e-5
 """Largest difference between matrices and controls of poses that count as equal (no unit, or mesh units)."""
-MIN_CHECKED_WIDTH = 10.0
-"""Width of the ranges of controls that are checked. Nearly all numbers that are made for animation have narrower
-ranges."""
-VALUE_COUNT = 17
-"""Number of values of a control at which the surface is compared."""
-MAX_CHANGE_RATIO = 1 / 8
-"""A range saturates if the surface changes in at most this part of it."""
 
 
 def check_target_moves(evaluator: PoseEvaluator, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
@@ -145,40 +137,3 @@ def measure_seconds_per_pose(evaluator: PoseEvaluator, plan: PosePlan, player: C
     clear_pose(evaluator.scene_rig.armature_object)
     player.restore_numbers()
     return float(np.median(np.diff(times)))
-
-
-def check_saturation(evaluator: PoseEvaluator) -> str:
-    """Return a sentence about the controls whose effect ends far inside their ranges; empty if there is none.
-
-    Random poses would hardly ever show the values between the two ends of the effect.
-
-    Args:
-        evaluator: evaluates the rig in its rest pose, prepared by `temporary_rig_state`.
-    """
-    scene_rig, sentences = evaluator.scene_rig, []
-    for control in evaluator.rig.controls:
-        owner, (low, high) = owner_of(scene_rig, control.owner), (control.low, control.high)
-        if high - low < MIN_CHECKED_WIDTH or not can_be_set(control.name) or is_driven(owner, control.path):
-            continue
-        previous_value = number_at(owner, control.path)
-        # Each step finds the part of the range with the effect, until it fills its part.
-        while True:
-            compared = np.linspace(low, high, VALUE_COUNT)
-            surfaces = []
-            for value in compared.tolist():
-                set_control(scene_rig, control.name, value)
-                surfaces.append(evaluator.evaluate()[1])
-            moves = np.linalg.norm(np.diff(surfaces, axis=0), axis=2).max(axis=1)
-            changed = np.flatnonzero(moves > INFLUENCE_TOLERANCE * evaluator.rig.size)
-            if len(changed):
-                low, high = float(compared[changed[0]]), float(compared[changed[-1] + 1])
-            if not 0 < len(changed) <= MAX_CHANGE_RATIO * (VALUE_COUNT - 1) or high - low < 1:
-                break
-        set_control(scene_rig, control.name, previous_value)
-        if high - low < MAX_CHANGE_RATIO * (control.high - control.low):
-            sentences.append(
-                f"The surface of '{scene_rig.mesh_object.name}' changes only between {low:.3g} and {high:.3g} in the "
-                f"range {control.low:g} to {control.high:g} of '{control.name}'. Give the range that is used: "
-                f"--extra-input '{control.name}={low:.3g}:{high:.3g}', or Soft Min and Soft Max of the property."
-            )
-    return " ".join(sentences)

@@ -5,10 +5,9 @@ In some of these, the reference joints of the rig are found. A user can see rand
 """
 
 from collections.abc import Callable, Collection, Container, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from copy import copy
 from dataclasses import replace
-from functools import partial
 
 import bpy
 import numpy as np
@@ -19,7 +18,6 @@ from ..core.mathematics.references import choose_references, has_reference_choic
 from ..core.rig import Rig
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
-from ..poses.motion_range import SuspendedLimits
 from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest
 from ..rig.reading import PoseReader
 from ..rig.references import split_bone_path
@@ -76,20 +74,11 @@ class PosePlan:
         self._sampler = make_pose_sampler(scene_rig, settings)
 
     def show_poses(self, player: ClipPlayer, pose_indices: Container[int]) -> Iterator[int]:
-        """Set the poses with the given indices, one per iteration, and yield each index.
-
-        Limit constraints are disabled while an overshoot pose is set.
-        """
-        overshoot, channels = self._overshoot, self._channels
-        with self._random_poses_prepared(), ExitStack() as stack:
-            set_pose = Poser(self._scene_rig, channels).set
+        """Set the poses with the given indices, one per iteration, and yield each index."""
+        with self._random_poses_prepared():
             for index in range(self.random_count):
-                if overshoot and index == self.in_range_count:
-                    channels = overshoot.channels
-                    limits = stack.enter_context(SuspendedLimits(self._scene_rig.armature_object, channels))
-                    set_pose = partial(_set_beyond_range, Poser(self._scene_rig, channels), limits)
                 if index in pose_indices:
-                    self.pose_setter.set_pose(self._make_transition(channels, index, set_pose))
+                    self.pose_setter.set_pose(self._make_transition(index))
                     yield index
         clip_start = self.random_count
         for clip in self._clips:
@@ -105,25 +94,23 @@ class PosePlan:
 
     def show_poses_again(self, pose_indices: Collection[int]) -> Iterator[int]:
         """Set settled random poses again, reached via other random poses, and yield each index."""
-        set_pose = Poser(self._scene_rig, self._channels).set
         with self._random_poses_prepared():
             for index in pose_indices:
                 indices = (index, REPEATABILITY_INDEX_OFFSET + index)
-                self.pose_setter.set_pose(*(self._make_transition(self._channels, each, set_pose) for each in indices))
+                self.pose_setter.set_pose(*map(self._make_transition, indices))
                 yield index
 
-    def _make_transition(
-        self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]
-    ) -> Callable[[float], None]:
+    def draw(self, index: int) -> tuple[tuple[Channel, ...], np.ndarray]:
+        """Return the channels that a random pose sets, and their values."""
+        channels, sampler = self._channels, self._sampler
+        if self._overshoot and self.in_range_count <= index < REPEATABILITY_INDEX_OFFSET:
+            channels, sampler = self._overshoot.channels, replace(sampler, remix=None)
+        return channels, sampler.draw_pose(channels, index)
+
+    def _make_transition(self, index: int) -> Callable[[float], None]:
         """Return a function that blends from the rest pose to a random pose by a factor of 0 to 1."""
-        is_in_range = index < self.in_range_count or index >= REPEATABILITY_INDEX_OFFSET
-        sampler = self._sampler if is_in_range else replace(self._sampler, remix=None)
-        return blend_from_rest(set_pose, channels, sampler.draw_pose(channels, index))
-
-
-def _set_beyond_range(poser: Poser, limits: SuspendedLimits, values: np.ndarray) -> None:
-    poser.set(values)
-    limits.suspend(values)
+        channels, values = self.draw(index)
+        return blend_from_rest(Poser(self._scene_rig, channels).set, channels, values)
 
 
 MAX_POSES = 24
@@ -187,9 +174,6 @@ def find_references(
 def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: int) -> int:
     """Set one of the random poses of a recording.
 
-    Limit constraints stay on, so an overshoot pose is shown within the limits that they enforce; a recording
-    suspends them.
-
     Args:
         settings: settings of the recording.
         index: index of the random pose, from 0.
@@ -200,12 +184,9 @@ def show_random_pose(scene_rig: SceneRig, settings: "RecordingSettings", index: 
     settings = replace(settings, poses=max(1, settings.poses))
     index = min(index, settings.poses - 1)
     _, channels = read_sampled_rig(scene_rig, settings)
-    overshoot = make_recording_overshoot(scene_rig, settings, channels)
-    sampler = make_pose_sampler(scene_rig, settings)
-    if overshoot and index >= settings.poses - overshoot.poses:
-        channels, sampler = overshoot.channels, replace(sampler, remix=None)
     clear_pose(scene_rig.armature_object)
-    Poser(scene_rig, channels).set(sampler.draw_pose(channels, index))
+    channels, values = PosePlan(scene_rig, channels, settings, ()).draw(index)
+    Poser(scene_rig, channels).set(values)
     scene_rig.armature_object.update_tag(refresh={"DATA"})
     return index
 

@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import RecordingError
-from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.features import joint_features
 from ..core.mathematics.metrics import distances
 from ..core.mathematics.partition import Partition
 from ..core.mathematics.poses import Channel, sample_pose
 from ..core.mathematics.refinement import Probes, choose_poses, nearest_recorded_distances
 from ..core.progress import Progress
-from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
 from ..core.recording.writer import RecordingExtension
 from ..core.rig import rig_differences
@@ -48,12 +46,10 @@ class RefinementSettings:
     Attributes:
         poses: number of poses to add.
         seed: seed of the random choices, which also depend on the length of the recording.
-        resume: count the poses that were added since the model was trained, and add only the remaining poses.
     """
 
     poses: int = REFINEMENT_POSES
     seed: int = 0
-    resume: bool = False
 
 
 def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSettings) -> Iterator[Progress]:
@@ -85,11 +81,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         check_time_inputs(scene_rig, rig.controls, stack, (), mesh_object)
     channels = model_channels(scene_rig, rig, network.info)
     _check_recording(scene_rig, recording, channels)
-    added_count = _count_added_poses(recording, model, network.info) if settings.resume else 0
-    if settings.resume and added_count >= settings.poses:
-        yield Progress("poses", settings.poses, settings.poses)
-        return
-    recorded_count = len(recording.pose_matrices) - added_count
+    recorded_count = len(recording.pose_matrices)
     with temporary_rig_state(scene_rig, rig, channels), set_keys_undriven(scene_rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
         first_probe = PROBE_INDEX + recorded_count
@@ -133,10 +125,10 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         chosen_poses = choose_poses(probes, channels, influencing_channels, base_poses, rng)
         recorded_evaluator = PoseEvaluator(scene_rig, recording.rig)
         with (
-            RecordingExtension(recording, settings.poses - added_count, model.name, added_count) as extension,
+            RecordingExtension(recording, settings.poses, model.name) as extension,
             PoseAppender(recorded_evaluator, extension, rig.vertex_count) as appender,
         ):
-            for pose in chosen_poses[added_count:]:
+            for pose in chosen_poses:
                 poser.set(pose)
                 appender.append_current_pose()
                 yield Progress("poses", appender.pose_count - recorded_count, settings.poses)
@@ -185,17 +177,3 @@ def _check_recording(scene_rig: SceneRig, recording: Recording, channels: tuple[
             f"The range of motion of the model is not that of '{recording.path}'; give the recording that it was "
             "trained on, or train a model on this one."
         )
-
-
-def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> int:
-    """Count the poses that were added to a recording since a model was trained on it."""
-    added_count = recording.info.poses - len(recording.info.alone_poses) - info.trained_poses
-    last_source = recording.info.sampling.sources[-1]
-    if added_count == 0 or (
-        last_source.kind == REFINED and (last_source.name, last_source.poses) == (model.name, added_count)
-    ):
-        return added_count
-    raise RecordingError(
-        f"Cannot resume: '{model}' was trained on {info.trained_poses} poses, and the other "
-        f"{added_count} of '{recording.path}' were not chosen for it; refine without --resume, or with the last model."
-    )

@@ -31,7 +31,6 @@ from ..scene.scene_rig import SceneRig, check_full_rig
 from .alone_poses import plan_alone_poses
 from .first_checks import (
     check_follows_pose,
-    check_saturation,
     check_target_moves,
     measure_seconds_per_pose,
 )
@@ -193,7 +192,6 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
                 settings = replace(settings, poses=poses, auto_poses=False)
                 plan = PosePlan(scene_rig, channels, settings, clips, pose_setter)
                 notes.append(f"{format_count(poses, 'random pose')}, at {1000 * seconds_per_pose:.1f} ms each.")
-            notes.append(check_saturation(evaluator))
         for note in filter(None, notes):
             yield Progress("poses", 0, plan.total, note)
         fixed_joints = find_fixed_joints(scene_rig)

@@ -196,18 +196,18 @@ def read_rig(
 
 def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndarray) -> None:
     """Raise a RigError if rest positions, (V, 3), are not finite or have no extent."""
-    object_name, vertex_count = mesh_object.name, len(rest_positions)
-    if not vertex_count:
-        raise RigError(f"The mesh of '{object_name}' has no vertices; choose another object.")
-    is_finite = np.isfinite(rest_positions).all(axis=1)
+    object_name, vertex_count, is_finite = (
+        mesh_object.name,
+        len(rest_positions),
+        np.isfinite(rest_positions).all(axis=1),
+    )
     if not is_finite.all():
         raise RigError(
             f"{vertex_count - is_finite.sum():,} of {vertex_count:,} vertices of '{object_name}' have coordinates that "
             f"are not finite, the first is vertex {is_finite.argmin()}; delete them, or give them others in edit mode."
         )
-    if vertex_count == 1:
-        raise RigError(f"The mesh of '{object_name}' has one vertex, and no surface to learn; choose another object.")
-    if np.ptp(rest_positions, axis=0).max() <= FLOAT32_ROUNDING_RATIO * np.abs(rest_positions).max():
+    size = np.ptp(rest_positions, axis=0).max() if vertex_count else 0.0
+    if size <= FLOAT32_ROUNDING_RATIO * np.abs(rest_positions).max(initial=0.0):
         raise RigError(
             f"All {vertex_count:,} vertices of '{object_name}' lie at one point in the rest pose, so the mesh has no "
             "size; give the mesh, or its Basis shape key, its shape."

@@ -16,7 +16,7 @@ from ..core.errors import RigError
 from ..core.recording.index import FRAMES, POSE, SIMULATION
 from ..poses.clip import Clip
 from ..scene import mesh as mesh_io
-from ..scene.arrays import EDGE_ELEMENT, read
+from ..scene.arrays import EDGE_ELEMENT, EDGE_INDEX_ELEMENT, read
 from ..scene.node_groups import SIMULATION_NODES, find_time_node
 from ..scene.scene_rig import SceneRig, is_flat
 from ..scene.stored_paths import resolve_path
@@ -287,5 +287,6 @@ def temporary_frame_range(target: Target, first_frame: int | None, last_frame: i
 
 
 def _sorted_edges(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Return the vertex indices of the edges, (E, 2) int32, in an order that does not depend on the mesh."""
-    return np.unique(np.sort(read(mesh.edges, EDGE_ELEMENT), axis=1), axis=0)
+    """Return the vertex indices of the edges of faces, (E, 2) int32, in an order that does not depend on the mesh."""
+    edges = read(mesh.edges, EDGE_ELEMENT)[read(mesh.loops, EDGE_INDEX_ELEMENT)]
+    return np.unique(np.sort(edges, axis=1), axis=0)

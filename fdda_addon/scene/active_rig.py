@@ -42,30 +42,23 @@ def active_rig(context: bpy.types.Context, mesh_object_name: str = "") -> SceneR
 
 def cached_active_rig(context: bpy.types.Context) -> SceneRig | None:
     """Find the active rig, cached for drawing; return None if there is none."""
-    active_object = context.view_layer.objects.active
-    return None if active_object is None else _cached_active_rig(context, active_object, context.scene)
-
-
-@draw_cached
-def _cached_active_rig(
-    context: bpy.types.Context, _active_object: bpy.types.Object, _scene: bpy.types.Scene
-) -> SceneRig | None:
-    try:
-        return active_rig(context)
-    except RigError:
-        return None
+    return _cached_rigs(context, context.view_layer.objects.active, context.scene)[0]
 
 
 def cached_rigs_together(context: bpy.types.Context) -> tuple[SceneRig, ...]:
     """Find the rigs of `rigs_together`, cached for drawing."""
-    return _cached_rigs(context, context.view_layer.objects.active, context.scene)
+    return _cached_rigs(context, context.view_layer.objects.active, context.scene)[1]
 
 
 @draw_cached
 def _cached_rigs(
-    context: bpy.types.Context, _active_object: bpy.types.Object, _scene: bpy.types.Scene
-) -> tuple[SceneRig, ...]:
-    return tuple(rigs_together(context))
+    context: bpy.types.Context, active_object: bpy.types.Object | None, _scene: bpy.types.Scene
+) -> tuple[SceneRig | None, tuple[SceneRig, ...]]:
+    """Return the active rig, and the rigs of `rigs_together`."""
+    try:
+        return active_rig(context), tuple(rigs_together(context))
+    except RigError:
+        return None, ()
 
 
 def any_mesh_object(context: bpy.types.Context, predicate: Callable[[bpy.types.Object], object]) -> bool:

@@ -39,6 +39,7 @@ LOOP_START_ELEMENT = ElementProperty("loop_start", np.int32)
 VERTEX_INDEX_ELEMENT = ElementProperty("vertex_index", np.int32)
 MATERIAL_INDEX_ELEMENT = ElementProperty("material_index", np.int32)
 EDGE_ELEMENT = ElementProperty("vertices", np.int32, (2,))
+EDGE_INDEX_ELEMENT = ElementProperty("edge_index", np.int32)
 TRIANGLE_ELEMENT = ElementProperty("vertices", np.int32, (3,))
 """Vertices of a loop triangle."""
 POSE_MATRIX_ELEMENT = ElementProperty("matrix", np.float32, (4, 4))

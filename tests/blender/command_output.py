@@ -16,7 +16,7 @@ class CommandOutput:
     err: list[str]
 
 
-def output_of(*arguments: object) -> CommandOutput:
+def output_of(*arguments: object, status: int = 0) -> CommandOutput:
     with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
-        assert run(*arguments) == 0, err.getvalue()
+        assert run(*arguments) == status, err.getvalue()
     return CommandOutput(out.getvalue().splitlines(), err.getvalue().splitlines())

@@ -32,12 +32,10 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, find_rig, join_rigs
 
-from .conftest import assert_plays, run, train
+from .conftest import assert_plays, evaluated_positions, run, train
 from .rig_changes import change_in_edit_mode, trigger_check
 from .scene_state import drain
 from .waves import wave
-
-SETTINGS = RecordingSettings(poses=80, influence_poses=2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,11 +68,10 @@ def build_limb(build=limb_with_helpers) -> SceneRig:
     return SceneRig(*build())
 
 
-def trained(rig: SceneRig, folder: Path, *options: object, settings: RecordingSettings = SETTINGS) -> ModelInfo:
-    """Record a rig, unless it is recorded, and train a model with key joints; return the metadata of the model."""
-    if not folder.exists():
-        drain(record(rig, folder / "recording", settings))
-    train(folder / "recording", folder / "model.onnx", "--passes", 1, "--bones-to-read", *(options or ("auto",)))
+def trained(rig: SceneRig, folder: Path) -> ModelInfo:
+    """Record a rig and train a model with key joints; return the metadata of the model."""
+    drain(record(rig, folder / "recording", RecordingSettings(poses=80, influence_poses=2)))
+    train(folder / "recording", folder / "model.onnx", "--passes", 1, "--bones-to-read", "auto")
     return read_model_info(folder / "model.onnx")
 
 
@@ -109,17 +106,11 @@ def test_the_model_plays_on_the_rig_and_a_saved_file_keeps_it(limb_files, tmp_pa
     pose_limb(rig.armature_object)
     shown = assert_plays(rig.mesh_object, limb_files.model)
     rig.mesh_object.fdda.mode = "LINEAR"
-    assert np.abs(assert_linear(rig.mesh_object) - shown).max() > 1e-4
+    assert np.abs(evaluated_positions(rig.mesh_object) - shown).max() > 1e-4
     rig.mesh_object.fdda.mode = "FDDA"
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "bound.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "bound.blend"))
     np.testing.assert_array_equal(assert_plays(bpy.data.objects["limb"], limb_files.model), shown)
-
-
-def assert_linear(mesh_object: bpy.types.Object) -> np.ndarray:
-    from .conftest import evaluated_positions
-
-    return evaluated_positions(mesh_object)
 
 
 @pytest.mark.parametrize("is_renamed", [False, True], ids=["other weights", "another bone"])

@@ -22,7 +22,6 @@ from fdda_addon.runtime.network import Network
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, run, train
-from .refusals import file_contents
 from .scene_state import drain, scene_state
 
 pytestmark = pytest.mark.one_blender_version
@@ -121,29 +120,6 @@ def test_another_rig_is_refused(elbow_files, recording, rig):
     if rig.mesh_object.data.shape_keys:
         rig.mesh_object.data.shape_keys.reference_key.data[0].co.x += 0.1
     assert "was trained for another rig" in sentence(rig, recording, elbow_files.model)
-
-
-def test_a_resumed_refinement_adds_only_the_missing_poses(elbow_files, recording, rig, tmp_path):
-    """An interrupted and resumed refinement writes the same bytes as an uninterrupted one."""
-    whole = shutil.copytree(recording, tmp_path / "whole")
-    settings = RefinementSettings(poses=7, resume=True)
-    list(refine(rig, whole, elbow_files.model, settings))
-    steps = refine(rig, recording, elbow_files.model, settings)
-    for step in steps:
-        if step.stage == "poses" and step.done == 3:
-            break
-    steps.close()
-    assert len(read_recording(recording).pose_matrices) == 165
-    for _ in range(2):
-        assert list(refine(rig, recording, elbow_files.model, settings))[-1].done == 7
-        assert file_contents(recording) == file_contents(whole)
-
-
-def test_poses_that_were_not_chosen_for_the_model_are_not_resumed(elbow_files, recording, rig):
-    list(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2)))
-    list(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2)))
-    with pytest.raises(FDDAError, match=r"was trained on 150 poses, and the other 4 of .* were not chosen for it"):
-        list(refine(rig, recording, elbow_files.model, RefinementSettings(poses=2, resume=True)))
 
 
 @pytest.mark.parametrize("option", [["--action", "elbow_wave"], ["--poses", 0]])

@@ -284,15 +284,14 @@ class RecordingExtension(RecordingWriter):
     which has the poses of all calls of `append` that returned.
     """
 
-    def __init__(self, recording: Recording, poses: int, model_name: str, added_count: int = 0):
+    def __init__(self, recording: Recording, poses: int, model_name: str):
         """Open the files of a recording.
 
         Args:
             poses: number of poses to append.
             model_name: file name of the model that the poses refine.
-            added_count: number of poses at the end of the recording that were already added for this model.
         """
-        self._recorded_count, self._added_count, self._model_name = recording.info.poses, added_count, model_name
+        self._recorded_count, self._model_name = recording.info.poses, model_name
         super().__init__(
             recording.path, recording.rig, replace(recording.info, poses=recording.info.poses + poses), resume=True
         )
@@ -307,10 +306,9 @@ class RecordingExtension(RecordingWriter):
             )
 
     def _index(self) -> dict:
-        sampling, count = self.info.sampling, self.complete - self._recorded_count + self._added_count
-        sources = sampling.sources[:-1] if self._added_count else sampling.sources
+        sampling, count = self.info.sampling, self.complete - self._recorded_count
         added_sources = (Source(REFINED, count, self._model_name),) if count else ()
-        sampling = replace(sampling, sources=(*sources, *added_sources))
+        sampling = replace(sampling, sources=(*sampling.sources, *added_sources))
         return super()._index() | {"poses": self.complete, "sampling": sampling.to_json()}
 
     def _write_error(self, error: OSError) -> OutputError:

@@ -59,7 +59,11 @@ def remove_armature(rig) -> None:
     ("change", "options", "message"),
     [
         (lambda rig: bpy.data.objects.remove(rig.mesh_object), (), "The scene has no mesh; open a file with a charac"),
-        (lambda rig: rig.mesh_object.data.clear_geometry(), (), "The mesh of 'elbow' has no vertices"),
+        (
+            lambda rig: rig.mesh_object.data.clear_geometry(),
+            (),
+            "All 0 vertices of 'elbow' lie at one point",
+        ),
         (add_second_mesh, ("--object", "glove"), "no mesh object 'glove'; its mesh objects: 'elbow', 'sleeve'."),
         (add_second_mesh, (), "2 meshes have an Armature modifier ('elbow', 'sleeve'); choose one with --object."),
         (remove_armature, (), "No mesh of the scene has an Armature modifier with an armature"),

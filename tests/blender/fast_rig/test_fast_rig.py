@@ -160,26 +160,23 @@ def test_what_would_differ_besides_joints_is_named(folder, monkeypatch, capsys, 
     assert not (folder / "fast.blend").exists()
 
 
-def test_objects_that_do_not_repeat_themselves_are_not_compared(folder):
-    """The driver adds to its own result in each evaluation, as simulations depend on the poses before."""
-    bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
-    prop = bpy.data.objects.new("prop", None)
-    bpy.context.scene.collection.objects.link(prop)
-    driver = prop.driver_add("location", 0).driver
+def add_to_itself(struct: bpy.types.bpy_struct, name: str) -> None:
+    """Add a driver that adds to its own result in each evaluation, as simulations depend on the poses before."""
+    driver = struct.driver_add(name, 0).driver
     driver.type = "SUM"
-    for datablock, path in ((prop, "location[0]"), (bpy.data.objects[ELBOW_RIG], 'pose.bones["control"].scale[0]')):
+    path = name if struct == struct.id_data else struct.path_from_id(name)
+    for owner, each in ((struct.id_data, path), (bpy.data.objects[ELBOW_RIG], 'pose.bones["control"].scale')):
         target = driver.variables.new().targets[0]
-        target.id, target.data_path = datablock, path
-    bpy.ops.wm.save_mainfile()
-    lines = output_of(*fast_rig_arguments(folder, "--frames", 0)).out
-    assert lines[3] == "  not compared, because the full rig does not repeat it: object 'prop'"
+        target.id, target.data_path = owner, f"{each}[0]"
 
 
-def test_the_comparison_leaves_the_file_as_it_was(folder):
+def test_the_comparison_leaves_the_file_as_it_was_and_objects_out_that_do_not_repeat(folder):
     """It links objects, shows them, and assigns actions, all for a while."""
     bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
-    prop = bpy.data.objects.new("prop", None)
-    bpy.context.scene.collection.objects.link(prop)
+    swinging, prop = bpy.data.objects.new("swinging", None), bpy.data.objects.new("prop", None)
+    for scene_object in (swinging, prop):
+        bpy.context.scene.collection.objects.link(scene_object)
+    add_to_itself(swinging, "location")
     prop.keyframe_insert("hide_render", frame=1)
     prop.animation_data.action.use_fake_user = True
     prop.animation_data_clear()
@@ -187,7 +184,8 @@ def test_the_comparison_leaves_the_file_as_it_was(folder):
     prop.hide_set(True)
     bpy.ops.wm.save_mainfile()
     collections = len(bpy.data.collections)
-    assert run(*fast_rig_arguments(folder, "--frames", 0)) == 0
+    lines = output_of(*fast_rig_arguments(folder, "--frames", 0)).out
+    assert lines[3] == "  not compared, because the full rig does not repeat it: object 'swinging'"
     bpy.ops.wm.open_mainfile(filepath=str(folder / "fast.blend"))
     prop = bpy.data.objects["prop"]
     assert len(bpy.data.collections) == collections and prop.animation_data is None
@@ -197,35 +195,20 @@ def test_the_comparison_leaves_the_file_as_it_was(folder):
 def test_a_rig_that_does_not_repeat_itself_is_refused(folder, capsys):
     """Where the full rig moves differently in the same pose, no comparison is possible."""
     bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
-    armature_object = bpy.data.objects[ELBOW_RIG]
-    # This driver adds to its own result in each evaluation.
-    source = armature_object.pose.bones[f"{SOURCE}.target"]
-    driver = source.driver_add("rotation_euler", 0).driver
-    driver.type = "SUM"
-    for name in ("rotation_euler", "scale"):
-        target = driver.variables.new().targets[0]
-        target.id, target.data_path = armature_object, f"{source.path_from_id(name)}[0]"
+    add_to_itself(bpy.data.objects[ELBOW_RIG].pose.bones[f"{SOURCE}.target"], "rotation_euler")
     bpy.ops.wm.save_mainfile()
     assert run(*fast_rig_arguments(folder)) == 1
     assert "of the size) of 'elbow_rig' differently, so a fast rig cannot be compared" in capsys.readouterr().err
     assert not (folder / "fast.blend").exists()
 
 
-def overflow_above(joint_name: str, threshold: float) -> None:
-    """Scale a joint beyond the largest float where the control has turned further than a threshold, and save."""
-    armature_object = bpy.data.objects[ELBOW_RIG]
-    driver = armature_object.pose.bones[joint_name].driver_add("scale", 0).driver
-    driver.expression = f"3e38 if angle > {threshold} else 1"
-    variable = driver.variables.new()
-    variable.name = "angle"
-    variable.targets[0].id = armature_object
-    variable.targets[0].data_path = 'pose.bones["control"].rotation_euler[0]'
-    bpy.ops.wm.save_mainfile()
-
-
 def test_transforms_that_are_infinite_in_both_rigs_are_equal(folder):
     bpy.ops.wm.open_mainfile(filepath=str(folder / "full.blend"))
-    overflow_above("upper", 0.8)
+    driver = bpy.data.objects[ELBOW_RIG].pose.bones["upper"].driver_add("scale", 0).driver
+    driver.expression = "3e38 if var > 0.8 else 1"
+    target = driver.variables.new().targets[0]
+    target.id, target.data_path = bpy.data.objects[ELBOW_RIG], 'pose.bones["control"].rotation_euler[0]'
+    bpy.ops.wm.save_mainfile()
     lines = output_of(*fast_rig_arguments(folder, "--frames", 0)).out
     assert lines[3].strip().startswith("in up to ")
     assert "of these, both rigs give no finite transform to 'upper' and 'lower'" in lines[3]
@@ -400,28 +383,20 @@ def test_relative_paths_lead_to_the_same_files_from_another_folder(elbow_files, 
     assert path.startswith("//") and Path(bpy.path.abspath(path)).resolve() == texture.resolve()
 
 
-def test_controls_that_choose_no_bone_are_refused(elbow_files, tmp_path, capsys):
-    bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
-    for action in list(bpy.data.actions):
-        bpy.data.actions.remove(action)
-    save_copy(tmp_path / "full.blend")
-    fast = tmp_path / "fast.blend"
-    assert run("fast-rig", tmp_path / "full.blend", elbow_files.model, fast, "--controls", "keyed") == 1
-    assert "'elbow_rig' has no bones for --controls keyed, so the fast rig would have" in capsys.readouterr().err
-    assert not fast.exists()
-
-
-def test_controls_that_move_no_joint_prove_nothing(elbow_files, tmp_path):
+def test_controls_that_choose_no_bone_are_refused_and_those_that_move_no_joint_prove_nothing(elbow_files, tmp_path):
+    full, fast = tmp_path / "full.blend", tmp_path / "fast.blend"
+    words = ("fast-rig", full, elbow_files.model, fast, "--controls", "keyed", "--frames", 0)
     bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
     for action in list(bpy.data.actions):
         bpy.data.actions.remove(action)
     armature_object = bpy.data.objects[ELBOW_RIG]
     add_bones(armature_object, NewBone("aside", (0.0, 0.0, 0.3), (0.1, 0.0, 0.3), is_deforming=False))
-    wave(armature_object, "aside")
-    save_copy(tmp_path / "full.blend")
-    files = (tmp_path / "full.blend", elbow_files.model, tmp_path / "fast.blend")
-    lines = output_of("fast-rig", *files, "--controls", "keyed", "--frames", 0).out
-    assert lines[2].startswith(
-        "  no joint moves in 220 poses of these controls, so nothing shows that the joints move as "
-    )
-    assert len(lines) == 3
+    save_copy(full)
+    refused = output_of(*words, status=1).err
+    assert "'elbow_rig' has no bones for --controls keyed, so the fast rig would have" in refused[-1]
+    assert not fast.exists()
+    bpy.ops.wm.open_mainfile(filepath=str(full))
+    wave(bpy.data.objects[ELBOW_RIG], "aside")
+    save_copy(full)
+    lines = output_of(*words).out
+    assert len(lines) == 3 and lines[2].startswith("  no joint moves in 220 poses of these controls, so nothing shows ")

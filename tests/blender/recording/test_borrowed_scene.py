@@ -205,7 +205,7 @@ def set_armature_location_to_nan(rig: SceneRig) -> None:
             "All 300 vertices of 'elbow' lie at one point in the rest pose, so the mesh has no size; give the",
         ),
         (collapse_basis_key, "All 300 vertices of 'elbow' lie at one point in the rest pose"),
-        (keep_one_vertex, "The mesh of 'elbow' has one vertex, and no surface to learn; choose another object."),
+        (keep_one_vertex, "All 1 vertices of 'elbow' lie at one point in the rest pose"),
         (
             set_bone_tail_to_nan,
             "The bone 'lower' has no length or no finite place in the rest pose; give its head and its tail",

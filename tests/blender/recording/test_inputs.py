@@ -218,34 +218,31 @@ def notes_of_recording(folder: Path, *controls: str) -> str:
     return " ".join(step.note for step in record(find_rig("elbow"), folder / "recording", settings))
 
 
-def drive_strength(owner: bpy.types.ID, path: str, expression: str = "value") -> None:
-    """Let the strength of a modifier of the tube follow an expression of the number `value` at a path, from 0 to 1."""
+def drive_strength(owner: bpy.types.ID, path: str) -> None:
+    """Let the strength of a modifier of the tube follow the number at a path, from 0 to 1."""
     drive_by_property(add_cast(bpy.data.objects["elbow"]), "factor", owner, path)
-    bpy.data.objects["elbow"].animation_data.drivers[0].driver.expression = f"min(max({expression}, 0), 1)"
+    bpy.data.objects["elbow"].animation_data.drivers[0].driver.expression = "min(max(value, 0), 1)"
     bpy.context.view_layer.update()
 
 
 @pytest.mark.parametrize(
-    ("value", "limits", "expression", "note"),
+    ("value", "limits", "note"),
     [
-        (0.0, (-10_000.0, 10_000.0), "value", "number 'armature_object/[\"fat\"]' without a range"),
-        (0.0, None, "value", "number 'armature_object/[\"fat\"]' without a range"),
-        (0, None, "value", "number 'armature_object/[\"fat\"]' without a range"),
-        (0.0, (-1000.0, 1000.0), "value", "changes only between 0 and 1.46 in the range -1000 to 1000"),
-        (0.0, (0.0, 360.0), "min(max((value - 90) / 10, 0), 1)", "changes only between 90 and 101 in the range 0 to"),
-        (0.0, (-180.0, 180.0), "(value + 180) / 360", ""),
-        (0.0, (0.0, 1.0), "value > 0.5", ""),
+        (0.0, (-10_000.0, 10_000.0), "number 'armature_object/[\"fat\"]' without a range"),
+        (0.0, None, "number 'armature_object/[\"fat\"]' without a range"),
+        (0, None, "number 'armature_object/[\"fat\"]' without a range"),
+        (0.0, (0.0, 1.0), ""),
     ],
 )
 def test_a_custom_property_is_an_input_or_is_named(
-    value: float, limits: tuple[float, float] | None, expression: str, note: str, tmp_path: Path
+    value: float, limits: tuple[float, float] | None, note: str, tmp_path: Path
 ):
     _, armature_object = tube()
     armature_object["fat"] = value
     if limits:
         armature_object.id_properties_ui("fat").update(min=limits[0], max=limits[1])
     armature_object.update_tag()
-    drive_strength(armature_object, '["fat"]', expression)
+    drive_strength(armature_object, '["fat"]')
     notes = notes_of_recording(tmp_path)
     assert note in notes and bool(note) == ("'elbow'" in notes)
     assert armature_object["fat"] == value
