@@ -32,7 +32,7 @@ def check_json(value: object, description: object, key_path: str = "it") -> None
             - a set: one of these texts
             - a range: a whole number in it
             - an `Interval`: a number in it
-            - `str` or `bool`
+            - a type: `str`, `bool`, or `list` for any list
         key_path: path of the value in the file, for the error.
 
     Raises:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Keeps the model that a training replaces, so that a worse model can be replaced by the former one."""
 
+import os
+from itertools import count
 from pathlib import Path
 
 import bpy
@@ -9,6 +11,7 @@ from ..core.errors import FDDAError, OutputError, os_error_text
 from ..core.files.output import atomic_write
 from ..core.formats.model import read_model_info
 from ..core.formats.report import page_path, report_path
+from ..core.rig import MeshPart
 from .model_list import add_model
 
 FORMER_FOLDER = "previous"
@@ -21,18 +24,22 @@ def former_model_path(model: Path) -> Path:
 
 
 def keep_former_model(model: Path) -> None:
-    """Copy a model and its report, which a training will replace; do nothing if the file is missing or no model.
+    """Copy a file and its report, which a training will replace; do nothing if the file is missing.
+
+    A former model of another rig, or one that cannot be read, gets another name.
 
     Raises:
         OutputError: a file cannot be copied.
     """
-    try:
-        read_model_info(model)
-    except FDDAError:
+    if not model.is_file():
         return
     former_model = former_model_path(model)
     try:
         former_model.parent.mkdir(exist_ok=True)
+        meshes = _meshes(former_model)
+        if former_model.is_file() and (meshes is None or meshes != _meshes(model)):
+            others = (former_model.with_stem(f"{model.stem}-{number}") for number in count(1))
+            former_model.rename(next(path for path in others if not os.path.lexists(path)))
         for path in (model, report_path(model), page_path(model)):
             if path.is_file():
                 with atomic_write(former_model.parent / path.name) as temporary_path:
@@ -42,6 +49,14 @@ def keep_former_model(model: Path) -> None:
             f"Cannot keep the former model in '{former_model.parent}': {os_error_text(error)}; make space, or choose "
             "another file under Model."
         ) from error
+
+
+def _meshes(model: Path) -> tuple[MeshPart, ...] | None:
+    """Return the meshes for which a model was trained; None if it cannot be read."""
+    try:
+        return read_model_info(model).meshes
+    except FDDAError:
+        return None
 
 
 def add_former_model(mesh_object: bpy.types.Object, model: Path) -> None:

@@ -83,6 +83,7 @@ SCALE = np.diag([2.0, 2, 2, 1]).ravel().tolist()
         ({"joints": [{"name": "a", "parent": -1}, {"name": "a", "parent": 0}]}, "two of one name"),
         ({"alone": ALONE | {"inputs": [["joint", 4]]}}, "a moved joint[0] is 4"),
         ({"alone": ALONE | {"inputs": [["bone", 0]]}}, "a moved input is 'bone'"),
+        ({"alone": {key: ALONE[key] for key in ("bases", "keys", "undetectable")}}, "alone lacks 'inputs'"),
         ({"alone": ALONE | {"keys": [1]}}, "alone.keys[0] is 1"),
         ({"alone": ALONE}, "poses in which one input moves alone, not [1]"),
         ({"controls": [FIST_CONTROL, FIST_CONTROL]}, "two of its controls have one name"),
@@ -285,6 +286,7 @@ POSE_SOURCE = {"kind": "random", "poses": 12, "name": "", "frames": [0, 0]}
         ({"seed": -1}, "sampling.seed is -1"),
         ({"spread": float("inf")}, "sampling.spread is inf"),
         ({"sources": [{**POSE_SOURCE, "kind": "stolen"}]}, "sampling.sources[0].kind is 'stolen'"),
+        ({"sources": [{**POSE_SOURCE, "frames": []}]}, "the frames of a source are not two"),
         ({"overshoot": {"factor": 99, "poses": 3, "limits": []}}, "its overshoot.factor is 99"),
     ],
 )

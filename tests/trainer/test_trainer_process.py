@@ -192,7 +192,7 @@ FULL_DISK_ERROR = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")
         (RuntimeError("DefaultCPUAllocator: not enough memory: you tried"), 75, "The training lacks memory ("),
         (OSError("[WinError 1455] The paging file is too small"), 75, "The training lacks memory ("),
         (OSError('[WinError 1114] … Error loading "c10.dll"'), 1, "install Microsoft's Visual C++ runtime from https:"),
-        (ImportError("libgomp.so.1: cannot open shared object file: No such file"), 1, "a file is missing, damaged"),
+        (ImportError("libgomp.so.1: cannot open shared object file: No such file"), 1, "Linux that has 'libgomp.so.1'"),
         (KeyError("x"), 1, "The trainer stopped on an error of its own (KeyError('x')); please report it."),
     ],
 )

@@ -131,9 +131,9 @@ def _find_half_turn_pairs(
 ) -> Iterator[tuple[int, tuple[np.ndarray, np.ndarray]]]:
     """Yield each joint that passes 180 degrees, with its pairs of similar poses on two sides and on the same side."""
     for joint in sorted({j for partition in partitions for j in partition.influencing}):
-        matrices = features[:, joint].reshape(-1, 3, 4)[:, :, :3].astype(np.float64)
-        scales = np.cbrt(np.abs(np.linalg.det(matrices)))
-        is_near_half_turn = np.trace(matrices, axis1=1, axis2=2) < scales * MAX_TRACE
+        u, _, v = np.linalg.svd(features[:, joint].reshape(-1, 3, 4)[:, :, :3].astype(np.float64))
+        matrices = u @ v * np.linalg.det(u @ v)[:, None, None]
+        is_near_half_turn = np.trace(matrices, axis1=1, axis2=2) < MAX_TRACE
         if is_near_half_turn.sum() < 2:
             continue
         # Near 180 degrees, these are small vectors along the axis, whose sign differs on the two sides.

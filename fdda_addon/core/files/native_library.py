@@ -14,6 +14,10 @@ _ADVICE = {
     r"((?:GLIBC|GLIBCXX|CXXABI)_[\d.]+)' not found": (
         "this Linux is too old, or LD_LIBRARY_PATH names an older library: {0} is needed",
     ),
+    r"(?:^|[\s(])([^\s:('\"/]+): cannot open shared object file": (
+        "install the package of this Linux that has '{0}', or else the training environment again",
+        "install the package of this Linux that has '{0}', or else the extension's zip for this platform again",
+    ),
     r'DLL load failed|Error loading "|needs msvcp140\.dll': (
         "install Microsoft's Visual C++ runtime from {runtime}, or else the training environment again",
         "another extension may have brought a newer ONNX Runtime, or a virus scanner removed a file: remove that "

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from ..controls import Control, owners_from_mesh, read_controls
-from ..json_check import COUNT, NUMBER, check_json
+from ..json_check import COUNT, NUMBER, Interval, check_json
 from ..mathematics.key_joints import KeyJointReport
 from ..mathematics.partition import Partition, make_partitions
 from ..mathematics.poses import CONTROL, Channel
@@ -17,6 +17,8 @@ from ..rig import IDENTITY, STATIC_JOINT, Joint, MeshPart, Rig, read_joints, rea
 VERSION = 1
 MAX_METADATA_LENGTH = 16 << 20
 """Largest number of characters of the metadata."""
+FLOAT32 = Interval(-1e30, 1e30)
+"""Description of a number that float32 can hold."""
 LIMITS_KEY = "limits"
 """Key in `ModelInfo.training` for the range of motion."""
 FIT_KEY, KEY_JOINTS_KEY = "fit", "key_joints"
@@ -188,7 +190,7 @@ def _read_info(value: dict) -> ModelInfo:
     if value["version"] != VERSION:
         raise ValueError(f"it is of version {value['version']!r} and this add-on reads version {VERSION}")
     joints, controls = read_joints(value["joints"]), read_controls(value.get("controls", []))
-    joint, control, ranges = range(len(joints)), range(len(controls)), [[NUMBER]]
+    joint, control, ranges = range(len(joints)), range(len(controls)), [[FLOAT32]]
     partition_keys = {
         **{"joint": joint, "influencing": [joint], "vertices": COUNT[1:], "basis": COUNT},
         **{"controls?": [control], "merged?": [joint]},

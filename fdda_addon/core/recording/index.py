@@ -214,7 +214,8 @@ class AloneMoves:
             TypeError, ValueError: the JSON is damaged.
         """
         control_indices = [range(controls)]
-        check_json(value, {"bases": COUNT[1:], "keys": control_indices, "undetectable": control_indices}, "alone")
+        keys = {"bases": COUNT[1:], "inputs": [list], "keys": control_indices, "undetectable": control_indices}
+        check_json(value, keys, "alone")
         inputs = tuple((kind, tuple(indices)) for kind, *indices in value["inputs"])
         for kind, indices in inputs:
             if kind not in (JOINT, CONTROL) or (kind == JOINT and len(indices) != 1):
@@ -328,6 +329,8 @@ def _check_index(index: dict) -> None:
     read_meshes(index["meshes"])
     read_unit(index)
     info = read_info(index)
+    if any(len(source.frames) != 2 for source in info.sampling.sources):
+        raise ValueError("the frames of a source are not two")
     alone_counts = [source.poses for source in info.sampling.sources if source.kind == ALONE]
     expected_counts = [info.alone.poses] if info.alone else []
     if alone_counts != expected_counts:

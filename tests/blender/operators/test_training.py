@@ -11,6 +11,7 @@ from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job
+from fdda_addon.models.former_model import keep_former_model
 from fdda_addon.panels import checks
 from fdda_addon.properties.character import model_file
 from fdda_addon.runtime.model_files import model_path
@@ -30,6 +31,20 @@ def train(rig: SceneRig, elbow_files, **options) -> set[str]:
     settings = rig.mesh_object.fdda.settings
     settings.passes, settings.detail_mm, settings.training_seed = 6, 0.2, 3
     return bpy.ops.fdda.train(recording=str(elbow_files.recording), **options)
+
+
+def test_what_a_training_replaces_is_kept_also_if_it_is_no_model_or_of_another_rig(elbow_files, tmp_path):
+    model, previous = tmp_path / "a.onnx", tmp_path / "previous"
+    for content, names in (
+        (b"of another program", ["a.onnx"]),
+        (elbow_files.model.read_bytes(), ["a-1.onnx", "a.onnx"]),
+        (elbow_files.model.read_bytes(), ["a-1.onnx", "a.onnx"]),
+    ):
+        model.write_bytes(content)
+        keep_former_model(model)
+        assert sorted(path.name for path in previous.iterdir()) == names
+        assert (previous / "a.onnx").read_bytes() == content
+    assert (previous / "a-1.onnx").read_bytes() == b"of another program"
 
 
 def test_a_model_is_trained_with_the_settings_and_kept_when_it_is_trained_again(saved, elbow_files, tmp_path):

@@ -129,6 +129,7 @@ PARTITION_JSON = {"joint": 0, "influencing": [], "vertices": 4, "basis": 1}
         ({"metres_per_unit": 0}, "metres_per_unit is 0"),
         ({"meshes": [{**MESH_JSON, "vertices": 5}]}, "the partitions do not add up to the vertices"),
         ({"rest_matrices": [[0.0] * 16] * 2}, "cannot reshape"),
+        ({"rest_matrices": [[1e39] * 16] * 3}, "rest_matrices[0][0] is 1e+39"),
     ],
 )
 def test_inconsistent_metadata_is_refused(tmp_path, changes, words):
