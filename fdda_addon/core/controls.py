@@ -60,8 +60,8 @@ class Control:
         check_json(value, {"owner": str, "path": str, "low": NUMBER, "high": NUMBER}, "control")
         control = Control(value["owner"], value["path"], float(value["low"]), float(value["high"]))
         is_other = control.owner.startswith(OTHER_OBJECT) or MESH_OWNER.fullmatch(control.owner)
-        if control.owner not in OWNERS and not is_other:
-            raise ValueError(f"a control belongs to {control.owner!r}")
+        if (control.owner not in OWNERS and not is_other) or not control.path:
+            raise ValueError(f"a control belongs to {control.owner!r} and is called {control.path!r}")
         if control.low > control.high:
             raise ValueError(f"the control {control.name!r} has the range {control.low} to {control.high}")
         return control

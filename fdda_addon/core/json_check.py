@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 MAX_NUMBER = 1e300
 """Largest absolute value of a number."""
+MAX_TEXT_LENGTH = 10_000
+"""Largest number of characters of a text. Names in Blender have at most 255, sentences at most 1,000."""
 COUNT, WHOLE = range(1 << 62), range(-(1 << 62), 1 << 62)
 """Descriptions of a whole number from 0, and of any."""
 
@@ -61,7 +63,7 @@ def check_json(value: object, description: object, key_path: str = "it") -> None
         for index, entry in enumerate(value if is_valid else ()):
             check_json(entry, description[0], f"{key_path}[{index}]")
     else:
-        is_valid = isinstance(value, description)
+        is_valid = isinstance(value, description) and (description is not str or len(value) <= MAX_TEXT_LENGTH)
     if not is_valid:
         raise ValueError(f"{key_path} is {reprlib.repr(value)}")
     return None

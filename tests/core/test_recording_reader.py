@@ -88,6 +88,7 @@ SCALE = np.diag([2.0, 2, 2, 1]).ravel().tolist()
         ({"alone": ALONE}, "poses in which one input moves alone, not [1]"),
         ({"controls": [FIST_CONTROL, FIST_CONTROL]}, "two of its controls have one name"),
         ({"controls": [{**FIST_CONTROL, "owner": "../scene"}]}, "a control belongs to '../scene'"),
+        ({"controls": [{**FIST_CONTROL, "path": ""}]}, "is called ''"),
         ({"controls": [{**FIST_CONTROL, "low": 2}]}, "has the range 2.0 to 1.0"),
         ({"faces": 5, "corners": 14}, "5 faces cannot have 14 corners"),
     ],
@@ -287,6 +288,8 @@ POSE_SOURCE = {"kind": "random", "poses": 12, "name": "", "frames": [0, 0]}
         ({"spread": float("inf")}, "sampling.spread is inf"),
         ({"sources": [{**POSE_SOURCE, "kind": "stolen"}]}, "sampling.sources[0].kind is 'stolen'"),
         ({"sources": [{**POSE_SOURCE, "frames": []}]}, "the frames of a source are not two"),
+        ({"overshoot": {"factor": 2, "poses": 10**6, "limits": []}}, "1000000 of its 10 random poses lie"),
+        ({"limits": [{"bone": "", "kind": "rotation", "axis": 0, "low": 0, "high": 1}]}, "motion of '' is"),
         ({"overshoot": {"factor": 99, "poses": 3, "limits": []}}, "its overshoot.factor is 99"),
     ],
 )

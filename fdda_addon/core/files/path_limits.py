@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks for output paths that are too long for Windows or Blender."""
+"""Checks for output paths that Windows or Blender would truncate or change without an error."""
 
 import os
 import sys
@@ -15,17 +15,24 @@ EXTENDED_PATH_PREFIX = "\\\\?\\"
 
 
 def check_path(path: Path, *files: Path) -> None:
-    """Check that paths are short enough.
+    """Check that paths are short enough, and that Windows does not change their names.
 
     Args:
         path: file or folder that the user named.
         files: all files that are written there, including temporary files.
 
     Raises:
-        OutputError: a path is too long.
+        OutputError: a path is too long, or would be changed.
     """
     if limit := path_length_problem(max((file.absolute() for file in files), key=lambda file: len(os.fsencode(file)))):
         raise OutputError(f"Cannot write '{path}': {limit}; choose a shorter folder.")
+    names = (name for name in path.absolute().parts[1:] if is_windows() and name != "..")
+    # Windows writes the first to a hidden stream of another file, and drops the others. What it refuses is tried.
+    if changed := next((name for name in names if ":" in name or name.rstrip(". ") != name), ""):
+        raise OutputError(
+            f"Cannot write '{path}': '{changed}' has a colon, or a dot or a blank at its end, which Windows changes; "
+            "give another name."
+        )
 
 
 def path_length_problem(path: Path) -> str:

@@ -74,7 +74,7 @@ class Channel:
         check_json(value, {"bone": str, **kinds, "low": NUMBER, "high": NUMBER}, "its range of motion")
         values = dict(value)
         channel = Channel(values.pop("bone"), **values)
-        if channel.low > channel.high:
+        if channel.low > channel.high or not channel.name:
             raise ValueError(f"its range of motion of {channel.name!r} is {channel.low} to {channel.high}")
         return channel
 

@@ -346,6 +346,9 @@ def read_info(index: dict) -> RecordingInfo:
     joint_count, control_count, value = len(index["joints"]), len(index["controls"]), index["sampling"]
     sources = tuple(Source(s["kind"], s["poses"], s["name"], tuple(s["frames"])) for s in value["sources"])
     overshoot = Overshoot.from_json(value["overshoot"]) if "overshoot" in value else None
+    random_pose_count = sum(source.poses for source in sources if source.kind == RANDOM)
+    if overshoot and overshoot.poses > random_pose_count:
+        raise ValueError(f"{overshoot.poses} of its {random_pose_count} random poses lie in the overshoot")
     channels = tuple(Channel.from_json(channel) for channel in value["limits"])
     return RecordingInfo(
         index["poses"],

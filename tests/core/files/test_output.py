@@ -174,6 +174,14 @@ def windows_without_long_paths(monkeypatch):
     monkeypatch.setattr(path_limits, "supports_long_windows_paths", lambda: False)
 
 
+@pytest.mark.usefixtures("windows_without_long_paths")
+@pytest.mark.parametrize("name", ["model.", "model.onnx ", "model.onnx:stream", "a. /model.onnx"])
+def test_a_name_that_windows_changes_is_refused(tmp_path, name):
+    with pytest.raises(OutputError, match="has a colon, or a dot or a blank at its end, which Windows changes"):
+        check_writable(tmp_path / name)
+    check_writable(tmp_path / ".." / tmp_path.name / ".a b.c")
+
+
 def folder_with_length(length: int, tmp_path: Path) -> Path:
     """Return the path of a folder, which may not exist, with this number of characters."""
     folder = tmp_path

@@ -188,6 +188,7 @@ def test_a_value_as_described_is_accepted(change):
         ({"name": "a"}, "it lacks 'count'"),
         (VALUE | {"name": 3}, "name is 3"),
         (VALUE | {"name": None}, "name is None"),
+        (VALUE | {"name": "x" * 10**6}, "name is 'xxxxxxxxxxxx...xxxxxxxxxxxxx'"),
         (VALUE | {"is_key": 1}, "is_key is 1"),
         (VALUE | {"count": -1}, "count is -1"),
         (VALUE | {"count": True}, "count is True"),
