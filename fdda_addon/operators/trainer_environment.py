@@ -139,9 +139,6 @@ class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operato
         "downloads 3 GB and uses 6 GB of disk space"
     )
 
-    python: StringProperty(
-        name="Python", description="Python to create it from. Empty for Blender's own", options={"SKIP_SAVE"}
-    )
     wheels: StringProperty(
         name="Offline Packages",
         description="Folder of .whl files to install from. Empty for the folder in the preferences",
@@ -153,7 +150,7 @@ class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operato
         if reason := folder.creation_obstacle(wheels):
             raise TrainerEnvironmentError(f"{reason}.")
         path = Path(bpy.path.abspath(wheels)) if wheels else None
-        creation = EnvironmentCreation(folder.environment_folder(), folder.log_path(), path, self.python)
+        creation = EnvironmentCreation(folder.environment_folder(), folder.log_path(), path)
         return creation.steps(), creation.cancel
 
     @staticmethod
@@ -212,26 +209,11 @@ class FDDA_OT_cancel_trainer_environment(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class FDDA_OT_open_trainer_log(bpy.types.Operator):
-    bl_idname = "fdda.open_trainer_log"
-    bl_label = "Open Log"
-    bl_description = "Open the log of the last installation of the training environment"
-    bl_options = {"INTERNAL"}
-
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        log = folder.log_path()
-        if not log.is_file():
-            self.report({"ERROR"}, f"There is no log '{log}' yet; it is written when the environment is installed.")
-            return {"CANCELLED"}
-        return bpy.ops.wm.path_open(filepath=str(log))
-
-
 CLASSES = (
     FDDA_OT_check_trainer,
     FDDA_OT_create_trainer_environment,
     FDDA_OT_remove_trainer_environment,
     FDDA_OT_cancel_trainer_environment,
-    FDDA_OT_open_trainer_log,
 )
 
 __all__ = ["CLASSES", "start_job", "unregister"]

@@ -13,7 +13,7 @@ from ..jobs.state import ENVIRONMENT, JobState
 from ..scene import folder_trust
 from ..training.environment import choice, session
 from ..training.environment.check import CheckResult
-from ..training.environment.folder import EXTENSION, FolderState, creation_obstacle, environment_folder
+from ..training.environment.folder import EXTENSION, FolderState, creation_obstacle, environment_folder, log_path
 
 MODULE = EXTENSION or __package__.partition(".")[0]
 """Name under which Blender stores the preferences of the installed extension. A script has no preferences."""
@@ -93,7 +93,8 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
             install_button.operator("fdda.create_trainer_environment", text=text, icon="IMPORT")
             if is_installed:
                 row.operator("fdda.remove_trainer_environment", text="", icon="TRASH")
-            row.operator("fdda.open_trainer_log", text="", icon="TEXT")
+            if log_path().is_file():
+                row.operator("wm.path_open", text="", icon="TEXT").filepath = str(log_path())
             if reason:
                 draw_lines(layout, f"{reason}.", "INFO")
         _, right = _split_row(layout)

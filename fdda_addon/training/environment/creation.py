@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Installs the training environment, a virtual environment with pinned package versions, and writes a log."""
 
-import json
 import os
 import re
 import shutil
@@ -11,8 +10,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -39,36 +36,6 @@ MAX_WHEEL_PATH_LENGTH = 126
 """Length of the longest path in the wheels for Windows, a license file of torch 2.15.0."""
 MIN_FREE_GB = 9 if sys.platform.startswith("linux") else 2
 """Free disk space that the packages and downloads need. On Linux they include CUDA."""
-QUERY_SECONDS = 30.0
-"""Time limit of `query_interpreter`."""
-_QUERY_SCRIPT = """
-import json, sys
-missing = []
-for name in ("ctypes", "ensurepip", "ssl", "venv"):
-    try:
-        __import__(name)
-    except ImportError:
-        missing.append(name)
-print(json.dumps([list(sys.version_info[:2]), sys.maxsize > 2**32, missing, sys.executable]))
-"""
-
-
-@dataclass(frozen=True)
-class Interpreter:
-    """A Python interpreter that runs.
-
-    Attributes:
-        path: path of the executable.
-        version: major and minor version.
-        problem: why no environment can be created from it; empty if one can.
-    """
-
-    path: str
-    version: tuple[int, int]
-    problem: str
-
-    def __str__(self) -> str:
-        return f"'{self.path}' (Python {self.version[0]}.{self.version[1]})"
 
 
 class EnvironmentCreation:
@@ -78,11 +45,10 @@ class EnvironmentCreation:
         folder: folder of the environment. An existing environment is removed first.
         log: file for the output of all commands.
         wheels: folder of wheels; None for the package index in the settings of pip.
-        base: path of the Python to create the environment from; empty for Blender's own.
     """
 
-    def __init__(self, folder: Path, log: Path, wheels: Path | None = None, base: str = ""):
-        self.folder, self.log, self.wheels, self.base = folder, log, wheels, base or sys.executable
+    def __init__(self, folder: Path, log: Path, wheels: Path | None = None):
+        self.folder, self.log, self.wheels = folder, log, wheels
         self._lock = threading.Lock()
         self._process: subprocess.Popen | None = None
         self._cancelled = False
@@ -104,34 +70,32 @@ class EnvironmentCreation:
             ) from error
 
     def _steps(self) -> Job[CheckResult]:
-        with creation_lock(self.folder), _open_log(self.log) as log:
+        with creation_lock(self.folder), self.log.open("w", encoding="utf-8") as log:
             _check_source(self.folder, self.wheels)
-            yield Progress(f"asking '{self.base}'", 0, 0)
-            interpreter = query_interpreter(self.base)
-            self._stop_if_cancelled()
-            if interpreter is None:
-                raise self._no_python_error(f"'{self.base}' is no Python that runs")
-            if interpreter.problem:
-                raise self._no_python_error(f"{interpreter} {interpreter.problem}")
+            python, version = sys.executable, sys.version_info[:2]
+            python_name = f"'{python}' (Python {version[0]}.{version[1]})"
+            if version not in PINNED_REQUIREMENTS:
+                raise self._no_python_error(f"{python_name} is too new")
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
                 self._stop_if_cancelled()
                 self._has_changed_folder = True
                 remove_environment(self.folder)
-                yield Progress(f"making it from {interpreter}", 0, 0)
-                command = [interpreter.path, "-I", "-m", "venv", "--clear", str(self.folder)]
-                if (yield from self._run(command, log)):
-                    raise self._no_python_error(f"{interpreter}: {self._error_line()}")
-                with self._temporary() as temporary:
-                    yield from self._install_with(temporary, interpreter, log)
+                yield Progress(f"making it from {python_name}", 0, 0)
+                if (yield from self._run([python, "-I", "-m", "venv", "--clear", str(self.folder)], log)):
+                    raise self._no_python_error(f"{python_name}: {self._error_line()}")
+                # On the disk, because /tmp may be in memory; on Windows with a short path.
+                place = None if os.name == "nt" else self.folder
+                with tempfile.TemporaryDirectory(prefix="fdda-", dir=place, ignore_cleanup_errors=True) as temporary:
+                    yield from self._install_with(temporary, version, log)
                 yield Progress("checking", 0, 0)
                 result = check(str(interpreter_path(self.folder)), f"the log is '{self.log}'")
                 log.writelines(f"{line}\n" for line in (result.message, *result.details))
                 self._stop_if_cancelled()
                 if result.level == "ERROR":
                     raise TrainerEnvironmentError(f"The packages were installed but do not work: {result.message}")
-                write_completion_marker(self.folder, interpreter.version)
+                write_completion_marker(self.folder, version)
                 complete = True
             finally:
                 if self._has_changed_folder and not complete:
@@ -151,31 +115,18 @@ class EnvironmentCreation:
             f"is '{self.log}'."
         )
 
-    @contextmanager
-    def _temporary(self) -> Iterator[Path]:
-        """Create a temporary folder on the disk, because /tmp may be in memory; on Windows with a short path."""
-        if os.name == "nt":
-            path = Path(tempfile.mkdtemp(prefix="fdda-"))
-        else:
-            path = self.folder / "temporary"
-            path.mkdir()
-        try:
-            yield path
-        finally:
-            shutil.rmtree(path, ignore_errors=True)
-
-    def _install_with(self, temporary: Path, interpreter: Interpreter, log: IO[str]) -> Iterator[Progress]:
-        packages = site_packages(self.folder, interpreter.version)
+    def _install_with(self, temporary: str, version: tuple[int, int], log: IO[str]) -> Iterator[Progress]:
+        packages = site_packages(self.folder, version)
         # Packages are installed into the folder itself, because paths in site-packages are 18 characters longer.
         # This .pth file makes Python import from there.
         (packages / "fdda.pth").write_text(os.path.relpath(self.folder, packages) + "\n", encoding="ascii")
         command = [str(interpreter_path(self.folder)), "-I", str(RUN_PIP), "install"]
         command += ["--no-input", "--disable-pip-version-check", "--no-cache-dir"]
         command += ["--target", str(self.folder)]
-        command += ["--only-binary=:all:", "--constraint", str(requirements_file(interpreter.version)), *PACKAGES]
+        command += ["--only-binary=:all:", "--constraint", str(requirements_file(version)), *PACKAGES]
         if self.wheels is not None:
             command += ["--no-index", "--find-links", str(self.wheels)]
-        status = yield from self._run(command, log, dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)))
+        status = yield from self._run(command, log, dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temporary))
         if status == UNREADABLE_SETTINGS_STATUS:
             raise TrainerEnvironmentError(
                 f"The settings of pip cannot be read ({self._error_line()}); correct or remove that file."
@@ -268,19 +219,6 @@ def _check_source(folder: Path, wheels: Path | None) -> None:
         raise TrainerEnvironmentError(f"'{wheels}' is no folder; choose the folder that holds the packages.")
 
 
-@contextmanager
-def _open_log(log: Path) -> Iterator[IO[str]]:
-    """Open the log for writing."""
-    try:
-        file = log.open("w", encoding="utf-8")
-    except OSError as error:
-        raise TrainerEnvironmentError(
-            f"The log '{log}' cannot be written ({os_error_text(error)}); remove it."
-        ) from error
-    with file:
-        yield file
-
-
 def _kill(process: subprocess.Popen) -> None:
     """Kill the process of a command, and its child processes."""
     if process.poll() is not None:
@@ -293,22 +231,3 @@ def _kill(process: subprocess.Popen) -> None:
         process.kill()
     else:
         os.killpg(process.pid, signal.SIGKILL)
-
-
-def query_interpreter(path: str) -> Interpreter | None:
-    """Run an interpreter, and return its version and problem; None if it is no Python."""
-    command = [path, "-I", "-c", _QUERY_SCRIPT]
-    try:
-        result = subprocess.run(command, capture_output=True, timeout=QUERY_SECONDS, check=True, **child_options())
-        version, is_64_bit, missing, path = json.loads(result.stdout.splitlines()[-1])
-    except (OSError, subprocess.SubprocessError, ValueError, TypeError, IndexError):
-        return None
-    problem = ""
-    if tuple(version) not in PINNED_REQUIREMENTS:
-        supported = ", ".join(f"{major}.{minor}" for major, minor in sorted(PINNED_REQUIREMENTS))
-        problem = f"is none of {supported}"
-    elif not is_64_bit:
-        problem = "is not 64-bit"
-    elif missing:
-        problem = f"lacks the module {missing[0]}"
-    return Interpreter(path, tuple(version), problem)

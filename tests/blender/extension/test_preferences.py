@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The add-on's preferences: how they are drawn, the trusted folders, and the log of the training environment."""
 
-import os
-import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +9,6 @@ import pytest
 
 from fdda_addon.properties import preferences as preferences_module
 from fdda_addon.properties.preferences import FDDA_AP_preferences, trusted_folders
-from fdda_addon.training.environment import folder
 
 from ..drawing import Context, Layout, texts_of
 from ..refusals import refused
@@ -46,14 +43,3 @@ def test_a_trusted_folder_is_added_and_removed(preferences, tmp_path: Path):
 
 def test_trusted_folders_need_an_installed_extension():
     refused(bpy.ops.fdda.remove_trusted_folder, "has no preferences; install the extension")
-
-
-def test_the_log_of_the_training_environment_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    opened_paths = []
-    monkeypatch.setattr(folder, "user_folder", lambda: tmp_path)
-    monkeypatch.setattr(os, "startfile", opened_paths.append, raising=False)
-    monkeypatch.setattr(subprocess, "check_call", lambda command: opened_paths.append(command[-1]))
-    refused(bpy.ops.fdda.open_trainer_log, "There is no log")
-    folder.log_path().write_text("Successfully installed")
-    assert bpy.ops.fdda.open_trainer_log() == {"FINISHED"}
-    assert [Path(path) for path in opened_paths] == [folder.log_path()]

@@ -484,7 +484,7 @@ def test_the_menu_has_all_operators_but_those_that_need_a_button_of_a_panel():
     in_menu = {name.removeprefix("fdda.") for group in MENU_OPERATORS for name in group}
     assert set(dir(bpy.ops.fdda)) - in_menu == {
         *("add_trusted_folder", "remove_trusted_folder"),
-        *("cancel", "cancel_trainer_environment", "open_trainer_log", "remove_trainer_environment"),
+        *("cancel", "cancel_trainer_environment", "remove_trainer_environment"),
         *("show_bone", "show_mesh", "copy_objects"),
     }
 

@@ -23,7 +23,7 @@ from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_envi
 from fdda_addon.training.environment import check, choice, creation, folder, session
 from fdda_addon.training.environment.check import CheckResult
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE, Origin
-from fdda_addon.training.environment.creation import EnvironmentCreation, query_interpreter
+from fdda_addon.training.environment.creation import EnvironmentCreation
 from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, FolderState, interpreter_path
 
 from ... import systems
@@ -53,7 +53,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An environment that is complete."""
     path = tmp_path_factory.mktemp("made") / "trainer"
-    answer = run_job(EnvironmentCreation(path, path.with_name("log"), wheels, sys.executable).steps())
+    answer = run_job(EnvironmentCreation(path, path.with_name("log"), wheels).steps())
     assert answer.level == "INFO"
     return path
 
@@ -66,7 +66,7 @@ def own(made: Path, user: Path) -> Path:
 
 
 def create(**options: str) -> set[str]:
-    return bpy.ops.fdda.create_trainer_environment(python=sys.executable, **options)
+    return bpy.ops.fdda.create_trainer_environment(**options)
 
 
 def refused(operator, **options: str) -> str:
@@ -117,7 +117,7 @@ def test_settings_of_pip_and_of_a_launcher_do_not_change_where_and_what_is_insta
     for name, value in (variables | {"PIP_PROXY": "http://me:secret@nowhere", "PYTHONHOME": "/nowhere"}).items():
         monkeypatch.setenv(name, value)
     log = tmp_path / "log"
-    answer = run_job(EnvironmentCreation(tmp_path / "trainer", log, base=sys.executable).steps())
+    answer = run_job(EnvironmentCreation(tmp_path / "trainer", log).steps())
     assert answer.level == "INFO" and folder.folder_state(tmp_path / "trainer") is FolderState.READY
     used = re.search(r"Settings of pip that are used: (.*)", log.read_text())[1].split(", ")
     assert {"find-links", "no-index", "proxy"} <= set(used) <= {"find-links", "no-index", "proxy", "cert"}
@@ -128,7 +128,7 @@ def test_settings_of_pip_that_cannot_be_read_are_named(user: Path, tmp_path: Pat
     (tmp_path / "pip.conf").write_text("user = true\n")
     monkeypatch.setenv("PIP_CONFIG_FILE", str(tmp_path / "pip.conf"))
     with pytest.raises(TrainerEnvironmentError, match=r"The settings of pip cannot be read \(.*pip\.conf.*\); correct"):
-        list(EnvironmentCreation(tmp_path / "trainer", tmp_path / "log", base=sys.executable).steps())
+        list(EnvironmentCreation(tmp_path / "trainer", tmp_path / "log").steps())
     assert not (tmp_path / "trainer").exists()
 
 
@@ -200,21 +200,14 @@ def test_too_little_disk_space_is_refused_before_the_installation(
     assert session.environment_state() is FolderState.READY
 
 
-def test_a_python_that_cannot_create_environments_is_refused(user: Path, wheels: Path, tmp_path: Path):
-    said = [sys.version_info[:2], True, []]
-    broken = write_program(
-        tmp_path / "python",
-        "if '-c' in sys.argv:",
-        f"    print(json.dumps([*{said!r}, {str(tmp_path / 'python')!r} + '.cmd' * (os.name == 'nt')]))",
-        "else:",
-        "    print('Error: no room for it')",
-        "    sys.exit(1)",
-    )
-    text = refused(bpy.ops.fdda.create_trainer_environment, python=broken, wheels=str(wheels))
+def test_a_python_that_cannot_create_environments_is_refused(
+    user: Path, wheels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sys, "executable", write_program(tmp_path / "python", "sys.exit('Error: no room for it')"))
+    text = refused(create, wheels=str(wheels))
     assert "cannot be created ('" in text and "Error: no room for it); choose an existing Python" in text
-    assert "('/none/python' is no Python that runs); choose" in refused(
-        bpy.ops.fdda.create_trainer_environment, python="/none/python", wheels=str(wheels)
-    )
+    monkeypatch.setattr(creation, "PINNED_REQUIREMENTS", {})
+    assert "is too new); choose an existing Python" in refused(create, wheels=str(wheels))
 
 
 @pytest.mark.one_blender_version
@@ -254,7 +247,7 @@ def begin_creation(job: EnvironmentCreation) -> JobRunner:
 
 
 def test_a_canceled_creation_ends_its_process_and_removes_its_files(user: Path, wheels: Path):
-    job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels, sys.executable)
+    job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels)
     run = begin_creation(job)
     assert not bpy.ops.fdda.create_trainer_environment.poll() and not run.work(0)
     wait_for(lambda: folder.environment_folder().is_dir())
@@ -270,7 +263,7 @@ def test_a_canceled_creation_ends_its_process_and_removes_its_files(user: Path, 
 
 @pytest.mark.one_blender_version
 def test_a_creation_canceled_before_its_start_keeps_the_environment(own: Path, wheels: Path):
-    job = EnvironmentCreation(own, folder.log_path(), wheels, sys.executable)
+    job = EnvironmentCreation(own, folder.log_path(), wheels)
     job.cancel()
     with pytest.raises(TrainerEnvironmentError, match="was canceled; the previous environment was kept"):
         list(job.steps())
@@ -280,7 +273,7 @@ def test_a_creation_canceled_before_its_start_keeps_the_environment(own: Path, w
 def test_unregistering_cancels_a_running_creation(user: Path, wheels: Path):
     import fdda_addon
 
-    job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels, sys.executable)
+    job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels)
     begin_creation(job).work(0)
     wait_for(lambda: folder.environment_folder().is_dir())
     fdda_addon.unregister()
@@ -445,19 +438,6 @@ def test_a_hanging_python_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert asked(write_program(tmp_path / "program", "time.sleep(5)")).message.endswith(
         "did not answer in 0 s; do this."
     )
-
-
-@pytest.mark.parametrize(
-    ("answer", "lacks"),
-    [
-        ([[3, 10], True, [], "/p"], "is none of 3.11, 3.12, 3.13"),
-        ([[3, 13], False, [], "/p"], "is not 64-bit"),
-        ([[3, 13], True, ["ensurepip", "venv"], "/p"], "lacks the module ensurepip"),
-    ],
-)
-def test_a_base_python_says_what_it_lacks(tmp_path: Path, answer: list, lacks: str):
-    base = query_interpreter(write_program(tmp_path / "python", f"print({json.dumps(answer)!r})"))
-    assert base.problem == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
 
 
 def test_a_training_without_blenders_program_finds_the_environment_that_blender_made(tmp_path: Path):
