@@ -47,13 +47,10 @@ def _draw_parts(layout: bpy.types.UILayout, times: Benchmark) -> None:
         ("   Bones", times.median(BONES)),
         ("   Other Objects", max(times.median(WITHOUT_MESHES) - times.median(BONES), 0.0)),
         ("   Network", times.median(INFERENCE)),
-        *((f"   Only {mesh.name}", times.median(mesh.variant)) for mesh in times.meshes if mesh.variant in times.times),
     ]
     grid = layout.column(align=True)
     for label, ms in rows:
         _draw_time(grid, label, f"{ms:.2f} ms")
-    if times.constant_bytes:
-        _draw_time(grid, "   Memory", f"{times.constant_bytes / 1e6:.1f} MB")
 
 
 def _draw_time(layout: bpy.types.UILayout, label: str, text: str) -> None:

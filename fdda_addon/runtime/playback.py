@@ -253,13 +253,3 @@ def suspended_playback() -> Iterator[None]:
         yield
     finally:
         resume()
-
-
-@contextmanager
-def without_model_runs() -> Iterator[None]:
-    """Play without running models in the block, to measure the rest of a frame: the last positions are kept."""
-    session.skips_models = True
-    try:
-        yield
-    finally:
-        session.skips_models = False

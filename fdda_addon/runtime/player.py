@@ -224,8 +224,7 @@ class Player:
         if self._shown is None:
             return True
         shown_inputs, shown_strength = self._shown
-        is_shown = shown_inputs is inputs and shown_strength == self.strength
-        return not (is_shown or (session.skips_models and self._positions is not None))
+        return shown_inputs is not inputs or shown_strength != self.strength
 
     def set_positions(self, inputs: ModelInputs, positions: np.ndarray, mesh_object: bpy.types.Object) -> None:
         """Use positions of the model.

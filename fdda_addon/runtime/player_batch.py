@@ -49,7 +49,7 @@ class PlayedPose:
         """Set the inputs if they have changed."""
         # Bytes are compared, because a pose may have values that are not numbers.
         key = inputs.pose_matrices.tobytes(), inputs.controls.tobytes(), inputs.warning
-        if key == self._key or (session.skips_models and self.inputs is not None):
+        if key == self._key:
             return
         self._key, self.is_outdated = key, True
         if not np.isfinite(inputs.pose_matrices).all():

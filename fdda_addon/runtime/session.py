@@ -74,7 +74,6 @@ class PlaybackSession:
         scanned_count: number of objects in the file at the last scan.
         suspension_count: number of saves that have begun and not ended. A handler of another add-on may save a copy
             before Blender writes the file itself.
-        skips_models: whether players keep their last positions instead of running models.
         is_switching: whether an animated mode is being applied.
         apply_effect: applies an effect to a character; `effects`, which imports this module, sets it.
         check_timer: the timer that checks changed rigs.
@@ -90,7 +89,7 @@ class PlaybackSession:
         self.chosen_paths: set[Path] = set()
         self.needs_scan, self.scanned_count = True, 0
         self.suspension_count = 0
-        self.skips_models = self.is_switching = False
+        self.is_switching = False
         self.apply_effect: Callable[[Effect, Character, FDDAError | None], None]
         self._count_without_bound: int | None = None
         self.read_bones: dict[tuple[int, bool], tuple] | None = None

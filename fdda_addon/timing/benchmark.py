@@ -27,7 +27,7 @@ from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.shape_keys import key_distances
 from ..rig.time_inputs import check_time_inputs
-from ..runtime import model_files, playback
+from ..runtime import model_files
 from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import read_matching_rig
 from ..scene.scene_rig import SceneRig, armature_modifier, check_full_rig, join_rigs, rigs_of_armature
@@ -47,7 +47,7 @@ MIN_WORTHWHILE_RATIO = 1.5
 MAX_RATIO_RANGE = 1.6
 """Largest ratio of the quartiles of the ratios of all rounds that allows a verdict."""
 
-RIG, LINEAR, FDDA, FLOOR, WITHOUT_MESHES, BONES = "rig", "linear", "fdda", "floor", "without_meshes", "bones"
+RIG, LINEAR, FDDA, WITHOUT_MESHES, BONES = "rig", "linear", "fdda", "without_meshes", "bones"
 
 INFERENCE = "inference"
 
@@ -55,7 +55,6 @@ LABELS = {
     RIG: "rig",
     LINEAR: "Armature modifiers alone",
     FDDA: "FDDA",
-    FLOOR: "FDDA without running the models",
     WITHOUT_MESHES: "without the meshes",
     BONES: "bones alone",
     INFERENCE: "the models alone, one pose",
@@ -63,7 +62,7 @@ LABELS = {
 
 
 @dataclass(frozen=True)
-class MeshTimes:
+class MeasuredMesh:
     """A mesh of a character.
 
     Attributes:
@@ -78,11 +77,6 @@ class MeshTimes:
     has_model: bool = False
     reason: str = ""
 
-    @property
-    def variant(self) -> str:
-        """Return the variant with the model of this mesh alone; a mesh may have the name of another variant."""
-        return _only(self.name)
-
 
 @dataclass(frozen=True)
 class Benchmark:
@@ -94,21 +88,19 @@ class Benchmark:
         model_count: number of meshes with a model.
         frames: number of timed frames of each variant.
         times: the times of each variant. `LINEAR` lacks for a character without Armature modifiers; meshes without one
-            do not deform in it. `FDDA` has all models, `FLOOR` does not run them. `WITHOUT_MESHES` evaluates everything
+            do not deform in it. `FDDA` has all models. `WITHOUT_MESHES` evaluates everything
             that models keep except the meshes of the character, `BONES` the armature alone. `INFERENCE` is one run of
             all models for one pose, outside of Blender's evaluation.
         rounds: the median time of each variant but `INFERENCE` in each round.
-        constant_bytes: size of the constants of the models' graphs, which each frame reads; 0 if unknown.
         is_estimate: whether the models are untrained.
     """
 
     armature: str
-    meshes: tuple[MeshTimes, ...]
+    meshes: tuple[MeasuredMesh, ...]
     model_count: int
     frames: int
     times: Mapping[str, list[float]]
     rounds: Mapping[str, list[float]]
-    constant_bytes: int
     is_estimate: bool
 
     def median(self, variant: str) -> float:
@@ -203,45 +195,26 @@ class Benchmark:
             **{
                 variant: {"median": _round(self.median(variant)), "p90": _round(np.percentile(times, 90))}
                 for variant, times in self.times.items()
-                if variant in LABELS
             },
-            "model_alone": {m.name: _round(self.median(m.variant)) for m in self.meshes if m.variant in self.times},
             "ratio": _round(self.ratio),
             "ratio_quartiles": [_round(ratio) for ratio in self.quartiles],
             "is_faster": self.ratio > 1,
             "is_estimate": self.is_estimate,
-            "constant_bytes": self.constant_bytes,
         }
 
     def table(self) -> str:
         """Format the times as tables, followed by a verdict."""
         names = f"{format_count(len(self.meshes), 'mesh', 'meshes')} of {self.armature}, ms per frame"
         lines = [f"{names:<37}{'median':>10}{'p90':>10}"]
-        for variant, times in ((variant, times) for variant, times in self.times.items() if variant in LABELS):
+        for variant, times in self.times.items():
             lines.append(f"  {LABELS[variant]:<35}{self.median(variant):>10.3f}{np.percentile(times, 90):>10.3f}")
-        if self.constant_bytes:
-            lines.append(f"  {'model data read per frame, MB':<35}{self.constant_bytes / 1e6:>10.2f}")
         lines.append(f"{'part of a frame, ms':<37}{'rig':>17}{'FDDA':>17}")
         rig, fdda = self.median(RIG), self.median(FDDA)
         for label, before, after in self.shares:
             lines.append(f"  {label:<35}{before:>10.3f} {before / rig:>5.0%}{after:>11.3f} {after / fdda:>5.0%}")
-        lines += [f"  {line}" for line in self.mesh_lines()]
+        for mesh in (mesh for mesh in self.meshes if not mesh.has_model):
+            lines.append(f"  {mesh.name} ({mesh.vertices:,} vertices): {mesh.reason or 'no model'}")
         return "\n".join([*lines, f"  {self.sentence}"])
-
-    def mesh_lines(self) -> list[str]:
-        """Return a line for each mesh of several."""
-        lines = []
-        for mesh in self.meshes if len(self.meshes) > 1 else ():
-            text = mesh.reason or ("" if mesh.has_model else "no model")
-            if mesh.variant in self.times:
-                ms = self.median(mesh.variant)
-                text = f"its model alone {ms:.2f} ms, {self.median(RIG) / ms:.1f}x as fast"
-            lines.append(f"{mesh.name} ({mesh.vertices:,} vertices): {text or 'the only model'}")
-        return lines
-
-
-def _only(mesh_name: str) -> str:
-    return f"only {mesh_name}"
 
 
 def _round(value: float) -> float:
@@ -307,14 +280,11 @@ def benchmark(
             RIG: partial(_models_shown, ()),
             LINEAR: partial(_skinning_shown, [rig.mesh_object for rig in rigs]),
             FDDA: partial(_models_shown, meshes),
-            FLOOR: partial(_models_shown, meshes, runs=False),
             WITHOUT_MESHES: partial(_models_shown, ()),
             BONES: partial(_models_shown, ()),
         }
         if all(armature_modifier(mesh_object) is None for mesh_object in meshes):
             del show[LINEAR]
-        if len(rigs) > 1 and len(meshes) > 1:
-            show |= {_only(mesh_object.name): partial(_models_shown, [mesh_object]) for mesh_object in meshes}
         times: dict[str, list[float]] = {variant: [] for variant in show}
         rounds: dict[str, list[float]] = {variant: [] for variant in show}
         frames_per_round = max(1, -(-frames // ROUNDS))
@@ -332,7 +302,7 @@ def benchmark(
         # Meshes may share a model, which runs once.
         networks = list(dict.fromkeys(network.model for network in networks))
         times[INFERENCE] = list(np.sum([_inference_times(network, frames) for network in networks], axis=0))
-    described = [MeshTimes(o.name, len(o.data.vertices), o in meshes, reasons.get(o, "")) for o in mesh_objects]
+    described = [MeasuredMesh(o.name, len(o.data.vertices), o in meshes, reasons.get(o, "")) for o in mesh_objects]
     return Benchmark(
         armature_object.name,
         tuple(sorted(described, key=lambda mesh: -mesh.vertices)),
@@ -340,7 +310,6 @@ def benchmark(
         frames_per_round * index,
         times,
         rounds,
-        sum(network.info.constant_bytes for network in networks),
         is_estimate,
     )
 
@@ -358,18 +327,11 @@ def _ratio_spread(rounds: Mapping[str, list[float]]) -> float:
 
 
 @contextmanager
-def _models_shown(mesh_objects: list[bpy.types.Object], runs: bool = True) -> Iterator[None]:
-    """Play the models of mesh objects in the block.
-
-    Args:
-        runs: whether the models run; else they show the pose that they have shown last.
-    """
+def _models_shown(mesh_objects: list[bpy.types.Object]) -> Iterator[None]:
+    """Play the models of mesh objects in the block."""
     with ExitStack() as stack:
         for mesh_object in mesh_objects:
             stack.enter_context(temporary_mode(mesh_object, "FDDA"))
-        if not runs:
-            bpy.context.view_layer.update()
-            stack.enter_context(playback.without_model_runs())
         yield
 
 

@@ -154,10 +154,7 @@ def constant_bytes(model: onnx.ModelProto) -> int:
     return sum(array.size * max(4, array.itemsize) for array in arrays)
 
 
-def test_constants_are_the_matrices_and_little_else(trained, trained_model, report):
-    info = read_model_info(trained / "model.onnx")
-    assert info.constant_bytes == report["constant_bytes"] == constant_bytes(onnx.load(trained / "model.onnx"))
-    assert f"{info.constant_bytes:,}" in (trained / "report.html").read_text()
+def test_constants_are_the_matrices_and_little_else(trained_model):
     network_parameters = sum(a.size for p in trained_model.prepared for a in (*p.network.weights, *p.network.biases))
     matrix_elements = sum(
         (4 * 2 + 4 * len(p.fit.joints) + 3 * len(p.basis.components)) * p.vertex_count for p in trained_model.prepared

@@ -2,7 +2,6 @@
 """Builds the ONNX model, checks it against the trained networks, and measures its errors."""
 
 import hashlib
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -234,7 +233,6 @@ def _model_info(
     trained_model: TrainedModel,
     held_out: Measurement,
     training_info: dict,
-    constant_bytes: int,
 ) -> ModelInfo:
     """Create the metadata of a model; arguments as in `build_model`."""
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
@@ -264,7 +262,6 @@ def _model_info(
             **({KEY_JOINTS_KEY: recording.key_joints.to_json()} if recording.key_joints else {}),
         },
         rig.metres_per_unit,
-        constant_bytes,
     )
 
 
@@ -299,12 +296,7 @@ def build_model(
     session = open_session(model.SerializeToString())
     held_out = measure(session, recording, held_out_poses, trained_model)
     check_parity(recording, held_out)
-    # ONNX Runtime converts compact constants to float32.
-    constant_bytes = sum(
-        math.prod(tensor.dims) * max(4, onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize)
-        for tensor in model.graph.initializer
-    )
-    info = _model_info(recording, trained_model, held_out, training_info, constant_bytes)
+    info = _model_info(recording, trained_model, held_out, training_info)
     # The checksum comes first, so that a truncated file still has it.
     model.metadata_props.add(key=CHECKSUM_KEY, value=hashlib.sha256(model.graph.SerializeToString()).hexdigest())
     model.metadata_props.add(key=METADATA_KEY, value=info.to_json())

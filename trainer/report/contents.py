@@ -62,7 +62,6 @@ def make_report(
         "poses": len(recording.pose_matrices),
         "training": exported.info.training,
         "parity": exported.info.parity_mm,
-        "constant_bytes": exported.info.constant_bytes,
         "fdda": {"training": error_statistics(training_errors.fdda).to_json(), "held_out": exported.info.held_out_mm},
         "linear": {"held_out": error_statistics(held_out.linear).to_json()},
         **surface,

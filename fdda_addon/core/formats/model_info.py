@@ -61,7 +61,6 @@ class ModelInfo:
         controls: controls with their ranges in training.
         held_out_mm: errors over the held-out poses, mm, by the names of `metrics.ErrorStatistics`.
         parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
-        constant_bytes: size of the constants of the graph; 0 where unknown.
         training: settings and seed of the training.
         metres_per_unit: length of one unit of mesh-object space, as in `Rig`.
     """
@@ -77,7 +76,6 @@ class ModelInfo:
     parity_mm: float = 0.0
     training: dict = field(default_factory=dict)
     metres_per_unit: float = 1.0
-    constant_bytes: int = 0
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -163,7 +161,6 @@ class ModelInfo:
             "parity_mm": self.parity_mm,
             "training": self.training,
             **unit_to_json(self.metres_per_unit),
-            **({"constant_bytes": self.constant_bytes} if self.constant_bytes else {}),
         }
         return json.dumps(value, allow_nan=False)
 
@@ -198,7 +195,7 @@ def _read_info(value: dict) -> ModelInfo:
     keys = {
         **{"rest_matrices": ranges, "meshes": [{}], "partitions": [partition_keys]},
         **{"training_ranges": {"low": ranges, "high": ranges}, "held_out_mm": {str: NUMBER}, "parity_mm": NUMBER},
-        **{"training": {f"{LIMITS_KEY}?": [{}]}, "constant_bytes?": COUNT},
+        **{"training": {f"{LIMITS_KEY}?": [{}]}},
     }
     check_json(value, keys)
     partitions = tuple(
@@ -222,7 +219,6 @@ def _read_info(value: dict) -> ModelInfo:
         value["parity_mm"],
         value["training"],
         read_unit(value),
-        value.get("constant_bytes", 0),
     )
     _ = info.limits, info.skin_sentence  # raises an error if the metadata is damaged
     return info

@@ -74,7 +74,6 @@ _REPORT_KEYS = {
         "bones_to_read": str,
     },
     "parity": NUMBER,
-    "constant_bytes?": WHOLE,
     "fdda": {"training": _ERROR_STATISTICS, "held_out": _ERROR_STATISTICS},
     "linear": {"held_out": _ERROR_STATISTICS},
     "normals?": ({"fdda": _ANGLE_STATISTICS, "linear": _ANGLE_STATISTICS}, None),

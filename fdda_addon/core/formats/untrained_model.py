@@ -57,7 +57,6 @@ def build_untrained_model(rig: Rig, key_distances: Mapping[str, np.ndarray]) -> 
         feature_high=high,
         controls=rig.controls,
         metres_per_unit=rig.metres_per_unit,
-        constant_bytes=graph.constant_bytes,
     )
     metadata = {CHECKSUM_KEY: hashlib.sha256(content).hexdigest(), METADATA_KEY: info.to_json()}
     return b"".join(
@@ -186,16 +185,11 @@ def _add_products(
 
 
 class _Graph:
-    """An ONNX graph that is built node by node.
-
-    Attributes:
-        constant_bytes: size of its constants.
-    """
+    """An ONNX graph that is built node by node."""
 
     def __init__(self) -> None:
         self._nodes: list[bytes] = []
         self._constants: list[bytes] = []
-        self.constant_bytes = 0
 
     def add(self, operator: str, inputs: list[str], *outputs: str, **attributes: int | list[int]) -> str:
         """Add a node, and return the name of its first output."""
@@ -233,7 +227,6 @@ class _Graph:
     def _add_constant(self, name: str, data_type: int, array: np.ndarray) -> str:
         dimensions = b"".join(_integer(1, size) for size in array.shape)
         self._constants.append(dimensions + _integer(2, data_type) + _text(8, name) + _bytes(9, array.tobytes()))
-        self.constant_bytes += array.nbytes
         return name
 
 

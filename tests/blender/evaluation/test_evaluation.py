@@ -165,11 +165,11 @@ def test_the_heat_map_shows_colored_errors(elbow_files, tmp_path):
     assert len(np.unique((picture * 16).astype(int).reshape(-1, 3), axis=0)) > 30
 
 
-def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path, capfd):
+def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path):
     path = tmp_path / "b.json"
     assert run("benchmark", elbow_files.rig, elbow_files.model, "--json", path, "--frames", 12) == 0
     report = json.loads(path.read_text())
-    methods = ["rig", "linear", "fdda", "floor", "without_meshes", "bones", "inference"]
+    methods = ["rig", "linear", "fdda", "without_meshes", "bones", "inference"]
     assert (report["unit"], report["vertices"]) == ("ms", 300)
     # At least five rounds of three frames; more while the times vary.
     assert report["frames"] in range(15, 3 * MAX_ROUNDS + 1, 3)
@@ -178,11 +178,8 @@ def test_the_benchmark_reports_times_and_their_ratio(elbow_files, tmp_path, capf
         assert min(report[method].values()) > 0
     assert report["linear"]["median"] < report["rig"]["median"]
     assert report["ratio"] == pytest.approx(report["rig"]["median"] / report["fdda"]["median"], rel=0.05)
-    out = capfd.readouterr().out
     assert report["is_faster"] == (report["ratio"] > 1) and not report["is_estimate"]
     assert report["meshes"] == [{"name": "elbow", "vertices": 300, "has_model": True, "reason": ""}]
-    assert report["constant_bytes"] == Network(elbow_files.model).info.constant_bytes > 10_000
-    assert f"{report['constant_bytes'] / 1e6:.2f}" in out
 
 
 def test_an_action_has_the_same_errors_with_and_without_held_out_poses(rig, elbow_files):
