@@ -102,15 +102,27 @@ def _deforming_bones(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bp
 def _channels_read_by_drivers(
     scene_rig: SceneRig, sources: Sources
 ) -> Iterator[tuple[bpy.types.Object, str, tuple[float, float] | None]]:
-    """Yield the free channels of bones of other armatures that drivers read by path, with their ranges."""
+    """Yield the unlocked channels of bones of other armatures that drivers read by path, with their ranges."""
     for datablock, path in sources.numbers:
         name, subpath = split_bone_path(datablock, path)
         bone = datablock.pose.bones.get(name) if name and is_transform_channel(subpath) else None
         if bone is not None and datablock != scene_rig.armature_object:
-            channel, axis = subpath[1:-3], int(subpath[-2])
-            ranges = next((ranges for _, other, ranges in _free_channels(bone) if other == channel), {})
-            if axis in ranges and _can_vary(ranges[axis]):
-                yield datablock, path, ranges[axis]
+            bounds = _channel_range(bone, *subpath[1:-1].split("["))
+            if _can_vary(bounds):
+                yield datablock, path, bounds
+
+
+def _channel_range(bone: bpy.types.PoseBone, channel: str, index: str) -> tuple[float, float] | None:
+    """Return the range of a channel, whether or not it moves the bone; empty if it is locked, None without a range."""
+    axis = int(index)
+    if channel in (LOCATION, SCALE):
+        is_locked = getattr(bone, f"lock_{channel}")[axis]
+        ranges = location_ranges(bone) if channel == LOCATION else scale_ranges(bone)
+        return (0.0, 0.0) if is_locked else ranges.get(axis)
+    if channel == "rotation_euler" and bone.rotation_mode not in FOUR_COMPONENT_ROTATIONS:
+        rotation_range = rotation_ranges(bone)[axis]
+        return (rotation_range.low, rotation_range.high) if rotation_range.moves else (0.0, 0.0)
+    return (0.0, 0.0) if all(bone.lock_rotation) else None
 
 
 def _can_vary(bounds: tuple[float, float] | None) -> bool:

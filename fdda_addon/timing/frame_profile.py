@@ -220,31 +220,41 @@ def _profile_shown_rig(rigs: list[SceneRig]) -> Job[FrameProfile]:
     frame_rounds: list[float] = []
     bone_ratios: list[float] = []
     part_ratios: dict[bpy.types.Object, dict[tuple[str, str], list[float]]] = {}
-    with temporary_animation(main_rig(rigs)) as frames, temporary_armature_scene(armature_object) as armature_scene:
+    with temporary_animation(main_rig(rigs)) as frames:
         evaluated = [d.original for d in bpy.context.evaluated_depsgraph_get().ids if isinstance(d, bpy.types.Object)]
         objects = {o.name: o for o in evaluated if o.type != "ARMATURE" and _removable_parts(o)}
         measured = [None, *(objects[name] for name in sorted(objects))]
-        for step, (round_index, scene_object) in enumerate(product(range(ROUNDS), measured), 1):
-            measure = partial(
-                frame_ms,
-                animation_frames=frames,
-                first_index=round_index * FRAMES_PER_ROUND,
-                count=FRAMES_PER_ROUND,
-            )
-            whole_ms = previous_ms = measure(bpy.context.scene)
-            frame_rounds.append(whole_ms)
-            if scene_object is None:
-                bone_ratios.append(measure(armature_scene) / whole_ms)
-            else:
-                ratios = part_ratios.setdefault(scene_object, {})
-                with ExitStack() as stack:
-                    # From the last modifier to the first, because the result of the first is the input of the next.
-                    for part in _removable_parts(scene_object):
-                        _disable_part(stack, scene_object, *part)
-                        remaining_ms = measure(bpy.context.scene)
-                        ratios.setdefault(part, []).append((previous_ms - remaining_ms) / whole_ms)
-                        previous_ms = remaining_ms
-            yield Progress("objects", step, ROUNDS * len(measured))
+        with temporary_armature_scene(armature_object) as armature_scene:
+            for step, (round_index, scene_object) in enumerate(product(range(ROUNDS), measured), 1):
+                # Objects that take next to nothing in the first round belong to the rest.
+                if round_index and scene_object is not None and scene_object not in part_ratios:
+                    continue
+                measure = partial(
+                    frame_ms,
+                    animation_frames=frames,
+                    first_index=round_index * FRAMES_PER_ROUND,
+                    count=FRAMES_PER_ROUND,
+                )
+                whole_ms = previous_ms = measure(bpy.context.scene)
+                frame_rounds.append(whole_ms)
+                if scene_object is None:
+                    bone_ratios.append(measure(armature_scene) / whole_ms)
+                else:
+                    ratios = part_ratios.setdefault(scene_object, {})
+                    with ExitStack() as stack:
+                        # From the last modifier to the first, because the result of the first is the input of the next.
+                        for part in _removable_parts(scene_object):
+                            _disable_part(stack, scene_object, *part)
+                            remaining_ms = measure(bpy.context.scene)
+                            ratios.setdefault(part, []).append((previous_ms - remaining_ms) / whole_ms)
+                            previous_ms = remaining_ms
+                    if (
+                        not round_index
+                        and scene_object not in mesh_objects
+                        and whole_ms - previous_ms < MIN_SHARE * whole_ms
+                    ):
+                        del part_ratios[scene_object]
+                yield Progress("objects", step, ROUNDS * len(measured))
         redraw_rounds = yield from time_redraws(frames, ROUNDS, FRAMES_PER_ROUND)
     rows, rest = {(BONES, armature_object.name, ""): bone_ratios}, 1 - np.array(bone_ratios)
     for scene_object, ratios in part_ratios.items():

@@ -2,6 +2,7 @@
 """A symmetric figure with two arms. Actions animate its bones, a custom property and a shape key."""
 
 import math
+from collections.abc import Callable
 
 import bpy
 import numpy as np
@@ -117,3 +118,11 @@ def add_smile(rig: SceneRig, action: bpy.types.Action) -> None:
         keys.keyframe_insert(SMILE, frame=frame)
     keys.key_blocks["Smile"].value = 0
     animation.action = None
+
+
+def edit_bones(rig: SceneRig, change: Callable[[bpy.types.ArmatureEditBones], None]) -> None:
+    """Change the armature's bones in edit mode."""
+    bpy.context.view_layer.objects.active = rig.armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    change(rig.armature_object.data.edit_bones)
+    bpy.ops.object.mode_set(mode="OBJECT")

@@ -84,7 +84,7 @@ def repeated_poses(count: int, unsettled: Collection[int]) -> list[int]:
     """Return the indices of the poses that are reached from a second direction: the first that came to rest.
 
     Args:
-        count: number of random poses in the range of motion, which are the first poses of a recording.
+        count: number of first poses among which they are: of all poses, or of those that are random and in the range.
         unsettled: indices of the poses in which the target did not come to rest.
     """
     return [index for index in range(count) if index not in unsettled][:REPEATED_POSES]
